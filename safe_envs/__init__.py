@@ -1,0 +1,33 @@
+"""Gymnasium environments of safety-critical systems under uncertainty; importing this package registers their ids."""
+
+from safe_envs.barrier import Barrier
+from safe_envs.env import SafeEnv
+from safe_envs.errors import (
+    ConfigurationError,
+    InvalidInputError,
+    NumericalError,
+    RelativeDegreeError,
+    SafeEnvsError,
+    SystemDefinitionError,
+)
+from safe_envs.problem import SafetyProblem
+from safe_envs.sde import ControlAffineSDE
+from safe_envs.systems import ENV_IDS, register_all
+from safe_envs.vector import SafeVectorEnv
+
+__all__ = [
+    "ENV_IDS",
+    "Barrier",
+    "ConfigurationError",
+    "ControlAffineSDE",
+    "InvalidInputError",
+    "NumericalError",
+    "RelativeDegreeError",
+    "SafeEnv",
+    "SafeEnvsError",
+    "SafeVectorEnv",
+    "SafetyProblem",
+    "SystemDefinitionError",
+]
+
+register_all()

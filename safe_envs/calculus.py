@@ -1,0 +1,101 @@
+"""Lie derivatives, the Ito generator and relative degree, by symbolic differentiation.
+
+The printed derivations of this field contain sign errors; here nothing is differentiated by hand.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+
+import sympy as sp
+
+from safe_envs.errors import RelativeDegreeError
+from safe_envs.sde import ControlAffineSDE
+
+Derivative = Callable[[ControlAffineSDE, sp.Expr], sp.Expr]
+
+
+def gradient(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
+    """Row of partial derivatives with respect to the states, shape (1, n)."""
+    return sp.ImmutableMatrix([[sp.diff(expression, s) for s in system.states]])
+
+
+def drift_derivative(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
+    """L_f phi = grad phi . f, the rate of phi along the uncontrolled, noise-free motion."""
+    return (gradient(system, expression) * system.drift)[0, 0]
+
+
+def input_derivative(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
+    """L_g phi = grad phi . g, shape (1, m): how the input changes the rate of phi."""
+    return sp.ImmutableMatrix(gradient(system, expression) * system.input_matrix)
+
+
+def ito_term(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
+    """1/2 tr(sigma sigma' phi_xx), the drift that the noise gives to a curved function."""
+    covariance = system.diffusion * system.diffusion.T
+    total = sp.Integer(0)
+    for i, row_state in enumerate(system.states):
+        if all(covariance[i, j] == 0 for j in range(system.n)):
+            continue
+        slope = sp.diff(expression, row_state)
+        total += sum(covariance[i, j] * sp.diff(slope, s) for j, s in enumerate(system.states) if covariance[i, j] != 0)
+    return total / 2
+
+
+def generator(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
+    """The part of A phi = L_f phi + L_g phi u + 1/2 tr(sigma sigma' phi_xx) that does not contain the input.
+
+    Source: thesis Eq. (4.4).
+    """
+    return drift_derivative(system, expression) + ito_term(system, expression)
+
+
+def vanishes(system: ControlAffineSDE, expression: sp.Expr) -> bool:
+    """Whether an expression is zero at every state, for the system's parameters.
+
+    The parameters enter as exact rationals and the states as random ones: a nonzero analytic expression is zero
+    there with probability 0, and no slow `simplify` is needed.
+    """
+    exact = system.exact(expression)
+    if exact.is_number:
+        return bool(exact.equals(0))
+    points = random.Random(0)
+    for _ in range(3):
+        at = {s: sp.Rational(points.randint(1, 10**6), 10**6) for s in system.states}
+        value = exact.subs(at).evalf(30, maxn=200)
+        if value.is_finite and abs(value) > sp.Float("1e-25"):
+            return False
+    return True
+
+
+def derivatives(system: ControlAffineSDE, expression: sp.Expr, order: int, derivative: Derivative) -> tuple[sp.Expr, ...]:
+    """(phi, D phi, ..., D^order phi) for D = `drift_derivative` or `generator`."""
+    result = [expression]
+    for _ in range(order):
+        result.append(derivative(system, result[-1]))
+    return tuple(result)
+
+
+def relative_degree(system: ControlAffineSDE, expression: sp.Expr, derivative: Derivative = drift_derivative) -> int:
+    """Smallest r with L_g D^(r-1) h not identically zero.
+
+    Args:
+        system: with the parameters for which the degree is asked.
+        expression: h.
+        derivative: D; `drift_derivative` for the deterministic degree (thesis Def. 3.1.3), `generator` for the
+            stochastic one. Thesis Def. 4.2.9 prints A^j h = 0 as the condition below r, where L_g A^(j-1) h = 0
+            is meant.
+
+    Raises:
+        RelativeDegreeError: the input reaches none of the first n derivatives, or h does not depend on the states.
+    """
+    system.require_known("the barrier", expression.free_symbols, system.states)
+    for order in range(system.n):
+        if any(not vanishes(system, entry) for entry in input_derivative(system, expression)):
+            return order + 1
+        expression = derivative(system, expression)
+    raise RelativeDegreeError(
+        f"no input ({', '.join(map(str, system.inputs))}) appears in the first {system.n} derivatives of the barrier: "
+        "it has no relative degree, and no action can keep it positive. Check the barrier and the input matrix"
+    )

@@ -1,0 +1,125 @@
+"""From sympy expressions to functions of plain floats, or of NumPy arrays over any batch.
+
+Both flavours take their arguments one by one, component by component, and return a tuple: with arrays, every
+component is an array over the batch, so that elementwise arithmetic runs on contiguous memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+import sympy as sp
+from sympy.printing.numpy import NumPyPrinter
+from sympy.printing.pycode import PythonCodePrinter
+
+Flavour = Literal["floats", "arrays"]
+Components = tuple[Any, ...]
+
+_LARGEST_EXPANDED_POWER = 8
+_REMEMBERED = 8
+
+
+class _Remembering:
+    """A costly ufunc that knows the last few arrays it was applied to.
+
+    The observation, the filter and the next step ask for the sine of one and the same heading. Arrays are told
+    apart by identity, so they must not be changed in place between calls: `compile_function` asks for that.
+    """
+
+    def __init__(self, ufunc: np.ufunc) -> None:
+        self._ufunc = ufunc
+        self._known: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def __call__(self, argument: Any) -> Any:
+        if type(argument) is not np.ndarray:
+            return self._ufunc(argument)
+        entry = self._known.get(id(argument))
+        if entry is not None and entry[0] is argument:
+            return entry[1]
+        value = self._ufunc(argument)
+        value.flags.writeable = False
+        if len(self._known) >= _REMEMBERED:
+            self._known = {}
+        self._known[id(argument)] = (argument, value)
+        return value
+
+
+_ARRAY_FUNCTIONS = {name: _Remembering(getattr(np, name)) for name in ("sin", "cos", "exp", "sqrt")}
+
+
+class _ArrayPrinter(NumPyPrinter):
+    """Prints Min and Max as nested binary ufuncs; sympy's own form stacks the operands first."""
+
+    def _nested(self, function: str, expression: sp.Expr) -> str:
+        code = self._print(expression.args[0])
+        for argument in expression.args[1:]:
+            code = f"{self._module_format('numpy.' + function)}({code}, {self._print(argument)})"
+        return code
+
+    def _print_Max(self, expression: sp.Expr) -> str:
+        return self._nested("maximum", expression)
+
+    def _print_Min(self, expression: sp.Expr) -> str:
+        return self._nested("minimum", expression)
+
+
+_PRINTER_SETTINGS = {"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True}
+
+
+def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[sp.Expr], flavour: Flavour) -> Callable[..., Components]:
+    """Compile expressions that share their common subexpressions.
+
+    Args:
+        arguments: symbols, in the order in which the function takes them.
+        expressions: what it returns, in order; every free symbol must be an argument.
+        flavour: "floats" for plain floats, "arrays" for NumPy arrays that broadcast against each other.
+
+    Returns:
+        A function of `len(arguments)` positional arguments that returns a tuple of `len(expressions)`. An
+        expression without any argument in it comes back as a float in both flavours. Neither the arrays given nor
+        those returned may be changed in place.
+    """
+    return _compile(tuple(arguments), tuple(sp.sympify(e) for e in expressions), flavour)
+
+
+@lru_cache(maxsize=1024)
+def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], flavour: Flavour) -> Callable[..., Components]:
+    printer = _ArrayPrinter(_PRINTER_SETTINGS) if flavour == "arrays" else PythonCodePrinter(_PRINTER_SETTINGS)
+    return sp.lambdify(
+        arguments,
+        tuple(sp.Float(e, 17) if e.is_number else e for e in expressions),
+        modules=[_ARRAY_FUNCTIONS, np] if flavour == "arrays" else [math],
+        printer=printer,
+        cse=_shared_subexpressions,
+        docstring_limit=0,
+    )
+
+
+def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
+    """Common subexpressions, with small integer powers written as products: `pow` is many times slower."""
+    shared, reduced = sp.cse(expressions, list=False)
+    fresh = sp.numbered_symbols("p", exclude=set().union(*(e.free_symbols for e in (*reduced, *(s for s, _ in shared)))))
+    replacements: list[tuple[sp.Symbol, sp.Expr]] = []
+
+    def expand(expression: sp.Expr) -> sp.Expr:
+        if not expression.args:
+            return expression
+        arguments = [expand(a) for a in expression.args]
+        if isinstance(expression, sp.Pow) and expression.exp.is_Integer and 2 <= abs(expression.exp) <= _LARGEST_EXPANDED_POWER:
+            base = arguments[0]
+            if not base.is_Symbol:
+                symbol = next(fresh)
+                replacements.append((symbol, base))
+                base = symbol
+            product = sp.Mul(*[base] * abs(int(expression.exp)), evaluate=False)
+            return product if expression.exp > 0 else sp.Pow(product, -1, evaluate=False)
+        return expression if arguments == list(expression.args) else expression.func(*arguments, evaluate=False)
+
+    for symbol, expression in shared:
+        expanded = expand(expression)
+        replacements.append((symbol, expanded))
+    return replacements, type(reduced)(expand(e) for e in reduced)

@@ -1,0 +1,187 @@
+"""The scalar face of a problem: a Gymnasium env."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
+from safe_envs.info import Info, safety_info
+from safe_envs.problem import SafetyProblem
+from safe_envs.simulation import NoiseStream, Simulation, center_and_half_width, steps_until
+
+
+def observation_box(problem: SafetyProblem) -> gym.spaces.Box:
+    """Observation space of a problem: its features within their bounds."""
+    low = np.array([f.low for f in problem.features], dtype=np.float32)
+    high = np.array([f.high for f in problem.features], dtype=np.float32)
+    return gym.spaces.Box(low, high, dtype=np.float32)
+
+
+def action_box(problem: SafetyProblem) -> gym.spaces.Box:
+    """Action space of a problem: [-1, 1] for each input, which stands for the physical box."""
+    return gym.spaces.Box(-1.0, 1.0, (len(problem.inputs),), dtype=np.float32)
+
+
+def make_problem(env_class: type[Any], barrier: Mapping[str, Any] | None, options: Mapping[str, Any]) -> SafetyProblem:
+    """Build the problem of a registered env class with the arguments of `gym.make`."""
+    try:
+        problem = env_class.problem_factory(**(barrier or {}))
+    except TypeError as error:
+        raise ConfigurationError(f"barrier = {barrier!r} does not fit {env_class.__name__}: {error}") from error
+    return problem.configured(**options)
+
+
+class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
+    """Any `SafetyProblem` as a Gymnasium env.
+
+    Actions are in [-1, 1] for every input and stand for the physical box; what lies beyond is clipped. Actions may
+    be given in double precision. The observation holds the problem's features as float32, `state` the exact state.
+    The keys of `info` are those of `safe_envs.info`.
+
+    The episode is terminated when the goal is reached or the state leaves the workspace, and truncated after
+    `horizon`. A violation does not end it.
+
+    Args:
+        problem: what to simulate.
+        max_episode_steps: truncate after so many control periods, if that is before the horizon.
+        render_mode: None; nothing is drawn yet.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # pyright: ignore[reportIncompatibleVariableOverride]
+
+    def __init__(self, problem: SafetyProblem, max_episode_steps: int | None = None, render_mode: str | None = None) -> None:
+        if render_mode is not None:
+            raise ConfigurationError(f"render_mode = {render_mode!r}; only None is available")
+        self.problem = problem
+        self.observation_space = observation_box(problem)
+        self.action_space = action_box(problem)
+        self.render_mode = render_mode
+        self._simulation = Simulation(problem, "floats")
+        self._noise = NoiseStream(self._simulation.integrator.channels)
+        self._center, self._half = center_and_half_width(problem)
+        self._limit = steps_until(problem, max_episode_steps)
+        self._x: tuple[float, ...] | None = None
+        self._steps = 0
+        self._h_min = math.inf
+        self._episode_cost = 0.0
+
+    @property
+    def components(self) -> tuple[float, ...]:
+        """The exact state, as plain floats in the order of the problem's states."""
+        if self._x is None:
+            raise gym.error.ResetNeeded("the env has no state yet: call reset() first")
+        return self._x
+
+    @property
+    def state(self) -> np.ndarray:
+        """The exact state, shape (n,), in the units of the problem's states."""
+        return np.array(self.components)
+
+    def physical_action(self, action: Any) -> tuple[float, ...]:
+        """Map an action in [-1, 1] to the physical box; what lies beyond is clipped.
+
+        Raises:
+            InvalidInputError: the action has another shape than (m,) or is not finite.
+        """
+        given = np.asarray(action)
+        if given.shape != self.action_space.shape:
+            raise InvalidInputError(f"action has shape {given.shape}; the env takes {self.action_space.shape}")
+        values = given.tolist()
+        for a in values:
+            if not math.isfinite(a):
+                raise InvalidInputError(f"action {values} is not finite; give numbers in [-1, 1]")
+        return tuple([c + w * min(max(a, -1.0), 1.0) for c, w, a in zip(self._center, self._half, values, strict=True)])
+
+    def normalized_action(self, physical: Sequence[float]) -> np.ndarray:
+        """Inverse of `physical_action`, in double precision."""
+        return np.array([(u - c) / w for c, w, u in zip(self._center, self._half, physical, strict=True)])
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+        """Start an episode from the problem's initial distribution."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self._noise.clear()
+        self._x = self._simulation.draw_start(self.np_random)
+        self._steps = 0
+        self._h_min = math.inf
+        self._episode_cost = 0.0
+        observation, _, _, info = self._observe(tuple(self._center))
+        return observation, info
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Info]:
+        """Hold an action for one control period.
+
+        Raises:
+            InvalidInputError: see `physical_action`.
+            NumericalError: the state is not finite any more.
+        """
+        u = self.physical_action(action)
+        try:
+            self._x = self._simulation.integrator.step(self.components, u, self._noise.next(self.np_random))
+            self._steps += 1
+            observation, reward, terminated, info = self._observe(u)
+        except (OverflowError, ZeroDivisionError, ValueError) as error:
+            raise NumericalError(f"the simulation of {self.problem.name!r} broke down at {self._x}: {error}") from error
+        return observation, reward, terminated, self._steps >= self._limit, info
+
+    def _observe(self, u: tuple[float, ...]) -> tuple[np.ndarray, float, bool, Info]:
+        x = self.components
+        if not math.isfinite(sum(x)):
+            raise NumericalError(f"the state {x} of {self.problem.name!r} is not finite; reduce dt or raise substeps")
+        features, barriers, reward, outside, goal = self._simulation.measure(x, u, self._steps * self.problem.dt)
+        h = min(barriers)
+        violation = h < 0.0
+        cost = 1.0 if violation else 0.0
+        self._episode_cost += cost
+        if h < self._h_min:
+            self._h_min = h
+        observation = np.array(features, dtype=np.float32)
+        left = outside > 0.0
+        if left:
+            np.clip(observation, self.observation_space.low, self.observation_space.high, out=observation)
+        info = safety_info(
+            violation=violation,
+            cost=cost,
+            barrier=np.array(barriers),
+            h_min=self._h_min,
+            episode_cost=self._episode_cost,
+        )
+        return observation, reward, left or goal >= 0.0, info
+
+
+class SystemEnv(SafeEnv):
+    """Base of the registered envs: a system's problem behind the arguments of `gym.make`.
+
+    Args:
+        noise: diffusion of plant and model, one number for all channels or one for each; 0 turns it off.
+        plant: parameters of the simulated system, by name.
+        model: parameters that the designer believes, by name.
+        barrier: arguments of the barrier, by name.
+        dt: control period in s.
+        substeps: integration steps in a control period.
+        horizon: length of an episode in s.
+        box: physical bounds (low, high) of every input, or one pair for each.
+        start: name of an initial distribution, or a fixed initial state.
+        max_episode_steps: truncate after so many control periods, if that is before the horizon.
+        render_mode: None; nothing is drawn yet.
+
+    Raises:
+        ConfigurationError: an argument names something unknown or is out of range.
+    """
+
+    problem_factory: ClassVar[Any]
+
+    def __init__(
+        self,
+        *,
+        barrier: Mapping[str, Any] | None = None,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(make_problem(type(self), barrier, options), max_episode_steps, render_mode)

@@ -1,0 +1,38 @@
+"""Errors of this project: each says what was given, what is allowed and what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class SafeEnvsError(Exception):
+    """Base of every error that this project raises on purpose."""
+
+
+class SystemDefinitionError(SafeEnvsError, ValueError):
+    """A system, barrier or problem contradicts itself."""
+
+
+class RelativeDegreeError(SystemDefinitionError):
+    """The input never appears in the derivatives of a barrier, or not where a condition needs it."""
+
+
+class ConfigurationError(SafeEnvsError, ValueError):
+    """An argument names something unknown or has a value outside its range."""
+
+
+class InvalidInputError(SafeEnvsError, ValueError):
+    """A state or an action has the wrong shape or is not finite."""
+
+
+class NumericalError(SafeEnvsError, ArithmeticError):
+    """A formula has no finite value at a state."""
+
+
+def nearest(name: str, allowed: Iterable[str]) -> str:
+    """Return a phrase that lists the allowed names, the nearest one to `name` first."""
+    names = list(allowed)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
+    listing = ", ".join(names) if names else "none"
+    return f"did you mean {close[0]!r}? (allowed: {listing})" if close else f"allowed: {listing}"

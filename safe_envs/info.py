@@ -1,0 +1,76 @@
+"""The info contract: which keys an env and a filter report, and of which type.
+
+Every key is present at reset and at every step, with one type throughout: Python scalars and float64 arrays from a
+scalar env, arrays with the batch in front from a vector env. No value is NaN.
+
+| key | type | meaning |
+|---|---|---|
+| `cost` | float | 1.0 where the state is unsafe, 0.0 elsewhere |
+| `violation` | bool | some barrier is negative |
+| `barrier` | float64 (k,) | value of each barrier |
+| `h_min` | float | smallest barrier value of the episode so far |
+| `episode_cost` | float | sum of the costs of the episode so far |
+
+and with a filter
+
+| key | type | meaning |
+|---|---|---|
+| `nominal_action` | float64 (m,) | what the policy proposed, in physical units |
+| `safe_action` | float64 (m,) | what was executed, in physical units |
+| `intervention` | bool | the two differ |
+| `filter_active` | bool | a barrier row is binding or cannot be met |
+| `feasible` | bool | some action in the box meets every row |
+| `slack` | float | by how much the worst row is violated by the executed action |
+| `episode_interventions` | int | interventions of the episode so far |
+| `episode_infeasible` | int | infeasible steps of the episode so far |
+
+At reset, where nothing was executed yet, the actions are the point of the box nearest to 0.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Info = dict[str, Any]
+
+
+def safety_info(*, violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any) -> Info:
+    """What every env reports; values as in the table above."""
+    return {
+        "cost": cost,
+        "violation": violation,
+        "barrier": barrier,
+        "h_min": h_min,
+        "episode_cost": episode_cost,
+    }
+
+
+def filter_info(
+    *,
+    nominal_action: np.ndarray,
+    safe_action: np.ndarray,
+    intervention: Any,
+    filter_active: Any,
+    feasible: Any,
+    slack: Any,
+    episode_interventions: Any,
+    episode_infeasible: Any,
+) -> Info:
+    """What a filter adds; values as in the table above."""
+    return {
+        "nominal_action": nominal_action,
+        "safe_action": safe_action,
+        "intervention": intervention,
+        "filter_active": filter_active,
+        "feasible": feasible,
+        "slack": slack,
+        "episode_interventions": episode_interventions,
+        "episode_infeasible": episode_infeasible,
+    }
+
+
+def with_masks(info: Info, present: np.ndarray) -> Info:
+    """Add Gymnasium's `_key` masks, which say for which envs of a batch a key was reported."""
+    return {**info, **{f"_{key}": present for key in info}}

@@ -1,0 +1,242 @@
+"""A safety problem: plant, model, barriers, input box, start, timing and task, as one frozen statement."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.barrier import Barrier
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
+from safe_envs.sde import ControlAffineSDE, finite_number
+
+TIME = sp.Symbol("t", real=True)
+"""Time since the start of the episode, in s: references and rewards may depend on it."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A state or an input with its range.
+
+    For a state the range is the workspace: an episode ends when the state leaves it (an infinite range never ends
+    one). For an input it is the box of admissible actions, finite.
+    """
+
+    symbol: sp.Symbol
+    low: float
+    high: float
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Feature:
+    """An entry of the observation: an expression of the states and of `TIME`, with finite bounds."""
+
+    name: str
+    expression: sp.Expr
+    low: float
+    high: float
+
+    @property
+    def symbol(self) -> sp.Symbol:
+        """The symbol by which a nominal controller refers to it."""
+        return sp.Symbol(self.name, real=True)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Distribution of the initial state: a map of independent uniforms on [0, 1), kept where `condition` > 0."""
+
+    state: tuple[sp.Expr, ...]
+    uniforms: tuple[sp.Symbol, ...] = ()
+    condition: sp.Expr | None = None
+
+    @classmethod
+    def at(cls, values: Sequence[float]) -> Start:
+        """A fixed initial state."""
+        return cls(tuple(sp.Float(v, 17) for v in values))
+
+
+@dataclass(frozen=True)
+class SafetyProblem:
+    """What the world is, what the designer believes, what is safe, and what is to be done.
+
+    Attributes:
+        name: of the problem.
+        plant: the real system, which the env simulates.
+        model: what the designer believes; filters and nominal controllers see this one.
+        barriers: what is safe.
+        states: range and unit of each state of the plant, in order.
+        inputs: box and unit of each input, in order.
+        reward: of a step, an expression of the state that it reaches, of the executed input and of `TIME`.
+        nominal: the nominal controller, an expression for each input of the features' symbols and the model's
+            parameters. The box clips it.
+        starts: named initial distributions.
+        start: the name of the one in use.
+        dt: control period in s.
+        horizon: length of an episode in s.
+        features: entries of the observation; the states by default.
+        goal: the episode ends where this expression is >= 0.
+        noise: names of the diffusion parameters, in the order of the `noise` argument.
+        gains: rates p_1..p_r in 1/s that the conditions use unless told otherwise.
+        filter: name of the condition that suits the problem.
+        substeps: integration steps in a control period.
+        plane: the two states that draw a trajectory, if any.
+
+    Raises:
+        SystemDefinitionError: the parts do not fit together.
+    """
+
+    name: str
+    plant: ControlAffineSDE
+    model: ControlAffineSDE
+    barriers: tuple[Barrier, ...]
+    states: tuple[Variable, ...]
+    inputs: tuple[Variable, ...]
+    reward: sp.Expr
+    nominal: tuple[sp.Expr, ...]
+    starts: Mapping[str, Start]
+    dt: float
+    horizon: float
+    features: tuple[Feature, ...] = ()
+    start: str = ""
+    goal: sp.Expr | None = None
+    noise: tuple[str, ...] = ()
+    gains: tuple[float, ...] = (1.0,)
+    filter: str = "hocbf"
+    substeps: int = 1
+    plane: tuple[str, str] | None = None
+    box: tuple[tuple[float, float], ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        plant, model = self.plant, self.model
+        if not self.features:
+            features = tuple(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in self.states)
+            object.__setattr__(self, "features", features)
+        object.__setattr__(self, "start", self.start or next(iter(self.starts)))
+        object.__setattr__(self, "box", tuple((i.low, i.high) for i in self.inputs))
+        if (plant.states, plant.inputs) != (model.states, model.inputs):
+            raise SystemDefinitionError("plant and model must have the same states and inputs")
+        if tuple(s.symbol for s in self.states) != plant.states or tuple(i.symbol for i in self.inputs) != plant.inputs:
+            raise SystemDefinitionError("the ranges of states and inputs must be given in the order of the plant's symbols")
+        if not self.barriers or len(self.nominal) != plant.m:
+            raise SystemDefinitionError(f"a problem needs a barrier and a nominal expression for each of the {plant.m} inputs")
+        for barrier in self.barriers:
+            plant.require_known(f"barrier {barrier.name}", barrier.expression.free_symbols, plant.states)
+        plant.require_known("the reward", self.reward.free_symbols, (*plant.states, *plant.inputs, TIME))
+        for feature in self.features:
+            plant.require_known(f"feature {feature.name}", feature.expression.free_symbols, (*plant.states, TIME))
+        for law in self.nominal:
+            known = (*(f.symbol for f in self.features), *model.parameters)
+            plant.require_known("the nominal controller", law.free_symbols, known)
+        for i in self.inputs:
+            if not (math.isfinite(i.low) and math.isfinite(i.high) and i.low < i.high):
+                raise ConfigurationError(
+                    f"box of input {i.symbol} is [{i.low}, {i.high}]; it needs finite bounds, the lower one below the upper. "
+                    "Unbounded control is a wide box"
+                )
+        self._check_timing()
+
+    def _check_timing(self) -> None:
+        if not self.dt > 0 or not math.isfinite(self.dt):
+            raise ConfigurationError(f"dt = {self.dt} s; a control period is positive and finite")
+        if not math.isfinite(self.horizon) or round(self.horizon / self.dt) < 1:
+            raise ConfigurationError(f"horizon = {self.horizon} s; it must hold at least one control period of {self.dt} s")
+        if not isinstance(self.substeps, int) or self.substeps < 1:
+            raise ConfigurationError(f"substeps = {self.substeps!r}; give a whole number from 1")
+
+    @property
+    def steps(self) -> int:
+        """Control periods in an episode."""
+        return round(self.horizon / self.dt)
+
+    @property
+    def outside(self) -> sp.Expr:
+        """Positive where the state has left the workspace; -1 if the workspace is unbounded."""
+        excess = [v.symbol - v.high for v in self.states if math.isfinite(v.high)]
+        excess += [v.low - v.symbol for v in self.states if math.isfinite(v.low)]
+        return sp.Max(*excess) if excess else sp.Integer(-1)
+
+    def configured(
+        self,
+        *,
+        noise: float | Sequence[float] | None = None,
+        plant: Mapping[str, float] | None = None,
+        model: Mapping[str, float] | None = None,
+        dt: float | None = None,
+        substeps: int | None = None,
+        horizon: float | None = None,
+        box: Sequence[Any] | None = None,
+        start: str | Sequence[float] | None = None,
+    ) -> SafetyProblem:
+        """Return the problem with other numbers; None keeps the default.
+
+        Args:
+            noise: diffusion of plant and model alike, one number for all channels or one for each; 0 turns it off.
+            plant: parameters of the plant, by name.
+            model: parameters of the model, by name.
+            dt: control period in s.
+            substeps: integration steps in a control period.
+            horizon: length of an episode in s.
+            box: (low, high) for every input, or one such pair for each.
+            start: name of an initial distribution, or a fixed initial state.
+
+        Raises:
+            ConfigurationError: a name is unknown or a value is not allowed.
+        """
+        levels = self._noise_levels(noise)
+        changes: dict[str, Any] = {
+            "plant": self.plant.with_parameters(**{**levels, **(plant or {})}),
+            "model": self.model.with_parameters(**{**levels, **(model or {})}),
+        }
+        for name, value in (("dt", dt), ("horizon", horizon)):
+            if value is not None:
+                changes[name] = finite_number(name, value)
+        if substeps is not None:
+            changes["substeps"] = substeps
+        if box is not None:
+            changes["inputs"] = self._boxed(box)
+        if isinstance(start, str):
+            if start not in self.starts:
+                raise ConfigurationError(f"unknown start {start!r}; {nearest(start, self.starts)}, or {len(self.states)} numbers")
+            changes["start"] = start
+        elif start is not None:
+            changes["starts"] = {**self.starts, "given": self._fixed(start)}
+            changes["start"] = "given"
+        return replace(self, **changes)
+
+    def _noise_levels(self, noise: float | Sequence[float] | None) -> dict[str, float]:
+        if noise is None:
+            return {}
+        if not self.noise:
+            raise ConfigurationError(f"{self.name} has no noise channels")
+        given = np.atleast_1d(np.asarray(noise, dtype=float))
+        if given.shape not in ((1,), (len(self.noise),)) or not np.isfinite(given).all() or (given < 0).any():
+            raise ConfigurationError(
+                f"noise = {noise!r}; give one number >= 0, or {len(self.noise)} of them ({', '.join(self.noise)})"
+            )
+        return dict(zip(self.noise, np.broadcast_to(given, len(self.noise)).tolist(), strict=True))
+
+    def _boxed(self, box: Sequence[Any]) -> tuple[Variable, ...]:
+        try:
+            pairs = np.asarray(box, dtype=float)
+            pairs = np.broadcast_to(pairs, (len(self.inputs), 2)) if pairs.shape == (2,) else pairs
+        except (TypeError, ValueError):
+            pairs = np.empty(0)
+        if pairs.shape != (len(self.inputs), 2):
+            raise ConfigurationError(f"box = {box!r}; give (low, high), or one such pair for each of the {len(self.inputs)} inputs")
+        return tuple(replace(i, low=low, high=high) for i, (low, high) in zip(self.inputs, pairs.tolist(), strict=True))
+
+    def _fixed(self, start: Sequence[float]) -> Start:
+        names = ", ".join(s.symbol.name for s in self.states)
+        if len(start) != len(self.states):
+            raise ConfigurationError(f"start has {len(start)} numbers; the state has {len(self.states)}: {names}")
+        values = [finite_number(f"start of {s.symbol}", v) for s, v in zip(self.states, start, strict=True)]
+        for s, v in zip(self.states, values, strict=True):
+            if not s.low <= v <= s.high:
+                raise ConfigurationError(f"start of {s.symbol} = {v} is outside the workspace [{s.low}, {s.high}]")
+        return Start.at(values)

@@ -1,0 +1,141 @@
+"""A control-affine stochastic differential equation, stated once, in symbols."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import sympy as sp
+
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
+
+
+def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
+    """Read a list, nested list or matrix as an immutable matrix of the required shape (None: any width)."""
+    try:
+        matrix = sp.ImmutableMatrix(entries)
+    except (TypeError, ValueError) as error:
+        raise SystemDefinitionError(f"{name} is no matrix of expressions: {error}") from error
+    rows, columns = shape
+    if matrix.rows != rows or (columns is not None and matrix.cols != columns):
+        wanted = f"{rows} x {'any' if columns is None else columns}"
+        raise SystemDefinitionError(f"{name} has shape {matrix.rows} x {matrix.cols}; the states and inputs need {wanted}")
+    return matrix
+
+
+def finite_number(name: str, value: Any) -> float:
+    """Return `value` as a float, or say why it cannot be one."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError(f"{name} = {value!r} is not a number") from error
+    if not math.isfinite(number):
+        raise ConfigurationError(f"{name} = {number} is not finite")
+    return number
+
+
+@dataclass(frozen=True)
+class ControlAffineSDE:
+    """dx = (f(x) + g(x) u) dt + sigma(x) dW.
+
+    Exogenous motion, a moving obstacle say, is a state of its own with a known drift, so that no time derivative
+    of a barrier can be forgotten.
+
+    Attributes:
+        states: n symbols x.
+        inputs: m symbols u.
+        drift: f, n x 1 expressions of the states and parameters.
+        input_matrix: g, n x m.
+        diffusion: sigma, n x d, for a d-dimensional standard Wiener process W.
+        parameters: value of every other symbol that occurs.
+
+    Raises:
+        SystemDefinitionError: a shape does not fit, a symbol is unknown or defined twice, or an input occurs in
+            f, g or sigma, so that the system is not control-affine.
+        ConfigurationError: a parameter is no finite number.
+
+    Source: thesis Eq. (4.1).
+    """
+
+    states: tuple[sp.Symbol, ...]
+    inputs: tuple[sp.Symbol, ...]
+    drift: sp.ImmutableMatrix
+    input_matrix: sp.ImmutableMatrix
+    diffusion: sp.ImmutableMatrix
+    parameters: Mapping[sp.Symbol, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        n, m = len(self.states), len(self.inputs)
+        if not n or not m:
+            raise SystemDefinitionError(f"a system needs a state and an input; given {n} states and {m} inputs")
+        fields: dict[str, Any] = {
+            "states": tuple(self.states),
+            "inputs": tuple(self.inputs),
+            "drift": _matrix("drift", self.drift, (n, 1)),
+            "input_matrix": _matrix("input_matrix", self.input_matrix, (n, m)),
+            "diffusion": _matrix("diffusion", self.diffusion, (n, None)),
+            "parameters": {p: finite_number(f"parameter {p}", v) for p, v in self.parameters.items()},
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        self._check_symbols()
+
+    def _check_symbols(self) -> None:
+        symbols = [*self.states, *self.inputs, *self.parameters]
+        names = [s.name for s in symbols]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise SystemDefinitionError(f"defined more than once among states, inputs and parameters: {', '.join(twice)}")
+        for name in ("drift", "input_matrix", "diffusion"):
+            used: set[Any] = getattr(self, name).free_symbols
+            if used & set(self.inputs):
+                raise SystemDefinitionError(
+                    f"{name} depends on the input {_names(used & set(self.inputs))}; the system must be affine in "
+                    "the input: put what multiplies it into input_matrix"
+                )
+            self.require_known(name, used, allowed=(*self.states, *self.parameters))
+
+    def require_known(self, what: str, used: Iterable[Any], allowed: Sequence[sp.Symbol]) -> None:
+        """Raise SystemDefinitionError if an expression uses a symbol that is not allowed in it."""
+        unknown = set(used) - set(allowed)
+        if unknown:
+            raise SystemDefinitionError(
+                f"{what} uses the unknown symbol {_names(unknown)}; allowed: {_names(allowed)}. "
+                "A symbol is known by name and assumptions: Symbol('x', real=True) is not Symbol('x')"
+            )
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    def with_parameters(self, **values: float) -> ControlAffineSDE:
+        """Return the same system with other parameter values.
+
+        Raises:
+            ConfigurationError: a name is no parameter of the system, or a value is no finite number.
+        """
+        by_name = {p.name: p for p in self.parameters}
+        for name in values:
+            if name not in by_name:
+                raise ConfigurationError(f"unknown parameter {name!r}; {nearest(name, by_name)}")
+        return replace(self, parameters={**self.parameters, **{by_name[k]: v for k, v in values.items()}})
+
+    def numeric(self, expression: Any) -> Any:
+        """Return an expression or matrix with the parameters' values in place of their symbols."""
+        return expression.subs({p: sp.Float(v, 17) if v != int(v) else sp.Integer(int(v)) for p, v in self.parameters.items()})
+
+    def exact(self, expression: Any) -> Any:
+        """Like `numeric`, with the decimal value of each parameter as a rational, so that terms cancel exactly."""
+        return expression.subs({p: sp.Rational(repr(v)) for p, v in self.parameters.items()})
+
+
+def _names(symbols: Iterable[Any]) -> str:
+    return ", ".join(sorted(str(s) for s in symbols))

@@ -1,0 +1,168 @@
+"""The one implementation of physics, reward, start and observation, over floats or over a batch of arrays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safe_envs.codegen import Components, Flavour, compile_function
+from safe_envs.errors import ConfigurationError
+from safe_envs.integrate import Integrator
+from safe_envs.problem import TIME, SafetyProblem
+
+_CHUNK = 128
+_TRIES_AT_ONCE = 8
+_MOST_TRIES = 10_000
+
+
+class Measurement(NamedTuple):
+    """What can be read off a state: each entry is a component, a float or an array over the batch."""
+
+    features: Components
+    barriers: Components
+    reward: Any
+    outside: Any
+    goal: Any
+
+
+class Simulation:
+    """The formulas of a problem, compiled: they hold no state, so that one object serves any number of envs."""
+
+    def __init__(self, problem: SafetyProblem, flavour: Flavour) -> None:
+        self.problem = problem
+        self.integrator = Integrator(problem.plant, problem.dt, problem.substeps, flavour)
+        self._features = len(problem.features)
+        self._barriers = self._features + len(problem.barriers)
+        read = (
+            *(f.expression for f in problem.features),
+            *(b.expression for b in problem.barriers),
+            problem.reward,
+            problem.outside,
+            -1 if problem.goal is None else problem.goal,
+        )
+        self._measure = compile_function((*problem.plant.states, *problem.plant.inputs, TIME), read, flavour)
+        start = problem.starts[problem.start]
+        self._uniforms = len(start.uniforms)
+        self._tries = 1 if start.condition is None else _TRIES_AT_ONCE
+        self._start = compile_function(start.uniforms, start.state, flavour)
+        if start.condition is not None:
+            condition = problem.model.numeric(start.condition)
+            self._accept = compile_function(problem.plant.states, (condition,), flavour)
+        else:
+            self._accept = None
+
+    def measure(self, x: Components, u: Components, time: Any) -> Measurement:
+        """Observation, barriers, reward of having arrived at x under u, and whether the episode ends here (> 0, >= 0)."""
+        values = self._measure(*x, *u, time)
+        f, b = self._features, self._barriers
+        return Measurement(values[:f], values[f:b], values[b], values[b + 1], values[b + 2])
+
+    def draw_start(self, rng: np.random.Generator) -> Components:
+        """Draw an initial state by rejection. For flavour "floats"."""
+        for _ in range(_MOST_TRIES // self._tries):
+            for uniforms in rng.random((self._tries, self._uniforms)).tolist():
+                x = self._start(*uniforms)
+                if self._accept is None or self._accept(*x)[0] > 0:
+                    return x
+        raise self._hopeless()
+
+    def draw_starts(self, rngs: Sequence[np.random.Generator]) -> list[np.ndarray]:
+        """Draw an initial state from each generator; components of shape (len(rngs),). For flavour "arrays"."""
+        states = [np.empty(len(rngs)) for _ in self.problem.states]
+        missing = np.arange(len(rngs))
+        for _ in range(_MOST_TRIES // self._tries):
+            uniforms = np.stack([rngs[i].random((self._tries, self._uniforms)) for i in missing.tolist()], axis=-1)
+            shape = (self._tries, missing.size)
+            tries = [np.broadcast_to(c, shape) for c in self._start(*uniforms.swapaxes(0, 1))]
+            accepted = np.ones(shape, bool) if self._accept is None else np.broadcast_to(self._accept(*tries)[0] > 0, shape)
+            first, found = accepted.argmax(axis=0), accepted.any(axis=0)
+            for state, component in zip(states, tries, strict=True):
+                state[missing] = component[first, np.arange(missing.size)]
+            missing = missing[~found]
+            if not missing.size:
+                return states
+        raise self._hopeless()
+
+    def _hopeless(self) -> ConfigurationError:
+        return ConfigurationError(
+            f"no start of {self.problem.name!r} met the condition of the distribution {self.problem.start!r} in "
+            f"{_MOST_TRIES} tries; give a fixed start or another distribution"
+        )
+
+
+class NoiseStream:
+    """Standard normals of one env, drawn ahead in chunks."""
+
+    def __init__(self, channels: int) -> None:
+        self._channels = channels
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what was drawn ahead: the generator was seeded anew."""
+        self._rows: list[list[float]] = []
+        self._position = 0
+
+    def next(self, rng: np.random.Generator) -> list[float]:
+        """The draws of the next control period."""
+        if not self._channels:
+            return []
+        if self._position == len(self._rows):
+            self._rows = rng.standard_normal((_CHUNK, self._channels)).tolist()
+            self._position = 0
+        self._position += 1
+        return self._rows[self._position - 1]
+
+
+class NoiseStreams:
+    """The same for a batch: each env keeps its own stream, so that its noise does not depend on its neighbours."""
+
+    def __init__(self, num_envs: int, channels: int) -> None:
+        self._buffer = np.empty((num_envs, _CHUNK, channels))
+        self._position = np.full(num_envs, _CHUNK)
+        self._first = np.arange(num_envs) * _CHUNK
+
+    def clear(self, envs: np.ndarray) -> None:
+        """Forget what was drawn ahead for some envs: their generators were seeded anew."""
+        self._position[envs] = _CHUNK
+
+    def next(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> np.ndarray:
+        """The draws of the next control period, shape (channels, num_envs).
+
+        Args:
+            rngs: generator of each env.
+            stepping: the envs whose stream moves on; None for all. The others get draws that are to be ignored.
+        """
+        channels = self._buffer.shape[2]
+        if not channels:
+            return self._buffer[:0, 0]
+        used_up = self._position == _CHUNK
+        if stepping is not None:
+            used_up &= stepping
+        for i in np.flatnonzero(used_up).tolist():
+            rngs[i].standard_normal(out=self._buffer[i])
+            self._position[i] = 0
+        row = self._position if stepping is None else np.where(stepping, self._position, 0)
+        draws = self._buffer.reshape(-1, channels).take(self._first + row, axis=0)
+        self._position += 1 if stepping is None else stepping
+        return np.ascontiguousarray(draws.T)
+
+
+def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
+    """Control periods until an episode is truncated."""
+    if max_episode_steps is None:
+        return problem.steps
+    if not isinstance(max_episode_steps, int) or max_episode_steps < 1:
+        raise ConfigurationError(f"max_episode_steps = {max_episode_steps!r}; give a whole number from 1")
+    return min(problem.steps, max_episode_steps)
+
+
+def center_and_half_width(problem: SafetyProblem) -> tuple[list[float], list[float]]:
+    """Physical input = center + half width * action, for an action in [-1, 1]."""
+    center = [0.5 * (low + high) for low, high in problem.box]
+    half = [0.5 * (high - low) for low, high in problem.box]
+    if not all(math.isfinite(c) and math.isfinite(w) for c, w in zip(center, half, strict=True)):
+        raise ConfigurationError(f"box {problem.box} is too wide for floating-point numbers")
+    return center, half

@@ -1,0 +1,19 @@
+"""The systems of the thesis, one file each, and their registration with Gymnasium."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+
+_CLASSES = {
+    "StochasticDubins": "dubins",
+}
+
+ENV_IDS = tuple(f"safe_envs/{name}-v0" for name in _CLASSES)
+"""Every registered id."""
+
+
+def register_all() -> None:
+    """Register every id with Gymnasium; the systems themselves are imported when an env is made."""
+    for name, module in _CLASSES.items():
+        path = f"safe_envs.systems.{module}:{name}"
+        gym.register(f"safe_envs/{name}-v0", entry_point=path, vector_entry_point=f"{path}Vector")

@@ -1,0 +1,270 @@
+"""The batched face of a problem: a Gymnasium vector env without a loop over its envs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from safe_envs.codegen import Components
+from safe_envs.env import action_box, make_problem, observation_box
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
+from safe_envs.info import Info, safety_info, with_masks
+from safe_envs.problem import SafetyProblem
+from safe_envs.simulation import NoiseStreams, Simulation, center_and_half_width, steps_until
+
+VectorStep = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]
+
+
+class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """`num_envs` copies of a problem, stepped together.
+
+    Env i, reset with seed s, follows the same trajectory as the scalar env reset with seed s + i, as in Gymnasium's
+    own SyncVectorEnv, whatever `num_envs` is. Infos are those of `SafeEnv` with the batch in front.
+
+    Args:
+        problem: what to simulate.
+        num_envs: size of the batch.
+        autoreset_mode: when ended episodes start anew: "NextStep" (Gymnasium's default: the following step ignores
+            the action and returns the reset observation, with reward 0), "SameStep" (the last observation and info
+            of the episode are in `infos["final_obs"]` and `infos["final_info"]`) or "Disabled" (reset by
+            `options={"reset_mask": mask}`).
+        max_episode_steps: truncate after so many control periods, if that is before the horizon.
+        render_mode: None; nothing is drawn yet.
+
+    Raises:
+        ConfigurationError: an argument is out of range.
+    """
+
+    def __init__(
+        self,
+        problem: SafetyProblem,
+        num_envs: int = 1,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if not isinstance(num_envs, int) or num_envs < 1:
+            raise ConfigurationError(f"num_envs = {num_envs!r}; give a whole number from 1")
+        if render_mode is not None:
+            raise ConfigurationError(f"render_mode = {render_mode!r}; only None is available")
+        try:
+            self._autoreset = AutoresetMode(autoreset_mode)
+        except ValueError as error:
+            allowed = ", ".join(mode.value for mode in AutoresetMode)
+            raise ConfigurationError(f"autoreset_mode = {autoreset_mode!r}; allowed: {allowed}") from error
+        self.problem = problem
+        self.num_envs = num_envs
+        self.metadata = {"render_modes": [], "autoreset_mode": self._autoreset}
+        self.single_observation_space = observation_box(problem)
+        self.single_action_space = action_box(problem)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._simulation = Simulation(problem, "arrays")
+        self._noise = NoiseStreams(num_envs, self._simulation.integrator.channels)
+        self._center, self._half = center_and_half_width(problem)
+        self._limit = steps_until(problem, max_episode_steps)
+        self._rngs: list[np.random.Generator] = []
+        self._seeds: list[int] = []
+        self._x: Components = ()
+        self._steps = np.zeros(num_envs, dtype=np.int64)
+        self._h_min = np.full(num_envs, np.inf)
+        self._episode_cost = np.zeros(num_envs)
+        self._ended = np.zeros(num_envs, dtype=bool)
+
+    @property
+    def components(self) -> Components:
+        """The exact states, an array of shape (num_envs,) for each of the problem's states."""
+        if not self._x:
+            raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
+        return self._x
+
+    @property
+    def state(self) -> np.ndarray:
+        """The exact states, shape (num_envs, n), in the units of the problem's states."""
+        return np.stack(self.components, axis=-1)
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The generator of each env."""
+        self._seed([None] * self.num_envs)
+        return tuple(self._rngs)
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The seed of each env."""
+        self._seed([None] * self.num_envs)
+        return tuple(self._seeds)
+
+    def physical_action(self, actions: Any) -> Components:
+        """Map actions in [-1, 1], shape (num_envs, m), to the components of the physical inputs, clipped to the box.
+
+        Raises:
+            InvalidInputError: the actions have another shape or are not finite.
+        """
+        given = np.asarray(actions, dtype=np.float64)
+        if given.shape != self.action_space.shape:
+            raise InvalidInputError(f"actions have shape {given.shape}; the envs take {self.action_space.shape}")
+        if not np.isfinite(given).all():
+            bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
+            raise InvalidInputError(f"the actions of envs {bad[:5].tolist()} are not finite; give numbers in [-1, 1]")
+        clipped = np.minimum(np.maximum(given, -1.0), 1.0)
+        return tuple([c + w * clipped[:, j] for j, (c, w) in enumerate(zip(self._center, self._half, strict=True))])
+
+    def normalized_action(self, physical: Components) -> np.ndarray:
+        """Inverse of `physical_action`, in double precision."""
+        actions = np.empty((self.num_envs, len(physical)))
+        for j, (u, c, w) in enumerate(zip(physical, self._center, self._half, strict=True)):
+            np.divide(u - c, w, out=actions[:, j])
+        return actions
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, Info]:
+        """Start episodes in every env, or in those of `options["reset_mask"]`.
+
+        Args:
+            seed: seed of env 0, with env i seeded by seed + i, or a seed (or None) for each env.
+            options: may hold "reset_mask", a bool array of shape (num_envs,).
+        """
+        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else list(seed or [None] * self.num_envs)
+        if len(seeds) != self.num_envs:
+            raise ConfigurationError(f"{len(seeds)} seeds were given for {self.num_envs} envs")
+        mask = self._reset_mask(options)
+        self._seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
+        self._restart(np.flatnonzero(mask))
+        observation, _, _, _, info = self._observe(tuple(self._center), counted=mask)
+        return observation, with_masks(info, mask)
+
+    def step(self, actions: Any) -> VectorStep:
+        """Hold an action in each env for one control period.
+
+        Raises:
+            InvalidInputError: see `physical_action`.
+            NumericalError: the state of an env is not finite any more.
+            ResetNeeded: an episode has ended, and autoreset is disabled.
+        """
+        u = self.physical_action(actions)
+        anew = self._ended.copy() if self._ended.any() else None
+        if anew is not None and self._autoreset == AutoresetMode.DISABLED:
+            raise gym.error.ResetNeeded(f"the episodes of envs {np.flatnonzero(anew)[:5].tolist()} have ended: reset them")
+        stepping = None if anew is None else ~anew
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._x = self._simulation.integrator.step(self.components, u, self._noise.next(self._rngs, stepping))
+        self._steps = self._steps + 1
+        if anew is not None:
+            self._restart(np.flatnonzero(anew))
+        observation, reward, terminated, truncated, info = self._observe(u)
+        if anew is not None:
+            reward = np.where(anew, 0.0, reward)
+        ended = terminated | truncated
+        if self._autoreset == AutoresetMode.SAME_STEP:
+            if ended.any():
+                observation, info = self._reset_in_same_step(ended, observation, info)
+        else:
+            self._ended = ended
+        return observation, reward, terminated, truncated, with_masks(info, np.ones(self.num_envs, dtype=bool))
+
+    def _reset_in_same_step(self, ended: np.ndarray, observation: np.ndarray, info: Info) -> tuple[np.ndarray, Info]:
+        final = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(ended).tolist():
+            final[i] = observation[i]
+        self._restart(np.flatnonzero(ended))
+        anew, _, _, _, fresh = self._observe(tuple(self._center), counted=ended)
+        return anew, {**fresh, "final_obs": final, "final_info": with_masks(info, ended)}
+
+    def _seed(self, seeds: Sequence[int | None]) -> None:
+        first = not self._rngs
+        if first:
+            self._rngs, self._seeds = [None] * self.num_envs, [0] * self.num_envs  # pyright: ignore[reportAttributeAccessIssue]
+        chosen = [i for i, s in enumerate(seeds) if first or s is not None]
+        for i in chosen:
+            self._rngs[i], self._seeds[i] = seeding.np_random(seeds[i])
+        self._noise.clear(np.array(chosen, dtype=np.int64))
+
+    def _reset_mask(self, options: Mapping[str, Any] | None) -> np.ndarray:
+        everything = np.ones(self.num_envs, dtype=bool)
+        given = (options or {}).get("reset_mask")
+        if given is None:
+            return everything
+        mask = np.asarray(given)
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
+            raise ConfigurationError(
+                f"reset_mask must be a bool array of shape ({self.num_envs},) with a True in it; given {given!r}"
+            )
+        if not self._x and not mask.all():
+            raise gym.error.ResetNeeded("some envs have no state yet: the first reset takes no reset_mask")
+        return mask
+
+    def _restart(self, envs: np.ndarray) -> None:
+        """Put some envs at the start of an episode."""
+        start = self._simulation.draw_starts([self._rngs[i] for i in envs.tolist()])
+        if envs.size == self.num_envs:
+            self._x = tuple(start)
+        else:
+            self._x = tuple([x.copy() for x in self._x])
+            for x, fresh in zip(self._x, start, strict=True):
+                x[envs] = fresh
+        self._steps[envs] = 0
+        self._h_min[envs] = np.inf
+        self._episode_cost[envs] = 0.0
+        self._ended[envs] = False
+
+    def _observe(self, u: Components, counted: np.ndarray | None = None) -> VectorStep:
+        """Read the states; `counted` are the envs whose states are new (None: all)."""
+        features, barriers, reward, outside, goal = self._simulation.measure(self.components, u, self._steps * self.problem.dt)
+        observation = np.empty(self.observation_space.shape, dtype=np.float32)  # pyright: ignore[reportArgumentType]
+        for j, feature in enumerate(features):
+            observation[:, j] = feature
+        barrier = np.empty((self.num_envs, len(barriers)))
+        for j, h in enumerate(barriers):
+            barrier[:, j] = h
+        h = barrier[:, 0] if len(barriers) == 1 else barrier.min(axis=1)
+        violation = h < 0.0
+        cost = violation.astype(np.float64)
+        self._episode_cost = self._episode_cost + (cost if counted is None else cost * counted)
+        self._h_min = np.minimum(self._h_min, h)
+        left = np.logical_not(np.less_equal(outside, 0.0))
+        if left.any():
+            self._clip_and_check(observation, np.flatnonzero(left))
+        terminated = np.logical_or(left, np.greater_equal(goal, 0.0), out=np.empty(self.num_envs, dtype=bool))
+        truncated = self._steps >= self._limit
+        info = safety_info(
+            violation=violation, cost=cost, barrier=barrier, h_min=self._h_min.copy(), episode_cost=self._episode_cost.copy()
+        )
+        reward = np.broadcast_to(np.asarray(reward, dtype=np.float64), (self.num_envs,))
+        return observation, reward, terminated, truncated, info
+
+    def _clip_and_check(self, observation: np.ndarray, envs: np.ndarray) -> None:
+        """Keep the observations of envs that left the workspace in their space, unless the state is not finite."""
+        finite = np.isfinite([x[envs] for x in self.components]).all(axis=0)
+        if not finite.all():
+            raise NumericalError(
+                f"the states of envs {envs[~finite][:5].tolist()} of {self.problem.name!r} are not finite; "
+                "reduce dt or raise substeps"
+            )
+        space = self.single_observation_space
+        observation[envs] = np.clip(observation[envs], space.low, space.high)
+
+
+class SystemVectorEnv(SafeVectorEnv):
+    """Base of the registered vector envs; arguments as for `SystemEnv`, and `num_envs` and `autoreset_mode`."""
+
+    env_class: ClassVar[type[Any]]
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        barrier: Mapping[str, Any] | None = None,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        problem = make_problem(self.env_class, barrier, options)
+        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)

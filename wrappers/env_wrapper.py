@@ -1,0 +1,104 @@
+"""A safety filter over a scalar env."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from safe_envs.env import SafeEnv
+from safe_envs.errors import ConfigurationError
+from safe_envs.info import Info, filter_info
+from safe_envs.problem import SafetyProblem
+from wrappers.conditions import Condition, parse_condition
+from wrappers.safety_filter import SafetyFilter
+
+
+class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], gym.utils.RecordConstructorArgs):
+    """Replaces each action of a policy by the nearest one that a condition allows.
+
+    The wrapper takes and passes on actions in [-1, 1]; `info` gains the keys of `safe_envs.info`, in physical units.
+
+    Args:
+        env: one of this project's envs, possibly wrapped.
+        condition: a `Condition`, or its text, like "scbf" or "hocbf:p=2,8"; without parameters it takes the env's.
+        knowledge: "model" (what the designer believes) or "plant" (the true system).
+
+    Raises:
+        ConfigurationError: the env is not one of this project, or an argument is unknown.
+        RelativeDegreeError: the condition does not suit the env's barrier.
+    """
+
+    def __init__(self, env: gym.Env[np.ndarray, np.ndarray], condition: Condition | str, knowledge: str = "model") -> None:
+        inner = env.unwrapped
+        if not isinstance(inner, SafeEnv):
+            raise ConfigurationError(f"{inner} is not one of this project's envs, so that the filter cannot read its state")
+        text, self.safety_filter = build_filter(inner.problem, condition, knowledge)
+        gym.utils.RecordConstructorArgs.__init__(self, condition=text, knowledge=knowledge)
+        gym.Wrapper.__init__(self, env)
+        self._inner = inner
+        self._tolerance = intervention_tolerance(inner.problem)
+        self._interventions = 0
+        self._infeasible = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+        """Start an episode."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._interventions = 0
+        self._infeasible = 0
+        return observation, {**info, **rest_info(self._inner.problem)}
+
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, Info]:
+        """Filter the action and hold it for one control period."""
+        proposed = self._inner.physical_action(action)
+        decision = self.safety_filter.decide_floats(self._inner.components, proposed)
+        step_action = self._inner.normalized_action(decision.action) if any(decision.active) else action
+        observation, reward, terminated, truncated, info = self.env.step(step_action)
+        differs = any([abs(u - v) > tol for u, v, tol in zip(decision.action, proposed, self._tolerance, strict=True)])
+        self._interventions += differs
+        self._infeasible += not decision.feasible
+        info.update(
+            filter_info(
+                nominal_action=np.array(proposed),
+                safe_action=np.array(decision.action),
+                intervention=differs,
+                filter_active=any(decision.active),
+                feasible=decision.feasible,
+                slack=max(decision.slack),
+                episode_interventions=self._interventions,
+                episode_infeasible=self._infeasible,
+            )
+        )
+        return observation, reward, terminated, truncated, info
+
+
+def build_filter(problem: SafetyProblem, condition: Condition | str, knowledge: str) -> tuple[str, SafetyFilter]:
+    """Return the filter of a condition for a problem, and the text that names it."""
+    if isinstance(condition, str):
+        condition = parse_condition(condition, problem.gains)
+    return condition.spec, SafetyFilter.for_problem(problem, condition, knowledge)
+
+
+def intervention_tolerance(problem: SafetyProblem) -> list[float]:
+    """By how much two actions must differ to count as different: far above rounding, far below use."""
+    return [1e-9 * (high - low) for low, high in problem.box]
+
+
+def resting_action(problem: SafetyProblem) -> np.ndarray:
+    """The point of the box nearest to 0, reported where no action was executed yet."""
+    return np.array([min(max(0.0, low), high) for low, high in problem.box])
+
+
+def rest_info(problem: SafetyProblem) -> Info:
+    """What a filter reports at reset."""
+    return filter_info(
+        nominal_action=resting_action(problem),
+        safe_action=resting_action(problem),
+        intervention=False,
+        filter_active=False,
+        feasible=True,
+        slack=0.0,
+        episode_interventions=0,
+        episode_infeasible=0,
+    )

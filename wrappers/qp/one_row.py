@@ -1,0 +1,148 @@
+"""One constraint row and a box: the exact projection, in closed form, for one state or a batch.
+
+    min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a . u + b >= 0,   low <= u <= high
+
+The minimiser is u(l) = clip(v + l a / w) for the smallest multiplier l >= 0 at which phi(l) = a . u(l) + b reaches 0.
+phi is nondecreasing and piecewise linear, with a kink wherever a component enters or leaves its interval. If phi stays
+negative, no action meets the row; u(infinity), which maximises a . u + b over the box, violates it least.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+_ROUNDING = 8 * float(np.finfo(float).eps)
+"""Relative rounding of a sum of a few products: a margin below it cannot be told from 0."""
+
+
+def project_floats(
+    a: Sequence[float], b: float, v: Sequence[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
+) -> tuple[list[float], float, bool, bool]:
+    """Project the input v of one state.
+
+    Returns:
+        The minimiser (m floats), its margin a . u + b, whether the row had to act, and whether it can be met.
+    """
+    u = [min(max(vj, lo), hi) for vj, lo, hi in zip(v, low, high, strict=True)]
+    margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])
+    if margin >= 0.0:
+        return u, margin, False, True
+    if len(u) == 1:
+        if a[0] != 0.0:
+            u[0] = min(max(-b / a[0], low[0]), high[0])
+    else:
+        u = _follow_multiplier(a, b, v, low, high, w)
+    products = [aj * uj for aj, uj in zip(a, u, strict=True)]
+    margin = b + sum(products)
+    feasible = margin >= -_ROUNDING * (abs(b) + sum([abs(p) for p in products]))
+    return u, margin, True, feasible
+
+
+def _follow_multiplier(
+    a: Sequence[float], b: float, v: Sequence[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
+) -> list[float]:
+    d = [aj / wj for aj, wj in zip(a, w, strict=True)]
+    enter, leave = [0.0] * len(a), [0.0] * len(a)
+    for j, (dj, vj, lo, hi) in enumerate(zip(d, v, low, high, strict=True)):
+        if dj != 0.0:
+            near, far = (lo, hi) if dj > 0.0 else (hi, lo)
+            enter[j], leave[j] = max((near - vj) / dj, 0.0), max((far - vj) / dj, 0.0)
+
+    def inputs(multiplier: float) -> list[float]:
+        return [min(max(vj + multiplier * dj, lo), hi) for vj, dj, lo, hi in zip(v, d, low, high, strict=True)]
+
+    kink, phi = max(
+        [(k, p) for k in (0.0, *enter, *leave) if (p := b + sum([aj * uj for aj, uj in zip(a, inputs(k), strict=True)])) < 0.0],
+        default=(0.0, -0.0),
+    )
+    slope = sum([aj * dj for aj, dj, e, x in zip(a, d, enter, leave, strict=True) if e <= kink < x])
+    if slope > 0.0:
+        return inputs(kink - phi / slope)
+    return [hi if aj > 0.0 else lo if aj < 0.0 else u for aj, lo, hi, u in zip(a, low, high, inputs(0.0), strict=True)]
+
+
+def project_arrays(
+    a: Sequence[Any], b: Any, v: Sequence[np.ndarray], low: Sequence[float], high: Sequence[float], w: Sequence[float]
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
+    """Project the inputs of a batch of B states.
+
+    Args:
+        a: m entries of the row, each a float or an array (B,).
+        b: the offset, a float or an array (B,).
+        v: m arrays (B,) of proposed inputs.
+        low, high, w: m bounds and weights.
+
+    Returns:
+        As `project_floats`, with arrays (B,) for every number.
+    """
+    u = [np.minimum(np.maximum(vj, lo), hi) for vj, lo, hi in zip(v, low, high, strict=True)]
+    margin = _dot(a, u) + b
+    active = margin < 0.0
+    if not active.any():
+        return u, margin, active, ~active
+    if len(u) == 1:
+        u = [_root_of_scalar_row(a[0], b, u[0], low[0], high[0], active)]
+    else:
+        u = _follow_multipliers(a, b, v, u, low, high, w, np.flatnonzero(active))
+    products = [aj * uj for aj, uj in zip(a, u, strict=True)]
+    margin = sum(products[1:], products[0]) + b
+    feasible = margin >= 0.0
+    if not feasible.all():
+        scale = sum([np.abs(p) for p in products]) + np.abs(b)
+        feasible = margin >= -_ROUNDING * scale
+    return u, margin, active, feasible
+
+
+def _dot(a: Sequence[Any], u: Sequence[np.ndarray]) -> np.ndarray:
+    total = a[0] * u[0]
+    for aj, uj in zip(a[1:], u[1:], strict=True):
+        total = total + aj * uj
+    return total
+
+
+def _root_of_scalar_row(a: Any, b: Any, u: np.ndarray, low: float, high: float, active: np.ndarray) -> np.ndarray:
+    moving = active & (a != 0.0)
+    root = np.divide(-b, a, out=u.copy(), where=moving)
+    return np.minimum(np.maximum(root, low), high, out=root)
+
+
+def _follow_multipliers(
+    a: Sequence[Any],
+    b: Any,
+    v: Sequence[np.ndarray],
+    u: list[np.ndarray],
+    low: Sequence[float],
+    high: Sequence[float],
+    w: Sequence[float],
+    rows: np.ndarray,
+) -> list[np.ndarray]:
+    """The general case for the states in `rows`, components in front: shape (m, R), kinks in a third axis (m, R, 2m + 1)."""
+    batch = u[0].shape
+    ar = np.array([np.broadcast_to(aj, batch)[rows] for aj in a])
+    vr = np.array([vj[rows] for vj in v])
+    br = np.broadcast_to(b, batch)[rows]
+    lo, hi, wr = (np.array(c)[:, None] for c in (low, high, w))
+    d = ar / wr
+    near, far = np.where(d > 0.0, lo, hi), np.where(d > 0.0, hi, lo)
+    free = d != 0.0
+    enter = np.maximum(np.divide(near - vr, d, out=np.zeros_like(d), where=free), 0.0)
+    leave = np.maximum(np.divide(far - vr, d, out=np.zeros_like(d), where=free), 0.0)
+    kinks = np.concatenate([np.zeros((1, rows.size)), enter, leave]).T
+    at_kinks = np.clip(vr[:, :, None] + kinks * d[:, :, None], lo[:, :, None], hi[:, :, None])
+    phi = (ar[:, :, None] * at_kinks).sum(axis=0) + br[:, None]
+    last = np.where(phi < 0.0, kinks, -1.0).argmax(axis=1)[:, None]
+    kink = np.take_along_axis(kinks, last, axis=1)[:, 0]
+    phi = np.take_along_axis(phi, last, axis=1)[:, 0]
+    slope = np.where((enter <= kink) & (kink < leave), ar * d, 0.0).sum(axis=0)
+    rises = slope > 0.0
+    multiplier = kink - np.divide(phi, slope, out=np.zeros_like(phi), where=rises)
+    solved = np.clip(vr + multiplier * d, lo, hi)
+    least = np.where(free, far, np.clip(vr, lo, hi))
+    result = [uj.copy() for uj in u]
+    for j, component in enumerate(np.where(rises, solved, least)):
+        result[j][rows] = component
+    return result

@@ -1,0 +1,226 @@
+"""A safety filter: from a state and a proposed input to the nearest input that the conditions allow. Free of gym."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safe_envs.barrier import Barrier
+from safe_envs.codegen import Components, Flavour, compile_function
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, SystemDefinitionError
+from safe_envs.problem import SafetyProblem
+from safe_envs.sde import ControlAffineSDE
+from wrappers.conditions import Condition
+from wrappers.qp.one_row import project_arrays, project_floats
+
+
+class FilterResult(NamedTuple):
+    """What a filter decides, for one state or a batch (leading axes `...`), with m inputs and k barriers.
+
+    Attributes:
+        action: executed input, shape (..., m), inside the box.
+        barrier: value of each barrier, shape (..., k).
+        margin: a u + b of each row at the action, shape (..., k).
+        active: rows that bind or cannot be met, shape (..., k).
+        feasible: whether some action in the box meets every row, shape (...). Where it is False, the action is the
+            least-violating one.
+        slack: by how much the action misses each row where the rows cannot be met, 0 elsewhere, shape (..., k).
+    """
+
+    action: np.ndarray
+    barrier: np.ndarray
+    margin: np.ndarray
+    active: np.ndarray
+    feasible: Any
+    slack: np.ndarray
+
+
+class Decision(NamedTuple):
+    """The same by components, floats or arrays over the batch: what the thin wrappers read."""
+
+    action: Sequence[Any]
+    barrier: Sequence[Any]
+    margin: Sequence[Any]
+    active: Sequence[Any]
+    feasible: Any
+    slack: Sequence[Any]
+
+
+class SafetyFilter:
+    """min 1/2 |u - u_nom|^2_W subject to a_i(x) u + b_i(x) >= 0 for every barrier, and the box.
+
+    One row has a closed form, exact for any number of inputs; several go to ProxQP.
+
+    Args:
+        model: the system that the filter believes in.
+        rows: (barrier, condition) pairs.
+        box: (low, high) of each input, in physical units.
+        weights: diagonal of W, one positive number for each input; ones by default.
+
+    Raises:
+        SystemDefinitionError: there is no row, or a barrier does not fit the model.
+        RelativeDegreeError: a condition does not suit a barrier.
+        ConfigurationError: the box or the weights are not allowed.
+    """
+
+    def __init__(
+        self,
+        model: ControlAffineSDE,
+        rows: Sequence[tuple[Barrier, Condition]],
+        box: Sequence[tuple[float, float]],
+        weights: Sequence[float] | None = None,
+    ) -> None:
+        if not rows:
+            raise SystemDefinitionError("a filter needs at least one (barrier, condition) pair")
+        self.model = model
+        self.rows = tuple(rows)
+        self._low, self._high = _bounds(model, box)
+        self._weights = _positive_weights(model, weights)
+        self.constraints = tuple(condition.constraint(model, barrier) for barrier, condition in self.rows)
+
+    @classmethod
+    def for_problem(cls, problem: SafetyProblem, condition: Condition, knowledge: str = "model") -> SafetyFilter:
+        """The filter that puts one condition on every barrier of a problem.
+
+        Args:
+            problem: whose model, barriers and box are taken.
+            condition: for every barrier.
+            knowledge: "model" for what the designer believes, "plant" for the true system.
+        """
+        if knowledge not in ("model", "plant"):
+            raise ConfigurationError(f"knowledge = {knowledge!r}; allowed: model, plant")
+        known = problem.model if knowledge == "model" else problem.plant
+        return cls(known, [(b, condition) for b in problem.barriers], problem.box)
+
+    @cached_property
+    def _floats(self) -> Any:
+        return self._compile("floats")
+
+    @cached_property
+    def _arrays(self) -> Any:
+        return self._compile("arrays")
+
+    def _compile(self, flavour: Flavour) -> Any:
+        values = []
+        for constraint, (barrier, _) in zip(self.constraints, self.rows, strict=True):
+            values += [*constraint.coefficient, constraint.offset, barrier.expression]
+        return compile_function(self.model.states, [self.model.numeric(v) for v in values], flavour)
+
+    def filter(self, x: Any, u_nominal: Any) -> FilterResult:
+        """Decide for one state (n,) and input (m,), or for batches (..., n) and (..., m).
+
+        Raises:
+            InvalidInputError: a shape does not fit, or an entry is not finite.
+            NumericalError: the constraint has no finite value at a state.
+        """
+        x, u = np.asarray(x, dtype=np.float64), np.asarray(u_nominal, dtype=np.float64)
+        n, m = self.model.n, self.model.m
+        if x.shape[-1:] != (n,) or u.shape[-1:] != (m,) or x.shape[:-1] != u.shape[:-1]:
+            raise InvalidInputError(f"state {x.shape} and input {u.shape} do not fit; give (..., {n}) and (..., {m}) with the same leading axes")
+        if x.ndim == 1:
+            states, inputs = x.tolist(), u.tolist()
+            if not math.isfinite(sum(states) + sum(inputs)):
+                _require_finite(x, u)
+            decision = self.decide_floats(states, inputs)
+            return FilterResult(*[np.array(part) for part in decision[:4]], decision.feasible, np.array(decision.slack))
+        _require_finite(x, u)
+        batch = x.shape[:-1]
+        columns = [np.ascontiguousarray(part.reshape(-1, part.shape[-1]).T) for part in (x, u)]
+        decision = self.decide_arrays(tuple(columns[0]), tuple(columns[1]))
+        action, barrier, margin, active, slack = [_stack(part, batch) for part in (*decision[:4], decision.slack)]
+        return FilterResult(action, barrier, margin, active, decision.feasible.reshape(batch), slack)
+
+    def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> Decision:
+        """Decide for one state, given and returned component by component; the components must be finite."""
+        if len(self.rows) > 1:
+            return self._decide_one_of_several(x, u)
+        try:
+            *a, b, h = self._floats(*x)
+        except (OverflowError, ZeroDivisionError, ValueError) as error:
+            raise self._undefined(x) from error
+        action, margin, active, feasible = project_floats(a, b, u, self._low, self._high, self._weights)
+        if not math.isfinite(margin + h):
+            raise self._undefined(x)
+        return Decision(action, (h,), (margin,), (active,), feasible, (0.0 if feasible else -margin,))
+
+    def decide_arrays(self, x: Components, u: Components) -> Decision:
+        """Decide for a batch, given and returned component by component, each an array (B,) of finite numbers."""
+        with np.errstate(all="ignore"):
+            values = self._arrays(*x)
+            if len(self.rows) > 1:
+                return self._decide_several(x, u, values)
+            *a, b, h = values
+            action, margin, active, feasible = project_arrays(a, b, u, self._low, self._high, self._weights)
+            total = margin + h
+        if not math.isfinite(total.sum()):
+            self._require_defined(x, total)
+        slack = np.zeros(len(margin)) if feasible.all() else np.where(feasible, 0.0, -margin)
+        return Decision(action, (h,), (margin,), (active,), feasible, (slack,))
+
+    def _decide_several(self, x: Components, u: Components, values: Components) -> Decision:
+        from wrappers.qp.several_rows import project
+
+        size = len(u[0])
+        row = self.model.m + 2
+        table = np.stack([np.broadcast_to(v, (size,)) for v in values], axis=-1).reshape(size, -1, row)
+        self._require_defined(x, table.sum(axis=(1, 2)))
+        bounds = [np.array(c) for c in (self._low, self._high, self._weights)]
+        found = project(table[:, :, :-2], table[:, :, -2], np.stack(u, axis=-1), *bounds)
+        missing = np.where(found.feasible[:, None], 0.0, np.maximum(-found.margin, 0.0))
+        return Decision(
+            action=tuple(found.u.T),
+            barrier=tuple(table[:, :, -1].T),
+            margin=tuple(found.margin.T),
+            active=tuple(found.active.T),
+            feasible=found.feasible,
+            slack=tuple(missing.T),
+        )
+
+    def _decide_one_of_several(self, x: Sequence[float], u: Sequence[float]) -> Decision:
+        batch = self.decide_arrays(tuple(np.array([c]) for c in x), tuple(np.array([c]) for c in u))
+        action, barrier, margin, active, slack = [[c.item() for c in part] for part in (*batch[:4], batch.slack)]
+        return Decision(action, barrier, margin, active, batch.feasible.item(), slack)
+
+    def _undefined(self, x: Sequence[float]) -> NumericalError:
+        at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.model.states, x, strict=True))
+        names = ", ".join(barrier.name for barrier, _ in self.rows)
+        return NumericalError(f"the constraint on {names} has no finite value at {at}; check the barrier and the model there")
+
+    def _require_defined(self, x: Components, totals: np.ndarray) -> None:
+        bad = np.flatnonzero(~np.isfinite(totals))
+        if bad.size:
+            raise self._undefined([float(c[bad[0]]) for c in x])
+
+
+def _require_finite(x: np.ndarray, u: np.ndarray) -> None:
+    for what, values in (("state", x), ("nominal input", u)):
+        finite = np.isfinite(values)
+        if not finite.all():
+            where = np.argwhere(~finite)[0].tolist()
+            raise InvalidInputError(f"the {what} has the entry {values[tuple(where)]} at {where}; a filter needs finite numbers")
+
+
+def _stack(components: Sequence[np.ndarray], batch: tuple[int, ...]) -> np.ndarray:
+    size = math.prod(batch)
+    return np.stack([np.broadcast_to(c, (size,)) for c in components], axis=-1).reshape(*batch, len(components))
+
+
+def _bounds(model: ControlAffineSDE, box: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+    if len(box) != model.m:
+        raise ConfigurationError(f"the box has {len(box)} intervals; the model has {model.m} inputs")
+    low, high = [float(pair[0]) for pair in box], [float(pair[1]) for pair in box]
+    for symbol, lo, hi in zip(model.inputs, low, high, strict=True):
+        if not (math.isfinite(lo) and math.isfinite(hi) and lo < hi):
+            raise ConfigurationError(f"box of {symbol} is [{lo}, {hi}]; it needs finite bounds, the lower one below the upper")
+    return low, high
+
+
+def _positive_weights(model: ControlAffineSDE, weights: Sequence[float] | None) -> list[float]:
+    values = [1.0] * model.m if weights is None else [float(w) for w in weights]
+    if len(values) != model.m or not all(math.isfinite(w) and w > 0 for w in values):
+        raise ConfigurationError(f"weights = {values}; give {model.m} positive numbers")
+    return values

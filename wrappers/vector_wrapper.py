@@ -1,0 +1,100 @@
+"""A safety filter over a native vector env."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from safe_envs.codegen import Components
+from safe_envs.errors import ConfigurationError
+from safe_envs.info import Info, filter_info, with_masks
+from safe_envs.vector import SafeVectorEnv, VectorStep
+from wrappers.conditions import Condition
+from wrappers.env_wrapper import build_filter, intervention_tolerance, rest_info
+from wrappers.safety_filter import Decision
+
+
+class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
+    """`SafetyFilterWrapper` for the whole batch at once; same arguments, same info with the batch in front.
+
+    A step that only resets an env (next-step autoreset) ignores its action: there the filter reports what it reports
+    at reset, and counts nothing.
+
+    Raises:
+        ConfigurationError: the env is not one of this project's vector envs, or an argument is unknown.
+        RelativeDegreeError: the condition does not suit the env's barrier.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv, condition: Condition | str, knowledge: str = "model") -> None:
+        inner = env.unwrapped
+        if not isinstance(inner, SafeVectorEnv):
+            raise ConfigurationError(f"{inner} is not one of this project's vector envs, so that the filter cannot read its state")
+        _, self.safety_filter = build_filter(inner.problem, condition, knowledge)
+        super().__init__(env)
+        self._inner = inner
+        self._rest = rest_info(inner.problem)
+        self._tolerance = intervention_tolerance(inner.problem)
+        self._mode = inner.metadata["autoreset_mode"]
+        self._interventions = np.zeros(self.num_envs, dtype=np.int64)
+        self._infeasible = np.zeros(self.num_envs, dtype=np.int64)
+        self._ended = np.zeros(self.num_envs, dtype=bool)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+        """Start episodes in every env, or in those of `options["reset_mask"]`."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        present = info["_cost"]
+        self._forget(present)
+        at_rest = {key: np.full((self.num_envs, *np.shape(value)), value) for key, value in self._rest.items()}
+        return observation, {**info, **with_masks(at_rest, present)}
+
+    def step(self, actions: Any) -> VectorStep:
+        """Filter the actions and hold them for one control period."""
+        proposed = self._inner.physical_action(actions)
+        decision = self.safety_filter.decide_arrays(self._inner.components, proposed)
+        active = decision.active[0] if len(decision.active) == 1 else np.logical_or.reduce(decision.active)
+        if active.any():
+            actions = np.where(active[:, None], self._inner.normalized_action(tuple(decision.action)), actions)
+        observation, reward, terminated, truncated, info = self.env.step(actions)
+        added = self._decided(proposed, decision, active)
+        ended = terminated | truncated
+        if self._mode == AutoresetMode.SAME_STEP and ended.any():
+            info["final_info"].update(with_masks({key: value.copy() for key, value in added.items()}, ended))
+            self._start_anew(added, ended)
+        elif self._mode == AutoresetMode.NEXT_STEP:
+            if self._ended.any():
+                self._start_anew(added, self._ended)
+            self._ended = ended
+        info.update(with_masks(added, info["_cost"]))
+        return observation, reward, terminated, truncated, info
+
+    def _decided(self, proposed: Components, decision: Decision, active: np.ndarray) -> Info:
+        """Count, and report what was decided."""
+        differs = np.abs(decision.action[0] - proposed[0]) > self._tolerance[0]
+        for u, v, tolerance in zip(decision.action[1:], proposed[1:], self._tolerance[1:], strict=True):
+            differs |= np.abs(u - v) > tolerance
+        self._interventions = self._interventions + differs
+        self._infeasible = self._infeasible + ~decision.feasible
+        return filter_info(
+            nominal_action=np.stack(proposed, axis=-1),
+            safe_action=np.stack(decision.action, axis=-1),
+            intervention=differs,
+            filter_active=active,
+            feasible=decision.feasible,
+            slack=decision.slack[0] if len(decision.slack) == 1 else np.maximum.reduce(decision.slack),
+            episode_interventions=self._interventions.copy(),
+            episode_infeasible=self._infeasible.copy(),
+        )
+
+    def _start_anew(self, added: Info, envs: np.ndarray) -> None:
+        """Put what is reported at reset in place of a decision, for the envs that were reset in this step."""
+        self._forget(envs)
+        for key, value in self._rest.items():
+            added[key][envs] = value
+
+    def _forget(self, envs: np.ndarray) -> None:
+        self._interventions[envs] = 0
+        self._infeasible[envs] = 0
+        self._ended = self._ended & ~envs
