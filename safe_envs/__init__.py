@@ -1,5 +1,7 @@
 """Gymnasium environments of safety-critical systems under uncertainty; importing this package registers their ids."""
 
+from importlib.metadata import version
+
 from safe_envs.barrier import Barrier
 from safe_envs.env import SafeEnv
 from safe_envs.errors import (
@@ -29,5 +31,7 @@ __all__ = [
     "SafetyProblem",
     "SystemDefinitionError",
 ]
+
+__version__ = version("safe-envs")
 
 register_all()

@@ -20,7 +20,7 @@ Flavour = Literal["floats", "arrays"]
 Components = tuple[Any, ...]
 
 _LARGEST_EXPANDED_POWER = 8
-_REMEMBERED = 8
+_REMEMBERED = 4
 
 
 class _Remembering:
@@ -123,3 +123,21 @@ def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.E
         expanded = expand(expression)
         replacements.append((symbol, expanded))
     return replacements, type(reduced)(expand(e) for e in reduced)
+
+
+def filled(component: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """A component as an array of the batch's shape: what does not depend on the arguments comes back as a float."""
+    return component if getattr(component, "shape", None) == shape else np.full(shape, component)
+
+
+def stacked(components: Sequence[Any], size: int) -> np.ndarray:
+    """Components side by side, shape (size, len(components)), in memory of their own."""
+    table = np.empty((size, len(components)))
+    for j, component in enumerate(components):
+        table[:, j] = component
+    return table
+
+
+def finite(values: np.ndarray) -> bool:
+    """Whether no entry is NaN or infinite; a quick look that may report huge finite entries as infinite."""
+    return math.isfinite(np.vdot(values, values))

@@ -63,7 +63,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self._simulation = Simulation(problem, "floats")
         self._noise = NoiseStream(self._simulation.integrator.channels)
-        self._center, self._half = center_and_half_width(problem)
+        center, half = center_and_half_width(problem)
+        self._scales = list(zip(center, half, strict=True))
+        self._action_shape = (len(problem.inputs),)
         self._limit = steps_until(problem, max_episode_steps)
         self._x: tuple[float, ...] | None = None
         self._steps = 0
@@ -82,24 +84,25 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         """The exact state, shape (n,), in the units of the problem's states."""
         return np.array(self.components)
 
-    def physical_action(self, action: Any) -> tuple[float, ...]:
+    def physical_action(self, action: Any) -> list[float]:
         """Map an action in [-1, 1] to the physical box; what lies beyond is clipped.
 
         Raises:
             InvalidInputError: the action has another shape than (m,) or is not finite.
         """
         given = np.asarray(action)
-        if given.shape != self.action_space.shape:
-            raise InvalidInputError(f"action has shape {given.shape}; the env takes {self.action_space.shape}")
-        values = given.tolist()
-        for a in values:
-            if not math.isfinite(a):
-                raise InvalidInputError(f"action {values} is not finite; give numbers in [-1, 1]")
-        return tuple([c + w * min(max(a, -1.0), 1.0) for c, w, a in zip(self._center, self._half, values, strict=True)])
+        if given.shape != self._action_shape:
+            raise InvalidInputError(f"action has shape {given.shape}; the env takes {self._action_shape}")
+        physical = []
+        for a, (c, w) in zip(given.tolist(), self._scales, strict=True):
+            if not -math.inf < a < math.inf:
+                raise InvalidInputError(f"action {given.tolist()} is not finite; give numbers in [-1, 1]")
+            physical.append(c + w if a > 1.0 else c - w if a < -1.0 else c + w * a)
+        return physical
 
     def normalized_action(self, physical: Sequence[float]) -> np.ndarray:
         """Inverse of `physical_action`, in double precision."""
-        return np.array([(u - c) / w for c, w, u in zip(self._center, self._half, physical, strict=True)])
+        return np.array([(u - c) / w for u, (c, w) in zip(physical, self._scales, strict=True)])
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         """Start an episode from the problem's initial distribution."""
@@ -110,7 +113,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self._steps = 0
         self._h_min = math.inf
         self._episode_cost = 0.0
-        observation, _, _, info = self._observe(tuple(self._center))
+        observation, _, _, info = self._observe([c for c, _ in self._scales])
         return observation, info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Info]:
@@ -120,7 +123,10 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             InvalidInputError: see `physical_action`.
             NumericalError: the state is not finite any more.
         """
-        u = self.physical_action(action)
+        return self.step_physical(self.physical_action(action))
+
+    def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, bool, Info]:
+        """`step` for a physical input inside the box, as a filter has it."""
         try:
             self._x = self._simulation.integrator.step(self.components, u, self._noise.next(self.np_random))
             self._steps += 1
@@ -129,7 +135,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             raise NumericalError(f"the simulation of {self.problem.name!r} broke down at {self._x}: {error}") from error
         return observation, reward, terminated, self._steps >= self._limit, info
 
-    def _observe(self, u: tuple[float, ...]) -> tuple[np.ndarray, float, bool, Info]:
+    def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
         x = self.components
         if not math.isfinite(sum(x)):
             raise NumericalError(f"the state {x} of {self.problem.name!r} is not finite; reduce dt or raise substeps")

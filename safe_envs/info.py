@@ -36,7 +36,7 @@ import numpy as np
 Info = dict[str, Any]
 
 
-def safety_info(*, violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any) -> Info:
+def safety_info(violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any) -> Info:
     """What every env reports; values as in the table above."""
     return {
         "cost": cost,
@@ -48,7 +48,6 @@ def safety_info(*, violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, e
 
 
 def filter_info(
-    *,
     nominal_action: np.ndarray,
     safe_action: np.ndarray,
     intervention: Any,

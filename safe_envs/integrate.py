@@ -38,7 +38,7 @@ class Integrator:
         else:
             self._rate = compile_function((*system.states, *system.inputs), tuple(rate), flavour)
 
-    def step(self, x: Components, u: Components, draws: Sequence[Any]) -> Components:
+    def step(self, x: Components, u: Sequence[Any], draws: Sequence[Any]) -> Components:
         """Return the components of the state one control period later.
 
         Args:
@@ -54,7 +54,7 @@ class Integrator:
             x = self._runge_kutta(x, u)
         return x
 
-    def _runge_kutta(self, x: Components, u: Components) -> Components:
+    def _runge_kutta(self, x: Components, u: Sequence[Any]) -> Components:
         h, rate = self._h, self._rate
         half = 0.5 * h
         k1 = rate(*x, *u)

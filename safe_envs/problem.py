@@ -157,8 +157,15 @@ class SafetyProblem:
     @property
     def outside(self) -> sp.Expr:
         """Positive where the state has left the workspace; -1 if the workspace is unbounded."""
-        excess = [v.symbol - v.high for v in self.states if math.isfinite(v.high)]
-        excess += [v.low - v.symbol for v in self.states if math.isfinite(v.low)]
+        bounded = [v for v in self.states if math.isfinite(v.low) or math.isfinite(v.high)]
+        symmetric: dict[float, list[sp.Expr]] = {}
+        excess: list[sp.Expr] = []
+        for v in bounded:
+            if v.low == -v.high:
+                symmetric.setdefault(v.high, []).append(sp.Abs(v.symbol))
+            else:
+                excess += [v.symbol - v.high] * math.isfinite(v.high) + [v.low - v.symbol] * math.isfinite(v.low)
+        excess += [sp.Max(*sizes) - half for half, sizes in symmetric.items()]
         return sp.Max(*excess) if excess else sp.Integer(-1)
 
     def configured(

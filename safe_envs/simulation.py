@@ -4,28 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
+import sympy as sp
 
-from safe_envs.codegen import Components, Flavour, compile_function
+from safe_envs.codegen import Components, Flavour, compile_function, filled
 from safe_envs.errors import ConfigurationError
 from safe_envs.integrate import Integrator
 from safe_envs.problem import TIME, SafetyProblem
 
 _CHUNK = 128
-_TRIES_AT_ONCE = 8
+_TRIES_AT_ONCE = 4
 _MOST_TRIES = 10_000
-
-
-class Measurement(NamedTuple):
-    """What can be read off a state: each entry is a component, a float or an array over the batch."""
-
-    features: Components
-    barriers: Components
-    reward: Any
-    outside: Any
-    goal: Any
 
 
 class Simulation:
@@ -43,6 +34,7 @@ class Simulation:
             problem.outside,
             -1 if problem.goal is None else problem.goal,
         )
+        self.timed = TIME in set().union(*(sp.sympify(e).free_symbols for e in read))
         self._measure = compile_function((*problem.plant.states, *problem.plant.inputs, TIME), read, flavour)
         start = problem.starts[problem.start]
         self._uniforms = len(start.uniforms)
@@ -54,11 +46,21 @@ class Simulation:
         else:
             self._accept = None
 
-    def measure(self, x: Components, u: Components, time: Any) -> Measurement:
-        """Observation, barriers, reward of having arrived at x under u, and whether the episode ends here (> 0, >= 0)."""
+    def measure(self, x: Components, u: Sequence[Any], time: Any) -> tuple[Components, Components, Any, Any, Any]:
+        """Read off a state what there is to see.
+
+        Args:
+            x: components of the state.
+            u: components of the executed input that led to it.
+            time: since the start of the episode, in s.
+
+        Returns:
+            The features, the barriers, the reward, the distance by which the workspace was left (> 0 outside), and the
+            goal (>= 0 where it is reached).
+        """
         values = self._measure(*x, *u, time)
         f, b = self._features, self._barriers
-        return Measurement(values[:f], values[f:b], values[b], values[b + 1], values[b + 2])
+        return values[:f], values[f:b], values[b], values[b + 1], values[b + 2]
 
     def draw_start(self, rng: np.random.Generator) -> Components:
         """Draw an initial state by rejection. For flavour "floats"."""
@@ -76,8 +78,8 @@ class Simulation:
         for _ in range(_MOST_TRIES // self._tries):
             uniforms = np.stack([rngs[i].random((self._tries, self._uniforms)) for i in missing.tolist()], axis=-1)
             shape = (self._tries, missing.size)
-            tries = [np.broadcast_to(c, shape) for c in self._start(*uniforms.swapaxes(0, 1))]
-            accepted = np.ones(shape, bool) if self._accept is None else np.broadcast_to(self._accept(*tries)[0] > 0, shape)
+            tries = [filled(c, shape) for c in self._start(*uniforms.swapaxes(0, 1))]
+            accepted = filled(True if self._accept is None else self._accept(*tries)[0] > 0, shape)
             first, found = accepted.argmax(axis=0), accepted.any(axis=0)
             for state, component in zip(states, tries, strict=True):
                 state[missing] = component[first, np.arange(missing.size)]
@@ -121,12 +123,15 @@ class NoiseStreams:
 
     def __init__(self, num_envs: int, channels: int) -> None:
         self._buffer = np.empty((num_envs, _CHUNK, channels))
-        self._position = np.full(num_envs, _CHUNK)
+        self._rows = self._buffer.reshape(num_envs * _CHUNK, channels)
         self._first = np.arange(num_envs) * _CHUNK
+        self._position = np.full(num_envs, _CHUNK)
+        self._before_refill = 0
 
-    def clear(self, envs: np.ndarray) -> None:
+    def clear(self, envs: Sequence[int]) -> None:
         """Forget what was drawn ahead for some envs: their generators were seeded anew."""
         self._position[envs] = _CHUNK
+        self._before_refill = 0
 
     def next(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> np.ndarray:
         """The draws of the next control period, shape (channels, num_envs).
@@ -135,19 +140,25 @@ class NoiseStreams:
             rngs: generator of each env.
             stepping: the envs whose stream moves on; None for all. The others get draws that are to be ignored.
         """
-        channels = self._buffer.shape[2]
-        if not channels:
-            return self._buffer[:0, 0]
+        if not self._buffer.shape[2]:
+            return self._rows.T[:0]
+        if not self._before_refill:
+            self._refill(rngs, stepping)
+        self._before_refill -= 1
+        rows = self._first + self._position
+        if stepping is None:
+            self._position += 1
+        else:
+            rows[~stepping] = 0
+            self._position += stepping
+        return np.ascontiguousarray(self._rows.take(rows, axis=0).T)
+
+    def _refill(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> None:
         used_up = self._position == _CHUNK
-        if stepping is not None:
-            used_up &= stepping
-        for i in np.flatnonzero(used_up).tolist():
+        for i in np.flatnonzero(used_up if stepping is None else used_up & stepping).tolist():
             rngs[i].standard_normal(out=self._buffer[i])
             self._position[i] = 0
-        row = self._position if stepping is None else np.where(stepping, self._position, 0)
-        draws = self._buffer.reshape(-1, channels).take(self._first + row, axis=0)
-        self._position += 1 if stepping is None else stepping
-        return np.ascontiguousarray(draws.T)
+        self._before_refill = max(_CHUNK - int(self._position.max()), 1)
 
 
 def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:

@@ -11,7 +11,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from safe_envs.codegen import Components
+from safe_envs.codegen import Components, filled, finite, stacked
 from safe_envs.env import action_box, make_problem, observation_box
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.info import Info, safety_info, with_masks
@@ -110,11 +110,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         given = np.asarray(actions, dtype=np.float64)
         if given.shape != self.action_space.shape:
             raise InvalidInputError(f"actions have shape {given.shape}; the envs take {self.action_space.shape}")
-        if not np.isfinite(given).all():
+        if not finite(given):
             bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
             raise InvalidInputError(f"the actions of envs {bad[:5].tolist()} are not finite; give numbers in [-1, 1]")
         clipped = np.minimum(np.maximum(given, -1.0), 1.0)
-        return tuple([c + w * clipped[:, j] for j, (c, w) in enumerate(zip(self._center, self._half, strict=True))])
+        return tuple([c + w * clipped[:, j] if c else w * clipped[:, j] for j, (c, w) in enumerate(zip(self._center, self._half, strict=True))])
 
     def normalized_action(self, physical: Components) -> np.ndarray:
         """Inverse of `physical_action`, in double precision."""
@@ -149,13 +149,16 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             NumericalError: the state of an env is not finite any more.
             ResetNeeded: an episode has ended, and autoreset is disabled.
         """
-        u = self.physical_action(actions)
-        anew = self._ended.copy() if self._ended.any() else None
+        return self.step_physical(self.physical_action(actions))
+
+    def step_physical(self, u: Components) -> VectorStep:
+        """`step` for the components of physical inputs inside the box, as a filter has them."""
+        anew = self._ended.copy() if np.count_nonzero(self._ended) else None
         if anew is not None and self._autoreset == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(f"the episodes of envs {np.flatnonzero(anew)[:5].tolist()} have ended: reset them")
-        stepping = None if anew is None else ~anew
+        draws = self._noise.next(self._rngs, None if anew is None else ~anew)
         with np.errstate(over="ignore", invalid="ignore"):
-            self._x = self._simulation.integrator.step(self.components, u, self._noise.next(self._rngs, stepping))
+            self._x = self._simulation.integrator.step(self.components, u, draws)
         self._steps = self._steps + 1
         if anew is not None:
             self._restart(np.flatnonzero(anew))
@@ -164,7 +167,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             reward = np.where(anew, 0.0, reward)
         ended = terminated | truncated
         if self._autoreset == AutoresetMode.SAME_STEP:
-            if ended.any():
+            if np.count_nonzero(ended):
                 observation, info = self._reset_in_same_step(ended, observation, info)
         else:
             self._ended = ended
@@ -185,7 +188,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         chosen = [i for i, s in enumerate(seeds) if first or s is not None]
         for i in chosen:
             self._rngs[i], self._seeds[i] = seeding.np_random(seeds[i])
-        self._noise.clear(np.array(chosen, dtype=np.int64))
+        self._noise.clear(chosen)
 
     def _reset_mask(self, options: Mapping[str, Any] | None) -> np.ndarray:
         everything = np.ones(self.num_envs, dtype=bool)
@@ -210,6 +213,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._x = tuple([x.copy() for x in self._x])
             for x, fresh in zip(self._x, start, strict=True):
                 x[envs] = fresh
+        # What was handed out in an info stays as it is: fresh arrays, not changes in place.
+        self._steps, self._h_min, self._episode_cost = self._steps.copy(), self._h_min.copy(), self._episode_cost.copy()
         self._steps[envs] = 0
         self._h_min[envs] = np.inf
         self._episode_cost[envs] = 0.0
@@ -217,39 +222,35 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _observe(self, u: Components, counted: np.ndarray | None = None) -> VectorStep:
         """Read the states; `counted` are the envs whose states are new (None: all)."""
-        features, barriers, reward, outside, goal = self._simulation.measure(self.components, u, self._steps * self.problem.dt)
-        observation = np.empty(self.observation_space.shape, dtype=np.float32)  # pyright: ignore[reportArgumentType]
-        for j, feature in enumerate(features):
-            observation[:, j] = feature
-        barrier = np.empty((self.num_envs, len(barriers)))
-        for j, h in enumerate(barriers):
-            barrier[:, j] = h
-        h = barrier[:, 0] if len(barriers) == 1 else barrier.min(axis=1)
+        time = self._steps * self.problem.dt if self._simulation.timed else 0.0
+        features, barriers, reward, outside, goal = self._simulation.measure(self.components, u, time)
+        observation = np.ascontiguousarray(np.array(features, dtype=np.float32).T)
+        barrier = stacked(barriers, self.num_envs)
+        h = barriers[0] if len(barriers) == 1 else barrier.min(axis=1)
+        if not finite(h):
+            self._report_breakdown()
         violation = h < 0.0
         cost = violation.astype(np.float64)
         self._episode_cost = self._episode_cost + (cost if counted is None else cost * counted)
         self._h_min = np.minimum(self._h_min, h)
-        left = np.logical_not(np.less_equal(outside, 0.0))
-        if left.any():
-            self._clip_and_check(observation, np.flatnonzero(left))
-        terminated = np.logical_or(left, np.greater_equal(goal, 0.0), out=np.empty(self.num_envs, dtype=bool))
-        truncated = self._steps >= self._limit
+        terminated = filled(outside > 0.0, (self.num_envs,))
+        if np.count_nonzero(terminated):
+            envs, space = np.flatnonzero(terminated), self.single_observation_space
+            observation[envs] = np.clip(observation[envs], space.low, space.high)
+        if self.problem.goal is not None:
+            terminated = terminated | (goal >= 0.0)
         info = safety_info(
-            violation=violation, cost=cost, barrier=barrier, h_min=self._h_min.copy(), episode_cost=self._episode_cost.copy()
+            violation=violation, cost=cost, barrier=barrier, h_min=self._h_min, episode_cost=self._episode_cost
         )
-        reward = np.broadcast_to(np.asarray(reward, dtype=np.float64), (self.num_envs,))
-        return observation, reward, terminated, truncated, info
+        return observation, filled(reward, (self.num_envs,)), terminated, self._steps >= self._limit, info
 
-    def _clip_and_check(self, observation: np.ndarray, envs: np.ndarray) -> None:
-        """Keep the observations of envs that left the workspace in their space, unless the state is not finite."""
-        finite = np.isfinite([x[envs] for x in self.components]).all(axis=0)
-        if not finite.all():
+    def _report_breakdown(self) -> None:
+        broken = ~np.isfinite(self.state).all(axis=1)
+        if broken.any():
             raise NumericalError(
-                f"the states of envs {envs[~finite][:5].tolist()} of {self.problem.name!r} are not finite; "
+                f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r} are not finite; "
                 "reduce dt or raise substeps"
             )
-        space = self.single_observation_space
-        observation[envs] = np.clip(observation[envs], space.low, space.high)
 
 
 class SystemVectorEnv(SafeVectorEnv):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -53,24 +54,32 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         """Filter the action and hold it for one control period."""
         proposed = self._inner.physical_action(action)
         decision = self.safety_filter.decide_floats(self._inner.components, proposed)
-        step_action = self._inner.normalized_action(decision.action) if any(decision.active) else action
-        observation, reward, terminated, truncated, info = self.env.step(step_action)
-        differs = any([abs(u - v) > tol for u, v, tol in zip(decision.action, proposed, self._tolerance, strict=True)])
+        executed, active = decision.action, True in decision.active
+        if active:
+            action = self._inner.normalized_action(executed)
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        differs = active and self._differ(executed, proposed)
         self._interventions += differs
         self._infeasible += not decision.feasible
         info.update(
             filter_info(
-                nominal_action=np.array(proposed),
-                safe_action=np.array(decision.action),
-                intervention=differs,
-                filter_active=any(decision.active),
-                feasible=decision.feasible,
-                slack=max(decision.slack),
-                episode_interventions=self._interventions,
-                episode_infeasible=self._infeasible,
+                np.array(proposed),
+                np.array(executed),
+                differs,
+                active,
+                decision.feasible,
+                max(decision.slack),
+                self._interventions,
+                self._infeasible,
             )
         )
         return observation, reward, terminated, truncated, info
+
+    def _differ(self, executed: Sequence[float], proposed: Sequence[float]) -> bool:
+        for u, v, tolerance in zip(executed, proposed, self._tolerance, strict=True):
+            if abs(u - v) > tolerance:
+                return True
+        return False
 
 
 def build_filter(problem: SafetyProblem, condition: Condition | str, knowledge: str) -> tuple[str, SafetyFilter]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safe_envs.barrier import Barrier
-from safe_envs.codegen import Components, Flavour, compile_function
+from safe_envs.codegen import Components, Flavour, compile_function, finite, stacked
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, SystemDefinitionError
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
@@ -131,7 +131,9 @@ class SafetyFilter:
         batch = x.shape[:-1]
         columns = [np.ascontiguousarray(part.reshape(-1, part.shape[-1]).T) for part in (x, u)]
         decision = self.decide_arrays(tuple(columns[0]), tuple(columns[1]))
-        action, barrier, margin, active, slack = [_stack(part, batch) for part in (*decision[:4], decision.slack)]
+        action, barrier, margin, active, slack = [
+            stacked(part, decision.feasible.size).reshape(*batch, -1) for part in (*decision[:4], decision.slack)
+        ]
         return FilterResult(action, barrier, margin, active, decision.feasible.reshape(batch), slack)
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> Decision:
@@ -151,14 +153,14 @@ class SafetyFilter:
         """Decide for a batch, given and returned component by component, each an array (B,) of finite numbers."""
         with np.errstate(all="ignore"):
             values = self._arrays(*x)
-            if len(self.rows) > 1:
-                return self._decide_several(x, u, values)
-            *a, b, h = values
-            action, margin, active, feasible = project_arrays(a, b, u, self._low, self._high, self._weights)
-            total = margin + h
-        if not math.isfinite(total.sum()):
-            self._require_defined(x, total)
-        slack = np.zeros(len(margin)) if feasible.all() else np.where(feasible, 0.0, -margin)
+        if len(self.rows) > 1:
+            return self._decide_several(x, u, values)
+        *a, b, h = values
+        action, margin, active, feasible = project_arrays(a, b, u, self._low, self._high, self._weights)
+        if not (finite(margin) and finite(h)):
+            self._require_defined(x, margin + h)
+        met = np.count_nonzero(feasible) == len(feasible)
+        slack = np.zeros(len(margin)) if met else np.where(feasible, 0.0, -margin)
         return Decision(action, (h,), (margin,), (active,), feasible, (slack,))
 
     def _decide_several(self, x: Components, u: Components, values: Components) -> Decision:
@@ -166,7 +168,7 @@ class SafetyFilter:
 
         size = len(u[0])
         row = self.model.m + 2
-        table = np.stack([np.broadcast_to(v, (size,)) for v in values], axis=-1).reshape(size, -1, row)
+        table = stacked(values, size).reshape(size, -1, row)
         self._require_defined(x, table.sum(axis=(1, 2)))
         bounds = [np.array(c) for c in (self._low, self._high, self._weights)]
         found = project(table[:, :, :-2], table[:, :, -2], np.stack(u, axis=-1), *bounds)
@@ -202,11 +204,6 @@ def _require_finite(x: np.ndarray, u: np.ndarray) -> None:
         if not finite.all():
             where = np.argwhere(~finite)[0].tolist()
             raise InvalidInputError(f"the {what} has the entry {values[tuple(where)]} at {where}; a filter needs finite numbers")
-
-
-def _stack(components: Sequence[np.ndarray], batch: tuple[int, ...]) -> np.ndarray:
-    size = math.prod(batch)
-    return np.stack([np.broadcast_to(c, (size,)) for c in components], axis=-1).reshape(*batch, len(components))
 
 
 def _bounds(model: ControlAffineSDE, box: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:

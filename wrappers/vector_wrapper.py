@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from safe_envs.codegen import Components
+from safe_envs.codegen import Components, stacked
 from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info, filter_info, with_masks
 from safe_envs.vector import SafeVectorEnv, VectorStep
@@ -55,16 +55,17 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         proposed = self._inner.physical_action(actions)
         decision = self.safety_filter.decide_arrays(self._inner.components, proposed)
         active = decision.active[0] if len(decision.active) == 1 else np.logical_or.reduce(decision.active)
-        if active.any():
-            actions = np.where(active[:, None], self._inner.normalized_action(tuple(decision.action)), actions)
-        observation, reward, terminated, truncated, info = self.env.step(actions)
+        if self.env is self._inner:
+            observation, reward, terminated, truncated, info = self._inner.step_physical(decision.action)
+        else:
+            observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(decision.action))
         added = self._decided(proposed, decision, active)
         ended = terminated | truncated
-        if self._mode == AutoresetMode.SAME_STEP and ended.any():
+        if self._mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
             info["final_info"].update(with_masks({key: value.copy() for key, value in added.items()}, ended))
             self._start_anew(added, ended)
         elif self._mode == AutoresetMode.NEXT_STEP:
-            if self._ended.any():
+            if np.count_nonzero(self._ended):
                 self._start_anew(added, self._ended)
             self._ended = ended
         info.update(with_masks(added, info["_cost"]))
@@ -78,14 +79,14 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         self._interventions = self._interventions + differs
         self._infeasible = self._infeasible + ~decision.feasible
         return filter_info(
-            nominal_action=np.stack(proposed, axis=-1),
-            safe_action=np.stack(decision.action, axis=-1),
+            nominal_action=stacked(proposed, self.num_envs),
+            safe_action=stacked(decision.action, self.num_envs),
             intervention=differs,
             filter_active=active,
             feasible=decision.feasible,
             slack=decision.slack[0] if len(decision.slack) == 1 else np.maximum.reduce(decision.slack),
-            episode_interventions=self._interventions.copy(),
-            episode_infeasible=self._infeasible.copy(),
+            episode_interventions=self._interventions,
+            episode_infeasible=self._infeasible,
         )
 
     def _start_anew(self, added: Info, envs: np.ndarray) -> None:
@@ -95,6 +96,6 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             added[key][envs] = value
 
     def _forget(self, envs: np.ndarray) -> None:
-        self._interventions[envs] = 0
-        self._infeasible[envs] = 0
+        self._interventions = np.where(envs, 0, self._interventions)
+        self._infeasible = np.where(envs, 0, self._infeasible)
         self._ended = self._ended & ~envs

@@ -5,7 +5,17 @@ from __future__ import annotations
 import gymnasium as gym
 
 _CLASSES = {
+    "DubinsDisk": "dubins",
+    "DubinsObstacle": "dubins_obstacle",
     "StochasticDubins": "dubins",
+    "QuadrotorAltitude": "quadrotor_altitude",
+    "Quadrotor": "quadrotor",
+    "ACC": "acc",
+    "ACCGap": "acc",
+    "Pendulum": "pendulum",
+    "CubicSDE": "cubic",
+    "CubicSDEDisk": "cubic",
+    "Scalar": "scalar",
 }
 
 ENV_IDS = tuple(f"safe_envs/{name}-v0" for name in _CLASSES)

@@ -1,30 +1,31 @@
-"""Dubins vehicles: in a disk (without and with noise) and around a moving obstacle."""
+"""Dubins vehicle in a disk: at an unknown speed (DubinsDisk) and with noise (StochasticDubins)."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
 
 import sympy as sp
 
 from safe_envs.barrier import Barrier
-from safe_envs.calculus import generator
+from safe_envs.calculus import drift_derivative, generator
 from safe_envs.env import SystemEnv
-from safe_envs.errors import ConfigurationError
 from safe_envs.problem import Feature, SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
+from safe_envs.systems._common import in_disk, positive, uniforms
 from safe_envs.vector import SystemVectorEnv
 
 x, y, theta, omega = sp.symbols("x y theta omega", real=True)
-x_o, y_o = sp.symbols("x_o y_o", real=True)
-v, sigma_1, sigma_2, v_o = sp.symbols("v sigma_1 sigma_2 v_o", real=True)
+v, sigma_1, sigma_2 = sp.symbols("v sigma_1 sigma_2", real=True)
 cos_theta, sin_theta = sp.symbols("cos_theta sin_theta", real=True)
-_radius, _angle, _heading = sp.symbols("uniform_1:4", real=True)
 
-_HEADING_GAIN = 2.0
-_GOAL = (3.0, 1.5)
-_GOAL_RADIUS = 0.3
+_HEADING_GAIN = 2
+_UNIFORMS = uniforms(3)
 
 
 def vehicle(speed: float, noise: float) -> ControlAffineSDE:
-    """dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt.
+    """The vehicle: dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt.
 
     Source: thesis Eq. (3.27) and Sec. 4.3.2.
     """
@@ -38,80 +39,234 @@ def vehicle(speed: float, noise: float) -> ControlAffineSDE:
     )
 
 
-def vehicle_and_obstacle(speed: float) -> ControlAffineSDE:
-    """The vehicle, and an obstacle that moves along x with the known speed v_o.
+def turn_rate_towards(wanted_x: sp.Expr, wanted_y: sp.Expr) -> sp.Expr:
+    """Proportional law on the angle from the heading to a wanted course, from the heading's cosine and sine."""
+    return _HEADING_GAIN * sp.atan2(cos_theta * wanted_y - sin_theta * wanted_x, cos_theta * wanted_x + sin_theta * wanted_y)
 
-    Source: thesis Sec. 3.5.1. The print drives the obstacle by the clock and forgets its velocity in the
-    derivatives of h; here its position is a state.
+
+def _patrol(r: float) -> tuple[sp.Expr, sp.Expr]:
+    """Reward and turn rate for riding a circle that lies partly beyond the edge of the disk, counterclockwise.
+
+    The wanted course is the circle's tangent, turned outward inside the circle and inward beyond it, in proportion
+    to the distance from it. The circle is not the edge itself: a filtered vehicle would come arbitrarily near to h = 0
+    there, where rounding decides whether that is a violation.
     """
-    car = vehicle(speed, noise=0.0)
-    return ControlAffineSDE(
-        states=(*car.states, x_o, y_o),
-        inputs=car.inputs,
-        drift=[*car.drift, v_o, 0],
-        input_matrix=[*car.input_matrix, 0, 0],
-        diffusion=car.diffusion.col_join(sp.zeros(2, 2)),
-        parameters={**car.parameters, v_o: 0.5},
-    )
+    radius, from_center = 0.75 * r, x - 0.5 * r
+    distance = sp.sqrt(from_center**2 + y**2 + 1e-9 * r**2)  # the small term keeps the centre from a division by zero
+    off = (radius - distance) / r
+    course = (-y + 3 * off * from_center) / distance, (from_center + 3 * off * y) / distance
+    return sp.exp(-((4 * off) ** 2)), v / radius + turn_rate_towards(*course)
 
 
-def _disk(name: str, *, plant_speed: float, model_speed: float, noise: float, radius: float, **timing: object) -> SafetyProblem:
-    if not radius > 0:
-        raise ConfigurationError(f"radius = {radius}; give a positive number of metres")
-    r = sp.Float(radius, 17)
-    model = vehicle(model_speed, noise)
-    h = r**2 - x**2 - y**2
-    anywhere = (
-        r * sp.sqrt(_radius) * sp.cos(2 * sp.pi * _angle),
-        r * sp.sqrt(_radius) * sp.sin(2 * sp.pi * _angle),
-        2 * sp.pi * _heading,
-    )
-    uniforms = (_radius, _angle, _heading)
+def _disk(
+    name: str, *, plant: ControlAffineSDE, model: ControlAffineSDE, r: float, h: sp.Expr, starts: Mapping[str, Start], **rest: Any
+) -> SafetyProblem:
+    """What both problems in the disk have in common."""
+    reward, turn_rate = _patrol(r)
     return SafetyProblem(
         name=name,
-        plant=vehicle(plant_speed, noise),
+        plant=plant,
         model=model,
         barriers=(Barrier(h),),
-        states=(Variable(x, -2 * radius, 2 * radius, "m"), Variable(y, -2 * radius, 2 * radius, "m"), Variable(theta, -sp.oo, sp.oo, "rad")),
-        inputs=(Variable(omega, -10.0, 10.0, "rad/s"),),
+        states=(Variable(x, -2 * r, 2 * r, "m"), Variable(y, -2 * r, 2 * r, "m"), Variable(theta, -math.inf, math.inf, "rad")),
         features=(
-            Feature("x", x, -2 * radius, 2 * radius),
-            Feature("y", y, -2 * radius, 2 * radius),
+            Feature("x", x, -2 * r, 2 * r),
+            Feature("y", y, -2 * r, 2 * r),
             Feature("cos_theta", sp.cos(theta), -1.0, 1.0),
             Feature("sin_theta", sp.sin(theta), -1.0, 1.0),
         ),
-        reward=sp.exp(-4 * (h / r**2) ** 2),
-        nominal=(_patrol(r),),
-        starts={"inward": Start(anywhere, uniforms, generator(model, h)), "uniform": Start(anywhere, uniforms)},
+        reward=reward,
+        nominal=(turn_rate,),
+        starts={**starts, "uniform": Start(_anywhere(r), _UNIFORMS)},
         noise=("sigma_1", "sigma_2"),
         plane=("x", "y"),
-        **timing,
+        **rest,
     )
 
 
-def _patrol(r: sp.Expr) -> sp.Expr:
-    """Turn rate that leads onto the circle of radius r, and around it counterclockwise.
+def _anywhere(r: float) -> tuple[sp.Expr, ...]:
+    """Position uniform in the disk, heading uniform."""
+    area, angle, heading = _UNIFORMS
+    return (*in_disk(r, area, angle), 2 * sp.pi * heading)
 
-    The wanted course is the tangent, turned outward inside the circle and inward beyond it, in proportion to
-    the distance from it.
+
+def dubins_disk(*, radius: float = 1.0) -> SafetyProblem:
+    """The disk with a vehicle that is faster than its designer believes.
+
+    Args:
+        radius: of the safe disk, in m.
+
+    Source: thesis Sec. 3.5.1, static case.
     """
-    distance = sp.sqrt(x**2 + y**2 + sp.Float(1e-9) * r**2)
-    outward = 1 - distance / r
-    wanted_x = (-y + 2 * outward * x) / distance
-    wanted_y = (x + 2 * outward * y) / distance
-    error = sp.atan2(cos_theta * wanted_y - sin_theta * wanted_x, cos_theta * wanted_x + sin_theta * wanted_y)
-    return v / r + _HEADING_GAIN * error
+    r = positive("radius", radius)
+    plant, model = vehicle(0.8, noise=0.0), vehicle(0.5, noise=0.0)
+    h = r**2 - x**2 - y**2
+    gains = (1.0, 2.0)
+    b_1 = plant.numeric(drift_derivative(plant, h)) + gains[0] * h
+    return _disk(
+        "DubinsDisk",
+        plant=plant,
+        model=model,
+        r=r,
+        h=h,
+        inputs=(Variable(omega, -math.pi, math.pi, "rad/s"),),
+        starts={"feasible": Start(_anywhere(r), _UNIFORMS, b_1), "thesis": Start.at((0.9, 0.1, 0.0)), "valid": Start.at((0.0, 0.1, 0.0))},
+        dt=0.05,
+        horizon=50.0,
+        gains=gains,
+        filter="hocbf",
+    )
 
 
 def stochastic_dubins(*, radius: float = 3.0) -> SafetyProblem:
+    """The disk with a vehicle whose position is disturbed by noise.
+
+    Args:
+        radius: of the safe disk, in m.
+
+    Source: thesis Sec. 4.3.2.
+    """
+    r = positive("radius", radius)
+    car = vehicle(2.0, noise=0.2)
+    h = r**2 - x**2 - y**2
     return _disk(
-        "StochasticDubins", plant_speed=2.0, model_speed=2.0, noise=0.2, radius=radius, dt=0.05, horizon=5.0, filter="scbf"
+        "StochasticDubins",
+        plant=car,
+        model=car,
+        r=r,
+        h=h,
+        inputs=(Variable(omega, -10.0, 10.0, "rad/s"),),
+        starts={"inward": Start(_anywhere(r), _UNIFORMS, generator(car, h))},
+        dt=0.05,
+        horizon=5.0,
+        gains=(1.0, 1.0),
+        filter="scbf",
     )
 
 
+class DubinsDisk(SystemEnv):
+    """A vehicle at constant speed, faster than its designer believes, is to stay in a disk.
+
+    ## Description
+    The vehicle cannot stop or slow down, only turn. Its task is to ride a circle that lies partly beyond the edge of the
+    safe disk, so that a policy that only wants reward leaves the disk in every round.
+
+    ## Equations
+    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt
+
+    ## States
+    | symbol | meaning | unit | workspace |
+    |---|---|---|---|
+    | `x`, `y` | position | m | [-2 r, 2 r], r = 1 m |
+    | `theta` | heading | rad | unbounded |
+
+    ## Inputs
+    | symbol | meaning | unit | box |
+    |---|---|---|---|
+    | `omega` | turn rate | rad/s | [-pi, pi], chosen by us |
+
+    ## Observation
+    x, y, cos(theta), sin(theta).
+
+    ## Barrier
+    h = r^2 - x^2 - y^2, of relative degree 2. Where the heading is radial the input does not reach its second derivative:
+    the condition can be met there only if b_2 >= 0 without it, which at the centre needs p_1 p_2 >= 2 v^2/r^2. Hence the
+    gains 1 and 2 in place of the thesis' 1 and 1, which miss that for v = .8. Natural filter: `hocbf`.
+
+    ## Noise
+    `sigma_1`, `sigma_2` in m/sqrt(s), both 0: the system is deterministic.
+
+    ## Mismatch
+    The plant has v = .8 m/s, the model v = .5 m/s. A filter that trusts the model lets h settle near
+    -2 v_model (v_plant - v_model)/(p_1 p_2) = -.15 m^2.
+
+    ## Reward
+    exp(-(4 e/r)^2) a step, in (0, 1], for the distance e from the circle of radius .75 r around (.5 r, 0). Chosen by us.
+
+    ## Nominal controller
+    Turns towards a course that leads onto that circle and around it. The thesis uses 0 here.
+
+    ## Start
+    `feasible`: uniform in the disk and in heading, kept where b_1 > 0 for the plant's default speed and the default gains, since
+    from elsewhere no filter of these gains is promised to succeed. `uniform`: without that condition. `thesis`: (.9, .1, 0), which
+    is such a start outside the set b_1 >= 0, for all gains that the thesis tries. `valid`: (0, .1, 0), which is inside.
+
+    ## Episode end
+    Terminated outside the workspace, truncated after 50 s = 1000 steps.
+
+    ## Arguments
+    `barrier={"radius": 1.0}`, the radius r in m; for all others see `SystemEnv`.
+
+    ## Source
+    Thesis Sec. 3.5.1, static obstacle avoidance, Eq. (3.27).
+    """
+
+    problem_factory = staticmethod(dubins_disk)
+
+
+class DubinsDiskVector(SystemVectorEnv):
+    """`DubinsDisk` in a batch."""
+
+    env_class = DubinsDisk
+
+
 class StochasticDubins(SystemEnv):
+    """A vehicle at constant speed, disturbed by noise, is to stay in a disk.
+
+    ## Description
+    As `DubinsDisk`, with a known speed, a larger disk and noise in the position.
+
+    ## Equations
+    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt
+
+    ## States
+    | symbol | meaning | unit | workspace |
+    |---|---|---|---|
+    | `x`, `y` | position | m | [-2 r, 2 r], r = 3 m |
+    | `theta` | heading | rad | unbounded |
+
+    ## Inputs
+    | symbol | meaning | unit | box |
+    |---|---|---|---|
+    | `omega` | turn rate | rad/s | [-10, 10] |
+
+    ## Observation
+    x, y, cos(theta), sin(theta).
+
+    ## Barrier
+    h = r^2 - x^2 - y^2, of relative degree 2. Natural filter: `scbf`, whose order-2 condition cannot stay feasible on a compact
+    set: with the full box it is met in about four steps of five. Gains for the other conditions: 1, 1.
+
+    ## Noise
+    `sigma_1`, `sigma_2` = .2 m/sqrt(s).
+
+    ## Mismatch
+    None: plant and model have v = 2 m/s.
+
+    ## Reward
+    exp(-(4 e/r)^2) a step, in (0, 1], for the distance e from the circle of radius .75 r around (.5 r, 0). Chosen by us.
+
+    ## Nominal controller
+    Turns towards a course that leads onto that circle and around it. Chosen by us.
+
+    ## Start
+    `inward`: uniform in the disk and in heading, kept where A h > 0 for the model. `uniform`: without that condition.
+
+    ## Episode end
+    Terminated outside the workspace, truncated after 5 s = 100 steps. At a control period of 50 ms some short exits go
+    unseen, so that a safety rate is a little higher than with a smaller one.
+
+    ## Arguments
+    `barrier={"radius": 3.0}`, the radius r in m; for all others see `SystemEnv`.
+
+    ## Source
+    Thesis Sec. 4.3.2, Eq. (4.25).
+    """
+
     problem_factory = staticmethod(stochastic_dubins)
 
 
 class StochasticDubinsVector(SystemVectorEnv):
+    """`StochasticDubins` in a batch."""
+
     env_class = StochasticDubins

@@ -20,26 +20,38 @@ _ROUNDING = 8 * float(np.finfo(float).eps)
 
 
 def project_floats(
-    a: Sequence[float], b: float, v: Sequence[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
+    a: Sequence[float], b: float, u: Sequence[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
 ) -> tuple[list[float], float, bool, bool]:
-    """Project the input v of one state.
+    """Project the input u of one state.
 
     Returns:
         The minimiser (m floats), its margin a . u + b, whether the row had to act, and whether it can be met.
     """
+    if len(u) == 1:
+        return _project_scalar(a[0], b, u[0], low[0], high[0])
+    v = u
     u = [min(max(vj, lo), hi) for vj, lo, hi in zip(v, low, high, strict=True)]
     margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])
     if margin >= 0.0:
         return u, margin, False, True
-    if len(u) == 1:
-        if a[0] != 0.0:
-            u[0] = min(max(-b / a[0], low[0]), high[0])
-    else:
-        u = _follow_multiplier(a, b, v, low, high, w)
+    u = _follow_multiplier(a, b, v, low, high, w)
     products = [aj * uj for aj, uj in zip(a, u, strict=True)]
     margin = b + sum(products)
     feasible = margin >= -_ROUNDING * (abs(b) + sum([abs(p) for p in products]))
     return u, margin, True, feasible
+
+
+def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tuple[list[float], float, bool, bool]:
+    """A single input: the root of the row, if the box holds it, and the end of the box next to it if not."""
+    u = low if v < low else high if v > high else v
+    margin = a * u + b
+    if margin >= 0.0:
+        return [u], margin, False, True
+    if a == 0.0:
+        return [u], margin, True, False
+    root = -b / a
+    u = low if root < low else high if root > high else root
+    return [u], a * u + b, True, u == root
 
 
 def _follow_multiplier(
@@ -79,22 +91,33 @@ def project_arrays(
     Returns:
         As `project_floats`, with arrays (B,) for every number.
     """
+    if len(v) == 1:
+        u, *rest = _project_scalars(a[0], b, v[0], low[0], high[0])
+        return [u], *rest
     u = [np.minimum(np.maximum(vj, lo), hi) for vj, lo, hi in zip(v, low, high, strict=True)]
     margin = _dot(a, u) + b
     active = margin < 0.0
-    if not active.any():
+    if not np.count_nonzero(active):
         return u, margin, active, ~active
-    if len(u) == 1:
-        u = [_root_of_scalar_row(a[0], b, u[0], low[0], high[0], active)]
-    else:
-        u = _follow_multipliers(a, b, v, u, low, high, w, np.flatnonzero(active))
-    products = [aj * uj for aj, uj in zip(a, u, strict=True)]
-    margin = sum(products[1:], products[0]) + b
-    feasible = margin >= 0.0
-    if not feasible.all():
-        scale = sum([np.abs(p) for p in products]) + np.abs(b)
-        feasible = margin >= -_ROUNDING * scale
-    return u, margin, active, feasible
+    u = _follow_multipliers(a, b, v, u, low, high, w, np.flatnonzero(active))
+    margin = _dot(a, u) + b
+    scale = _dot([np.abs(aj) for aj in a], [np.abs(uj) for uj in u]) + np.abs(b)
+    return u, margin, active, margin >= -_ROUNDING * scale
+
+
+def _project_scalars(a: Any, b: Any, v: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    u = np.minimum(np.maximum(v, low), high)
+    margin = a * u + b
+    active = margin < 0.0
+    if not np.count_nonzero(active):
+        return u, margin, active, ~active
+    with np.errstate(divide="ignore", over="ignore"):
+        root = -b / a
+    nearest = np.minimum(np.maximum(root, low), high)
+    feasible = (nearest == root) | ~active
+    moving = active if np.count_nonzero(a) == np.size(a) else active & (a != 0.0)
+    u = np.where(moving, nearest, u)
+    return u, a * u + b, active, feasible
 
 
 def _dot(a: Sequence[Any], u: Sequence[np.ndarray]) -> np.ndarray:
@@ -102,12 +125,6 @@ def _dot(a: Sequence[Any], u: Sequence[np.ndarray]) -> np.ndarray:
     for aj, uj in zip(a[1:], u[1:], strict=True):
         total = total + aj * uj
     return total
-
-
-def _root_of_scalar_row(a: Any, b: Any, u: np.ndarray, low: float, high: float, active: np.ndarray) -> np.ndarray:
-    moving = active & (a != 0.0)
-    root = np.divide(-b, a, out=u.copy(), where=moving)
-    return np.minimum(np.maximum(root, low), high, out=root)
 
 
 def _follow_multipliers(

@@ -1,9 +1,9 @@
 """Several constraint rows and a box: ProxQP, batched, and never wrong silently.
 
 ProxQP's defaults return feasible points that are not the minimisers, and an infeasible problem ends at the iteration
-limit. So the settings ask for the duality gap, every answer is checked against the rows, a failed one is solved again
-from scratch, and where the rows contradict each other inside the box, the least-violating action is found in two exact
-steps: the smallest sum of squared slacks first, then the action nearest to the proposed one that needs no more.
+limit. So the settings ask for the duality gap and cap the iterations, and every answer is checked against the rows. What
+is left is solved in two exact steps, which serve contradicting rows too: the smallest sum of squared slacks first, then
+the action nearest to the proposed one that needs no more than these.
 """
 
 from __future__ import annotations
@@ -15,15 +15,8 @@ import qpsolvers
 import scipy.optimize
 from proxsuite import proxqp
 
-_SETTINGS = {
-    "eps_abs": 1e-9,
-    "eps_rel": 0.0,
-    "check_duality_gap": True,
-    "eps_duality_gap_abs": 1e-9,
-    "eps_primal_inf": 1e-14,
-    "max_iter": 200,
-    "max_iter_in": 50,
-}
+_PRECISION = {"eps_abs": 1e-9, "eps_rel": 0.0, "check_duality_gap": True, "eps_duality_gap_abs": 1e-9}
+_SETTINGS = {**_PRECISION, "eps_primal_inf": 1e-14, "max_iter": 200, "max_iter_in": 50}
 _INFINITY = 1e20
 _ACCEPTED = 1e-7
 """Largest violation of a normalised row that counts as met: a hundred times what the solver is asked for."""
@@ -91,13 +84,9 @@ class _Scaled(NamedTuple):
         """Minimisers (B, m), and whether the rows are met (B,)."""
         z, met = self._in_batch(threads)
         for i in np.flatnonzero(~met).tolist():
-            again = self._from_scratch(i, 0.0)
-            if again is not None:
-                z[i], met[i] = again, True
-                continue
             least = self._least_violating(i)
             slack = np.maximum(-(self.rows[i] @ least + self.offsets[i]), 0.0)
-            nearest = self._from_scratch(i, slack + _ACCEPTED)
+            nearest = self._nearest(i, slack + _ACCEPTED)
             z[i] = least if nearest is None else nearest
             met[i] = bool((slack <= _ACCEPTED).all())
         return z, met
@@ -125,13 +114,11 @@ class _Scaled(NamedTuple):
         rows_met = self.rows[i] @ z + self.offsets[i] + slack >= -_ACCEPTED
         return bool(rows_met.all() and (np.abs(z) <= 1.0 + _ACCEPTED).all())
 
-    def _from_scratch(self, i: int, slack: np.ndarray | float) -> np.ndarray | None:
-        """The minimiser with every row relaxed by a slack, without a guess; None where it is not found."""
+    def _nearest(self, i: int, slack: np.ndarray) -> np.ndarray | None:
+        """The minimiser with the rows relaxed until they can be met, without a guess; None where it is not found."""
         bound = np.ones(self.half.size)
-        problem = qpsolvers.Problem(
-            self.hessian, -self.hessian @ self.target[i], self.rows[i] * -1.0, self.offsets[i] + slack, lb=-bound, ub=bound
-        )
-        solution = qpsolvers.solve_problem(problem, solver="proxqp", initial_guess=proxqp.NO_INITIAL_GUESS, **_SETTINGS)
+        problem = qpsolvers.Problem(self.hessian, -self.hessian @ self.target[i], -self.rows[i], self.offsets[i] + slack, lb=-bound, ub=bound)
+        solution = qpsolvers.solve_problem(problem, solver="proxqp", initial_guess=proxqp.NO_INITIAL_GUESS, **_PRECISION)
         z = solution.x
         return z if solution.found and z is not None and self._meets(i, z, slack) else None
 

@@ -1,0 +1,181 @@
+"""Episodes in waves on a vector env: what is counted, and what is kept for pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from agents.policy import Policy
+from agents.statistics import FirstValues, RunningSum, share, wilson_interval
+from safe_envs.codegen import Components
+from safe_envs.info import Info
+from safe_envs.vector import SafeVectorEnv
+from wrappers import SafetyFilterVectorWrapper
+
+Env = SafeVectorEnv | SafetyFilterVectorWrapper
+Progress = Callable[[float], None]
+Row = dict[str, Any]
+
+_KEPT_BARRIERS = 256
+_KEPT_STATES = 32
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """Seed of the env in an episode of an evaluation: its own child of the evaluation's seed."""
+    return int(np.random.SeedSequence(seed, spawn_key=(episode,)).generate_state(1, np.uint64)[0])
+
+
+class Recorder:
+    """Trajectories of the first episodes, NaN after their ends.
+
+    Attributes:
+        barrier: smallest barrier value, shape (steps + 1, at most 256).
+        states: shape (steps + 1, at most 32, n).
+    """
+
+    def __init__(self, steps: int, states: int, episodes: int) -> None:
+        self.barrier = np.full((steps + 1, min(episodes, _KEPT_BARRIERS)), np.nan)
+        self.states = np.full((steps + 1, min(episodes, _KEPT_STATES), states), np.nan)
+
+    def note(self, k: int, first: int, present: np.ndarray, h: np.ndarray, x: Components) -> None:
+        """Keep instant k of a wave that begins with the episode `first`."""
+        self._put(self.barrier[k], first, present, h)
+        for j, component in enumerate(x):
+            self._put(self.states[k, :, j], first, present, component)
+
+    @staticmethod
+    def _put(row: np.ndarray, first: int, present: np.ndarray, values: np.ndarray) -> None:
+        room = row[first : first + len(present)]
+        np.copyto(room, values[: len(room)], where=present[: len(room)])
+
+
+class Wave:
+    """Counts of episodes that run side by side, an array entry for each; ended and surplus ones stay as they are."""
+
+    def __init__(self, size: int, count: int, h: np.ndarray) -> None:
+        self.alive = np.arange(size) < count
+        self.safe = h > 0.0
+        self.h_min = h.copy()
+        self.counted = np.zeros(size, dtype=np.int64)
+        self.interventions = np.zeros(size, dtype=np.int64)
+        self.infeasible = np.zeros(size, dtype=np.int64)
+        self.lengths = np.zeros(size, dtype=np.int64)
+        self.effort = np.zeros(size)
+        self.returns = np.zeros(size)
+
+    def add(self, h: np.ndarray, u: Components, reward: np.ndarray, info: Info) -> None:
+        """Count a step; it counts for the filter only if the episode was safe up to its beginning."""
+        alive, counts = self.alive, self.alive & self.safe
+        self.counted += counts
+        self.lengths += alive
+        if "intervention" in info:
+            self.interventions += counts & info["intervention"]
+            self.infeasible += counts & ~info["feasible"]
+        square = u[0] * u[0]
+        for component in u[1:]:
+            square = square + component * component
+        self.effort += np.where(counts, square, 0.0)
+        self.returns += np.where(alive, reward, 0.0)
+        np.copyto(self.h_min, np.minimum(self.h_min, h), where=alive)
+        self.safe &= (h > 0.0) | ~alive
+
+
+class Totals:
+    """Sums over the episodes of a row, wave by wave."""
+
+    def __init__(self) -> None:
+        self.episodes = self.safe = self.steps = 0
+        self._counted = self._interventions = self._infeasible = self._with_effort = 0
+        self._effort, self._return, self._h_min = RunningSum(), RunningSum(), FirstValues()
+
+    def add(self, wave: Wave, count: int) -> None:
+        """Add the first `count` episodes of a wave."""
+        self.episodes += count
+        self.safe += int(wave.safe[:count].sum())
+        self.steps += int(wave.lengths[:count].sum())
+        self._counted += int(wave.counted[:count].sum())
+        self._interventions += int(wave.interventions[:count].sum())
+        self._infeasible += int(wave.infeasible[:count].sum())
+        some = wave.counted[:count] > 0
+        self._with_effort += int(some.sum())
+        self._effort.add(wave.effort[:count][some] / wave.counted[:count][some])
+        self._return.add(wave.returns[:count])
+        self._h_min.add(wave.h_min[:count])
+
+    def row(self) -> Row:
+        """The statistics of the episodes; None where no step counts."""
+        low, high = wilson_interval(self.safe, self.episodes)
+        p05, median = self._h_min.quantiles((0.05, 0.5))
+        return {
+            "episodes": self.episodes,
+            "safe": self.safe,
+            "safety_rate": self.safe / self.episodes,
+            "ci_low": low,
+            "ci_high": high,
+            "min_h_median": median,
+            "min_h_p05": p05,
+            "violations": self.episodes - self.safe,
+            "intervention_rate": share(self._interventions, self._counted),
+            "infeasible_rate": share(self._infeasible, self._counted),
+            "effort_mean": share(self._effort.total, self._with_effort),
+            "return_mean": self._return.total / self.episodes,
+        }
+
+
+def run_episodes(env: Env, policy: Any, episodes: int, seed: int, progress: Progress | None, recorder: Recorder | None) -> Totals:
+    """Simulate episodes 0..episodes-1 in waves of the size of the vector env.
+
+    Args:
+        env: with next-step autoreset: what it simulates after an episode's end is ignored.
+        policy: anything with Stable-Baselines3's `predict`.
+        episodes: how many.
+        seed: whose children seed the episodes.
+        progress: told, after every step, how many episodes are done; the fraction tells of those under way.
+        recorder: keeps trajectories, if any.
+    """
+    totals = Totals()
+    for first in range(0, episodes, env.num_envs):
+        count = min(env.num_envs, episodes - first)
+        rows = range(first, first + env.num_envs)
+        if isinstance(policy, Policy):
+            policy.begin(rows, seed)
+        totals.add(_play(env, policy, rows, count, seed, progress, recorder), count)
+    return totals
+
+
+def _play(env: Env, policy: Any, rows: range, count: int, seed: int, progress: Progress | None, recorder: Recorder | None) -> Wave:
+    world: SafeVectorEnv = env.unwrapped  # pyright: ignore[reportAssignmentType]
+    steps, first = world.problem.steps, rows.start
+    observation, info = env.reset(seed=[episode_seed(seed, i) for i in rows])
+    h = _smallest(info["barrier"])
+    wave = Wave(len(rows), count, h)
+    if recorder:
+        recorder.note(0, first, wave.alive, h, world.components)
+    state, start = None, np.ones(len(rows), dtype=bool)
+    for k in range(1, steps + 1):
+        actions, state = policy.predict(observation, state, start, deterministic=True)
+        observation, reward, terminated, truncated, info = env.step(actions)
+        h = _smallest(info["barrier"])
+        wave.add(h, _executed(world, actions, info), reward, info)
+        if recorder:
+            recorder.note(k, first, wave.alive, h, world.components)
+        start = terminated | truncated
+        wave.alive &= ~start
+        if progress:
+            progress(first + count * k / steps)
+        if not wave.alive.any():
+            break
+    if progress:
+        progress(first + count)
+    return wave
+
+
+def _smallest(barriers: np.ndarray) -> np.ndarray:
+    return barriers[:, 0] if barriers.shape[1] == 1 else barriers.min(axis=1)
+
+
+def _executed(world: SafeVectorEnv, actions: np.ndarray, info: Info) -> Components:
+    """Components of the executed input in physical units."""
+    return tuple(info["safe_action"].T) if "safe_action" in info else world.physical_action(actions)

@@ -1,0 +1,192 @@
+"""How safe a policy is, bare and under filters: the same episodes for every filter, batched."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.episodes import Env, Progress, Recorder, Row, run_episodes
+from agents.policy import POLICIES, Policy, make_policy
+from agents.problems import full_id, load_problem
+from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.integrate import Integrator
+from safe_envs.problem import SafetyProblem
+from safe_envs.vector import SafeVectorEnv
+from wrappers import CONDITIONS, SafetyFilterVectorWrapper, parse_condition
+
+BARE = "none"
+"""Name of the row without any filter."""
+
+_PACKAGES = ("safe-envs", "gymnasium", "numpy", "scipy", "sympy", "proxsuite", "stable-baselines3", "torch")
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The answer of `evaluate`.
+
+    Attributes:
+        problem: what was simulated.
+        config: everything needed to run it again, as JSON.
+        rows: statistics, one row for each filter.
+        timing: the only part that depends on the machine and on `num_envs`.
+        recorders: trajectories for each filter, if asked for.
+        repeats: whether nothing is random, so that all episodes are one and the same.
+    """
+
+    problem: SafetyProblem
+    config: dict[str, Any]
+    rows: list[Row]
+    timing: dict[str, Any]
+    recorders: dict[str, Recorder]
+    repeats: bool
+
+    def document(self) -> dict[str, Any]:
+        """The whole as JSON-able data."""
+        return {"config": self.config, "versions": _versions(), "rows": self.rows, "timing": self.timing}
+
+
+def evaluate(
+    problem: SafetyProblem | str,
+    policy: Any = "nominal",
+    filters: Sequence[str] | None = None,
+    *,
+    options: Mapping[str, Any] | None = None,
+    episodes: int = 1000,
+    seed: int = 0,
+    num_envs: int = 1024,
+    knowledge: str = "model",
+    progress: Progress | None = None,
+    record: bool = False,
+) -> Evaluation:
+    """Estimate the safety of a policy under each filter.
+
+    An episode is safe if every barrier is positive at every control instant, its start included. After its first
+    violation an episode's interventions, infeasible steps and effort are no longer counted: the conditions mean
+    nothing outside the safe set. Its simulation goes on, and its return and smallest h are of the whole episode.
+
+    Episode i is seeded by its own child of `seed`, the same for all filters; all but `timing` is the same, to the
+    last bit, for every `num_envs`.
+
+    Args:
+        problem: what to simulate, or the id of a registered env.
+        policy: a name or a path for `make_policy`, or anything with Stable-Baselines3's `predict`.
+        filters: texts for `parse_condition`, and "none" for the bare env; by default that and the problem's own.
+        options: arguments of `gym.make` for an id.
+        episodes: number for each filter.
+        seed: whole number from 0.
+        num_envs: how many episodes to simulate side by side.
+        knowledge: what the filters know, "model" or "plant".
+        progress: told the part of the work that is done, from 0 to 1.
+        record: keep trajectories for pictures.
+
+    Raises:
+        ConfigurationError: an argument names something unknown or is out of range.
+        RelativeDegreeError: a condition does not suit a barrier.
+        NumericalError: a simulation or a condition left the finite numbers.
+    """
+    for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("num_envs", num_envs, 1)):
+        _require_whole(name, value, least)
+    if knowledge not in ("model", "plant"):
+        raise ConfigurationError(f"knowledge = {knowledge!r}; {nearest(knowledge, ('model', 'plant'))}")
+    env_id = full_id(problem) if isinstance(problem, str) else None
+    if env_id is None and options:
+        raise ConfigurationError("options are the arguments of a registered id; configure the problem itself instead")
+    world = problem if isinstance(problem, SafetyProblem) else load_problem(problem, options)
+    actor = make_policy(policy, world) if isinstance(policy, str) else policy
+    names = list(dict.fromkeys((BARE, world.filter) if filters is None else filters))
+    specs = [_spec(name, world) for name in names]
+    envs = [_make_env(world, spec, knowledge, min(num_envs, episodes)) for spec in specs]
+    config = {
+        "env_id": env_id,
+        "options": {k: v for k, v in (options or {}).items() if v is not None},
+        "problem": _describe(world),
+        "policy": _describe_policy(policy),
+        "filters": [{"name": name, "spec": spec} for name, spec in zip(names, specs, strict=True)],
+        "knowledge": knowledge,
+        "episodes": episodes,
+        "seed": seed,
+    }
+    rows, speeds, recorders = [], [], {}
+    for i, (name, env) in enumerate(zip(names, envs, strict=True)):
+        recorder = Recorder(world.steps, world.plant.n, episodes) if record else None
+        told = None if progress is None else _part_of(progress, i, len(names), episodes)
+        begun = time.perf_counter()
+        totals = run_episodes(env, actor, episodes, seed, told, recorder)
+        seconds = time.perf_counter() - begun
+        rows.append({"filter": name, "policy": config["policy"]["name"], **totals.row()})
+        speeds.append({"filter": name, "seconds": seconds, "steps": totals.steps, "steps_per_second": totals.steps / seconds})
+        if recorder:
+            recorders[name] = recorder
+    timing = {"num_envs": num_envs, "rows": speeds}
+    return Evaluation(world, config, rows, timing, recorders, _is_deterministic(world, actor))
+
+
+def _part_of(progress: Progress, before: int, parts: int, episodes: int) -> Progress:
+    """From episodes done in one of several parts to the share of the whole that is done."""
+    return lambda done: progress((before + done / episodes) / parts)
+
+
+def _require_whole(name: str, value: Any, least: int) -> None:
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise ConfigurationError(f"{name} = {value!r}; give a whole number from {least}")
+
+
+def _spec(name: str, problem: SafetyProblem) -> str:
+    """The text of a filter with all its parameters."""
+    if name == BARE:
+        return BARE
+    if name.partition(":")[0] not in CONDITIONS:
+        raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, (BARE, *CONDITIONS))}")
+    return parse_condition(name, problem.gains).spec
+
+
+def _make_env(problem: SafetyProblem, spec: str, knowledge: str, num_envs: int) -> Env:
+    env = SafeVectorEnv(problem, num_envs)
+    if spec == BARE:
+        filtered: Env = env
+    else:
+        filtered = SafetyFilterVectorWrapper(env, spec, knowledge)
+    # The first step compiles what the filter needs: an error shows before a long run, and the timing is of steps.
+    filtered.reset(seed=0)
+    filtered.step(np.zeros(env.action_space.shape or ()))
+    return filtered
+
+
+def _is_deterministic(problem: SafetyProblem, policy: Any) -> bool:
+    noise = Integrator(problem.plant, problem.dt, problem.substeps, "arrays").channels
+    acts_alike = policy.deterministic if isinstance(policy, Policy) else True
+    return acts_alike and not noise and not problem.starts[problem.start].uniforms
+
+
+def _describe(problem: SafetyProblem) -> dict[str, Any]:
+    return {
+        "name": problem.name,
+        "plant": {p.name: v for p, v in problem.plant.parameters.items()},
+        "model": {p.name: v for p, v in problem.model.parameters.items()},
+        "barriers": [str(b.expression) for b in problem.barriers],
+        "box": [[float(low), float(high)] for low, high in problem.box],
+        "start": problem.start,
+        "dt": problem.dt,
+        "substeps": problem.substeps,
+        "horizon": problem.horizon,
+    }
+
+
+def _describe_policy(policy: Any) -> dict[str, Any]:
+    if not isinstance(policy, str):
+        return {"name": type(policy).__name__}
+    if policy in POLICIES:
+        return {"name": policy}
+    return {"name": policy, "sha256": hashlib.sha256(Path(policy).read_bytes()).hexdigest()}
+
+
+def _versions() -> dict[str, str]:
+    return {"python": platform.python_version(), **{package: version(package) for package in _PACKAGES}}

@@ -1,0 +1,45 @@
+"""From a registered id to its problem."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+
+from safe_envs import ENV_IDS, SafeEnv, SafetyProblem
+from safe_envs.errors import ConfigurationError, nearest
+
+
+def full_id(env_id: str) -> str:
+    """Return the registered id, which may be given without its namespace.
+
+    Raises:
+        ConfigurationError: there is no such id.
+    """
+    for candidate in (env_id, f"safe_envs/{env_id}"):
+        if candidate in gym.registry or ":" in candidate:
+            return candidate
+    raise ConfigurationError(f"unknown env {env_id!r}; {nearest(env_id, ENV_IDS)}")
+
+
+def make_env(env_id: str, options: Mapping[str, Any] | None = None) -> SafeEnv:
+    """Make the scalar env of an id, without wrappers.
+
+    Args:
+        env_id: registered id.
+        options: arguments of `gym.make`; those that are None are left out.
+
+    Raises:
+        ConfigurationError: the id is unknown or not of this project, or an argument is not allowed.
+    """
+    given = {key: value for key, value in (options or {}).items() if value is not None}
+    env = gym.make(full_id(env_id), disable_env_checker=True, **given).unwrapped
+    if not isinstance(env, SafeEnv):
+        raise ConfigurationError(f"{env_id} is not one of this project's envs; {nearest(env_id, ENV_IDS)}")
+    return env
+
+
+def load_problem(env_id: str, options: Mapping[str, Any] | None = None) -> SafetyProblem:
+    """The problem of a registered env; arguments and errors as for `make_env`."""
+    return make_env(env_id, options).problem

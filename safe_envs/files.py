@@ -1,0 +1,41 @@
+"""Files that are there whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from safe_envs.errors import ConfigurationError
+
+
+def require_writable(path: Path) -> None:
+    """Raise ConfigurationError unless a file can be created at `path`: asked before a long run, not after it."""
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise ConfigurationError(f"cannot write {path}: the folder {folder} does not exist; create it or choose another")
+    if path.is_dir() or not os.access(folder, os.W_OK):
+        raise ConfigurationError(f"cannot write {path}: it is a folder, or its folder is not writable")
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file in the same folder, then move it to `path` in one step.
+
+    Args:
+        path: where the file is to be.
+        write: is given the temporary path, which has the suffix of `path`.
+
+    Raises:
+        ConfigurationError: the folder does not exist or is not writable.
+    """
+    require_writable(path)
+    handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.absolute().parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        write(temporary)
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,223 @@
+"""Cubic planar system: with a parabola for its safe set (CubicSDE) and with a disk (CubicSDEDisk)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import sympy as sp
+
+from safe_envs.barrier import Barrier
+from safe_envs.clf import min_norm_clf
+from safe_envs.env import SystemEnv
+from safe_envs.problem import SafetyProblem, Start, Variable
+from safe_envs.sde import ControlAffineSDE
+from safe_envs.systems._common import around, in_disk, positive, uniforms
+from safe_envs.vector import SystemVectorEnv
+
+x_1, x_2, u = sp.symbols("x_1 x_2 u", real=True)
+a, k, sigma_1, sigma_2 = sp.symbols("a k sigma_1 sigma_2", real=True)
+
+
+def cubic(diffusion: Any, noise: Mapping[sp.Symbol, float]) -> ControlAffineSDE:
+    """The system: dx_1 = (-a x_1 - x_2) dt + ..., dx_2 = (x_1^3 + x_2 u) dt + ..., with a = .6 and the given diffusion.
+
+    Source: thesis Sec. 5.4.2 and 6.3.1. The print writes d of the states' derivatives where d of the states is meant.
+    """
+    return ControlAffineSDE(
+        states=(x_1, x_2),
+        inputs=(u,),
+        drift=[-a * x_1 - x_2, x_1**3],
+        input_matrix=[0, x_2],
+        diffusion=diffusion,
+        parameters={a: 0.6, **noise},
+    )
+
+
+def _problem(name: str, *, system: ControlAffineSDE, **rest: Any) -> SafetyProblem:
+    """What both problems have in common."""
+    return SafetyProblem(
+        name=name,
+        plant=system,
+        model=system,
+        inputs=(Variable(u, -10.0, 10.0, "1/s"),),
+        dt=0.01,
+        filter="scbf",
+        gains=(2.0,),
+        plane=("x_1", "x_2"),
+        **rest,
+    )
+
+
+def cubic_sde(*, offset: float = 1.0) -> SafetyProblem:
+    """The inside of a parabola, with noise that grows with x_2.
+
+    Args:
+        offset: where the parabola meets the x_1 axis.
+
+    Source: thesis Sec. 5.4.2.
+    """
+    system = cubic(diffusion=[0, k * x_2], noise={k: 0.1})
+    h = positive("offset", offset) - x_1 - x_2**2
+    first, second = uniforms(2)
+    return _problem(
+        "CubicSDE",
+        system=system,
+        reward=sp.exp(-(x_1**2) - x_2**2),
+        barriers=(Barrier(h),),
+        states=(Variable(x_1, -6.0, 6.0), Variable(x_2, -6.0, 6.0)),
+        nominal=min_norm_clf(system, x_1**2 + x_2**2, rate=1, input_weight=1, slack_weight=1),
+        starts={"near-edge": Start((around(-1.0, 2.0, first), around(0.0, 2.0, second)), (first, second), sp.Min(h, 0.5 - h))},
+        horizon=2.0,
+        noise=("k",),
+    )
+
+
+def cubic_sde_disk(*, radius: float = 1.0) -> SafetyProblem:
+    """A disk, with additive noise.
+
+    Args:
+        radius: of the safe disk.
+
+    Source: thesis Sec. 6.3.1.
+    """
+    r = positive("radius", radius)
+    system = cubic(diffusion=[[sigma_1, 0], [0, sigma_2]], noise={sigma_1: 0.2, sigma_2: 0.2})
+    h = r**2 - x_1**2 - x_2**2
+    area, angle = uniforms(2)
+    return _problem(
+        "CubicSDEDisk",
+        system=system,
+        reward=sp.exp(-4 * (h / r**2) ** 2),
+        barriers=(Barrier(h),),
+        states=(Variable(x_1, -2 * r, 2 * r), Variable(x_2, -2 * r, 2 * r)),
+        nominal=(sp.Integer(0),),
+        starts={
+            "uniform": Start(in_disk(r, area, angle), (area, angle)),
+            "thesis-1": Start.at((-0.1, 0.7)),
+            "thesis-2": Start.at((-0.1, 0.8)),
+        },
+        horizon=1.0,
+        noise=("sigma_1", "sigma_2"),
+    )
+
+
+class CubicSDE(SystemEnv):
+    """A cubic planar system, with noise and control that vanish together, is to stay inside a parabola.
+
+    ## Description
+    The state starts near the edge and is to come to the origin. Where x_2 = 0 the input does nothing.
+
+    ## Equations
+    dx_1 = (-a x_1 - x_2) dt, dx_2 = (x_1^3 + x_2 u) dt + k x_2 dW, with a = .6
+
+    ## States
+    | symbol | meaning | unit | workspace |
+    |---|---|---|---|
+    | `x_1`, `x_2` | | 1 | [-6, 6] |
+
+    ## Inputs
+    | symbol | meaning | unit | box |
+    |---|---|---|---|
+    | `u` | | 1/s | [-10, 10] |
+
+    ## Observation
+    The states.
+
+    ## Barrier
+    h = offset - x_1 - x_2^2 with offset 1, of relative degree 1. C is unbounded and so is h, so that h/sup h is no bound on
+    the probability of staying safe. The condition cannot be met at x_2 = 0, x_1 < 0. Gain 2. Natural filter: `scbf`.
+
+    ## Noise
+    `k` = .1 1/sqrt(s).
+
+    ## Mismatch
+    None by default. The thesis takes the diffusion as unknown: `model={"k": 0.0}` is a designer who neglects it.
+
+    ## Reward
+    exp(-x_1^2 - x_2^2) a step, in (0, 1].
+
+    ## Nominal controller
+    Min-norm CLF law of V = x_1^2 + x_2^2: AV + V <= d, at the cost u^2 + d^2.
+
+    ## Start
+    `near-edge`: uniform where 0 < h < .5 in [-3, 1] x [-2, 2].
+
+    ## Episode end
+    Terminated outside the workspace, truncated after 2 s = 200 steps.
+
+    ## Arguments
+    `barrier={"offset": 1.0}`; for all others see `SystemEnv`.
+
+    ## Source
+    Thesis Sec. 5.4.2, which prints the differential of the states' derivatives where that of the states is meant, and calls C
+    compact.
+    """
+
+    problem_factory = staticmethod(cubic_sde)
+
+
+class CubicSDEVector(SystemVectorEnv):
+    """`CubicSDE` in a batch."""
+
+    env_class = CubicSDE
+
+
+class CubicSDEDisk(SystemEnv):
+    """A cubic planar system with additive noise is to stay in a disk.
+
+    ## Description
+    The drift of `CubicSDE` with constant noise in both states. The input works in proportion to x_2, the noise everywhere.
+
+    ## Equations
+    dx_1 = (-a x_1 - x_2) dt + sigma_1 dW_1, dx_2 = (x_1^3 + x_2 u) dt + sigma_2 dW_2, with a = .6
+
+    ## States
+    | symbol | meaning | unit | workspace |
+    |---|---|---|---|
+    | `x_1`, `x_2` | | 1 | [-2 r, 2 r], r = 1 |
+
+    ## Inputs
+    | symbol | meaning | unit | box |
+    |---|---|---|---|
+    | `u` | | 1/s | [-10, 10] |
+
+    ## Observation
+    The states.
+
+    ## Barrier
+    h = r^2 - x_1^2 - x_2^2, of relative degree 1, with sup h = r^2. The thesis' bound h/sup h does not apply: at x_2 = 0,
+    abs(x_1) < .258 the condition cannot be met (Ah(0) = -.08). Gain 2. Natural filter: `scbf`.
+
+    ## Noise
+    `sigma_1`, `sigma_2` = .2 1/sqrt(s).
+
+    ## Mismatch
+    None by default.
+
+    ## Reward
+    exp(-4 (h/r^2)^2) a step, in (0, 1]: as near to the edge as can be. Chosen by us.
+
+    ## Nominal controller
+    0, as the thesis has it.
+
+    ## Start
+    `uniform` in the disk. `thesis-1`: (-.1, .7). `thesis-2`: (-.1, .8).
+
+    ## Episode end
+    Terminated outside the workspace, truncated after 1 s = 100 steps.
+
+    ## Arguments
+    `barrier={"radius": 1.0}`, r; for all others see `SystemEnv`.
+
+    ## Source
+    Thesis Sec. 6.3.1, whose Ah has x_1 x_2 for 2 x_1 x_2, and sigma_2^2 twice.
+    """
+
+    problem_factory = staticmethod(cubic_sde_disk)
+
+
+class CubicSDEDiskVector(SystemVectorEnv):
+    """`CubicSDEDisk` in a batch."""
+
+    env_class = CubicSDEDisk

@@ -1,0 +1,157 @@
+"""Dubins vehicle on its way to a goal that a moving obstacle crosses."""
+
+from __future__ import annotations
+
+import math
+
+import sympy as sp
+
+from safe_envs.barrier import Barrier
+from safe_envs.env import SystemEnv
+from safe_envs.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.sde import ControlAffineSDE
+from safe_envs.systems._common import around, positive, uniforms
+from safe_envs.systems.dubins import omega, theta, turn_rate_towards, vehicle, x, y
+from safe_envs.vector import SystemVectorEnv
+
+x_o, y_o, v_o = sp.symbols("x_o y_o v_o", real=True)
+
+_GOAL_X, _GOAL_Y = 3.0, 1.5
+_GOAL_RADIUS = 0.3
+_GOAL_BONUS = 10
+_START = (-2.0, -2.0, 0.0)
+_OBSTACLE_START = (-1.0, 0.0)
+
+
+def vehicle_and_obstacle(speed: float) -> ControlAffineSDE:
+    """The vehicle of Eq. (3.27), and an obstacle that moves along x: dx_o = v_o dt, dy_o = 0.
+
+    Source: thesis Sec. 3.5.1. The print drives the obstacle by the clock and forgets its velocity in the
+    derivatives of h; here its position is a state, so that nothing can be forgotten.
+    """
+    car = vehicle(speed, noise=0.0)
+    return ControlAffineSDE(
+        states=(*car.states, x_o, y_o),
+        inputs=car.inputs,
+        drift=[*car.drift, v_o, 0],
+        input_matrix=[*car.input_matrix, 0, 0],
+        diffusion=car.diffusion.col_join(sp.zeros(2, 2)),
+        parameters={**car.parameters, v_o: 0.5},
+    )
+
+
+def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
+    """The way to the goal with an obstacle in it, for a vehicle that is faster than its designer believes.
+
+    Args:
+        radius: r_O of the obstacle, in m.
+
+    Source: thesis Sec. 3.5.1, moving case.
+    """
+    r = positive("radius", radius)
+    to_goal_x, to_goal_y = _GOAL_X - x, _GOAL_Y - y
+    distance = sp.sqrt(to_goal_x**2 + to_goal_y**2 + 1e-12)  # the small term keeps the goal from a division by zero
+    towards_goal = (to_goal_x * sp.cos(theta) + to_goal_y * sp.sin(theta)) / distance
+    goal = _GOAL_RADIUS**2 - to_goal_x**2 - to_goal_y**2
+    spread = uniforms(3)
+    return SafetyProblem(
+        name="DubinsObstacle",
+        plant=vehicle_and_obstacle(0.8),
+        model=vehicle_and_obstacle(0.5),
+        barriers=(Barrier((x - x_o) ** 2 + (y - y_o) ** 2 - r**2),),
+        states=(
+            Variable(x, -5.0, 6.0, "m"),
+            Variable(y, -5.0, 5.0, "m"),
+            Variable(theta, -math.inf, math.inf, "rad"),
+            Variable(x_o, -5.0, 20.0, "m"),
+            Variable(y_o, -5.0, 5.0, "m"),
+        ),
+        inputs=(Variable(omega, -math.pi, math.pi, "rad/s"),),
+        features=(
+            Feature("x", x, -5.0, 6.0),
+            Feature("y", y, -5.0, 5.0),
+            Feature("cos_theta", sp.cos(theta), -1.0, 1.0),
+            Feature("sin_theta", sp.sin(theta), -1.0, 1.0),
+            Feature("ahead_x", x_o - x, -11.0, 25.0),
+            Feature("ahead_y", y_o - y, -10.0, 10.0),
+        ),
+        reward=towards_goal + _GOAL_BONUS * (1 + sp.sign(goal)) / 2,
+        nominal=(turn_rate_towards(to_goal_x, to_goal_y),),
+        starts={
+            "spread": Start((*(around(s, 0.5, w) for s, w in zip(_START, spread, strict=True)), *map(sp.Float, _OBSTACLE_START)), spread),
+            "thesis": Start.at((*_START, *_OBSTACLE_START)),
+        },
+        goal=goal,
+        dt=0.05,
+        horizon=15.0,
+        noise=("sigma_1", "sigma_2"),
+        gains=(1.0, 1.0),
+        filter="hocbf",
+        plane=("x", "y"),
+    )
+
+
+class DubinsObstacle(SystemEnv):
+    """A vehicle at constant speed heads for a goal, and an obstacle moves across its way.
+
+    ## Description
+    The straight way to the goal leads through the place where the obstacle will be. The vehicle cannot slow down: it has to
+    turn aside. The obstacle does not react.
+
+    ## Equations
+    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt, dx_o = v_o dt, dy_o = 0
+
+    ## States
+    | symbol | meaning | unit | workspace |
+    |---|---|---|---|
+    | `x` | position of the vehicle | m | [-5, 6] |
+    | `y` | | m | [-5, 5] |
+    | `theta` | heading | rad | unbounded |
+    | `x_o` | position of the obstacle | m | [-5, 20] |
+    | `y_o` | | m | [-5, 5] |
+
+    ## Inputs
+    | symbol | meaning | unit | box |
+    |---|---|---|---|
+    | `omega` | turn rate | rad/s | [-pi, pi], chosen by us |
+
+    ## Observation
+    x, y, cos(theta), sin(theta), and the position of the obstacle seen from the vehicle, x_o - x and y_o - y.
+
+    ## Barrier
+    h = (x - x_o)^2 + (y - y_o)^2 - r_O^2 with r_O = .5 m, of relative degree 2. Gains 1 and 1. Natural filter: `hocbf`.
+
+    ## Noise
+    `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both 0.
+
+    ## Mismatch
+    The plant has v = .8 m/s, the model v = .5 m/s; both know the obstacle's v_o = .5 m/s.
+
+    ## Reward
+    The cosine of the angle between heading and goal a step, in [-1, 1], that is the progress in units of v dt; and 10 on
+    arrival. The sum of the progress is what the distance shrank by: neither circling nor leaving the workspace pays.
+
+    ## Nominal controller
+    Turns towards the goal with gain 2 1/s.
+
+    ## Start
+    `spread`: vehicle uniform within .5 (m, m, rad) of (-2, -2, 0), obstacle at (-1, 0). `thesis`: exactly there.
+
+    ## Episode end
+    Terminated within .3 m of the goal (3, 1.5) or outside the workspace, truncated after 15 s = 300 steps.
+
+    ## Arguments
+    `barrier={"radius": 0.5}`, the obstacle's radius r_O in m; for all others see `SystemEnv`.
+
+    ## Source
+    Thesis Sec. 3.5.1, moving obstacle avoidance. The derivatives of h printed there forget the obstacle's velocity; with the
+    obstacle as a state they are right by construction.
+    """
+
+    problem_factory = staticmethod(dubins_obstacle)
+
+
+class DubinsObstacleVector(SystemVectorEnv):
+    """`DubinsObstacle` in a batch."""
+
+    env_class = DubinsObstacle

@@ -1,0 +1,220 @@
+"""Quadrotor with all twelve states and four rotors, whose altitude is to stay in a band."""
+
+from __future__ import annotations
+
+import math
+
+import sympy as sp
+
+from safe_envs.env import SystemEnv
+from safe_envs.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.sde import ControlAffineSDE
+from safe_envs.systems._common import around, uniforms
+from safe_envs.systems.quadrotor_altitude import (
+    FOLLOWED,
+    GRAVITY,
+    HEIGHT,
+    MODEL_MASS,
+    PLANT_MASS,
+    altitude_problem,
+    band,
+    climb_per_thrust,
+    g,
+    m,
+    phi,
+    sigma_z,
+    theta,
+    thrust_law,
+    z,
+    zdot,
+)
+from safe_envs.vector import SystemVectorEnv
+
+x, y, psi = sp.symbols("x y psi", real=True)
+xdot, ydot, phidot, thetadot, psidot = sp.symbols("xdot ydot phidot thetadot psidot", real=True)
+rotors = sp.symbols("rotor_1:5", real=True)
+ell, I_x, I_y, I_z, k_t, k_d = sp.symbols("l I_x I_y I_z k_t k_d", real=True)
+sigma_x, sigma_y = sp.symbols("sigma_x sigma_y", real=True)
+cos_psi, sin_psi = sp.symbols("cos_psi sin_psi", real=True)
+
+_AIRFRAME = {ell: 0.23, I_x: 7.5e-3, I_y: 7.5e-3, I_z: 1.3e-2, k_t: 3.13e-5, k_d: 7.5e-7}
+_MOST_ROTOR = 1.0e5
+_TILT = math.pi / 3
+
+MIXING = sp.ImmutableMatrix([[k_t] * 4, [0, -k_t, 0, k_t], [k_t, 0, -k_t, 0], [k_d, -k_d, k_d, -k_d]])
+"""(U_1, U_2, U_3, U_4) = MIXING (Omega_1^2, ..., Omega_4^2). Source: thesis Eq. (3.30)."""
+
+
+def quadrotor(mass: float) -> ControlAffineSDE:
+    """The rigid body with four rotors; accelerations along x, y and z carry noise.
+
+    The inputs are the squared speeds of the rotors, in which the system is affine.
+
+    Source: thesis Eq. (3.29), (3.30).
+    """
+    drift = [
+        *(xdot, ydot, zdot),
+        *(0, 0, -g),
+        *(phidot, thetadot, psidot),
+        thetadot * psidot * (I_y - I_z) / I_x,
+        phidot * psidot * (I_z - I_x) / I_y,
+        phidot * thetadot * (I_x - I_y) / I_z,
+    ]
+    by_force = sp.zeros(12, 4)
+    by_force[3, 0] = (sp.cos(phi) * sp.sin(theta) * sp.cos(psi) + sp.sin(phi) * sp.sin(psi)) / m
+    by_force[4, 0] = (sp.cos(phi) * sp.sin(theta) * sp.sin(psi) - sp.sin(phi) * sp.cos(psi)) / m
+    by_force[5, 0] = climb_per_thrust()
+    by_force[9, 1], by_force[10, 2], by_force[11, 3] = ell / I_x, ell / I_y, 1 / I_z
+    diffusion = sp.zeros(12, 3)
+    diffusion[3, 0], diffusion[4, 1], diffusion[5, 2] = sigma_x, sigma_y, sigma_z
+    return ControlAffineSDE(
+        states=(x, y, z, xdot, ydot, zdot, phi, theta, psi, phidot, thetadot, psidot),
+        inputs=rotors,
+        drift=drift,
+        input_matrix=by_force * MIXING,
+        diffusion=diffusion,
+        parameters={m: mass, g: GRAVITY, **_AIRFRAME, sigma_x: 0.0, sigma_y: 0.0, sigma_z: 0.0},
+    )
+
+
+def _rotor_laws() -> tuple[sp.Expr, ...]:
+    """Thrust by the altitude, torques that hold position and heading, through the inverse of the mixing.
+
+    The position loop asks for a horizontal acceleration, which for small tilts is g times an angle: that angle is
+    what the attitude loop, about three times as fast, follows.
+    """
+    wanted_x, wanted_y = -x - 2 * xdot, -y - 2 * ydot
+    wanted_phi = (wanted_x * sin_psi - wanted_y * cos_psi) / g
+    wanted_theta = (wanted_x * cos_psi + wanted_y * sin_psi) / g
+    efforts = sp.Matrix(
+        [
+            thrust_law(),
+            I_x / ell * (36 * (wanted_phi - phi) - 12 * phidot),
+            I_y / ell * (36 * (wanted_theta - theta) - 12 * thetadot),
+            I_z * (-4 * sp.atan2(sin_psi, cos_psi) - 4 * psidot),
+        ]
+    )
+    return tuple(MIXING.inv() * efforts)
+
+
+def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyProblem:
+    """All twelve states, for a quadrotor that is heavier than its designer believes.
+
+    Args:
+        center: c, the middle of the safe band, in m.
+        half_width: p, from the middle of the band to its edges, in m.
+
+    Source: thesis Sec. 3.5.2, Eq. (3.29), (3.30), (3.32).
+    """
+    height, climb = uniforms(2)
+    start = dict.fromkeys((x, y, z, xdot, ydot, zdot, phi, theta, psi, phidot, thetadot, psidot), sp.Integer(0))
+    states = (
+        *(Variable(s, -5.0, 5.0, "m") for s in (x, y)),
+        HEIGHT[0],
+        *(Variable(s, -10.0, 10.0, "m/s") for s in (xdot, ydot)),
+        HEIGHT[1],
+        *(Variable(s, -_TILT, _TILT, "rad") for s in (phi, theta)),
+        Variable(psi, -math.inf, math.inf, "rad"),
+        *(Variable(s, -15.0, 15.0, "rad/s") for s in (phidot, thetadot, psidot)),
+    )
+    return altitude_problem(
+        "Quadrotor",
+        plant=quadrotor(PLANT_MASS),
+        model=quadrotor(MODEL_MASS),
+        barriers=(band(center, half_width),),
+        states=states,
+        inputs=tuple(Variable(s, 0.0, _MOST_ROTOR, "rad^2/s^2") for s in rotors),
+        features=(
+            *(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in states if s.symbol != psi),
+            Feature("cos_psi", sp.cos(psi), -1.0, 1.0),
+            Feature("sin_psi", sp.sin(psi), -1.0, 1.0),
+            *FOLLOWED,
+        ),
+        nominal=_rotor_laws(),
+        starts={
+            "spread": Start(tuple({**start, z: around(5.0, 0.5, height), zdot: around(0.0, 0.5, climb)}.values()), (height, climb)),
+            "thesis": Start(tuple({**start, z: sp.Integer(5)}.values())),
+        },
+        noise=("sigma_x", "sigma_y", "sigma_z"),
+        plane=("x", "z"),
+    )
+
+
+class Quadrotor(SystemEnv):
+    """The altitude of a quadrotor with all its twelve states and four rotors is to stay in a band.
+
+    ## Description
+    The task of `QuadrotorAltitude`, through the full dynamics: the thrust that a filter adds is shared among four rotors, and
+    acts along a body axis that tilts.
+
+    ## Equations
+    Positions and angles integrate their rates. With noise sigma_i dW_i on the three accelerations,
+
+        xddot   = (cos(phi) sin(theta) cos(psi) + sin(phi) sin(psi)) U_1/m
+        yddot   = (cos(phi) sin(theta) sin(psi) - sin(phi) cos(psi)) U_1/m
+        zddot   = -g + cos(phi) cos(theta) U_1/m
+        phiddot   = thetadot psidot (I_y - I_z)/I_x + l/I_x U_2
+        thetaddot = phidot psidot (I_z - I_x)/I_y + l/I_y U_3
+        psiddot   = phidot thetadot (I_x - I_y)/I_z + 1/I_z U_4
+
+        U_1 = k_t (O_1 + O_2 + O_3 + O_4),  U_2 = k_t (O_4 - O_2),  U_3 = k_t (O_1 - O_3)
+        U_4 = k_d (O_1 - O_2 + O_3 - O_4),  O_i = Omega_i^2
+
+    Chosen by us, in the range of a small research quadrotor: l = .23 m, I_x = I_y = .0075, I_z = .013 kg m^2,
+    k_t = 3.13e-5 N s^2, k_d = 7.5e-7 N m s^2.
+
+    ## States
+    | symbol | meaning | unit | workspace |
+    |---|---|---|---|
+    | `x`, `y` | horizontal position | m | [-5, 5] |
+    | `z` | altitude | m | [0, 10] |
+    | `xdot`, `ydot`, `zdot` | velocity | m/s | [-10, 10] |
+    | `phi`, `theta` | roll, pitch | rad | [-pi/3, pi/3] |
+    | `psi` | yaw | rad | unbounded |
+    | `phidot`, `thetadot`, `psidot` | rates | rad/s | [-15, 15] |
+
+    ## Inputs
+    | symbol | meaning | unit | box |
+    |---|---|---|---|
+    | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the plant's hover, chosen by us |
+
+    ## Observation
+    The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5 sin(t), and its rate.
+
+    ## Barrier
+    h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold on h at z = c, where it is
+    not needed. Gains 2 and 8. Natural filter: `hocbf`.
+
+    ## Noise
+    `sigma_x`, `sigma_y`, `sigma_z` of the accelerations in m/s/sqrt(s), all 0.
+
+    ## Mismatch
+    The plant has m = .6 kg, the model m = .4 kg.
+
+    ## Reward
+    exp(-(z - z_ref)^2) a step, in (0, 1].
+
+    ## Nominal controller
+    U_1 as in `QuadrotorAltitude`; PD laws that hold x, y and psi at 0 through the roll and pitch angles, for the torques; and
+    the rotor speeds by the inverse of the mixing.
+
+    ## Start
+    `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0, all else 0. `thesis`: z = 5 m, all else 0.
+
+    ## Episode end
+    Terminated outside the workspace, truncated after 30 s = 600 steps.
+
+    ## Arguments
+    `barrier={"center": 5.0, "half_width": 2.0}`, c and p in m; for all others see `SystemEnv`.
+
+    ## Source
+    Thesis Sec. 3.5.2, Eq. (3.29), (3.30), (3.32). Its experiment uses the altitude alone.
+    """
+
+    problem_factory = staticmethod(quadrotor_full)
+
+
+class QuadrotorVector(SystemVectorEnv):
+    """`Quadrotor` in a batch."""
+
+    env_class = Quadrotor

@@ -1,0 +1,165 @@
+"""Altitude of a quadrotor that is to stay in a band, and what the full quadrotor shares with it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import sympy as sp
+
+from safe_envs.barrier import Barrier
+from safe_envs.env import SystemEnv
+from safe_envs.problem import TIME, Feature, SafetyProblem, Start, Variable
+from safe_envs.sde import ControlAffineSDE, finite_number
+from safe_envs.systems._common import around, positive, uniforms
+from safe_envs.vector import SystemVectorEnv
+
+z, zdot, phi, theta = sp.symbols("z zdot phi theta", real=True)
+U_1 = sp.Symbol("U_1", real=True)
+m, g, sigma_z = sp.symbols("m g sigma_z", real=True)
+z_ref, z_ref_rate = sp.symbols("z_ref z_ref_rate", real=True)
+
+PLANT_MASS = 0.6
+MODEL_MASS = 0.4
+GRAVITY = 9.81
+
+_MOST_THRUST = 12.0
+_REFERENCE = sp.Add(5, sp.Rational(5, 2) * sp.sin(TIME))
+
+HEIGHT = (Variable(z, 0.0, 10.0, "m"), Variable(zdot, -10.0, 10.0, "m/s"))
+"""Range of the altitude and of its rate."""
+
+FOLLOWED = (Feature("z_ref", _REFERENCE, 2.5, 7.5), Feature("z_ref_rate", _REFERENCE.diff(TIME), -2.5, 2.5))
+"""The reference altitude, and its rate."""
+
+
+def climb_per_thrust() -> sp.Expr:
+    """Vertical acceleration that a newton of thrust adds to -g, in thesis Eq. (3.29) and (3.31)."""
+    return sp.cos(phi) * sp.cos(theta) / m
+
+
+def altitude(mass: float) -> ControlAffineSDE:
+    """The altitude: dz = zdot dt, dzdot = (-g + U_1/m) dt + sigma_z dW, in level flight.
+
+    Source: thesis Eq. (3.31) with phi = theta = 0.
+    """
+    return ControlAffineSDE(
+        states=(z, zdot),
+        inputs=(U_1,),
+        drift=[zdot, -g],
+        input_matrix=[0, climb_per_thrust().subs({phi: 0, theta: 0})],
+        diffusion=[0, sigma_z],
+        parameters={m: mass, g: GRAVITY, sigma_z: 0.0},
+    )
+
+
+def thrust_law() -> sp.Expr:
+    """PD law on the altitude with gravity compensated: m (g + 6 e + 4 edot)."""
+    return m * (g + 6 * (z_ref - z) + 4 * (z_ref_rate - zdot))
+
+
+def band(center: float, half_width: float) -> Barrier:
+    """The barrier h = 1 - ((z - c)/p)^4.
+
+    Source: thesis Eq. (3.32).
+    """
+    return Barrier(1 - ((z - finite_number("center", center)) / positive("half_width", half_width)) ** 4)
+
+
+def altitude_problem(name: str, **rest: Any) -> SafetyProblem:
+    """What both problems have in common: the task, the timing and the gains."""
+    return SafetyProblem(
+        name=name,
+        reward=sp.exp(-((z - _REFERENCE) ** 2)),
+        dt=0.05,
+        horizon=30.0,
+        gains=(2.0, 8.0),
+        filter="hocbf",
+        **rest,
+    )
+
+
+def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> SafetyProblem:
+    """The altitude alone, for a quadrotor that is heavier than its designer believes.
+
+    Args:
+        center: c, the middle of the safe band, in m.
+        half_width: p, from the middle of the band to its edges, in m.
+
+    Source: thesis Sec. 3.5.2, Eq. (3.31), (3.32).
+    """
+    height, climb = uniforms(2)
+    return altitude_problem(
+        "QuadrotorAltitude",
+        plant=altitude(PLANT_MASS),
+        model=altitude(MODEL_MASS),
+        barriers=(band(center, half_width),),
+        states=HEIGHT,
+        inputs=(Variable(U_1, 0.0, _MOST_THRUST, "N"),),
+        features=(*(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in HEIGHT), *FOLLOWED),
+        nominal=(thrust_law(),),
+        starts={"spread": Start((around(5.0, 0.5, height), around(0.0, 0.5, climb)), (height, climb)), "thesis": Start.at((5.0, 0.0))},
+        noise=("sigma_z",),
+        plane=("z", "zdot"),
+    )
+
+
+class QuadrotorAltitude(SystemEnv):
+    """The altitude of a quadrotor, heavier than its designer believes, is to stay in a band.
+
+    ## Description
+    A quadrotor in level flight follows a sinusoidal altitude that leaves the safe band at both ends.
+
+    ## Equations
+    dz = zdot dt, dzdot = (-g + U_1/m) dt + sigma_z dW
+
+    ## States
+    | symbol | meaning | unit | workspace |
+    |---|---|---|---|
+    | `z` | altitude | m | [0, 10] |
+    | `zdot` | climb rate | m/s | [-10, 10] |
+
+    ## Inputs
+    | symbol | meaning | unit | box |
+    |---|---|---|---|
+    | `U_1` | thrust | N | [0, 12], twice the plant's weight, chosen by us |
+
+    ## Observation
+    z, zdot, the reference z_ref = 5 + 2.5 sin(t) at the time t of the observation, and its rate.
+
+    ## Barrier
+    h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold on h at z = c, where it is
+    not needed. Gains 2 and 8. Natural filter: `hocbf`.
+
+    ## Noise
+    `sigma_z` of the acceleration in m/s/sqrt(s), 0.
+
+    ## Mismatch
+    The plant has m = .6 kg, the model m = .4 kg: the designer expects half as much acceleration again as the thrust gives.
+
+    ## Reward
+    exp(-(z - z_ref)^2) a step, in (0, 1].
+
+    ## Nominal controller
+    U_1 = m (g + 6 e + 4 edot), e = z_ref - z, with the model's mass. The thesis names a PID controller without its gains.
+
+    ## Start
+    `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0. `thesis`: (5, 0).
+
+    ## Episode end
+    Terminated outside the workspace, truncated after 30 s = 600 steps.
+
+    ## Arguments
+    `barrier={"center": 5.0, "half_width": 2.0}`, c and p in m; for all others see `SystemEnv`.
+
+    ## Source
+    Thesis Sec. 3.5.2, Eq. (3.31) with phi = theta = 0, (3.32). Eq. (3.33) has wrong signs in L_f^2 h and L_g L_f h, and zdot
+    in place of its square; nothing here depends on it.
+    """
+
+    problem_factory = staticmethod(quadrotor_altitude)
+
+
+class QuadrotorAltitudeVector(SystemVectorEnv):
+    """`QuadrotorAltitude` in a batch."""
+
+    env_class = QuadrotorAltitude

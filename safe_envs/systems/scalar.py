@@ -1,0 +1,110 @@
+"""Scalar unstable system with noise, at the edge of a half-line."""
+
+from __future__ import annotations
+
+import sympy as sp
+
+from safe_envs.barrier import Barrier
+from safe_envs.env import SystemEnv
+from safe_envs.problem import SafetyProblem, Start, Variable
+from safe_envs.sde import ControlAffineSDE
+from safe_envs.systems._common import around, positive, uniforms
+from safe_envs.vector import SystemVectorEnv
+
+x, u, sigma = sp.symbols("x u sigma", real=True)
+
+
+def scalar_system() -> ControlAffineSDE:
+    """The system: dx = (x + u) dt + sigma dW.
+
+    Source: thesis Sec. 4.2.2.
+    """
+    return ControlAffineSDE(states=(x,), inputs=(u,), drift=[x], input_matrix=[1], diffusion=[sigma], parameters={sigma: 0.2})
+
+
+def scalar(*, limit: float = 1.0) -> SafetyProblem:
+    """The half-line below a limit.
+
+    Args:
+        limit: the edge of the safe set.
+
+    Source: thesis Sec. 4.2.2.
+    """
+    system = scalar_system()
+    edge = positive("limit", limit)
+    (spread,) = uniforms(1)
+    return SafetyProblem(
+        name="Scalar",
+        plant=system,
+        model=system,
+        barriers=(Barrier(edge - x),),
+        states=(Variable(x, -3 * edge, 2 * edge),),
+        inputs=(Variable(u, -10.0, 10.0, "1/s"),),
+        reward=sp.exp(-((2 * (x / edge - 1)) ** 2)),
+        nominal=(-x + edge - x,),
+        starts={"spread": Start((around(0.0, 0.9 * edge, spread),), (spread,)), "origin": Start.at((0.0,))},
+        dt=0.01,
+        horizon=5.0,
+        noise=("sigma",),
+        gains=(1.0,),
+        filter="scbf",
+    )
+
+
+class Scalar(SystemEnv):
+    """An unstable scalar system with noise is to stay below a limit.
+
+    ## Description
+    The smallest system on which the conditions differ: near the limit a reciprocal one asks for unbounded control.
+
+    ## Equations
+    dx = (x + u) dt + sigma dW
+
+    ## States
+    | symbol | meaning | unit | workspace |
+    |---|---|---|---|
+    | `x` | | 1 | [-3 limit, 2 limit], limit = 1 |
+
+    ## Inputs
+    | symbol | meaning | unit | box |
+    |---|---|---|---|
+    | `u` | | 1/s | [-10, 10], chosen by us |
+
+    ## Observation
+    The state.
+
+    ## Barrier
+    h = limit - x, of relative degree 1 and unbounded above. Gain 1. Natural filter: `scbf`.
+
+    ## Noise
+    `sigma` = .2 1/sqrt(s), chosen by us.
+
+    ## Mismatch
+    None.
+
+    ## Reward
+    exp(-(2 (x/limit - 1))^2) a step, in (0, 1]: as near to the limit as can be. Chosen by us.
+
+    ## Nominal controller
+    u = limit - 2 x: it makes the closed loop dx = (limit - x) dt + sigma dW. Chosen by us.
+
+    ## Start
+    `spread`: uniform in (-.9 limit, .9 limit). `origin`: 0. Chosen by us.
+
+    ## Episode end
+    Terminated outside the workspace, truncated after 5 s = 500 steps. Chosen by us.
+
+    ## Arguments
+    `barrier={"limit": 1.0}`; for all others see `SystemEnv`.
+
+    ## Source
+    Thesis Sec. 4.2.2. `noise=0` gives its first system, the deterministic one.
+    """
+
+    problem_factory = staticmethod(scalar)
+
+
+class ScalarVector(SystemVectorEnv):
+    """`Scalar` in a batch."""
+
+    env_class = Scalar

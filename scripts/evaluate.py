@@ -1,0 +1,100 @@
+"""`safe-envs evaluate`: how safe a policy is, bare and under filters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from safe_envs.files import require_writable
+from scripts import options
+from scripts.console import progress_bar, run, stdout
+
+
+def evaluate(
+    env_id: Annotated[str, typer.Argument(metavar="ENV_ID", help="Registered id; `safe-envs list` shows all.")],
+    filters: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--filter",
+            metavar="NAME",
+            help="none, cbf, ecbf, hocbf, scbf; with parameters: hocbf:p=2,8. Repeatable. By default none and the env's own.",
+        ),
+    ] = None,
+    policy: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME|FILE",
+            help="nominal, zero, random, or a .zip of Stable-Baselines3. Loading a file runs code that it contains: trust its source.",
+        ),
+    ] = "nominal",
+    episodes: Annotated[int, typer.Option(help="Episodes for each filter.")] = 1000,
+    seed: Annotated[int, typer.Option(help="Seed of all randomness.")] = 0,
+    noise: Annotated[
+        str | None, typer.Option(metavar="X", help="Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.")
+    ] = None,
+    plant: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter of the simulated system. Repeatable.")] = None,
+    model: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter that the designer believes. Repeatable.")] = None,
+    barrier: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Argument of the barrier. Repeatable.")] = None,
+    knowledge: Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")] = "model",
+    dt: Annotated[float | None, typer.Option(help="Control period in s.")] = None,
+    substeps: Annotated[int | None, typer.Option(help="Integration steps in a control period.")] = None,
+    horizon: Annotated[float | None, typer.Option(help="Length of an episode in s.")] = None,
+    box: Annotated[list[str] | None, typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each.")] = None,
+    start: Annotated[str | None, typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution.")] = None,
+    num_envs: Annotated[int, typer.Option(help="Episodes side by side; it changes the speed, not the answer.")] = 1024,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write configuration, versions, rows and timing.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw h over time, and trajectories: .png, .pdf, .svg.")] = None,
+) -> None:
+    """Print the safety rate of a policy under each filter, with its 95 % Wilson interval.
+
+    An episode is safe if every barrier is positive at every control instant. After an episode's first violation its
+    interventions, infeasible steps and effort are no longer counted.
+    """
+    from agents import evaluation
+    from scripts.table import print_evaluation, write_json
+
+    if json is not None:
+        require_writable(json)
+    if plot is not None:
+        from scripts.figure import require_format
+
+        require_writable(plot)
+        require_format(plot)
+    arguments = {
+        "noise": options.noise(noise),
+        "plant": options.parameters("--plant", plant or ()),
+        "model": options.parameters("--model", model or ()),
+        "barrier": options.parameters("--barrier", barrier or (), words=True),
+        "dt": dt,
+        "substeps": substeps,
+        "horizon": horizon,
+        "box": options.box(box or ()),
+        "start": options.start(start),
+    }
+    names = list(dict.fromkeys(filters)) if filters else None
+    with progress_bar("Evaluating") as tell:
+        answer = evaluation.evaluate(
+            env_id,
+            policy,
+            names,
+            options=arguments,
+            episodes=episodes,
+            seed=seed,
+            num_envs=num_envs,
+            knowledge=knowledge,
+            progress=tell,
+            record=plot is not None,
+        )
+    print_evaluation(stdout(), answer)
+    if json is not None:
+        write_json(json, answer)
+    if plot is not None:
+        from scripts.figure import draw
+
+        draw(answer, plot)
+
+
+if __name__ == "__main__":
+    run(lambda: typer.run(evaluate))

@@ -1,0 +1,18 @@
+from __future__ import annotations
+
+import gymnasium as gym
+import pytest
+
+import safe_envs
+from safe_envs.problem import SafetyProblem
+
+
+@pytest.fixture(params=safe_envs.ENV_IDS, ids=lambda env_id: env_id.split("/")[1])
+def env_id(request: pytest.FixtureRequest) -> str:
+    """Every registered id in turn."""
+    return request.param
+
+
+def problem_of(env_id: str, **arguments) -> SafetyProblem:
+    """The problem behind a registered id, made with the arguments of `gym.make`."""
+    return gym.make(env_id, **arguments).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]

@@ -1,0 +1,227 @@
+"""Symbolic derivatives of every system, against finite differences in fifty digits."""
+
+from __future__ import annotations
+
+import mpmath
+import numpy as np
+import pytest
+import sympy as sp
+
+import safe_envs
+from safe_envs import ControlAffineSDE, RelativeDegreeError, SystemDefinitionError
+from safe_envs.calculus import derivatives, drift_derivative, generator, input_derivative, relative_degree
+from safe_envs.simulation import Simulation
+from tests.conftest import problem_of
+
+DEGREES = {
+    "DubinsDisk": 2, "DubinsObstacle": 2, "StochasticDubins": 2, "QuadrotorAltitude": 2, "Quadrotor": 2,
+    "ACC": 1, "ACCGap": 2, "Pendulum": 1, "CubicSDE": 1, "CubicSDEDisk": 1, "Scalar": 1,
+}  # fmt: skip
+
+
+def in_fifty_digits(system, expression):
+    return sp.lambdify([system.states], system.exact(expression), "mpmath")
+
+
+def states_near_starts(problem, count=4):
+    simulation = Simulation(problem, "floats")
+    rng = np.random.default_rng(0)
+    return [[mpmath.mpf(c) for c in np.add(simulation.draw_start(rng), 0.3 * rng.normal(size=problem.plant.n))] for _ in range(count)]
+
+
+def moved(x, direction, step):
+    return [a + step * d for a, d in zip(x, direction, strict=True)]
+
+
+@pytest.mark.parametrize("side", ["plant", "model"])
+def test_derivatives_equal_finite_differences(env_id, side):
+    problem = problem_of(env_id, noise=0.3)
+    system = getattr(problem, side)
+    step = mpmath.mpf("1e-12")
+    with mpmath.workdps(60):
+        f, g, sigma = (in_fifty_digits(system, m) for m in (system.drift, system.input_matrix, system.diffusion))
+        for x in states_near_starts(problem):
+            columns = [[f(x)[i] for i in range(system.n)]]
+            columns += [[g(x)[i, j] for i in range(system.n)] for j in range(system.m)]
+            noises = [[sigma(x)[i, j] for i in range(system.n)] for j in range(system.diffusion.cols)]
+            phi = problem.barriers[0].expression
+            for _ in range(relative_degree(system, phi, generator)):
+                at = in_fifty_digits(system, phi)
+                slopes = [(at(moved(x, d, step)) - at(moved(x, d, -step))) / (2 * step) for d in columns]
+                curvature = sum((at(moved(x, s, step)) - 2 * at(x) + at(moved(x, s, -step))) / step**2 for s in noises)
+                exact = [drift_derivative(system, phi), *input_derivative(system, phi)]
+                for slope, expression in zip(slopes, exact, strict=True):
+                    assert abs(slope - in_fifty_digits(system, expression)(x)) < mpmath.mpf("1e-9") * (1 + abs(slope))
+                a_phi = slopes[0] + curvature / 2
+                assert abs(a_phi - in_fifty_digits(system, generator(system, phi))(x)) < mpmath.mpf("1e-9") * (1 + abs(a_phi))
+                phi = generator(system, phi)
+
+
+def test_relative_degrees_of_the_registered_systems(env_id):
+    problem = problem_of(env_id, noise=0.3)
+    expected = DEGREES[env_id.removeprefix("safe_envs/").removesuffix("-v0")]
+    h = problem.barriers[0].expression
+    assert relative_degree(problem.plant, h) == expected
+    assert relative_degree(problem.plant, h, generator) == expected
+    assert len(problem.gains) == expected
+
+
+def test_degrees_are_listed_for_every_id():
+    assert {f"safe_envs/{name}-v0" for name in DEGREES} == set(safe_envs.ENV_IDS)
+
+
+def integrators(count, **changes):
+    """x_1' = x_2, ..., x_n' = u."""
+    x = sp.symbols(f"x_1:{count + 1}", real=True)
+    arguments = {
+        "states": x, "inputs": sp.symbols("u", real=True, seq=True), "drift": [*x[1:], 0],
+        "input_matrix": [0] * (count - 1) + [1], "diffusion": [0] * count, **changes,
+    }  # fmt: skip
+    return ControlAffineSDE(**arguments)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_degree_of_a_chain_of_integrators_is_its_length(count):
+    system = integrators(count)
+    assert relative_degree(system, system.states[0]) == count
+    assert relative_degree(system, system.states[0] ** 3 + sp.sin(system.states[0]), generator) == count
+
+
+def test_noise_can_lower_the_degree():
+    # dx_1 = x_3 dt + x_2 dW, dx_2 = u dt, dx_3 = x_1 dt: the input reaches x_1 through the size of its noise alone,
+    # A x_1^2 = 2 x_1 x_3 + x_2^2.
+    x1, x2, x3, u = sp.symbols("x1 x2 x3 u", real=True)
+    system = ControlAffineSDE((x1, x2, x3), (u,), [x3, 0, x1], [0, 1, 0], [x2, 0, 0])
+    assert relative_degree(system, x1**2, generator) == 2
+    with pytest.raises(RelativeDegreeError, match="no input"):
+        relative_degree(system, x1**2, drift_derivative)
+
+
+def test_input_that_never_appears_is_an_error():
+    x, y, u = sp.symbols("x y u", real=True)
+    system = ControlAffineSDE((x, y), (u,), [-x, 0], [0, 1], [0, 0])
+    with pytest.raises(RelativeDegreeError, match="no input \\(u\\) appears"):
+        relative_degree(system, 1 - x**2)
+
+
+def test_cancelling_parameters_leave_no_false_degree():
+    # In binary, .1 + .2 - .3 is not 0; the designer means that it is.
+    x, y, u, a, b, c = sp.symbols("x y u a b c", real=True)
+    system = ControlAffineSDE((x, y), (u,), [y, 0], [a + b - c, 1], [0, 0], {a: 0.1, b: 0.2, c: 0.3})
+    assert relative_degree(system, x) == 2
+    assert relative_degree(system.with_parameters(c=0.31), x) == 1
+
+
+def test_hidden_zero_is_seen_without_simplification():
+    x, y, u = sp.symbols("x y u", real=True)
+    system = ControlAffineSDE((x, y), (u,), [y, 0], [sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, 1], [0, 0])
+    assert relative_degree(system, x) == 2
+
+
+def test_barrier_of_unknown_symbols_is_refused():
+    system = integrators(2)
+    with pytest.raises(SystemDefinitionError, match="unknown symbol q"):
+        relative_degree(system, sp.Symbol("q"))
+
+
+# What the thesis prints, where it is right, and what it should have printed, where it is not.
+
+
+def same(system, ours, theirs):
+    return sp.simplify(system.exact(ours - theirs)) == 0
+
+
+def named(problem):
+    system = problem.model
+    return {s.name: s for s in (*system.states, *system.inputs, *system.parameters)}
+
+
+def test_dubins_disk_as_printed():
+    problem = problem_of("safe_envs/DubinsDisk-v0")
+    s, system, h = named(problem), problem.model, problem.barriers[0].expression
+    _, lf, lf2 = derivatives(system, h, 2, drift_derivative)
+    cos, sin = sp.cos(s["theta"]), sp.sin(s["theta"])
+    assert same(system, lf, -2 * s["v"] * (s["x"] * cos + s["y"] * sin))
+    assert same(system, lf2, -2 * s["v"] ** 2)
+    assert same(system, input_derivative(system, lf)[0], -2 * s["v"] * (s["y"] * cos - s["x"] * sin))
+
+
+def test_moving_obstacle_keeps_the_velocity_that_the_print_forgets():
+    problem = problem_of("safe_envs/DubinsObstacle-v0")
+    s, system, h = named(problem), problem.model, problem.barriers[0].expression
+    x_o, y_o = system.states[3:]
+    _, lf, lf2 = derivatives(system, h, 2, drift_derivative)
+    dx, dy = s["x"] - x_o, s["y"] - y_o
+    cos, sin, v, v_o = sp.cos(s["theta"]), sp.sin(s["theta"]), s["v"], s["v_o"]
+    assert same(system, lf, 2 * v * (dx * cos + dy * sin) - 2 * v_o * dx)
+    assert same(system, lf2, 2 * v**2 - 4 * v * v_o * cos + 2 * v_o**2)
+
+
+def test_altitude_with_the_signs_of_the_print_corrected():
+    problem = problem_of("safe_envs/QuadrotorAltitude-v0")
+    system, h = problem.model, problem.barriers[0].expression
+    s = named(problem)
+    z, zdot = system.states
+    e = z - 5
+    _, lf, lf2 = derivatives(system, h, 2, drift_derivative)
+    assert same(system, lf, -4 * e**3 * zdot / 16)
+    printed = -4 * e**3 * s["g"] / 16 - 12 * e**2 * zdot / 16
+    corrected = 4 * e**3 * s["g"] / 16 - 12 * e**2 * zdot**2 / 16
+    assert same(system, lf2, corrected)
+    assert not same(system, lf2, printed)
+    assert same(system, input_derivative(system, lf)[0], -4 * e**3 / (16 * s["m"]))
+
+
+def test_pendulum_as_printed():
+    problem = problem_of("safe_envs/Pendulum-v0")
+    system, h = problem.model, problem.barriers[0].expression
+    th, om = system.states
+    root = sp.sqrt(3)
+    lf = -(2 * root * th + 2 * om) * om - (2 * th + 2 * root * om) * sp.Rational(100, 7) * sp.sin(th)
+    rows = [
+        (drift_derivative(system, h), lf),
+        (input_derivative(system, h)[0], -(2 * th + 2 * root * om) / sp.Rational(49, 100)),
+        (generator(system, h) - drift_derivative(system, h), -root * (th / 10) ** 2),
+    ]
+    for ours, theirs in rows:
+        difference = sp.lambdify((th, om), system.exact(ours - theirs))
+        assert abs(difference(0.7, -0.4)) < 1e-9
+
+
+def test_cubic_generators():
+    parabola, disk = problem_of("safe_envs/CubicSDE-v0"), problem_of("safe_envs/CubicSDEDisk-v0")
+    x1, x2 = parabola.model.states
+    a_h = generator(parabola.model, parabola.barriers[0].expression)
+    assert same(parabola.model, a_h, sp.Rational(6, 10) * x1 + x2 - 2 * x1**3 * x2 - (x2 / 10) ** 2)
+    # The print has x1 x2 for 2 x1 x2, and sigma_2 twice.
+    a_h = generator(disk.model, disk.barriers[0].expression)
+    assert same(disk.model, a_h, sp.Rational(12, 10) * x1**2 + 2 * x1 * x2 - 2 * x1**3 * x2 - sp.Rational(8, 100))
+
+
+def test_cruise_generators():
+    problem = problem_of("safe_envs/ACC-v0")
+    system, s = problem.model, named(problem_of("safe_envs/ACC-v0"))
+    drag = s["f_0"] + s["f_1"] * s["x_1"] + s["f_2"] * s["x_1"] ** 2
+    tau = sp.Rational(9, 5)
+    h = problem.barriers[0].expression
+    assert same(system, sp.nsimplify(generator(system, h)), s["x_2"] - s["x_1"] + tau * drag / s["M"])
+    assert same(system, sp.nsimplify(input_derivative(system, h)[0]), -tau / s["M"])
+    assert same(system, generator(system, h), drift_derivative(system, h))
+
+
+def test_gap_generators_with_the_terms_of_the_print_corrected():
+    problem = problem_of("safe_envs/ACCGap-v0")
+    system, s = problem.model, named(problem)
+    y, d = s["z"] - 10, s["v_f"] - s["v"]
+    drag = s["f_0"] + s["f_1"] * s["v"] + s["f_2"] * s["v"] ** 2
+    s2 = s["sigma_2"]
+    h, b1, b2 = derivatives(system, sp.nsimplify(problem.barriers[0].expression), 2, generator)
+    assert same(system, b1, 5 * y**4 * d + 10 * s2**2 * y**3)
+    assert same(system, b2, 20 * y**3 * d**2 + 60 * s2**2 * y**2 * d + 5 * y**4 * drag / s["M"] + 30 * s2**4 * y)
+    assert same(system, input_derivative(system, b1)[0], -5 * y**4 / s["M"])
+
+
+def test_scalar_generator():
+    problem = problem_of("safe_envs/Scalar-v0")
+    system = problem.model
+    assert same(system, generator(system, problem.barriers[0].expression), -system.states[0])

@@ -1,0 +1,58 @@
+"""Construction of a system says what is wrong with it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import sympy as sp
+
+from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError
+
+x, y, u, k = sp.symbols("x y u k", real=True)
+
+
+def scalar(**changes):
+    arguments = {
+        "states": (x,), "inputs": (u,), "drift": [k * x], "input_matrix": [1], "diffusion": [0.1], "parameters": {k: 2.0}, **changes
+    }
+    return ControlAffineSDE(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"drift": [x, x]}, "drift has shape 2 x 1"),
+        ({"input_matrix": [[1, 2]]}, "input_matrix has shape 1 x 2"),
+        ({"diffusion": [[1], [2]]}, "diffusion has shape 2 x 1"),
+        ({"drift": [x * u]}, "drift depends on the input u"),
+        ({"input_matrix": [u]}, "input_matrix depends on the input u"),
+        ({"diffusion": [sp.sin(u)]}, "diffusion depends on the input u"),
+        ({"drift": [y]}, "unknown symbol y"),
+        ({"drift": [sp.Symbol("x")]}, "Symbol\\('x'\\)"),
+        ({"parameters": {}}, "unknown symbol k"),
+        ({"states": (x, x), "drift": [k * x, 0], "input_matrix": [1, 0], "diffusion": [0, 0]}, "more than once"),
+        ({"inputs": (), "input_matrix": []}, "needs a state and an input"),
+        ({"drift": "no matrix"}, "drift is no matrix"),
+    ],
+)
+def test_contradictions_are_named(changes, message):
+    with pytest.raises(SystemDefinitionError, match=message):
+        scalar(**changes)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, "two"])
+def test_parameters_are_finite_numbers(value):
+    with pytest.raises(ConfigurationError, match="parameter k"):
+        scalar(parameters={k: value})
+    with pytest.raises(ConfigurationError, match="parameter k"):
+        scalar().with_parameters(k=value)
+
+
+def test_with_parameters_returns_another_system_and_knows_its_names():
+    system = scalar()
+    other = system.with_parameters(k=3)
+    assert system.parameters == {k: 2.0}
+    assert other.parameters == {k: 3.0}
+    with pytest.raises(ConfigurationError, match="unknown parameter 'kk'; did you mean 'k'"):
+        system.with_parameters(kk=1.0)
