@@ -137,19 +137,19 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
         x = self.components
-        if not math.isfinite(sum(x)):
-            raise NumericalError(f"the state {x} of {self.problem.name!r} is not finite; reduce dt or raise substeps")
         features, barriers, reward, outside, goal = self._simulation.measure(x, u, self._steps * self.problem.dt)
         h = min(barriers)
+        if not math.isfinite(h + sum(x)):
+            raise NumericalError(f"the state {x} of {self.problem.name!r} has left the finite numbers; reduce dt or raise substeps")
         violation = h < 0.0
         cost = 1.0 if violation else 0.0
         self._episode_cost += cost
         if h < self._h_min:
             self._h_min = h
-        observation = np.array(features, dtype=np.float32)
         left = outside > 0.0
         if left:
-            np.clip(observation, self.observation_space.low, self.observation_space.high, out=observation)
+            features = np.clip(features, self.observation_space.low, self.observation_space.high)
+        observation = np.array(features, dtype=np.float32)
         info = safety_info(
             violation=violation,
             cost=cost,

@@ -153,33 +153,37 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def step_physical(self, u: Components) -> VectorStep:
         """`step` for the components of physical inputs inside the box, as a filter has them."""
+        x = self.components
         anew = self._ended.copy() if np.count_nonzero(self._ended) else None
         if anew is not None and self._autoreset == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(f"the episodes of envs {np.flatnonzero(anew)[:5].tolist()} have ended: reset them")
         draws = self._noise.next(self._rngs, None if anew is None else ~anew)
+        # A state that overflows is found by `_observe`, which says so better than a warning.
         with np.errstate(over="ignore", invalid="ignore"):
-            self._x = self._simulation.integrator.step(self.components, u, draws)
-        self._steps = self._steps + 1
-        if anew is not None:
-            self._restart(np.flatnonzero(anew))
-        observation, reward, terminated, truncated, info = self._observe(u)
+            self._x = self._simulation.integrator.step(x, u, draws)
+            self._steps = self._steps + 1
+            if anew is not None:
+                self._restart(np.flatnonzero(anew))
+            observation, reward, terminated, truncated, info = self._observe(u)
         if anew is not None:
             reward = np.where(anew, 0.0, reward)
         ended = terminated | truncated
+        last: Info = {}
         if self._autoreset == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):
-                observation, info = self._reset_in_same_step(ended, observation, info)
+                last = self._last_of_episode(ended, observation, info)
+                observation, _, _, _, info = self._observe(tuple(self._center), counted=ended)
         else:
             self._ended = ended
-        return observation, reward, terminated, truncated, with_masks(info, np.ones(self.num_envs, dtype=bool))
+        return observation, reward, terminated, truncated, {**with_masks(info, np.ones(self.num_envs, dtype=bool)), **last}
 
-    def _reset_in_same_step(self, ended: np.ndarray, observation: np.ndarray, info: Info) -> tuple[np.ndarray, Info]:
+    def _last_of_episode(self, ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
+        """Keep what the ended envs showed last, and restart them."""
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended).tolist():
             final[i] = observation[i]
         self._restart(np.flatnonzero(ended))
-        anew, _, _, _, fresh = self._observe(tuple(self._center), counted=ended)
-        return anew, {**fresh, "final_obs": final, "final_info": with_masks(info, ended)}
+        return with_masks({"final_obs": final, "final_info": with_masks(info, ended)}, ended)
 
     def _seed(self, seeds: Sequence[int | None]) -> None:
         first = not self._rngs
@@ -228,7 +232,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         barrier = stacked(barriers, self.num_envs)
         h = barriers[0] if len(barriers) == 1 else barrier.min(axis=1)
         if not finite(h):
-            self._report_breakdown()
+            self._report_breakdown(h)
         violation = h < 0.0
         cost = violation.astype(np.float64)
         self._episode_cost = self._episode_cost + (cost if counted is None else cost * counted)
@@ -244,11 +248,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         )
         return observation, filled(reward, (self.num_envs,)), terminated, self._steps >= self._limit, info
 
-    def _report_breakdown(self) -> None:
-        broken = ~np.isfinite(self.state).all(axis=1)
+    def _report_breakdown(self, h: np.ndarray) -> None:
+        broken = ~np.isfinite(h)
         if broken.any():
             raise NumericalError(
-                f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r} are not finite; "
+                f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r} have left the finite numbers; "
                 "reduce dt or raise substeps"
             )
 

@@ -25,7 +25,7 @@ _UNSAFE = "#B9B9B9"
 _QUIET = "#444444"
 _SHOWN = 8
 _GRID = 300
-_STYLE = {
+_STYLE: Any = {
     "font.size": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,

@@ -132,7 +132,7 @@ class SafetyFilter:
         columns = [np.ascontiguousarray(part.reshape(-1, part.shape[-1]).T) for part in (x, u)]
         decision = self.decide_arrays(tuple(columns[0]), tuple(columns[1]))
         action, barrier, margin, active, slack = [
-            stacked(part, decision.feasible.size).reshape(*batch, -1) for part in (*decision[:4], decision.slack)
+            stacked(part, decision.feasible.size).reshape(*batch, len(part)) for part in (*decision[:4], decision.slack)
         ]
         return FilterResult(action, barrier, margin, active, decision.feasible.reshape(batch), slack)
 
@@ -151,12 +151,13 @@ class SafetyFilter:
 
     def decide_arrays(self, x: Components, u: Components) -> Decision:
         """Decide for a batch, given and returned component by component, each an array (B,) of finite numbers."""
+        # What overflows or has no value is found below, which says where.
         with np.errstate(all="ignore"):
             values = self._arrays(*x)
-        if len(self.rows) > 1:
-            return self._decide_several(x, u, values)
-        *a, b, h = values
-        action, margin, active, feasible = project_arrays(a, b, u, self._low, self._high, self._weights)
+            if len(self.rows) > 1:
+                return self._decide_several(x, u, values)
+            *a, b, h = values
+            action, margin, active, feasible = project_arrays(a, b, u, self._low, self._high, self._weights)
         if not (finite(margin) and finite(h)):
             self._require_defined(x, margin + h)
         met = np.count_nonzero(feasible) == len(feasible)

@@ -1,0 +1,167 @@
+"""The gym wrappers: they execute what the filter decides, from the model alone, and report it by the contract."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from safe_envs import ConfigurationError, InvalidInputError, RelativeDegreeError
+from wrappers import HOCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
+
+BASE = {"cost": float, "violation": bool, "barrier": np.ndarray, "h_min": float, "episode_cost": float}
+FILTER = {
+    "nominal_action": np.ndarray,
+    "safe_action": np.ndarray,
+    "intervention": bool,
+    "filter_active": bool,
+    "feasible": bool,
+    "slack": float,
+    "episode_interventions": int,
+    "episode_infeasible": int,
+}
+DTYPES = {float: np.float64, bool: np.bool_, int: np.int64, np.ndarray: np.float64}
+
+
+@pytest.mark.parametrize("filtered", [False, True])
+def test_info_has_every_key_with_one_type_at_reset_and_at_each_step(env_id, filtered):
+    contract = {**BASE, **FILTER} if filtered else BASE
+    env, vector = gym.make(env_id), gym.make_vec(env_id, num_envs=3)
+    if filtered:
+        natural = env.unwrapped.problem.filter
+        env, vector = SafetyFilterWrapper(env, natural), SafetyFilterVectorWrapper(vector, natural)
+    env.action_space.seed(0)
+    infos = [env.reset(seed=0)[1]] + [env.step(env.action_space.sample())[4] for _ in range(5)]
+    for info in infos:
+        assert {key: type(value) for key, value in info.items()} == contract
+        for value in info.values():
+            assert np.isfinite(value).all()
+    infos = [vector.reset(seed=0)[1]] + [vector.step(vector.action_space.sample())[4] for _ in range(5)]
+    shapes = {"barrier": (3, 1), "nominal_action": vector.action_space.shape, "safe_action": vector.action_space.shape}
+    for info in infos:
+        assert set(info) == set(contract) | {f"_{key}" for key in contract}
+        for key, kind in contract.items():
+            assert info[key].dtype == DTYPES[kind], key
+            assert info[key].shape == shapes.get(key, (3,)), key
+            assert info[f"_{key}"].all()
+
+
+def test_executed_action_is_the_safe_one():
+    filtered = SafetyFilterWrapper(gym.make("safe_envs/StochasticDubins-v0"), "hocbf")
+    bare = gym.make("safe_envs/StochasticDubins-v0")
+    filtered.reset(seed=1)
+    bare.reset(seed=1)
+    interventions = 0
+    for _ in range(60):
+        observation, *_, info = filtered.step(np.array([0.3], dtype=np.float32))
+        replayed, *_ = bare.step(bare.unwrapped.normalized_action(info["safe_action"]))
+        np.testing.assert_allclose(observation, replayed, rtol=1e-6, atol=1e-7)
+        np.testing.assert_allclose(info["nominal_action"], [3.0], rtol=1e-6)
+        assert info["intervention"] == (abs(info["safe_action"][0] - info["nominal_action"][0]) > 1e-7)
+        assert -10.0 <= info["safe_action"][0] <= 10.0
+        interventions += info["intervention"]
+        assert info["episode_interventions"] == interventions
+    assert 0 < interventions < 60
+
+
+def test_filter_sees_the_model_and_never_the_plant():
+    env_id, start = "safe_envs/DubinsDisk-v0", {"start": [0.5, 0.0, 0.4], "box": [-50.0, 50.0]}
+
+    def first(knowledge="model", **arguments):
+        env = SafetyFilterWrapper(gym.make(env_id, **start, **arguments), "hocbf:p=0.5,0.5", knowledge)
+        env.reset(seed=2)
+        return env.step(np.zeros(1, dtype=np.float32))[4]["safe_action"][0]
+
+    assert first() == first(plant={"v": 0.6})
+    assert first() != first(model={"v": 0.6})
+    assert first("plant") == first("plant", model={"v": 0.6})
+    assert first("plant") != first("plant", plant={"v": 0.6})
+    assert first("plant", plant={"v": 0.5}) == first("model")
+
+
+def test_vector_filter_sees_the_model_and_never_the_plant():
+    def first(knowledge="model", **arguments):
+        env = gym.make_vec("safe_envs/DubinsDisk-v0", num_envs=2, start=[0.5, 0.0, 0.4], box=[-50.0, 50.0], **arguments)
+        env = SafetyFilterVectorWrapper(env, HOCBF((0.5, 0.5)), knowledge)
+        env.reset(seed=0)
+        return env.step(np.zeros((2, 1), dtype=np.float32))[4]["safe_action"][0, 0]
+
+    assert first() == first(plant={"v": 0.6}) != first(model={"v": 0.6})
+    assert first("plant") == first("plant", model={"v": 0.6}) != first("plant", plant={"v": 0.6})
+
+
+def test_filter_draws_no_random_numbers():
+    bare, filtered = gym.make("safe_envs/StochasticDubins-v0"), SafetyFilterWrapper(gym.make("safe_envs/StochasticDubins-v0"), "scbf")
+    bare.reset(seed=4)
+    filtered.reset(seed=4)
+    for _ in range(20):
+        bare.step(np.zeros(1, dtype=np.float32))
+        filtered.step(np.zeros(1, dtype=np.float32))
+    assert bare.unwrapped.np_random.bit_generator.state == filtered.unwrapped.np_random.bit_generator.state
+
+
+def test_infeasible_steps_are_counted_and_flagged():
+    env = SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0", start=[0.9], box=[-0.5, 0.5], noise=0.0), "cbf:alpha=1")
+    env.reset(seed=0)
+    for step in range(1, 4):
+        *_, info = env.step(np.ones(1, dtype=np.float32))
+        assert (info["feasible"], info["episode_infeasible"], info["safe_action"][0]) == (False, step, -0.5)
+        assert info["slack"] > 0
+    _, info = env.reset()
+    assert (info["feasible"], info["episode_infeasible"], info["episode_interventions"], info["slack"]) == (True, 0, 0, 0.0)
+
+
+def test_wrong_speed_settles_where_theory_says():
+    # A model with speed v_hat settles at h = -2 v_hat (v - v_hat)/(p_1 p_2): thesis-notes, for equal rates.
+    p, v, v_hat = 2.0, 0.8, 0.5
+    arguments = {"start": "valid", "box": [-50.0, 50.0], "dt": 0.005, "horizon": 40.0}
+    env = SafetyFilterWrapper(gym.make("safe_envs/DubinsDisk-v0", **arguments), f"hocbf:p={p},{p}")
+    env.reset(seed=0)
+    for _ in range(8000):
+        *_, info = env.step(np.zeros(1, dtype=np.float32))
+    assert info["barrier"][0] == pytest.approx(-2 * v_hat * (v - v_hat) / p**2, abs=2e-3)
+
+
+def test_known_speed_keeps_the_disk():
+    env = SafetyFilterWrapper(gym.make("safe_envs/DubinsDisk-v0", start="valid", dt=0.01, horizon=20.0), "hocbf:p=2,2", knowledge="plant")
+    env.reset(seed=0)
+    for _ in range(2000):
+        *_, info = env.step(np.zeros(1, dtype=np.float32))
+    assert info["h_min"] > -1e-6
+    assert info["episode_interventions"] > 0
+
+
+def test_bad_actions_and_bad_arguments_are_errors():
+    env = SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0"), "scbf")
+    env.reset(seed=0)
+    for action in (np.array([np.nan]), np.array([np.inf]), np.zeros(2)):
+        with pytest.raises(InvalidInputError):
+            env.step(action)
+    vector = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/Scalar-v0", num_envs=2), "scbf")
+    vector.reset(seed=0)
+    for action in (np.array([[0.0], [np.nan]]), np.zeros((3, 1)), np.zeros(2)):
+        with pytest.raises(InvalidInputError):
+            vector.step(action)
+    with pytest.raises(ConfigurationError, match="did you mean 'scbf'"):
+        SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0"), "scb")
+    with pytest.raises(ConfigurationError, match="knowledge"):
+        SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0"), "scbf", knowledge="none")
+    with pytest.raises(RelativeDegreeError, match="use hocbf"):
+        SafetyFilterWrapper(gym.make("safe_envs/DubinsDisk-v0"), "cbf")
+    with pytest.raises(ConfigurationError, match="not one of this project's envs"):
+        SafetyFilterWrapper(gym.make("Pendulum-v1"), "scbf")
+    with pytest.raises(ConfigurationError, match="not one of this project's vector envs"):
+        SafetyFilterVectorWrapper(gym.make_vec("Pendulum-v1", num_envs=2), "scbf")
+
+
+def test_wrapping_under_other_wrappers_works():
+    vector = gym.wrappers.vector.RecordEpisodeStatistics(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=2, horizon=0.2))
+    over = SafetyFilterVectorWrapper(vector, "scbf")
+    under = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=2, horizon=0.2), "scbf")
+    for env in (over, under):
+        env.reset(seed=0)
+    for _ in range(4):
+        actions = np.full((2, 1), 0.7, dtype=np.float32)
+        first, second = over.step(actions), under.step(actions)
+        np.testing.assert_allclose(first[0], second[0], rtol=1e-6)
+    assert "episode" in first[4]
