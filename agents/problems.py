@@ -34,7 +34,12 @@ def make_env(env_id: str, options: Mapping[str, Any] | None = None) -> SafeEnv:
         ConfigurationError: the id is unknown or not of this project, or an argument is not allowed.
     """
     given = {key: value for key, value in (options or {}).items() if value is not None}
-    env = gym.make(full_id(env_id), disable_env_checker=True, **given).unwrapped
+    try:
+        env = gym.make(full_id(env_id), disable_env_checker=True, **given).unwrapped
+    except ModuleNotFoundError as error:
+        raise ConfigurationError(
+            f"unknown env {env_id!r}: there is no module {error.name!r} to import; {nearest(env_id, ENV_IDS)}"
+        ) from error
     if not isinstance(env, SafeEnv):
         raise ConfigurationError(f"{env_id} is not one of this project's envs; {nearest(env_id, ENV_IDS)}")
     return env

@@ -9,11 +9,14 @@ import random
 from collections.abc import Callable
 
 import sympy as sp
+from sympy.simplify.fu import TR5
 
 from safe_envs.errors import RelativeDegreeError
 from safe_envs.sde import ControlAffineSDE
 
 Derivative = Callable[[ControlAffineSDE, sp.Expr], sp.Expr]
+
+_LARGEST_TIDIED = 100
 
 
 def gradient(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
@@ -75,6 +78,14 @@ def derivatives(system: ControlAffineSDE, expression: sp.Expr, order: int, deriv
     for _ in range(order):
         result.append(derivative(system, result[-1]))
     return tuple(result)
+
+
+def tidied(expression: sp.Expr) -> sp.Expr:
+    """An equal expression with fewer operations, if sin^2 + cos^2 = 1 and common factors give one quickly."""
+    if expression.count_ops() > _LARGEST_TIDIED:
+        return expression
+    expanded = sp.expand(TR5(sp.expand(expression)))
+    return min((expression, sp.factor_terms(expression), sp.factor_terms(expanded)), key=sp.count_ops)
 
 
 def relative_degree(system: ControlAffineSDE, expression: sp.Expr, derivative: Derivative = drift_derivative) -> int:

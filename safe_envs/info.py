@@ -35,6 +35,14 @@ import numpy as np
 
 Info = dict[str, Any]
 
+_MASKS = {
+    key: f"_{key}"
+    for key in (
+        *("cost", "violation", "barrier", "h_min", "episode_cost", "nominal_action", "safe_action", "intervention"),
+        *("filter_active", "feasible", "slack", "episode_interventions", "episode_infeasible"),
+    )
+}
+
 
 def safety_info(violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any) -> Info:
     """What every env reports; values as in the table above."""
@@ -72,4 +80,6 @@ def filter_info(
 
 def with_masks(info: Info, present: np.ndarray) -> Info:
     """Add Gymnasium's `_key` masks, which say for which envs of a batch a key was reported."""
-    return {**info, **{f"_{key}": present for key in info}}
+    for key in tuple(info):
+        info[_MASKS.get(key) or f"_{key}"] = present
+    return info

@@ -76,9 +76,11 @@ class Simulation:
         states = [np.empty(len(rngs)) for _ in self.problem.states]
         missing = np.arange(len(rngs))
         for _ in range(_MOST_TRIES // self._tries):
-            uniforms = np.stack([rngs[i].random((self._tries, self._uniforms)) for i in missing.tolist()], axis=-1)
+            uniforms = np.empty((missing.size, self._tries, self._uniforms))
+            for i, row in zip(missing.tolist(), uniforms, strict=True):
+                rngs[i].random(out=row)
             shape = (self._tries, missing.size)
-            tries = [filled(c, shape) for c in self._start(*uniforms.swapaxes(0, 1))]
+            tries = [filled(c, shape) for c in self._start(*np.ascontiguousarray(uniforms.T))]
             accepted = filled(True if self._accept is None else self._accept(*tries)[0] > 0, shape)
             first, found = accepted.argmax(axis=0), accepted.any(axis=0)
             for state, component in zip(states, tries, strict=True):
@@ -124,13 +126,13 @@ class NoiseStreams:
     def __init__(self, num_envs: int, channels: int) -> None:
         self._buffer = np.empty((num_envs, _CHUNK, channels))
         self._rows = self._buffer.reshape(num_envs * _CHUNK, channels)
-        self._first = np.arange(num_envs) * _CHUNK
-        self._position = np.full(num_envs, _CHUNK)
+        self._end = (np.arange(num_envs) + 1) * _CHUNK
+        self._row = self._end.copy()
         self._before_refill = 0
 
     def clear(self, envs: Sequence[int]) -> None:
         """Forget what was drawn ahead for some envs: their generators were seeded anew."""
-        self._position[envs] = _CHUNK
+        self._row[envs] = self._end[envs]
         self._before_refill = 0
 
     def next(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> np.ndarray:
@@ -145,20 +147,18 @@ class NoiseStreams:
         if not self._before_refill:
             self._refill(rngs, stepping)
         self._before_refill -= 1
-        rows = self._first + self._position
-        if stepping is None:
-            self._position += 1
-        else:
-            rows[~stepping] = 0
-            self._position += stepping
-        return np.ascontiguousarray(self._rows.take(rows, axis=0).T)
+        rows = self._row
+        self._row = rows + (1 if stepping is None else stepping)
+        if stepping is not None:
+            rows = np.where(stepping, rows, 0)
+        return self._rows.take(rows, axis=0).T
 
     def _refill(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> None:
-        used_up = self._position == _CHUNK
+        used_up = self._row == self._end
         for i in np.flatnonzero(used_up if stepping is None else used_up & stepping).tolist():
             rngs[i].standard_normal(out=self._buffer[i])
-            self._position[i] = 0
-        self._before_refill = max(_CHUNK - int(self._position.max()), 1)
+            self._row[i] -= _CHUNK
+        self._before_refill = max(int((self._end - self._row).min()), 1)
 
 
 def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:

@@ -17,7 +17,7 @@ from scripts.table import print_evaluation
 ENV_ID = "safe_envs/StochasticDubins-v0"
 FILTERS = ("none", "hocbf", "scbf")
 
-_STEPS = 80_000
+_STEPS = 100_000
 _COPIES = 8
 
 
@@ -73,7 +73,7 @@ def train(path: Path, tell: Callable[[float], None] | None = None, steps: int = 
         n_steps=128,
         batch_size=256,
         n_epochs=8,
-        gamma=0.95,
+        gamma=0.97,
         learning_rate=1e-3,
         policy_kwargs={"net_arch": [64, 64]},
         device="cpu",

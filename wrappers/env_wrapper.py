@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -39,7 +38,6 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         gym.utils.RecordConstructorArgs.__init__(self, condition=text, knowledge=knowledge)
         gym.Wrapper.__init__(self, env)
         self._inner = inner
-        self._tolerance = intervention_tolerance(inner.problem)
         self._interventions = 0
         self._infeasible = 0
 
@@ -58,7 +56,7 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         if active:
             action = self._inner.normalized_action(executed)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        differs = active and self._differ(executed, proposed)
+        differs = active and executed != proposed
         self._interventions += differs
         self._infeasible += not decision.feasible
         info.update(
@@ -75,23 +73,12 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         )
         return observation, reward, terminated, truncated, info
 
-    def _differ(self, executed: Sequence[float], proposed: Sequence[float]) -> bool:
-        for u, v, tolerance in zip(executed, proposed, self._tolerance, strict=True):
-            if abs(u - v) > tolerance:
-                return True
-        return False
-
 
 def build_filter(problem: SafetyProblem, condition: Condition | str, knowledge: str) -> tuple[str, SafetyFilter]:
     """Return the filter of a condition for a problem, and the text that names it."""
     if isinstance(condition, str):
         condition = parse_condition(condition, problem.gains)
     return condition.spec, SafetyFilter.for_problem(problem, condition, knowledge)
-
-
-def intervention_tolerance(problem: SafetyProblem) -> list[float]:
-    """By how much two actions must differ to count as different: far above rounding, far below use."""
-    return [1e-9 * (high - low) for low, high in problem.box]
 
 
 def resting_action(problem: SafetyProblem) -> np.ndarray:

@@ -40,10 +40,9 @@ class FilterResult(NamedTuple):
 
 
 class Decision(NamedTuple):
-    """The same by components, floats or arrays over the batch: what the thin wrappers read."""
+    """What the thin wrappers read, by components: floats, or arrays over the batch; entries as in `FilterResult`."""
 
     action: Sequence[Any]
-    barrier: Sequence[Any]
     margin: Sequence[Any]
     active: Sequence[Any]
     feasible: Any
@@ -97,18 +96,27 @@ class SafetyFilter:
         return cls(known, [(b, condition) for b in problem.barriers], problem.box)
 
     @cached_property
-    def _floats(self) -> Any:
-        return self._compile("floats")
+    def _rows_floats(self) -> Any:
+        return self._compile(self._row_expressions(), "floats")
 
     @cached_property
-    def _arrays(self) -> Any:
-        return self._compile("arrays")
+    def _rows_arrays(self) -> Any:
+        return self._compile(self._row_expressions(), "arrays")
 
-    def _compile(self, flavour: Flavour) -> Any:
-        values = []
-        for constraint, (barrier, _) in zip(self.constraints, self.rows, strict=True):
-            values += [*constraint.coefficient, constraint.offset, barrier.expression]
-        return compile_function(self.model.states, [self.model.numeric(v) for v in values], flavour)
+    @cached_property
+    def _barriers_floats(self) -> Any:
+        return self._compile([barrier.expression for barrier, _ in self.rows], "floats")
+
+    @cached_property
+    def _barriers_arrays(self) -> Any:
+        return self._compile([barrier.expression for barrier, _ in self.rows], "arrays")
+
+    def _row_expressions(self) -> list[Any]:
+        """a_1, ..., a_m, b of each row, one row after the other."""
+        return [e for constraint in self.constraints for e in (*constraint.coefficient, constraint.offset)]
+
+    def _compile(self, expressions: Sequence[Any], flavour: Flavour) -> Any:
+        return compile_function(self.model.states, [self.model.numeric(e) for e in expressions], flavour)
 
     def filter(self, x: Any, u_nominal: Any) -> FilterResult:
         """Decide for one state (n,) and input (m,), or for batches (..., n) and (..., m).
@@ -122,71 +130,66 @@ class SafetyFilter:
         if x.shape[-1:] != (n,) or u.shape[-1:] != (m,) or x.shape[:-1] != u.shape[:-1]:
             raise InvalidInputError(f"state {x.shape} and input {u.shape} do not fit; give (..., {n}) and (..., {m}) with the same leading axes")
         if x.ndim == 1:
-            states, inputs = x.tolist(), u.tolist()
-            if not math.isfinite(sum(states) + sum(inputs)):
-                _require_finite(x, u)
-            decision = self.decide_floats(states, inputs)
-            return FilterResult(*[np.array(part) for part in decision[:4]], decision.feasible, np.array(decision.slack))
+            return self._filter_one(x, u)
         _require_finite(x, u)
         batch = x.shape[:-1]
-        columns = [np.ascontiguousarray(part.reshape(-1, part.shape[-1]).T) for part in (x, u)]
-        decision = self.decide_arrays(tuple(columns[0]), tuple(columns[1]))
-        action, barrier, margin, active, slack = [
-            stacked(part, decision.feasible.size).reshape(*batch, len(part)) for part in (*decision[:4], decision.slack)
-        ]
-        return FilterResult(action, barrier, margin, active, decision.feasible.reshape(batch), slack)
+        states, inputs = (tuple(np.ascontiguousarray(part.reshape(-1, part.shape[-1]).T)) for part in (x, u))
+        decision = self.decide_arrays(states, inputs)
+        parts = (decision.action, self._barriers_arrays(*states), *decision[1:3], decision.slack)
+        action, barrier, margin, active, slack = [stacked(part, len(inputs[0])).reshape(*batch, len(part)) for part in parts]
+        return FilterResult(action, barrier, margin, active > 0.0, decision.feasible.reshape(batch), slack)
+
+    def _filter_one(self, x: np.ndarray, u: np.ndarray) -> FilterResult:
+        state, inputs = x.tolist(), u.tolist()
+        if not math.isfinite(sum(state) + sum(inputs)):
+            _require_finite(x, u)
+        action, margin, active, feasible, slack = self.decide_floats(state, inputs)
+        barrier = self._barriers_floats(*state)
+        return FilterResult(np.array(action), np.array(barrier), np.array(margin), np.array(active), feasible, np.array(slack))
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> Decision:
         """Decide for one state, given and returned component by component; the components must be finite."""
         if len(self.rows) > 1:
             return self._decide_one_of_several(x, u)
         try:
-            *a, b, h = self._floats(*x)
+            *a, b = self._rows_floats(*x)
         except (OverflowError, ZeroDivisionError, ValueError) as error:
             raise self._undefined(x) from error
         action, margin, active, feasible = project_floats(a, b, u, self._low, self._high, self._weights)
-        if not math.isfinite(margin + h):
+        if not math.isfinite(margin):
             raise self._undefined(x)
-        return Decision(action, (h,), (margin,), (active,), feasible, (0.0 if feasible else -margin,))
+        return Decision(action, (margin,), (active,), feasible, (0.0 if feasible else -margin,))
 
     def decide_arrays(self, x: Components, u: Components) -> Decision:
         """Decide for a batch, given and returned component by component, each an array (B,) of finite numbers."""
         # What overflows or has no value is found below, which says where.
         with np.errstate(all="ignore"):
-            values = self._arrays(*x)
+            values = self._rows_arrays(*x)
             if len(self.rows) > 1:
                 return self._decide_several(x, u, values)
-            *a, b, h = values
+            *a, b = values
             action, margin, active, feasible = project_arrays(a, b, u, self._low, self._high, self._weights)
-        if not (finite(margin) and finite(h)):
-            self._require_defined(x, margin + h)
+        if not finite(margin):
+            self._require_defined(x, margin)
         met = np.count_nonzero(feasible) == len(feasible)
         slack = np.zeros(len(margin)) if met else np.where(feasible, 0.0, -margin)
-        return Decision(action, (h,), (margin,), (active,), feasible, (slack,))
+        return Decision(action, (margin,), (active,), feasible, (slack,))
 
     def _decide_several(self, x: Components, u: Components, values: Components) -> Decision:
+        # Imported here, since a filter of one row needs no solver.
         from wrappers.qp.several_rows import project
 
         size = len(u[0])
-        row = self.model.m + 2
-        table = stacked(values, size).reshape(size, -1, row)
-        self._require_defined(x, table.sum(axis=(1, 2)))
-        bounds = [np.array(c) for c in (self._low, self._high, self._weights)]
-        found = project(table[:, :, :-2], table[:, :, -2], np.stack(u, axis=-1), *bounds)
-        missing = np.where(found.feasible[:, None], 0.0, np.maximum(-found.margin, 0.0))
-        return Decision(
-            action=tuple(found.u.T),
-            barrier=tuple(table[:, :, -1].T),
-            margin=tuple(found.margin.T),
-            active=tuple(found.active.T),
-            feasible=found.feasible,
-            slack=tuple(missing.T),
-        )
+        rows = stacked(values, size).reshape(size, -1, self.model.m + 1)
+        self._require_defined(x, rows.sum(axis=(1, 2)))
+        found = project(rows[:, :, :-1], rows[:, :, -1], stacked(u, size), np.array(self._low), np.array(self._high), np.array(self._weights))
+        slack = np.where(found.feasible[:, None], 0.0, np.maximum(-found.margin, 0.0))
+        return Decision(tuple(found.u.T), tuple(found.margin.T), tuple(found.active.T), found.feasible, tuple(slack.T))
 
     def _decide_one_of_several(self, x: Sequence[float], u: Sequence[float]) -> Decision:
         batch = self.decide_arrays(tuple(np.array([c]) for c in x), tuple(np.array([c]) for c in u))
-        action, barrier, margin, active, slack = [[c.item() for c in part] for part in (*batch[:4], batch.slack)]
-        return Decision(action, barrier, margin, active, batch.feasible.item(), slack)
+        action, margin, active, slack = [[c.item() for c in part] for part in (*batch[:3], batch.slack)]
+        return Decision(action, margin, active, batch.feasible.item(), slack)
 
     def _undefined(self, x: Sequence[float]) -> NumericalError:
         at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.model.states, x, strict=True))

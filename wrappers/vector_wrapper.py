@@ -13,7 +13,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info, filter_info, with_masks
 from safe_envs.vector import SafeVectorEnv, VectorStep
 from wrappers.conditions import Condition
-from wrappers.env_wrapper import build_filter, intervention_tolerance, rest_info
+from wrappers.env_wrapper import build_filter, rest_info
 from wrappers.safety_filter import Decision
 
 
@@ -36,7 +36,6 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         super().__init__(env)
         self._inner = inner
         self._rest = rest_info(inner.problem)
-        self._tolerance = intervention_tolerance(inner.problem)
         self._mode = inner.metadata["autoreset_mode"]
         self._interventions = np.zeros(self.num_envs, dtype=np.int64)
         self._infeasible = np.zeros(self.num_envs, dtype=np.int64)
@@ -73,9 +72,10 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
 
     def _decided(self, proposed: Components, decision: Decision, active: np.ndarray) -> Info:
         """Count, and report what was decided."""
-        differs = np.abs(decision.action[0] - proposed[0]) > self._tolerance[0]
-        for u, v, tolerance in zip(decision.action[1:], proposed[1:], self._tolerance[1:], strict=True):
-            differs |= np.abs(u - v) > tolerance
+        differs = decision.action[0] != proposed[0]
+        for u, v in zip(decision.action[1:], proposed[1:], strict=True):
+            differs |= u != v
+        differs &= active
         self._interventions = self._interventions + differs
         self._infeasible = self._infeasible + ~decision.feasible
         return filter_info(

@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple
 import sympy as sp
 
 from safe_envs.barrier import Barrier
-from safe_envs.calculus import Derivative, input_derivative, relative_degree
+from safe_envs.calculus import Derivative, input_derivative, relative_degree, tidied
 from safe_envs.errors import ConfigurationError, RelativeDegreeError
 from safe_envs.sde import ControlAffineSDE
 
@@ -20,6 +20,12 @@ class AffineConstraint(NamedTuple):
     coefficient: tuple[sp.Expr, ...]
     offset: sp.Expr
     chain: tuple[sp.Expr, ...]
+
+    @classmethod
+    def after(cls, model: ControlAffineSDE, chain: Sequence[sp.Expr], offset: sp.Expr) -> AffineConstraint:
+        """The constraint L_g b_(r-1) u + offset >= 0 at the end of a chain."""
+        a = input_derivative(model, chain[-1])
+        return cls(tuple(tidied(a[0, j]) for j in range(model.m)), tidied(offset), tuple(chain))
 
 
 class Condition:
@@ -86,4 +92,4 @@ def linear_chain(model: ControlAffineSDE, barrier: Barrier, rates: Sequence[floa
         chain.append(derivative(model, chain[-1]) + sp.Float(p, 17) * chain[-1] if p else derivative(model, chain[-1]))
     last = chain[-1]
     offset = derivative(model, last) + (sp.Float(rates[-1], 17) * last if rates[-1] else 0)
-    return AffineConstraint(tuple(input_derivative(model, last)), offset, tuple(chain))
+    return AffineConstraint.after(model, chain, offset)

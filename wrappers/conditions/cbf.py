@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import sympy as sp
 
 from safe_envs.barrier import Barrier
-from safe_envs.calculus import derivatives, drift_derivative, input_derivative, relative_degree
+from safe_envs.calculus import derivatives, drift_derivative, relative_degree
 from safe_envs.errors import ConfigurationError, RelativeDegreeError
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.base import AffineConstraint, Condition, linear_chain, positive_rates
@@ -113,7 +113,7 @@ class ECBF(Condition):
             raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree}; {len(self.k)} gains were given")
         chain = derivatives(model, barrier.expression, degree - 1, drift_derivative)
         offset = drift_derivative(model, chain[-1]) + sum(sp.Float(k, 17) * eta for k, eta in zip(self.k, chain, strict=True))
-        return AffineConstraint(tuple(input_derivative(model, chain[-1])), offset, chain)
+        return AffineConstraint.after(model, chain, offset)
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> ECBF:
