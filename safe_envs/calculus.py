@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable
+from typing import Any
 
 import sympy as sp
 from sympy.simplify.fu import TR5
@@ -54,7 +55,7 @@ def generator(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
     return drift_derivative(system, expression) + ito_term(system, expression)
 
 
-def vanishes(system: ControlAffineSDE, expression: sp.Expr) -> bool:
+def vanishes(system: ControlAffineSDE, expression: Any) -> bool:
     """Whether an expression is zero at every state, for the system's parameters.
 
     The parameters enter as exact rationals and the states as random ones: a nonzero analytic expression is zero
@@ -80,7 +81,7 @@ def derivatives(system: ControlAffineSDE, expression: sp.Expr, order: int, deriv
     return tuple(result)
 
 
-def tidied(expression: sp.Expr) -> sp.Expr:
+def tidied(expression: Any) -> sp.Expr:
     """An equal expression with fewer operations, if sin^2 + cos^2 = 1 and common factors give one quickly."""
     if expression.count_ops() > _LARGEST_TIDIED:
         return expression

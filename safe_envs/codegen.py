@@ -54,23 +54,24 @@ _ARRAY_FUNCTIONS = {name: _Remembering(getattr(np, name)) for name in ("sin", "c
 class _ArrayPrinter(NumPyPrinter):
     """Prints Min and Max as nested binary ufuncs; sympy's own form stacks the operands first."""
 
-    def _nested(self, function: str, expression: sp.Expr) -> str:
-        code = self._print(expression.args[0])
-        for argument in expression.args[1:]:
+    def _nested(self, function: str, expression: Any) -> str:
+        first, *others = expression.args
+        code = self._print(first)
+        for argument in others:
             code = f"{self._module_format('numpy.' + function)}({code}, {self._print(argument)})"
         return code
 
-    def _print_Max(self, expression: sp.Expr) -> str:
-        return self._nested("maximum", expression)
+    def _print_Max(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
+        return self._nested("maximum", expr)
 
-    def _print_Min(self, expression: sp.Expr) -> str:
-        return self._nested("minimum", expression)
+    def _print_Min(self, expr: Any) -> str:  # noqa: N802
+        return self._nested("minimum", expr)
 
 
 _PRINTER_SETTINGS = {"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True}
 
 
-def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[sp.Expr], flavour: Flavour) -> Callable[..., Components]:
+def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[Any], flavour: Flavour) -> Callable[..., Components]:
     """Compile expressions that share their common subexpressions.
 
     Args:
@@ -94,18 +95,20 @@ def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...],
         tuple(sp.Float(e, 17) if e.is_number else e for e in expressions),
         modules=[_ARRAY_FUNCTIONS, np] if flavour == "arrays" else [math],
         printer=printer,
-        cse=_shared_subexpressions,
+        cse=_shared_subexpressions,  # pyright: ignore[reportArgumentType]  (annotated as bool, documented as callable)
         docstring_limit=0,
     )
 
 
 def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
     """Common subexpressions, with small integer powers written as products: `pow` is many times slower."""
+    shared: Any
+    reduced: Any
     shared, reduced = sp.cse(expressions, list=False)
     fresh = sp.numbered_symbols("p", exclude=set().union(*(e.free_symbols for e in (*reduced, *(s for s, _ in shared)))))
     replacements: list[tuple[sp.Symbol, sp.Expr]] = []
 
-    def expand(expression: sp.Expr) -> sp.Expr:
+    def expand(expression: Any) -> Any:
         if not expression.args:
             return expression
         arguments = [expand(a) for a in expression.args]
@@ -132,10 +135,10 @@ def filled(component: Any, shape: tuple[int, ...]) -> np.ndarray:
 
 def stacked(components: Sequence[Any], size: int) -> np.ndarray:
     """Components side by side, shape (size, len(components)), in memory of their own."""
-    table = np.empty((size, len(components)))
-    for j, component in enumerate(components):
-        table[:, j] = component
-    return table
+    table = np.empty((len(components), size))
+    for row, component in zip(table, components, strict=True):
+        row[:] = component
+    return table.T
 
 
 def finite(values: np.ndarray) -> bool:

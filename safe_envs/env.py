@@ -58,7 +58,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         if render_mode is not None:
             raise ConfigurationError(f"render_mode = {render_mode!r}; only None is available")
         self.problem = problem
-        self.observation_space = observation_box(problem)
+        self.observation_space = self._bounds = observation_box(problem)
         self.action_space = action_box(problem)
         self.render_mode = render_mode
         self._simulation = Simulation(problem, "floats")
@@ -148,7 +148,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             self._h_min = h
         left = outside > 0.0
         if left:
-            features = np.clip(features, self.observation_space.low, self.observation_space.high)
+            features = np.clip(features, self._bounds.low, self._bounds.high)
         observation = np.array(features, dtype=np.float32)
         info = safety_info(
             violation=violation,

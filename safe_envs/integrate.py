@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import sympy as sp
 
 from safe_envs.codegen import Components, Flavour, compile_function
@@ -38,7 +39,7 @@ class Integrator:
         else:
             self._rate = compile_function((*system.states, *system.inputs), tuple(rate), flavour)
 
-    def step(self, x: Components, u: Sequence[Any], draws: Sequence[Any]) -> Components:
+    def step(self, x: Components, u: Sequence[Any], draws: Sequence[Any] | np.ndarray) -> Components:
         """Return the components of the state one control period later.
 
         Args:
@@ -62,6 +63,4 @@ class Integrator:
         k3 = rate(*[a + half * b for a, b in zip(x, k2, strict=True)], *u)
         k4 = rate(*[a + h * b for a, b in zip(x, k3, strict=True)], *u)
         sixth = h / 6.0
-        return tuple(
-            a + sixth * (b1 + 2.0 * (b2 + b3) + b4) for a, b1, b2, b3, b4 in zip(x, k1, k2, k3, k4, strict=True)
-        )
+        return tuple(a + sixth * (b1 + 2.0 * (b2 + b3) + b4) for a, b1, b2, b3, b4 in zip(x, k1, k2, k3, k4, strict=True))

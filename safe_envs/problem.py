@@ -221,22 +221,18 @@ class SafetyProblem:
             return {}
         if not self.noise:
             raise ConfigurationError(f"{self.name} has no noise channels")
-        given = np.atleast_1d(np.asarray(noise, dtype=float))
+        given = _numbers(noise)
         if given.shape not in ((1,), (len(self.noise),)) or not np.isfinite(given).all() or (given < 0).any():
-            raise ConfigurationError(
-                f"noise = {noise!r}; give one number >= 0, or {len(self.noise)} of them ({', '.join(self.noise)})"
-            )
+            raise ConfigurationError(f"noise = {noise!r}; give one number >= 0, or {len(self.noise)} of them ({', '.join(self.noise)})")
         return dict(zip(self.noise, np.broadcast_to(given, len(self.noise)).tolist(), strict=True))
 
     def _boxed(self, box: Sequence[Any]) -> tuple[Variable, ...]:
-        try:
-            pairs = np.asarray(box, dtype=float)
-            pairs = np.broadcast_to(pairs, (len(self.inputs), 2)) if pairs.shape == (2,) else pairs
-        except (TypeError, ValueError):
-            pairs = np.empty(0)
+        pairs = _numbers(box)
+        pairs = np.broadcast_to(pairs, (len(self.inputs), 2)) if pairs.shape == (2,) else pairs
         if pairs.shape != (len(self.inputs), 2):
             raise ConfigurationError(f"box = {box!r}; give (low, high), or one such pair for each of the {len(self.inputs)} inputs")
-        return tuple(replace(i, low=low, high=high) for i, (low, high) in zip(self.inputs, pairs.tolist(), strict=True))
+        bounds = [(float(low), float(high)) for low, high in pairs]
+        return tuple(replace(i, low=low, high=high) for i, (low, high) in zip(self.inputs, bounds, strict=True))
 
     def _fixed(self, start: Sequence[float]) -> Start:
         names = ", ".join(s.symbol.name for s in self.states)
@@ -247,3 +243,11 @@ class SafetyProblem:
             if not s.low <= v <= s.high:
                 raise ConfigurationError(f"start of {s.symbol} = {v} is outside the workspace [{s.low}, {s.high}]")
         return Start.at(values)
+
+
+def _numbers(given: Any) -> np.ndarray:
+    """What the user gave as an array of at least one axis; empty if it holds no numbers."""
+    try:
+        return np.atleast_1d(np.asarray(given, dtype=float))
+    except (TypeError, ValueError):
+        return np.empty(0)

@@ -46,7 +46,7 @@ class ControlAffineSDE:
     Attributes:
         states: n symbols x.
         inputs: m symbols u.
-        drift: f, n x 1 expressions of the states and parameters.
+        drift: f, n x 1 expressions of the states and parameters. Lists are read as matrices, here and below.
         input_matrix: g, n x m.
         diffusion: sigma, n x d, for a d-dimensional standard Wiener process W.
         parameters: value of every other symbol that occurs.
@@ -61,9 +61,9 @@ class ControlAffineSDE:
 
     states: tuple[sp.Symbol, ...]
     inputs: tuple[sp.Symbol, ...]
-    drift: sp.ImmutableMatrix
-    input_matrix: sp.ImmutableMatrix
-    diffusion: sp.ImmutableMatrix
+    drift: Any
+    input_matrix: Any
+    diffusion: Any
     parameters: Mapping[sp.Symbol, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

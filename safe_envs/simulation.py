@@ -14,7 +14,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.integrate import Integrator
 from safe_envs.problem import TIME, SafetyProblem
 
-_CHUNK = 128
+_CHUNK = 256
 _TRIES_AT_ONCE = 4
 _MOST_TRIES = 10_000
 

@@ -61,7 +61,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.problem = problem
         self.num_envs = num_envs
         self.metadata = {"render_modes": [], "autoreset_mode": self._autoreset}
-        self.single_observation_space = observation_box(problem)
+        self.single_observation_space = self._bounds = observation_box(problem)
         self.single_action_space = action_box(problem)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -114,18 +114,18 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
             raise InvalidInputError(f"the actions of envs {bad[:5].tolist()} are not finite; give numbers in [-1, 1]")
         clipped = np.minimum(np.maximum(given, -1.0), 1.0)
-        return tuple([c + w * clipped[:, j] if c else w * clipped[:, j] for j, (c, w) in enumerate(zip(self._center, self._half, strict=True))])
+        return tuple(
+            [c + w * clipped[:, j] if c else w * clipped[:, j] for j, (c, w) in enumerate(zip(self._center, self._half, strict=True))]
+        )
 
-    def normalized_action(self, physical: Components) -> np.ndarray:
+    def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
         """Inverse of `physical_action`, in double precision."""
         actions = np.empty((self.num_envs, len(physical)))
         for j, (u, c, w) in enumerate(zip(physical, self._center, self._half, strict=True)):
             np.divide(u - c, w, out=actions[:, j])
         return actions
 
-    def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, Info]:
+    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`.
 
         Args:
@@ -151,7 +151,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         return self.step_physical(self.physical_action(actions))
 
-    def step_physical(self, u: Components) -> VectorStep:
+    def step_physical(self, u: Sequence[Any]) -> VectorStep:
         """`step` for the components of physical inputs inside the box, as a filter has them."""
         x = self.components
         anew = self._ended.copy() if np.count_nonzero(self._ended) else None
@@ -201,9 +201,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return everything
         mask = np.asarray(given)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-            raise ConfigurationError(
-                f"reset_mask must be a bool array of shape ({self.num_envs},) with a True in it; given {given!r}"
-            )
+            raise ConfigurationError(f"reset_mask must be a bool array of shape ({self.num_envs},) with a True in it; given {given!r}")
         if not self._x and not mask.all():
             raise gym.error.ResetNeeded("some envs have no state yet: the first reset takes no reset_mask")
         return mask
@@ -224,11 +222,14 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._episode_cost[envs] = 0.0
         self._ended[envs] = False
 
-    def _observe(self, u: Components, counted: np.ndarray | None = None) -> VectorStep:
+    def _observe(self, u: Sequence[Any], counted: np.ndarray | None = None) -> VectorStep:
         """Read the states; `counted` are the envs whose states are new (None: all)."""
         time = self._steps * self.problem.dt if self._simulation.timed else 0.0
         features, barriers, reward, outside, goal = self._simulation.measure(self.components, u, time)
-        observation = np.ascontiguousarray(np.array(features, dtype=np.float32).T)
+        rows = np.empty((len(features), self.num_envs), dtype=np.float32)
+        for row, feature in zip(rows, features, strict=True):
+            row[:] = feature
+        observation = rows.T
         barrier = stacked(barriers, self.num_envs)
         h = barriers[0] if len(barriers) == 1 else barrier.min(axis=1)
         if not finite(h):
@@ -239,13 +240,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._h_min = np.minimum(self._h_min, h)
         terminated = filled(outside > 0.0, (self.num_envs,))
         if np.count_nonzero(terminated):
-            envs, space = np.flatnonzero(terminated), self.single_observation_space
-            observation[envs] = np.clip(observation[envs], space.low, space.high)
+            envs = np.flatnonzero(terminated)
+            observation[envs] = np.clip(observation[envs], self._bounds.low, self._bounds.high)
         if self.problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
-        info = safety_info(
-            violation=violation, cost=cost, barrier=barrier, h_min=self._h_min, episode_cost=self._episode_cost
-        )
+        info = safety_info(violation=violation, cost=cost, barrier=barrier, h_min=self._h_min, episode_cost=self._episode_cost)
         return observation, filled(reward, (self.num_envs,)), terminated, self._steps >= self._limit, info
 
     def _report_breakdown(self, h: np.ndarray) -> None:

@@ -128,7 +128,9 @@ class SafetyFilter:
         x, u = np.asarray(x, dtype=np.float64), np.asarray(u_nominal, dtype=np.float64)
         n, m = self.model.n, self.model.m
         if x.shape[-1:] != (n,) or u.shape[-1:] != (m,) or x.shape[:-1] != u.shape[:-1]:
-            raise InvalidInputError(f"state {x.shape} and input {u.shape} do not fit; give (..., {n}) and (..., {m}) with the same leading axes")
+            raise InvalidInputError(
+                f"state {x.shape} and input {u.shape} do not fit; give (..., {n}) and (..., {m}) with the same leading axes"
+            )
         if x.ndim == 1:
             return self._filter_one(x, u)
         _require_finite(x, u)
@@ -182,7 +184,9 @@ class SafetyFilter:
         size = len(u[0])
         rows = stacked(values, size).reshape(size, -1, self.model.m + 1)
         self._require_defined(x, rows.sum(axis=(1, 2)))
-        found = project(rows[:, :, :-1], rows[:, :, -1], stacked(u, size), np.array(self._low), np.array(self._high), np.array(self._weights))
+        found = project(
+            rows[:, :, :-1], rows[:, :, -1], stacked(u, size), np.array(self._low), np.array(self._high), np.array(self._weights)
+        )
         slack = np.where(found.feasible[:, None], 0.0, np.maximum(-found.margin, 0.0))
         return Decision(tuple(found.u.T), tuple(found.margin.T), tuple(found.active.T), found.feasible, tuple(slack.T))
 

@@ -215,7 +215,7 @@ def test_gap_generators_with_the_terms_of_the_print_corrected():
     y, d = s["z"] - 10, s["v_f"] - s["v"]
     drag = s["f_0"] + s["f_1"] * s["v"] + s["f_2"] * s["v"] ** 2
     s2 = s["sigma_2"]
-    h, b1, b2 = derivatives(system, sp.nsimplify(problem.barriers[0].expression), 2, generator)
+    _, b1, b2 = derivatives(system, sp.nsimplify(problem.barriers[0].expression), 2, generator)
     assert same(system, b1, 5 * y**4 * d + 10 * s2**2 * y**3)
     assert same(system, b2, 20 * y**3 * d**2 + 60 * s2**2 * y**2 * d + 5 * y**4 * drag / s["M"] + 30 * s2**4 * y)
     assert same(system, input_derivative(system, b1)[0], -5 * y**4 / s["M"])

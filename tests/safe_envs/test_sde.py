@@ -14,7 +14,13 @@ x, y, u, k = sp.symbols("x y u k", real=True)
 
 def scalar(**changes):
     arguments = {
-        "states": (x,), "inputs": (u,), "drift": [k * x], "input_matrix": [1], "diffusion": [0.1], "parameters": {k: 2.0}, **changes
+        "states": (x,),
+        "inputs": (u,),
+        "drift": [k * x],
+        "input_matrix": [1],
+        "diffusion": [0.1],
+        "parameters": {k: 2.0},
+        **changes,
     }
     return ControlAffineSDE(**arguments)
 

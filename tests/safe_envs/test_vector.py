@@ -129,9 +129,7 @@ def test_trajectories_do_not_depend_on_the_size_of_the_batch(env_id):
 
 def test_what_was_handed_out_does_not_change_afterwards():
     env = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.2), "scbf")
-    handed_out = [env.reset(seed=0)]
-    for _ in range(12):
-        handed_out.append(env.step(np.full((3, 1), 0.9, dtype=np.float32)))
+    handed_out = [env.reset(seed=0), *(env.step(np.full((3, 1), 0.9, dtype=np.float32)) for _ in range(12))]
     again = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.2), "scbf")
     for step in range(13):
         fresh = again.reset(seed=0) if step == 0 else again.step(np.full((3, 1), 0.9, dtype=np.float32))

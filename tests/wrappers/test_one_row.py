@@ -83,8 +83,17 @@ def test_equals_proxqp(m):
             continue
         scale = np.abs(a).max()
         solution = qpsolvers.solve_qp(
-            np.diag(w), -w * v, -a[None] / scale, np.array([b / scale]), lb=low, ub=high, solver="proxqp",
-            eps_abs=1e-10, eps_rel=0.0, check_duality_gap=True, eps_duality_gap_abs=1e-10,
+            np.diag(w),
+            -w * v,
+            -a[None] / scale,
+            np.array([b / scale]),
+            lb=low,
+            ub=high,
+            solver="proxqp",
+            eps_abs=1e-10,
+            eps_rel=0.0,
+            check_duality_gap=True,
+            eps_duality_gap_abs=1e-10,
         )
         if solution is None:
             continue  # ProxQP gives up on a few feasible problems; its answers are what is compared

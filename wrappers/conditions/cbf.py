@@ -100,7 +100,9 @@ class ECBF(Condition):
         # Positive coefficients leave no root at or right of 0, so that only complex ones remain to be refused.
         if polynomial.count_roots() < len(sp.sqf_part(polynomial).all_coeffs()) - 1:
             roots = ", ".join(str(sp.N(root, 4)) for root in polynomial.nroots())
-            raise ConfigurationError(f"k = {gains} places complex poles ({roots}), so that h would oscillate through 0; place real negative ones")
+            raise ConfigurationError(
+                f"k = {gains} places complex poles ({roots}), so that h would oscillate through 0; place real negative ones"
+            )
 
     def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint.

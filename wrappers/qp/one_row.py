@@ -9,7 +9,6 @@ negative, no action meets the row; u(infinity), which maximises a . u + b over t
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -51,7 +50,7 @@ def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tu
         return [u], margin, True, False
     root = -b / a
     u = low if root < low else high if root > high else root
-    return [u], a * u + b, True, u == root
+    return ([u], 0.0, True, True) if u == root else ([u], a * u + b, True, False)
 
 
 def _follow_multiplier(
@@ -86,14 +85,16 @@ def project_arrays(
         a: m entries of the row, each a float or an array (B,).
         b: the offset, a float or an array (B,).
         v: m arrays (B,) of proposed inputs.
-        low, high, w: m bounds and weights.
+        low: m lower bounds.
+        high: m upper bounds.
+        w: m positive weights.
 
     Returns:
         As `project_floats`, with arrays (B,) for every number.
     """
     if len(v) == 1:
-        u, *rest = _project_scalars(a[0], b, v[0], low[0], high[0])
-        return [u], *rest
+        u, margin, active, feasible = _project_scalars(a[0], b, v[0], low[0], high[0])
+        return [u], margin, active, feasible
     u = [np.minimum(np.maximum(vj, lo), hi) for vj, lo, hi in zip(v, low, high, strict=True)]
     margin = _dot(a, u) + b
     active = margin < 0.0
@@ -114,10 +115,14 @@ def _project_scalars(a: Any, b: Any, v: np.ndarray, low: float, high: float) -> 
     with np.errstate(divide="ignore", over="ignore"):
         root = -b / a
     nearest = np.minimum(np.maximum(root, low), high)
-    feasible = (nearest == root) | ~active
+    # Where the box holds the root, the margin there is 0.
+    missed = active & (nearest != root)
     moving = active if np.count_nonzero(a) == np.size(a) else active & (a != 0.0)
     u = np.where(moving, nearest, u)
-    return u, a * u + b, active, feasible
+    margin = np.maximum(margin, 0.0)
+    if np.count_nonzero(missed):
+        margin = np.where(missed, a * u + b, margin)
+    return u, margin, active, ~missed
 
 
 def _dot(a: Sequence[Any], u: Sequence[np.ndarray]) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import qpsolvers
 import scipy.optimize
-from proxsuite import proxqp
+from proxsuite import proxqp  # pyright: ignore[reportMissingImports]  (it lives in a prefix of its own)
 
 _PRECISION = {"eps_abs": 1e-9, "eps_rel": 0.0, "check_duality_gap": True, "eps_duality_gap_abs": 1e-9}
 _SETTINGS = {**_PRECISION, "eps_primal_inf": 1e-14, "max_iter": 200, "max_iter_in": 50}
@@ -38,7 +38,9 @@ def project(a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: 
         a: rows, shape (B, k, m).
         b: offsets, shape (B, k).
         v: proposed inputs, shape (B, m).
-        low, high, w: bounds and weights, shape (m,).
+        low: lower bounds, shape (m,).
+        high: upper bounds, shape (m,).
+        w: positive weights, shape (m,).
         threads: that ProxQP may use.
     """
     u = np.clip(v, low, high)
@@ -117,7 +119,9 @@ class _Scaled(NamedTuple):
     def _nearest(self, i: int, slack: np.ndarray) -> np.ndarray | None:
         """The minimiser with the rows relaxed until they can be met, without a guess; None where it is not found."""
         bound = np.ones(self.half.size)
-        problem = qpsolvers.Problem(self.hessian, -self.hessian @ self.target[i], -self.rows[i], self.offsets[i] + slack, lb=-bound, ub=bound)
+        problem = qpsolvers.Problem(
+            self.hessian, -self.hessian @ self.target[i], -self.rows[i], self.offsets[i] + slack, lb=-bound, ub=bound
+        )
         solution = qpsolvers.solve_problem(problem, solver="proxqp", initial_guess=proxqp.NO_INITIAL_GUESS, **_PRECISION)
         z = solution.x
         return z if solution.found and z is not None and self._meets(i, z, slack) else None
