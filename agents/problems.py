@@ -37,9 +37,7 @@ def make_env(env_id: str, options: Mapping[str, Any] | None = None) -> SafeEnv:
     try:
         env = gym.make(full_id(env_id), disable_env_checker=True, **given).unwrapped
     except ModuleNotFoundError as error:
-        raise ConfigurationError(
-            f"unknown env {env_id!r}: there is no module {error.name!r} to import; {nearest(env_id, ENV_IDS)}"
-        ) from error
+        raise ConfigurationError(f"unknown env {env_id!r}: {error}") from error
     if not isinstance(env, SafeEnv):
         raise ConfigurationError(f"{env_id} is not one of this project's envs; {nearest(env_id, ENV_IDS)}")
     return env

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -9,7 +10,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, nearest
 from safe_envs.info import Info, safety_info
 from safe_envs.problem import SafetyProblem
 from safe_envs.simulation import NoiseStream, Simulation, center_and_half_width, steps_until
@@ -29,11 +30,14 @@ def action_box(problem: SafetyProblem) -> gym.spaces.Box:
 
 def make_problem(env_class: type[Any], barrier: Mapping[str, Any] | None, options: Mapping[str, Any]) -> SafetyProblem:
     """Build the problem of a registered env class with the arguments of `gym.make`."""
-    try:
-        problem = env_class.problem_factory(**(barrier or {}))
-    except TypeError as error:
-        raise ConfigurationError(f"barrier = {barrier!r} does not fit {env_class.__name__}: {error}") from error
-    return problem.configured(**options)
+    for name, allowed, given in (
+        ("barrier argument", inspect.signature(env_class.problem_factory).parameters, barrier or {}),
+        ("argument", inspect.signature(SafetyProblem.configured).parameters, options),
+    ):
+        for key in given:
+            if key not in allowed:
+                raise ConfigurationError(f"{env_class.__name__} has no {name} {key!r}; {nearest(key, allowed)}")
+    return env_class.problem_factory(**(barrier or {})).configured(**options)
 
 
 class SafeEnv(gym.Env[np.ndarray, np.ndarray]):

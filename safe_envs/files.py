@@ -13,10 +13,15 @@ from safe_envs.errors import ConfigurationError
 def require_writable(path: Path) -> None:
     """Raise ConfigurationError unless a file can be created at `path`: asked before a long run, not after it."""
     folder = path.absolute().parent
+    if path.is_dir():
+        raise ConfigurationError(f"cannot write {path}: it is a folder; name a file in it")
     if not folder.is_dir():
         raise ConfigurationError(f"cannot write {path}: the folder {folder} does not exist; create it or choose another")
-    if path.is_dir() or not os.access(folder, os.W_OK):
-        raise ConfigurationError(f"cannot write {path}: it is a folder, or its folder is not writable")
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {path}: no file can be created in {folder} ({error.strerror})") from error
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:

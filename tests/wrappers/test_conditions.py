@@ -61,9 +61,9 @@ def test_cbf_ignores_the_noise_and_scbf_does_not():
 def test_wrong_relative_degrees_are_named():
     with pytest.raises(RelativeDegreeError, match=r"relative degree 2.*use hocbf or ecbf"):
         constraint(CBF(1.0), "safe_envs/DubinsDisk-v0")
-    with pytest.raises(RelativeDegreeError, match=r"relative degree 1; 2 rates were given and 1 is needed"):
+    with pytest.raises(RelativeDegreeError, match=r"relative degree 1 and needs as many rates; 2 given"):
         constraint(HOCBF((1.0, 1.0)), "safe_envs/ACC-v0")
-    with pytest.raises(RelativeDegreeError, match=r"relative degree 2; 1 gains were given"):
+    with pytest.raises(RelativeDegreeError, match=r"relative degree 2 and needs as many gains; 1 given"):
         constraint(ECBF((1.0,)), "safe_envs/DubinsDisk-v0")
 
 

@@ -84,8 +84,7 @@ def linear_chain(model: ControlAffineSDE, barrier: Barrier, rates: Sequence[floa
         rates = (0.0,) * degree
     if len(rates) != degree:
         raise RelativeDegreeError(
-            f"barrier {barrier.name} has relative degree {degree}; {len(rates)} rate{'s' if len(rates) > 1 else ''} "
-            f"were given and {degree} {'are' if degree > 1 else 'is'} needed"
+            f"barrier {barrier.name} has relative degree {degree} and needs as many rates; {len(rates)} given"
         )
     chain = [barrier.expression]
     for p in rates[:-1]:

@@ -112,7 +112,7 @@ class ECBF(Condition):
         """
         degree = relative_degree(model, barrier.expression)
         if len(self.k) != degree:
-            raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree}; {len(self.k)} gains were given")
+            raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree} and needs as many gains; {len(self.k)} given")
         chain = derivatives(model, barrier.expression, degree - 1, drift_derivative)
         offset = drift_derivative(model, chain[-1]) + sum(sp.Float(k, 17) * eta for k, eta in zip(self.k, chain, strict=True))
         return AffineConstraint.after(model, chain, offset)
