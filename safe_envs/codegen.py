@@ -48,11 +48,37 @@ class _Remembering:
         return value
 
 
-_ARRAY_FUNCTIONS = {name: _Remembering(getattr(np, name)) for name in ("sin", "cos", "exp", "sqrt")}
+_ARRAY_FUNCTIONS = {name: _Remembering(getattr(np, name)) for name in ("sin", "cos")}
+
+
+_PRINTER_SETTINGS = {"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True}
 
 
 class _ArrayPrinter(NumPyPrinter):
-    """Prints Min and Max as nested binary ufuncs; sympy's own form stacks the operands first."""
+    """Prints Min and Max as nested binary ufuncs, where sympy stacks the operands first, and names the constants.
+
+    Attributes:
+        constants: arrays without axes by name: see `constants`.
+    """
+
+    def __init__(self, settings: dict[str, Any]) -> None:
+        super().__init__(settings)
+        self.constants: dict[str, np.ndarray] = {}
+
+    def _named_constant(self, expr: Any) -> str:
+        name = f"_c{len(self.constants)}"
+        self.constants[name] = np.array(float(expr))
+        return name
+
+    def _as_ordered_terms(self, expr: Any, order: str | None = None) -> list[Any]:
+        # A sum that begins with a negative term would cost a negation of its own.
+        return sorted(super()._as_ordered_terms(expr, order), key=lambda term: term.could_extract_minus_sign())
+
+    _print_Float = _print_Integer = _print_Rational = _print_Pi = _named_constant
+
+    def _print_Pow(self, expr: Any, rational: bool = False) -> str:  # noqa: N802  (sympy's dispatch by name)
+        # NumPy's power has short cuts for exponents that are literal.
+        return NumPyPrinter(_PRINTER_SETTINGS)._print_Pow(expr, rational)
 
     def _nested(self, function: str, expression: Any) -> str:
         first, *others = expression.args
@@ -61,14 +87,11 @@ class _ArrayPrinter(NumPyPrinter):
             code = f"{self._module_format('numpy.' + function)}({code}, {self._print(argument)})"
         return code
 
-    def _print_Max(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
+    def _print_Max(self, expr: Any) -> str:  # noqa: N802
         return self._nested("maximum", expr)
 
     def _print_Min(self, expr: Any) -> str:  # noqa: N802
         return self._nested("minimum", expr)
-
-
-_PRINTER_SETTINGS = {"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True}
 
 
 def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[Any], flavour: Flavour) -> Callable[..., Components]:
@@ -81,7 +104,7 @@ def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[Any],
 
     Returns:
         A function of `len(arguments)` positional arguments that returns a tuple of `len(expressions)`. An
-        expression without any argument in it comes back as a float in both flavours. Neither the arrays given nor
+        expression without any argument in it comes back as a number without axes. Neither the arrays given nor
         those returned may be changed in place.
     """
     return _compile(tuple(arguments), tuple(sp.sympify(e) for e in expressions), flavour)
@@ -89,15 +112,17 @@ def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[Any],
 
 @lru_cache(maxsize=1024)
 def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], flavour: Flavour) -> Callable[..., Components]:
-    printer = _ArrayPrinter(_PRINTER_SETTINGS) if flavour == "arrays" else PythonCodePrinter(_PRINTER_SETTINGS)
-    return sp.lambdify(
+    arrays = _ArrayPrinter(_PRINTER_SETTINGS)
+    function = sp.lambdify(
         arguments,
         tuple(sp.Float(e, 17) if e.is_number else e for e in expressions),
         modules=[_ARRAY_FUNCTIONS, np] if flavour == "arrays" else [math],
-        printer=printer,
+        printer=arrays if flavour == "arrays" else PythonCodePrinter(_PRINTER_SETTINGS),
         cse=_shared_subexpressions,  # pyright: ignore[reportArgumentType]  (annotated as bool, documented as callable)
         docstring_limit=0,
     )
+    function.__globals__.update(arrays.constants)
+    return function
 
 
 def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
@@ -128,6 +153,11 @@ def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.E
     return replacements, type(reduced)(expand(e) for e in reduced)
 
 
+def constants(values: Sequence[float]) -> list[np.ndarray]:
+    """Numbers as arrays without axes: a ufunc converts a Python float anew at every call, for as long as a small batch takes."""
+    return [np.array(v) for v in values]
+
+
 def filled(component: Any, shape: tuple[int, ...]) -> np.ndarray:
     """A component as an array of the batch's shape: what does not depend on the arguments comes back as a float."""
     return component if getattr(component, "shape", None) == shape else np.full(shape, component)
@@ -143,4 +173,5 @@ def stacked(components: Sequence[Any], size: int) -> np.ndarray:
 
 def finite(values: np.ndarray) -> bool:
     """Whether no entry is NaN or infinite; a quick look that may report huge finite entries as infinite."""
-    return math.isfinite(np.vdot(values, values))
+    flat = values.ravel()
+    return math.isfinite(flat.dot(flat))

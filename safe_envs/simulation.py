@@ -147,11 +147,9 @@ class NoiseStreams:
         if not self._before_refill:
             self._refill(rngs, stepping)
         self._before_refill -= 1
-        rows = self._row
-        self._row = rows + (1 if stepping is None else stepping)
-        if stepping is not None:
-            rows = np.where(stepping, rows, 0)
-        return self._rows.take(rows, axis=0).T
+        draws = self._rows.take(self._row if stepping is None else np.where(stepping, self._row, 0), axis=0).T
+        self._row += 1 if stepping is None else stepping
+        return draws
 
     def _refill(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> None:
         used_up = self._row == self._end

@@ -11,12 +11,14 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from safe_envs.codegen import Components, filled, finite, stacked
+from safe_envs.codegen import Components, constants, filled, finite, stacked
 from safe_envs.env import action_box, make_problem, observation_box
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.info import Info, safety_info, with_masks
 from safe_envs.problem import SafetyProblem
 from safe_envs.simulation import NoiseStreams, Simulation, center_and_half_width, steps_until
+
+_LOWEST, _HIGHEST = constants((-1.0, 1.0))
 
 VectorStep = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]
 
@@ -67,7 +69,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._simulation = Simulation(problem, "arrays")
         self._noise = NoiseStreams(num_envs, self._simulation.integrator.channels)
-        self._center, self._half = center_and_half_width(problem)
+        self._center, self._half = (constants(c) for c in center_and_half_width(problem))
         self._limit = steps_until(problem, max_episode_steps)
         self._rngs: list[np.random.Generator] = []
         self._seeds: list[int] = []
@@ -113,7 +115,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if not finite(given):
             bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
             raise InvalidInputError(f"the actions of envs {bad[:5].tolist()} are not finite; give numbers in [-1, 1]")
-        clipped = np.minimum(np.maximum(given, -1.0), 1.0)
+        clipped = np.minimum(np.maximum(given, _LOWEST), _HIGHEST)
         return tuple(
             [c + w * clipped[:, j] if c else w * clipped[:, j] for j, (c, w) in enumerate(zip(self._center, self._half, strict=True))]
         )
@@ -161,7 +163,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         # A state that overflows is found by `_observe`, which says so better than a warning.
         with np.errstate(over="ignore", invalid="ignore"):
             self._x = self._simulation.integrator.step(x, u, draws)
-            self._steps = self._steps + 1
+            self._steps += 1
             if anew is not None:
                 self._restart(np.flatnonzero(anew))
             observation, reward, terminated, truncated, info = self._observe(u)
@@ -216,7 +218,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             for x, fresh in zip(self._x, start, strict=True):
                 x[envs] = fresh
         # What was handed out in an info stays as it is: fresh arrays, not changes in place.
-        self._steps, self._h_min, self._episode_cost = self._steps.copy(), self._h_min.copy(), self._episode_cost.copy()
+        self._h_min, self._episode_cost = self._h_min.copy(), self._episode_cost.copy()
         self._steps[envs] = 0
         self._h_min[envs] = np.inf
         self._episode_cost[envs] = 0.0

@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from safe_envs.env import SafeEnv
 from safe_envs.errors import ConfigurationError
@@ -38,6 +39,7 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         gym.utils.RecordConstructorArgs.__init__(self, condition=text, knowledge=knowledge)
         gym.Wrapper.__init__(self, env)
         self._inner = inner
+        self._directly = _only_checks_between(env, inner)
         self._interventions = 0
         self._infeasible = 0
 
@@ -53,9 +55,10 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         proposed = self._inner.physical_action(action)
         decision = self.safety_filter.decide_floats(self._inner.components, proposed)
         executed, active = decision.action, True in decision.active
-        if active:
-            action = self._inner.normalized_action(executed)
-        observation, reward, terminated, truncated, info = self.env.step(action)
+        if self._directly:
+            observation, reward, terminated, truncated, info = self._inner.step_physical(executed)
+        else:
+            observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(executed))
         differs = active and executed != proposed
         self._interventions += differs
         self._infeasible += not decision.feasible
@@ -72,6 +75,13 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
             )
         )
         return observation, reward, terminated, truncated, info
+
+
+def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv) -> bool:
+    """Whether no wrapper between the filter and the env could change a step, so that its input need not be encoded."""
+    while isinstance(env, (OrderEnforcing, PassiveEnvChecker)):
+        env = env.env
+    return env is inner
 
 
 def build_filter(problem: SafetyProblem, condition: Condition | str, knowledge: str) -> tuple[str, SafetyFilter]:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safe_envs.barrier import Barrier
-from safe_envs.codegen import Components, Flavour, compile_function, finite, stacked
+from safe_envs.codegen import Components, Flavour, compile_function, constants, finite, stacked
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, SystemDefinitionError
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
@@ -78,6 +78,7 @@ class SafetyFilter:
         self.model = model
         self.rows = tuple(rows)
         self._low, self._high = _bounds(model, box)
+        self._low_arrays, self._high_arrays = constants(self._low), constants(self._high)
         self._weights = _positive_weights(model, weights)
         self.constraints = tuple(condition.constraint(model, barrier) for barrier, condition in self.rows)
 
@@ -170,7 +171,7 @@ class SafetyFilter:
             if len(self.rows) > 1:
                 return self._decide_several(x, u, values)
             *a, b = values
-            action, margin, active, feasible = project_arrays(a, b, u, self._low, self._high, self._weights)
+            action, margin, active, feasible = project_arrays(a, b, u, self._low_arrays, self._high_arrays, self._weights)
         if not finite(margin):
             self._require_defined(x, margin)
         met = np.count_nonzero(feasible) == len(feasible)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from safe_envs.codegen import Components, stacked
+from safe_envs.codegen import Components
 from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info, filter_info, with_masks
 from safe_envs.vector import SafeVectorEnv, VectorStep
@@ -79,8 +80,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         self._interventions = self._interventions + differs
         self._infeasible = self._infeasible + ~decision.feasible
         return filter_info(
-            nominal_action=stacked(proposed, self.num_envs),
-            safe_action=stacked(decision.action, self.num_envs),
+            nominal_action=_beside(proposed),
+            safe_action=_beside(decision.action),
             intervention=differs,
             filter_active=active,
             feasible=decision.feasible,
@@ -99,3 +100,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         self._interventions = np.where(envs, 0, self._interventions)
         self._infeasible = np.where(envs, 0, self._infeasible)
         self._ended = self._ended & ~envs
+
+
+def _beside(components: Sequence[np.ndarray]) -> np.ndarray:
+    """Fresh components as columns; a single one needs no copy."""
+    return components[0].reshape(-1, 1) if len(components) == 1 else np.stack(components, axis=-1)

@@ -55,7 +55,7 @@ def _patrol(r: float) -> tuple[sp.Expr, sp.Expr]:
     distance = sp.sqrt(from_center**2 + y**2 + 1e-9 * r**2)  # the small term keeps the centre from a division by zero
     off = (radius - distance) / r
     course = (-y + 3 * off * from_center) / distance, (from_center + 3 * off * y) / distance
-    on_circle = sp.exp(-((1.5 * ((from_center**2 + y**2) / radius**2 - 1)) ** 2))
+    on_circle = 1 / (1 + (2 * ((from_center**2 + y**2) / radius**2 - 1)) ** 2)
     along = (from_center * sp.sin(theta) - y * sp.cos(theta)) / radius
     return on_circle * (1 + along) / 2, v / radius + turn_rate_towards(*course)
 
@@ -183,9 +183,9 @@ class DubinsDisk(SystemEnv):
     -2 v_model (v_plant - v_model)/(p_1 p_2) = -.15 m^2.
 
     ## Reward
-    exp(-(1.5 (d^2/R^2 - 1))^2) (1 + (d/R) cos(a))/2 a step, at most about 1, for the distance d from (.5 r, 0), R = .75 r
-    and the angle a from the heading to the counterclockwise tangent: the circle alone would reward turning on the spot.
-    Chosen by us.
+    (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from (.5 r, 0), R = .75 r and
+    the angle a from the heading to the counterclockwise tangent: the circle alone would reward turning on the spot. Chosen
+    by us.
 
     ## Nominal controller
     Turns towards a course that leads onto that circle and around it. The thesis uses 0 here.
@@ -248,9 +248,9 @@ class StochasticDubins(SystemEnv):
     None: plant and model have v = 2 m/s.
 
     ## Reward
-    exp(-(1.5 (d^2/R^2 - 1))^2) (1 + (d/R) cos(a))/2 a step, at most about 1, for the distance d from (.5 r, 0), R = .75 r
-    and the angle a from the heading to the counterclockwise tangent: the circle alone would reward turning on the spot.
-    Chosen by us.
+    (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from (.5 r, 0), R = .75 r and
+    the angle a from the heading to the counterclockwise tangent: the circle alone would reward turning on the spot. Chosen
+    by us.
 
     ## Nominal controller
     Turns towards a course that leads onto that circle and around it. Chosen by us.

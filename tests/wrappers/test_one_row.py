@@ -10,6 +10,8 @@ import qpsolvers
 
 from wrappers.qp.one_row import project_arrays, project_floats
 
+project_arrays = np.errstate(divide="ignore")(project_arrays)
+
 EPS = float(np.finfo(float).eps)
 
 

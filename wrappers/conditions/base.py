@@ -83,9 +83,7 @@ def linear_chain(model: ControlAffineSDE, barrier: Barrier, rates: Sequence[floa
     if rates is None:
         rates = (0.0,) * degree
     if len(rates) != degree:
-        raise RelativeDegreeError(
-            f"barrier {barrier.name} has relative degree {degree} and needs as many rates; {len(rates)} given"
-        )
+        raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree} and needs as many rates; {len(rates)} given")
     chain = [barrier.expression]
     for p in rates[:-1]:
         chain.append(derivative(model, chain[-1]) + sp.Float(p, 17) * chain[-1] if p else derivative(model, chain[-1]))

@@ -50,7 +50,7 @@ def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tu
         return [u], margin, True, False
     root = -b / a
     u = low if root < low else high if root > high else root
-    return ([u], 0.0, True, True) if u == root else ([u], a * u + b, True, False)
+    return [u], a * u + b, True, u == root
 
 
 def _follow_multiplier(
@@ -79,7 +79,7 @@ def _follow_multiplier(
 def project_arrays(
     a: Sequence[Any], b: Any, v: Sequence[np.ndarray], low: Sequence[float], high: Sequence[float], w: Sequence[float]
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
-    """Project the inputs of a batch of B states.
+    """Project the inputs of a batch of B states. A flat row divides by zero: the caller silences that warning.
 
     Args:
         a: m entries of the row, each a float or an array (B,).
@@ -106,23 +106,18 @@ def project_arrays(
     return u, margin, active, margin >= -_ROUNDING * scale
 
 
-def _project_scalars(a: Any, b: Any, v: np.ndarray, low: float, high: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _project_scalars(a: Any, b: Any, v: np.ndarray, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     u = np.minimum(np.maximum(v, low), high)
     margin = a * u + b
     active = margin < 0.0
     if not np.count_nonzero(active):
         return u, margin, active, ~active
-    with np.errstate(divide="ignore", over="ignore"):
-        root = -b / a
+    root = -b / a
     nearest = np.minimum(np.maximum(root, low), high)
-    # Where the box holds the root, the margin there is 0.
-    missed = active & (nearest != root)
+    feasible = (nearest == root) | ~active
     moving = active if np.count_nonzero(a) == np.size(a) else active & (a != 0.0)
     u = np.where(moving, nearest, u)
-    margin = np.maximum(margin, 0.0)
-    if np.count_nonzero(missed):
-        margin = np.where(missed, a * u + b, margin)
-    return u, margin, active, ~missed
+    return u, a * u + b, active, feasible
 
 
 def _dot(a: Sequence[Any], u: Sequence[np.ndarray]) -> np.ndarray:
