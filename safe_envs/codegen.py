@@ -74,7 +74,7 @@ class _ArrayPrinter(NumPyPrinter):
         # A sum that begins with a negative term would cost a negation of its own.
         return sorted(super()._as_ordered_terms(expr, order), key=lambda term: term.could_extract_minus_sign())
 
-    _print_Float = _print_Integer = _print_Rational = _print_Pi = _named_constant
+    _print_Float = _print_Integer = _print_Rational = _print_Pi = _named_constant  # noqa: N815
 
     def _print_Pow(self, expr: Any, rational: bool = False) -> str:  # noqa: N802  (sympy's dispatch by name)
         # NumPy's power has short cuts for exponents that are literal.
