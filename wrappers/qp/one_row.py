@@ -77,7 +77,7 @@ def _follow_multiplier(
 
 
 def project_arrays(
-    a: Sequence[Any], b: Any, v: Sequence[np.ndarray], low: Sequence[float], high: Sequence[float], w: Sequence[float]
+    a: Sequence[Any], b: Any, v: Sequence[np.ndarray], low: Sequence[Any], high: Sequence[Any], w: Sequence[float]
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
     """Project the inputs of a batch of B states. A flat row divides by zero: the caller silences that warning.
 
@@ -132,8 +132,8 @@ def _follow_multipliers(
     b: Any,
     v: Sequence[np.ndarray],
     u: list[np.ndarray],
-    low: Sequence[float],
-    high: Sequence[float],
+    low: Sequence[Any],
+    high: Sequence[Any],
     w: Sequence[float],
     rows: np.ndarray,
 ) -> list[np.ndarray]:
