@@ -134,9 +134,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             seed: seed of env 0, with env i seeded by seed + i, or a seed (or None) for each env.
             options: may hold "reset_mask", a bool array of shape (num_envs,).
         """
-        seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else list(seed or [None] * self.num_envs)
-        if len(seeds) != self.num_envs:
-            raise ConfigurationError(f"{len(seeds)} seeds were given for {self.num_envs} envs")
+        seeds = self._one_seed_each(seed)
         mask = self._reset_mask(options)
         self._seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
         self._restart(np.flatnonzero(mask))
@@ -196,6 +194,15 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._rngs[i], self._seeds[i] = seeding.np_random(seeds[i])
         self._noise.clear(chosen)
 
+    def _one_seed_each(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+        if seed is None:
+            return [None] * self.num_envs
+        if isinstance(seed, int | np.integer):
+            return [int(seed) + i for i in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ConfigurationError(f"{len(seed)} seeds were given for {self.num_envs} envs")
+        return [None if s is None else int(s) for s in seed]
+
     def _reset_mask(self, options: Mapping[str, Any] | None) -> np.ndarray:
         everything = np.ones(self.num_envs, dtype=bool)
         given = (options or {}).get("reset_mask")
@@ -217,8 +224,6 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._x = tuple([x.copy() for x in self._x])
             for x, fresh in zip(self._x, start, strict=True):
                 x[envs] = fresh
-        # What was handed out in an info stays as it is: fresh arrays, not changes in place.
-        self._h_min, self._episode_cost = self._h_min.copy(), self._episode_cost.copy()
         self._steps[envs] = 0
         self._h_min[envs] = np.inf
         self._episode_cost[envs] = 0.0
@@ -238,15 +243,15 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._report_breakdown(h)
         violation = h < 0.0
         cost = violation.astype(np.float64)
-        self._episode_cost = self._episode_cost + (cost if counted is None else cost * counted)
-        self._h_min = np.minimum(self._h_min, h)
+        self._episode_cost += cost if counted is None else cost * counted
+        np.minimum(self._h_min, h, out=self._h_min)
         terminated = filled(outside > 0.0, (self.num_envs,))
         if np.count_nonzero(terminated):
             envs = np.flatnonzero(terminated)
             observation[envs] = np.clip(observation[envs], self._bounds.low, self._bounds.high)
         if self.problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
-        info = safety_info(violation=violation, cost=cost, barrier=barrier, h_min=self._h_min, episode_cost=self._episode_cost)
+        info = safety_info(violation, cost, barrier, self._h_min.copy(), self._episode_cost.copy())
         return observation, filled(reward, (self.num_envs,)), terminated, self._steps >= self._limit, info
 
     def _report_breakdown(self, h: np.ndarray) -> None:

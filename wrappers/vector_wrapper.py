@@ -77,8 +77,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         for u, v in zip(decision.action[1:], proposed[1:], strict=True):
             differs |= u != v
         differs &= active
-        self._interventions = self._interventions + differs
-        self._infeasible = self._infeasible + ~decision.feasible
+        self._interventions += differs
+        self._infeasible += ~decision.feasible
         return filter_info(
             nominal_action=_beside(proposed),
             safe_action=_beside(decision.action),
@@ -86,8 +86,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             filter_active=active,
             feasible=decision.feasible,
             slack=decision.slack[0] if len(decision.slack) == 1 else np.maximum.reduce(decision.slack),
-            episode_interventions=self._interventions,
-            episode_infeasible=self._infeasible,
+            episode_interventions=self._interventions.copy(),
+            episode_infeasible=self._infeasible.copy(),
         )
 
     def _start_anew(self, added: Info, envs: np.ndarray) -> None:
@@ -97,8 +97,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             added[key][envs] = value
 
     def _forget(self, envs: np.ndarray) -> None:
-        self._interventions = np.where(envs, 0, self._interventions)
-        self._infeasible = np.where(envs, 0, self._infeasible)
+        self._interventions[envs] = 0
+        self._infeasible[envs] = 0
         self._ended = self._ended & ~envs
 
 

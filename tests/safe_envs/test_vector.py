@@ -138,10 +138,25 @@ def test_what_was_handed_out_does_not_change_afterwards():
         assert_same(handed_out[step][-1], fresh[-1], f"info of step {step}")
 
 
+def test_what_a_user_writes_into_an_info_stays_there():
+    env = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3), "scbf")
+    again = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3), "scbf")
+    env.reset(seed=0)
+    again.reset(seed=0)
+    for _ in range(3):
+        actions = np.full((3, 1), 0.9, dtype=np.float32)
+        info, expected = env.step(actions)[4], again.step(actions)[4]
+        assert_same(info, expected, "info")
+        for value in info.values():
+            value[...] = 0
+
+
 def test_seeds_may_be_a_list():
     env = gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=2)
     first, _ = env.reset(seed=[4, 9])
     np.testing.assert_array_equal(first[1], env.reset(seed=[9, 4])[0][0])
+    np.testing.assert_array_equal(first, env.reset(seed=np.array([4, 9]))[0])
+    np.testing.assert_array_equal(env.reset(seed=np.int64(4))[0], env.reset(seed=4)[0])
     with pytest.raises(ConfigurationError, match="3 seeds were given for 2 envs"):
         env.reset(seed=[1, 2, 3])
 
