@@ -7,16 +7,16 @@ import os
 import timeit
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
-import typer
-from rich.console import Console
+from rich import box
 from rich.table import Table
 
 import safe_envs
 from safe_envs.files import require_writable, write_atomically
+from scripts.console import stdout
 from wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
 _ID = "safe_envs/StochasticDubins-v0"
@@ -36,14 +36,21 @@ class Case(NamedTuple):
     prepare: Callable[[], Any] = lambda: None
 
 
-def benchmark(
-    json_file: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the figures to this file.")] = None,
-) -> None:
-    """Measure speed on one core: filter calls, scalar and vector steps, bare and filtered, and the fused limit."""
+def benchmark(json_file: Path | None = None) -> None:
+    """Measure, print and, if asked, write the speed of filter calls, scalar and vector steps, and the fused limit.
+
+    Args:
+        json_file: where the figures go.
+
+    Raises:
+        ConfigurationError: the file cannot be written.
+    """
     if json_file is not None:
         require_writable(json_file)
     figures = measure()
-    Console(width=None if Console().is_terminal else 100).print(_table(figures))
+    console = stdout()
+    console.print(f"{_ID} with scbf, safe-envs {safe_envs.__version__}, on one of {os.cpu_count()} cores\n", highlight=False)
+    console.print(_table(figures))
     if json_file is not None:
         write_atomically(json_file, lambda path: path.write_text(json.dumps(figures, indent=2) + "\n"))
 
@@ -136,8 +143,8 @@ def _fused_loop() -> Case:
 
 
 def _table(figures: Figures) -> Table:
-    table = Table(title=f"{_ID}, scbf, {_NUM_ENVS} envs; safe_envs {safe_envs.__version__}, one of {os.cpu_count()} cores")
-    table.add_column("us per state, or a ratio")
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table.add_column(f"microseconds for each state, or a ratio; vector envs of {_NUM_ENVS}")
     table.add_column("figure", justify="right")
     for name, value in figures.items():
         table.add_row(name, f"{value:.3g}")
