@@ -50,6 +50,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     The episode is terminated when the goal is reached or the state leaves the workspace, and truncated after
     `horizon`. A violation does not end it.
 
+    Attributes:
+        executed: the physical input of the last step.
+
     Args:
         problem: what to simulate.
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
@@ -71,6 +74,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self._scales = list(zip(center, half, strict=True))
         self._action_shape = (len(problem.inputs),)
         self._limit = steps_until(problem, max_episode_steps)
+        self.executed: Sequence[float] = ()
         self._x: tuple[float, ...] | None = None
         self._steps = 0
         self._h_min = math.inf
@@ -131,6 +135,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, bool, Info]:
         """`step` for a physical input inside the box, as a filter has it."""
+        self.executed = u
         try:
             self._x = self._simulation.integrator.step(self.components, u, self._noise.next(self.np_random))
             self._steps += 1

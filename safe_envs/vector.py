@@ -29,6 +29,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Env i, reset with seed s, follows the same trajectory as the scalar env reset with seed s + i, as in Gymnasium's
     own SyncVectorEnv, whatever `num_envs` is. Infos are those of `SafeEnv` with the batch in front.
 
+    Attributes:
+        executed: the components of the physical inputs of the last step.
+
     Args:
         problem: what to simulate.
         num_envs: size of the batch.
@@ -73,6 +76,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._limit = steps_until(problem, max_episode_steps)
         self._rngs: list[np.random.Generator] = []
         self._seeds: list[int] = []
+        self.executed: Sequence[Any] = ()
         self._x: Components = ()
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._h_min = np.full(num_envs, np.inf)
@@ -154,6 +158,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
         """`step` for the components of physical inputs inside the box, as a filter has them."""
         x = self.components
+        self.executed = u
         anew = self._ended.copy() if np.count_nonzero(self._ended) else None
         if anew is not None and self._autoreset == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(f"the episodes of envs {np.flatnonzero(anew)[:5].tolist()} have ended: reset them")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -27,7 +28,8 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         knowledge: "model" (what the designer believes) or "plant" (the true system).
 
     Raises:
-        ConfigurationError: the env is not one of this project, or an argument is unknown.
+        ConfigurationError: the env is not one of this project, or an argument is unknown; or, at a step, a wrapper
+            between the filter and the env changed the action.
         RelativeDegreeError: the condition does not suit the env's barrier.
     """
 
@@ -59,6 +61,7 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
             observation, reward, terminated, truncated, info = self._inner.step_physical(executed)
         else:
             observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(executed))
+            require_executed(self, executed, self._inner.executed)
         differs = active and executed != proposed
         self._interventions += differs
         self._infeasible += not decision.feasible
@@ -82,6 +85,16 @@ def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv) -> bool:
     while isinstance(env, (OrderEnforcing, PassiveEnvChecker)):
         env = env.env
     return env is inner
+
+
+def require_executed(wrapper: object, decided: Sequence[Any], executed: Sequence[Any]) -> None:
+    """Raise ConfigurationError if a wrapper below the filter changed the action that the filter decided on."""
+    for u, v in zip(decided, executed, strict=True):
+        if not np.allclose(u, v, rtol=1e-6, atol=1e-12):
+            raise ConfigurationError(
+                f"a wrapper below the filter changed the safe action {u} into {v}: {wrapper}. Put wrappers that change actions "
+                "around the filter; several conditions go into one SafetyFilter"
+            )
 
 
 def build_filter(problem: SafetyProblem, condition: Condition | str, knowledge: str) -> tuple[str, SafetyFilter]:

@@ -14,7 +14,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info, filter_info, with_masks
 from safe_envs.vector import SafeVectorEnv, VectorStep
 from wrappers.conditions import Condition
-from wrappers.env_wrapper import build_filter, rest_info
+from wrappers.env_wrapper import build_filter, require_executed, rest_info
 from wrappers.safety_filter import Decision
 
 
@@ -59,6 +59,7 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             observation, reward, terminated, truncated, info = self._inner.step_physical(decision.action)
         else:
             observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(decision.action))
+            require_executed(self, decision.action, self._inner.executed)
         added = self._decided(proposed, decision, active)
         ended = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -165,3 +168,28 @@ def test_wrapping_under_other_wrappers_works():
         first, second = over.step(actions), under.step(actions)
         np.testing.assert_allclose(first[0], second[0], rtol=1e-6)
     assert "episode" in first[4]
+
+
+def test_wrapper_that_changes_the_safe_action_is_an_error():
+    rescaled = gym.wrappers.RescaleAction(gym.make("safe_envs/Scalar-v0"), -2.0, 2.0)
+    env = SafetyFilterWrapper(rescaled, "scbf")
+    env.reset(seed=0)
+    with pytest.raises(ConfigurationError, match="changed the safe action"):
+        env.step(np.ones(1))
+    outside = gym.wrappers.RescaleAction(SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0"), "scbf"), -2.0, 2.0)
+    outside.reset(seed=0)
+    np.testing.assert_allclose(outside.step(np.array([1.0]))[4]["nominal_action"], [5.0])
+    vector = gym.wrappers.vector.RescaleAction(gym.make_vec("safe_envs/Scalar-v0", num_envs=2), -2.0, 2.0)
+    batch = SafetyFilterVectorWrapper(vector, "scbf")
+    batch.reset(seed=0)
+    with pytest.raises(ConfigurationError, match="changed the safe action"):
+        batch.step(np.ones((2, 1)))
+
+
+def test_copies_and_processes():
+    env = SafetyFilterWrapper(gym.make("safe_envs/StochasticDubins-v0"), "scbf")
+    env.reset(seed=0)
+    twin = copy.deepcopy(env)
+    np.testing.assert_array_equal(env.step([0.2])[0], twin.step([0.2])[0])
+    problem = env.unwrapped.problem
+    assert pickle.loads(pickle.dumps(problem)) == problem
