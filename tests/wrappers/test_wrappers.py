@@ -170,6 +170,7 @@ def test_wrapping_under_other_wrappers_works():
     assert "episode" in first[4]
 
 
+@pytest.mark.filterwarnings("ignore:.*precision lowered by casting")
 def test_wrapper_that_changes_the_safe_action_is_an_error():
     rescaled = gym.wrappers.RescaleAction(gym.make("safe_envs/Scalar-v0"), -2.0, 2.0)
     env = SafetyFilterWrapper(rescaled, "scbf")
@@ -179,7 +180,7 @@ def test_wrapper_that_changes_the_safe_action_is_an_error():
     outside = gym.wrappers.RescaleAction(SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0"), "scbf"), -2.0, 2.0)
     outside.reset(seed=0)
     np.testing.assert_allclose(outside.step(np.array([1.0]))[4]["nominal_action"], [5.0])
-    vector = gym.wrappers.vector.RescaleAction(gym.make_vec("safe_envs/Scalar-v0", num_envs=2), np.float32(-2.0), np.float32(2.0))
+    vector = gym.wrappers.vector.RescaleAction(gym.make_vec("safe_envs/Scalar-v0", num_envs=2), -2.0, 2.0)
     batch = SafetyFilterVectorWrapper(vector, "scbf")
     batch.reset(seed=0)
     with pytest.raises(ConfigurationError, match="changed the safe action"):
