@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
 
 from safe_envs import ENV_IDS, SafeEnv, SafetyProblem
 from safe_envs.errors import ConfigurationError, nearest
@@ -18,7 +19,7 @@ def full_id(env_id: str) -> str:
         ConfigurationError: there is no such id.
     """
     for candidate in (env_id, f"safe_envs/{env_id}"):
-        if candidate in gym.registry or ":" in candidate:
+        if candidate in gym.registry:
             return candidate
     raise ConfigurationError(f"unknown env {env_id!r}; {nearest(env_id, ENV_IDS)}")
 
@@ -33,14 +34,12 @@ def make_env(env_id: str, options: Mapping[str, Any] | None = None) -> SafeEnv:
     Raises:
         ConfigurationError: the id is unknown or not of this project, or an argument is not allowed.
     """
-    given = {key: value for key, value in (options or {}).items() if value is not None}
-    try:
-        env = gym.make(full_id(env_id), disable_env_checker=True, **given).unwrapped
-    except ModuleNotFoundError as error:
-        raise ConfigurationError(f"unknown env {env_id!r}: {error}") from error
-    if not isinstance(env, SafeEnv):
+    spec = gym.spec(full_id(env_id))
+    creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
+    if not (isinstance(creator, type) and issubclass(creator, SafeEnv)):
         raise ConfigurationError(f"{env_id} is not one of this project's envs; {nearest(env_id, ENV_IDS)}")
-    return env
+    given = {key: value for key, value in (options or {}).items() if value is not None}
+    return gym.make(spec, disable_env_checker=True, **given).unwrapped  # pyright: ignore[reportReturnType]
 
 
 def load_problem(env_id: str, options: Mapping[str, Any] | None = None) -> SafetyProblem:

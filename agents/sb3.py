@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -65,18 +67,19 @@ def _load(path: Path) -> Any:
 
     # Small networks run many times slower on several threads of a busy machine.
     torch.set_num_threads(1)
-    data, parameters, _ = load_from_zip_file(path, device="cpu")
-    missing = [key for key in ("policy_class", "observation_space", "action_space") if key not in (data or {})]
-    if missing or data is None:
-        raise ConfigurationError(f"{path} holds no readable {', '.join(missing)}; save it with this version of Stable-Baselines3")
-    options = dict(data.get("policy_kwargs") or {})
-    if data.get("use_sde"):
-        options["use_sde"] = True
-    network = data["policy_class"](data["observation_space"], data["action_space"], _no_learning, **options)
     try:
+        data, parameters, _ = load_from_zip_file(path, device="cpu")
+        saved: Mapping[str, Any] = data or {}
+        options = dict(saved.get("policy_kwargs") or {})
+        if saved.get("use_sde"):
+            options["use_sde"] = True
+        network = saved["policy_class"](saved["observation_space"], saved["action_space"], _no_learning, **options)
         network.load_state_dict(parameters["policy"])
-    except RuntimeError as error:
-        raise ConfigurationError(f"the weights in {path} do not fit its policy: {error}") from error
+    except (AttributeError, LookupError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError) as error:
+        raise ConfigurationError(
+            f"{path} cannot be read as a policy ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else error!r}); "
+            "it is damaged, or another version of Stable-Baselines3 saved it"
+        ) from error
     network.set_training_mode(False)
     return network.to("cpu")
 

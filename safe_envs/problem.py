@@ -17,6 +17,9 @@ from safe_envs.sde import ControlAffineSDE, finite_number
 TIME = sp.Symbol("t", real=True)
 """Time since the start of the episode, in s: references and rewards may depend on it."""
 
+_WIDEST = 1e100
+"""Largest bound of a box: its square, an effort, is still a number."""
+
 
 @dataclass(frozen=True)
 class Variable:
@@ -134,9 +137,9 @@ class SafetyProblem:
             known = (*(f.symbol for f in self.features), *model.parameters)
             plant.require_known("the nominal controller", law.free_symbols, known)
         for i in self.inputs:
-            if not (math.isfinite(i.low) and math.isfinite(i.high) and i.low < i.high):
+            if not -_WIDEST <= i.low < i.high <= _WIDEST:
                 raise ConfigurationError(
-                    f"box of input {i.symbol} is [{i.low}, {i.high}]; it needs finite bounds, the lower one below the upper. "
+                    f"box of input {i.symbol} is [{i.low}, {i.high}]; it needs bounds within {_WIDEST:g}, the lower one below the upper. "
                     "Unbounded control is a wide box"
                 )
         self._check_timing()

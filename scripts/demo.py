@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from agents.evaluation import evaluate
 from agents.problems import make_env
@@ -79,7 +80,13 @@ def train(path: Path, tell: Callable[[float], None] | None = None, steps: int = 
         device="cpu",
         seed=seed,
     )
-    model.learn(steps, callback=None if tell is None else lambda found, _: tell(found["self"].num_timesteps / steps))
+
+    def note(found: dict[str, Any], _: dict[str, Any]) -> bool:
+        if tell is not None:
+            tell(found["self"].num_timesteps / steps)
+        return True  # anything else would end the training
+
+    model.learn(steps, callback=note)
     model.save(path)
     envs.close()
 

@@ -42,7 +42,8 @@ def require_format(path: Path) -> None:
     Raises:
         ConfigurationError: it does not.
     """
-    formats = sorted(Figure().canvas.get_supported_filetypes())
+    # pgf is left out: it needs a TeX installation.
+    formats = sorted(set(Figure().canvas.get_supported_filetypes()) - {"pgf"})
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in formats:
         raise ConfigurationError(f"--plot {path}: unknown format {suffix!r}; {nearest(suffix, formats)}")
@@ -88,7 +89,7 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
         lowest, highest, last = min(lowest, low.min()), max(highest, high.max()), max(last, time[-1])
     # Far below 0 it does not matter how far: what is seen of the filters shall not shrink for that.
     bottom = max(lowest, -highest) if highest > 0.0 else lowest
-    margin = 0.05 * (highest - bottom)
+    margin = 0.05 * max(highest - bottom, 1e-3)
     axes.set(xlim=(0.0, max(last, evaluation.problem.dt)), ylim=(bottom - margin, highest + margin))
     axes.axhspan(bottom - margin, 0.0, color=_UNSAFE, alpha=0.35, linewidth=0, zorder=0)
     axes.axhline(0.0, color="black", linewidth=1.2)

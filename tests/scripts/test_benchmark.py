@@ -1,0 +1,54 @@
+"""The benchmark measures; how fast things are is not tested here."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from scripts import benchmark
+from wrappers import SafetyFilterWrapper
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(benchmark, "_ROUNDS", 1)
+    monkeypatch.setattr(benchmark, "_SECONDS_PER_ROUND", 1e-4)
+
+
+def test_figures_are_finite_and_positive_and_ratios_fit(quick):
+    figures = benchmark.measure()
+    assert all(math.isfinite(value) and value > 0 for value in figures.values())
+    for batch in (1, 32, 1024, 10_000):
+        assert sum(name.startswith(f"filter call, {batch} state") for name in figures) == 1
+    step, vector = "env.step, {}", "vector env, {}"
+    assert figures["filtered / bare env.step"] == pytest.approx(figures[step.format("filtered")] / figures[step.format("bare")])
+    for name in ("bare", "filtered"):
+        assert figures[f"vector env, {name}, million steps a second"] == pytest.approx(1 / figures[vector.format(name)])
+    assert figures["speed of the filtered vector env / fused loop"] == pytest.approx(
+        figures["hand-fused loop"] / figures[vector.format("filtered")]
+    )
+
+
+def test_command_prints_and_writes_the_figures(quick, tmp_path, capsys):
+    benchmark.benchmark(tmp_path / "out.json")
+    figures = json.loads((tmp_path / "out.json").read_text())
+    out = capsys.readouterr().out
+    for name in figures:
+        assert name in out
+
+
+def test_the_fused_loop_does_the_work_of_the_filter():
+    step = benchmark._fused_loop().call
+    cells = dict(zip(step.__code__.co_freevars, step.__closure__, strict=True))
+    before = np.stack([cells[name].cell_contents for name in ("x", "y", "theta")], axis=1)
+    step()
+    env = gym.make("safe_envs/StochasticDubins-v0").unwrapped
+    turned = (cells["theta"].cell_contents - before[:, 2]) / env.problem.dt
+    result = SafetyFilterWrapper(env, "scbf").safety_filter.filter(before, np.full((len(before), 1), 3.0))
+    np.testing.assert_allclose(turned, result.action[:, 0], rtol=1e-9, atol=1e-9)
+    assert result.active.any()
+    assert not result.active.all()
