@@ -10,6 +10,7 @@ import numpy as np
 from agents.policy import Policy
 from agents.statistics import FirstValues, RunningSum, share, wilson_interval
 from safe_envs.codegen import Components
+from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info
 from safe_envs.vector import SafeVectorEnv
 from wrappers import SafetyFilterVectorWrapper
@@ -20,6 +21,7 @@ Row = dict[str, Any]
 
 _KEPT_BARRIERS = 256
 _KEPT_STATES = 32
+_MOST_RECORDED = 1_000_000
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -33,9 +35,14 @@ class Recorder:
     Attributes:
         barrier: smallest barrier value, shape (steps + 1, at most 256).
         states: shape (steps + 1, at most 32, n).
+
+    Raises:
+        ConfigurationError: an episode has more steps than a picture could show.
     """
 
     def __init__(self, steps: int, states: int, episodes: int) -> None:
+        if steps > _MOST_RECORDED:
+            raise ConfigurationError(f"an episode of {steps} steps is too long to draw; choose a horizon of at most {_MOST_RECORDED} steps")
         self.barrier = np.full((steps + 1, min(episodes, _KEPT_BARRIERS)), np.nan)
         self.states = np.full((steps + 1, min(episodes, _KEPT_STATES), states), np.nan)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import struct
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -75,7 +76,7 @@ def _load(path: Path) -> Any:
             options["use_sde"] = True
         network = saved["policy_class"](saved["observation_space"], saved["action_space"], _no_learning, **options)
         network.load_state_dict(parameters["policy"])
-    except (AttributeError, LookupError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError) as error:
+    except (AttributeError, EOFError, LookupError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError, struct.error) as error:
         raise ConfigurationError(
             f"{path} cannot be read as a policy ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else error!r}); "
             "it is damaged, or another version of Stable-Baselines3 saved it"
