@@ -29,19 +29,12 @@ At reset, where nothing was executed yet, the actions are the point of the box n
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 Info = dict[str, Any]
-
-_MASKS = {
-    key: f"_{key}"
-    for key in (
-        *("cost", "violation", "barrier", "h_min", "episode_cost", "nominal_action", "safe_action", "intervention"),
-        *("filter_active", "feasible", "slack", "episode_interventions", "episode_infeasible"),
-    )
-}
 
 
 def safety_info(violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any) -> Info:
@@ -80,6 +73,10 @@ def filter_info(
 
 def with_masks(info: Info, present: np.ndarray) -> Info:
     """Add Gymnasium's `_key` masks, which say for which envs of a batch a key was reported."""
-    for key in tuple(info):
-        info[_MASKS.get(key) or f"_{key}"] = present
+    info.update(dict.fromkeys(_mask_names(tuple(info)), present))
     return info
+
+
+@lru_cache(maxsize=64)
+def _mask_names(keys: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple([f"_{key}" for key in keys])

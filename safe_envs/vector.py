@@ -78,6 +78,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._seeds: list[int] = []
         self.executed: Sequence[Any] = ()
         self._x: Components = ()
+        self._everywhere = np.ones(num_envs, dtype=bool)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._h_min = np.full(num_envs, np.inf)
         self._episode_cost = np.zeros(num_envs)
@@ -180,7 +181,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 observation, _, _, _, info = self._observe(tuple(self._center), counted=ended)
         else:
             self._ended = ended
-        return observation, reward, terminated, truncated, {**with_masks(info, np.ones(self.num_envs, dtype=bool)), **last}
+        return observation, reward, terminated, truncated, {**with_masks(info, self._everywhere.copy()), **last}
 
     def _last_of_episode(self, ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
         """Keep what the ended envs showed last, and restart them."""
@@ -209,10 +210,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return [None if s is None else int(s) for s in seed]
 
     def _reset_mask(self, options: Mapping[str, Any] | None) -> np.ndarray:
-        everything = np.ones(self.num_envs, dtype=bool)
         given = (options or {}).get("reset_mask")
         if given is None:
-            return everything
+            return self._everywhere.copy()
         mask = np.asarray(given)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
             raise ConfigurationError(f"reset_mask must be a bool array of shape ({self.num_envs},) with a True in it; given {given!r}")
