@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ POLICIES = ("nominal", "zero", "random")
 """Names that `make_policy` knows besides the path of a file."""
 
 
-class Policy:
+class Policy(ABC):
     """Base of this project's policies, with the `predict` of Stable-Baselines3.
 
     Attributes:
@@ -23,7 +24,7 @@ class Policy:
 
     deterministic: bool = True
 
-    def begin(self, episodes: range, seed: int) -> None:
+    def begin(self, episodes: range, seed: int) -> None:  # noqa: B027  (most policies need not know)
         """Learn which episodes the rows of the coming batches belong to, before each wave of an evaluation.
 
         What a policy does in an episode may depend on the episode and the seed, never on the other rows: the
@@ -34,6 +35,7 @@ class Policy:
             seed: of the evaluation.
         """
 
+    @abstractmethod
     def predict(
         self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
@@ -48,7 +50,6 @@ class Policy:
         Returns:
             Actions in [-1, 1], shape (m,) or (B, m), and the hidden state.
         """
-        raise NotImplementedError
 
 
 def make_policy(name: str, problem: SafetyProblem) -> Policy:

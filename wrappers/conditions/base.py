@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar, NamedTuple
 
@@ -28,7 +29,7 @@ class AffineConstraint(NamedTuple):
         return cls(tuple(tidied(a[0, j]) for j in range(model.m)), tidied(offset), tuple(chain))
 
 
-class Condition:
+class Condition(ABC):
     """Base of the conditions, which are small frozen dataclasses of their parameters.
 
     Attributes:
@@ -37,14 +38,14 @@ class Condition:
 
     name: ClassVar[str]
 
+    @abstractmethod
     def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint for a model and a barrier, in the model's symbols."""
-        raise NotImplementedError
 
     @classmethod
+    @abstractmethod
     def for_gains(cls, gains: Sequence[float]) -> Condition:
         """The condition with the rates p_1..p_r of a problem for its parameters."""
-        raise NotImplementedError
 
     @property
     def spec(self) -> str:
