@@ -43,5 +43,11 @@ def make_env(env_id: str, options: Mapping[str, Any] | None = None) -> SafeEnv:
 
 
 def load_problem(env_id: str, options: Mapping[str, Any] | None = None) -> SafetyProblem:
-    """The problem of a registered env; arguments and errors as for `make_env`."""
+    """The problem of a registered env; arguments and errors as for `make_env`.
+
+    Raises:
+        ConfigurationError: `max_episode_steps` is given, which is no property of a problem.
+    """
+    if (options or {}).get("max_episode_steps") is not None:
+        raise ConfigurationError("max_episode_steps is not part of a problem; shorten its episodes by horizon")
     return make_env(env_id, options).problem

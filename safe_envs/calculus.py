@@ -100,14 +100,16 @@ def relative_degree(system: ControlAffineSDE, expression: sp.Expr, derivative: D
             is meant.
 
     Raises:
-        RelativeDegreeError: the input reaches none of the first n derivatives, or h does not depend on the states.
+        RelativeDegreeError: the input reaches none of the first n derivatives (3 n with the generator), or h does not depend on the states.
     """
     system.require_known("the barrier", expression.free_symbols, system.states)
-    for order in range(system.n):
+    # Differentiation along a flow leaves nothing new after n orders; the Ito term has no such bound.
+    orders = system.n if derivative is drift_derivative else 3 * system.n
+    for order in range(orders):
         if any(not vanishes(system, entry) for entry in input_derivative(system, expression)):
             return order + 1
         expression = derivative(system, expression)
     raise RelativeDegreeError(
-        f"no input ({', '.join(map(str, system.inputs))}) appears in the first {system.n} derivatives of the barrier: "
+        f"no input ({', '.join(map(str, system.inputs))}) appears in the first {orders} derivatives of the barrier: "
         "it has no relative degree, and no action can keep it positive. Check the barrier and the input matrix"
     )

@@ -147,7 +147,7 @@ class SafetyProblem:
     def _check_timing(self) -> None:
         if not self.dt > 0 or not math.isfinite(self.dt):
             raise ConfigurationError(f"dt = {self.dt} s; a control period is positive and finite")
-        if not math.isfinite(self.horizon) or round(self.horizon / self.dt) < 1:
+        if not math.isfinite(self.horizon / self.dt) or round(self.horizon / self.dt) < 1:
             raise ConfigurationError(f"horizon = {self.horizon} s; it must hold at least one control period of {self.dt} s")
         if not isinstance(self.substeps, int) or self.substeps < 1:
             raise ConfigurationError(f"substeps = {self.substeps!r}; give a whole number from 1")
@@ -239,9 +239,10 @@ class SafetyProblem:
 
     def _fixed(self, start: Sequence[float]) -> Start:
         names = ", ".join(s.symbol.name for s in self.states)
-        if len(start) != len(self.states):
-            raise ConfigurationError(f"start has {len(start)} numbers; the state has {len(self.states)}: {names}")
-        values = [finite_number(f"start of {s.symbol}", v) for s, v in zip(self.states, start, strict=True)]
+        given = _numbers(start)
+        if given.shape != (len(self.states),):
+            raise ConfigurationError(f"start has {given.size} numbers; the state has {len(self.states)}: {names}")
+        values = [finite_number(f"start of {s.symbol}", v) for s, v in zip(self.states, given.tolist(), strict=True)]
         for s, v in zip(self.states, values, strict=True):
             if not s.low <= v <= s.high:
                 raise ConfigurationError(f"start of {s.symbol} = {v} is outside the workspace [{s.low}, {s.high}]")

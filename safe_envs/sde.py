@@ -130,7 +130,11 @@ class ControlAffineSDE:
 
     def numeric(self, expression: Any) -> Any:
         """Return an expression or matrix with the parameters' values in place of their symbols."""
-        return expression.subs({p: sp.Float(v, 17) if v != int(v) else sp.Integer(int(v)) for p, v in self.parameters.items()})
+        found = expression.subs({p: sp.Float(v, 17) if v != int(v) else sp.Integer(int(v)) for p, v in self.parameters.items()})
+        if found.has(sp.zoo, sp.nan, sp.oo, -sp.oo):
+            values = ", ".join(f"{p} = {v:g}" for p, v in self.parameters.items())
+            raise ConfigurationError(f"the system has no finite value for its parameters ({values}); look for a division by 0")
+        return found
 
     def exact(self, expression: Any) -> Any:
         """Like `numeric`, with the decimal value of each parameter as a rational, so that terms cancel exactly."""

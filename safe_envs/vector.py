@@ -117,7 +117,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         given = np.asarray(actions, dtype=np.float64)
         if given.shape != self.action_space.shape:
             raise InvalidInputError(f"actions have shape {given.shape}; the envs take {self.action_space.shape}")
-        if not finite(given):
+        with np.errstate(over="ignore"):
+            suspicious = not finite(given)
+        if suspicious and not np.isfinite(given).all():
             bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
             raise InvalidInputError(f"the actions of envs {bad[:5].tolist()} are not finite; give numbers in [-1, 1]")
         clipped = np.minimum(np.maximum(given, _LOWEST), _HIGHEST)
@@ -244,8 +246,6 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observation = rows.T
         barrier = stacked(barriers, self.num_envs)
         h = barriers[0] if len(barriers) == 1 else barrier.min(axis=1)
-        if not finite(h):
-            self._report_breakdown(h)
         violation = h < 0.0
         cost = violation.astype(np.float64)
         self._episode_cost += cost if counted is None else cost * counted
@@ -254,13 +254,15 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if np.count_nonzero(terminated):
             envs = np.flatnonzero(terminated)
             observation[envs] = np.clip(observation[envs], self._bounds.low, self._bounds.high)
+        if not (finite(h) and finite(rows)):
+            self._report_breakdown(h, observation)
         if self.problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
         info = safety_info(violation, cost, barrier, self._h_min.copy(), self._episode_cost.copy())
-        return observation, filled(reward, (self.num_envs,)), terminated, self._steps >= self._limit, info
+        return observation, filled(reward, (self.num_envs,)).copy(), terminated, self._steps >= self._limit, info
 
-    def _report_breakdown(self, h: np.ndarray) -> None:
-        broken = ~np.isfinite(h)
+    def _report_breakdown(self, h: np.ndarray, observation: np.ndarray) -> None:
+        broken = ~(np.isfinite(h) & np.isfinite(observation).all(axis=1))
         if broken.any():
             raise NumericalError(
                 f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r} have left the finite numbers; "

@@ -40,6 +40,16 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     console.print()
     console.print(table)
     console.print()
+    whole = evaluation.problem.steps * evaluation.config["episodes"]
+    for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True):
+        if speed["steps"] < 0.99 * whole:
+            length = speed["steps"] / evaluation.config["episodes"]
+            console.print(
+                f"Note: with {row['filter']} the mean episode ends after {length:.1f} of {evaluation.problem.steps} steps, at the goal or "
+                "outside the workspace; its safety is that of the instants until then.",
+                soft_wrap=True,
+                highlight=False,
+            )
     if evaluation.repeats:
         console.print(
             "Note: nothing is random here (no noise, a fixed start, a deterministic policy), so that all episodes are "

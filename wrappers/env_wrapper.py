@@ -61,7 +61,8 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
             observation, reward, terminated, truncated, info = self._inner.step_physical(executed)
         else:
             observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(executed))
-            require_executed(self, executed, self._inner.executed)
+            if any([abs(u - v) > 1e-12 + 1e-6 * abs(v) for u, v in zip(executed, self._inner.executed, strict=True)]):  # noqa: C419  (a list is faster here)
+                raise changed_action(self, executed, self._inner.executed)
         differs = active and executed != proposed
         self._interventions += differs
         self._infeasible += not decision.feasible
@@ -87,14 +88,12 @@ def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv) -> bool:
     return env is inner
 
 
-def require_executed(wrapper: object, decided: Sequence[Any], executed: Sequence[Any]) -> None:
-    """Raise ConfigurationError if a wrapper below the filter changed the action that the filter decided on."""
-    for u, v in zip(decided, executed, strict=True):
-        if not np.allclose(u, v, rtol=1e-6, atol=1e-12):
-            raise ConfigurationError(
-                f"a wrapper below the filter changed the safe action {u} into {v}: {wrapper}. Put wrappers that change actions "
-                "around the filter; several conditions go into one SafetyFilter"
-            )
+def changed_action(wrapper: object, decided: Sequence[Any], executed: Sequence[Any]) -> ConfigurationError:
+    """The error of a wrapper below the filter that changed the action that the filter decided on."""
+    return ConfigurationError(
+        f"a wrapper below the filter changed the safe action {decided} into {executed}: {wrapper}. Put wrappers that change "
+        "actions around the filter; several conditions go into one SafetyFilter"
+    )
 
 
 def build_filter(problem: SafetyProblem, condition: Condition | str, knowledge: str) -> tuple[str, SafetyFilter]:

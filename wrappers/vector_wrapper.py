@@ -14,7 +14,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info, filter_info, with_masks
 from safe_envs.vector import SafeVectorEnv, VectorStep
 from wrappers.conditions import Condition
-from wrappers.env_wrapper import build_filter, require_executed, rest_info
+from wrappers.env_wrapper import build_filter, changed_action, rest_info
 from wrappers.safety_filter import Decision
 
 
@@ -59,7 +59,9 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             observation, reward, terminated, truncated, info = self._inner.step_physical(decision.action)
         else:
             observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(decision.action))
-            require_executed(self, decision.action, self._inner.executed)
+            for u, v in zip(decision.action, self._inner.executed, strict=True):
+                if not np.allclose(u, v, rtol=1e-6, atol=1e-12):
+                    raise changed_action(self, decision.action, self._inner.executed)
         added = self._decided(proposed, decision, active)
         ended = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):

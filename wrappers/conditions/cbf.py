@@ -97,9 +97,10 @@ class ECBF(Condition):
         object.__setattr__(self, "k", gains)
         s = sp.Symbol("s")
         polynomial = sp.Poly([1, *(sp.Rational(repr(g)) for g in reversed(gains))], s)
-        # Positive coefficients leave no root at or right of 0, so that only complex ones remain to be refused.
-        if polynomial.count_roots() < len(sp.sqf_part(polynomial).all_coeffs()) - 1:
-            roots = ", ".join(str(sp.N(root, 4)) for root in polynomial.nroots())
+        roots = polynomial.nroots(maxsteps=200)
+        # Rounding splits a multiple pole into a ring about it: what oscillates a thousand times slower than it decays is real.
+        if any(sp.re(root) >= 0 or abs(sp.im(root)) > 1e-3 * abs(root) for root in roots):
+            roots = ", ".join(str(sp.N(root, 4)) for root in roots)
             raise ConfigurationError(
                 f"k = {gains} places complex poles ({roots}), so that h would oscillate through 0; place real negative ones"
             )

@@ -14,9 +14,6 @@ from typing import Any
 
 import numpy as np
 
-_ROUNDING = 8 * float(np.finfo(float).eps)
-"""Relative rounding of a sum of a few products: a margin below it cannot be told from 0."""
-
 
 def project_floats(
     a: Sequence[float], b: float, u: Sequence[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
@@ -34,10 +31,9 @@ def project_floats(
     if margin >= 0.0:
         return u, margin, False, True
     u = _follow_multiplier(a, b, v, low, high, w)
-    products = [aj * uj for aj, uj in zip(a, u, strict=True)]
-    margin = b + sum(products)
-    feasible = margin >= -_ROUNDING * (abs(b) + sum([abs(p) for p in products]))
-    return u, margin, True, feasible
+    margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])
+    reach = b + sum([max(aj * lo, aj * hi) for aj, lo, hi in zip(a, low, high, strict=True)])
+    return u, margin, True, reach >= 0.0
 
 
 def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tuple[list[float], float, bool, bool]:
@@ -56,6 +52,8 @@ def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tu
 def _follow_multiplier(
     a: Sequence[float], b: float, v: Sequence[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
 ) -> list[float]:
+    size = max([abs(aj) for aj in a]) or 1.0
+    a, b = [aj / size for aj in a], b / size  # so that products neither overflow nor vanish
     d = [aj / wj for aj, wj in zip(a, w, strict=True)]
     enter, leave = [0.0] * len(a), [0.0] * len(a)
     for j, (dj, vj, lo, hi) in enumerate(zip(d, v, low, high, strict=True)):
@@ -101,9 +99,8 @@ def project_arrays(
     if not np.count_nonzero(active):
         return u, margin, active, ~active
     u = _follow_multipliers(a, b, v, u, low, high, w, np.flatnonzero(active))
-    margin = _dot(a, u) + b
-    scale = _dot([np.abs(aj) for aj in a], [np.abs(uj) for uj in u]) + np.abs(b)
-    return u, margin, active, margin >= -_ROUNDING * scale
+    reach = sum([np.maximum(aj * lo, aj * hi) for aj, lo, hi in zip(a, low, high, strict=True)]) + b
+    return u, _dot(a, u) + b, active, ~active | (reach >= 0.0)
 
 
 def _project_scalars(a: Any, b: Any, v: np.ndarray, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -141,7 +138,9 @@ def _follow_multipliers(
     batch = u[0].shape
     ar = np.array([np.broadcast_to(aj, batch)[rows] for aj in a])
     vr = np.array([vj[rows] for vj in v])
-    br = np.broadcast_to(b, batch)[rows]
+    size = np.abs(ar).max(axis=0)
+    size[size == 0.0] = 1.0
+    ar, br = ar / size, np.broadcast_to(b, batch)[rows] / size  # so that products neither overflow nor vanish
     lo, hi, wr = (np.array(c)[:, None] for c in (low, high, w))
     d = ar / wr
     near, far = np.where(d > 0.0, lo, hi), np.where(d > 0.0, hi, lo)

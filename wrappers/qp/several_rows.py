@@ -90,7 +90,8 @@ class _Scaled(NamedTuple):
             slack = np.maximum(-(self.rows[i] @ least + self.offsets[i]), 0.0)
             nearest = self._nearest(i, slack + _ACCEPTED)
             z[i] = least if nearest is None else nearest
-            met[i] = bool((slack <= _ACCEPTED).all())
+            # Without a certified minimiser the rows may be met, but the step is flagged all the same.
+            met[i] = nearest is not None and bool((slack <= _ACCEPTED).all())
         return z, met
 
     def _in_batch(self, threads: int) -> tuple[np.ndarray, np.ndarray]:
@@ -103,7 +104,7 @@ class _Scaled(NamedTuple):
                 setattr(qp.settings, name, value)
             rows = np.vstack([self.rows[i], np.eye(m)])
             lower = np.concatenate([-self.offsets[i], -np.ones(m)])
-            qp.init(self.hessian, -self.hessian @ self.target[i], None, None, rows, lower, upper)
+            qp.init(*self._objective(i), None, None, rows, lower, upper)
         proxqp.dense.solve_in_parallel(batch, threads)
         z, met = np.zeros((count, m)), np.zeros(count, dtype=bool)
         for i in range(count):
@@ -112,6 +113,11 @@ class _Scaled(NamedTuple):
                 z[i], met[i] = results.x, True
         return z, met
 
+    def _objective(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+        """Hessian and gradient, scaled down where the proposal lies far outside the box."""
+        size = max(1.0, float(np.abs(self.target[i]).max()))
+        return self.hessian / size, -self.hessian @ self.target[i] / size
+
     def _meets(self, i: int, z: np.ndarray, slack: np.ndarray | float) -> bool:
         rows_met = self.rows[i] @ z + self.offsets[i] + slack >= -_ACCEPTED
         return bool(rows_met.all() and (np.abs(z) <= 1.0 + _ACCEPTED).all())
@@ -119,9 +125,7 @@ class _Scaled(NamedTuple):
     def _nearest(self, i: int, slack: np.ndarray) -> np.ndarray | None:
         """The minimiser with the rows relaxed until they can be met, without a guess; None where it is not found."""
         bound = np.ones(self.half.size)
-        problem = qpsolvers.Problem(
-            self.hessian, -self.hessian @ self.target[i], -self.rows[i], self.offsets[i] + slack, lb=-bound, ub=bound
-        )
+        problem = qpsolvers.Problem(*self._objective(i), -self.rows[i], self.offsets[i] + slack, lb=-bound, ub=bound)
         solution = qpsolvers.solve_problem(problem, solver="proxqp", initial_guess=proxqp.NO_INITIAL_GUESS, **_PRECISION)
         z = solution.x
         return z if solution.found and z is not None and self._meets(i, z, slack) else None
