@@ -97,6 +97,12 @@ def test_noise_can_lower_the_degree():
         relative_degree(system, x1**2, drift_derivative)
 
 
+def test_stochastic_degree_may_exceed_the_number_of_states():
+    x1, x2, u = sp.symbols("x1 x2 u", real=True)
+    system = ControlAffineSDE((x1, x2), (u,), [x1**2, 0], [0, 1], [x2, 0])
+    assert relative_degree(system, 1 - x1, generator) == 3
+
+
 def test_input_that_never_appears_is_an_error():
     x, y, u = sp.symbols("x y u", real=True)
     system = ControlAffineSDE((x, y), (u,), [-x, 0], [0, 1], [0, 0])

@@ -189,6 +189,8 @@ def test_actions_that_are_none_are_errors(action):
         ({"box": [2.0, 1.0]}, "box of input omega"),
         ({"box": [[0.0, 1.0], [0.0, 1.0]]}, "box = "),
         ({"start": [0.0, 0.0]}, "start has 2 numbers"),
+        ({"start": 0.5}, "start has 1 numbers"),
+        ({"dt": 1e-320}, "horizon = "),
         ({"start": [0.0, math.nan, 0.0]}, "start of y"),
         ({"start": [100.0, 0.0, 0.0]}, "outside the workspace"),
         ({"start": "inwards"}, "did you mean 'inward'"),
@@ -209,6 +211,27 @@ def test_divergence_is_an_error_not_a_nan(make):
     env.reset(seed=0)
     with pytest.raises(NumericalError, match="finite"):
         env.step(np.ones(env.action_space.shape, dtype=np.float32))
+
+
+def test_state_that_breaks_down_outside_the_barrier_is_an_error_too():
+    for make in (gym.make, gym.make_vec):
+        env = make("safe_envs/Quadrotor-v0", plant={"I_x": 1e-200})
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        with pytest.raises(NumericalError, match="finite|broke down"):
+            env.step(env.action_space.sample())
+
+
+def test_parameters_that_divide_by_zero_are_errors():
+    with pytest.raises(ConfigurationError, match="m = 0"):
+        gym.make("safe_envs/QuadrotorAltitude-v0", plant={"m": 0.0})
+
+
+def test_huge_actions_are_clipped():
+    for make in (gym.make, gym.make_vec):
+        env = make("safe_envs/Scalar-v0", noise=0.0)
+        env.reset(seed=0)
+        env.step(np.full(env.action_space.shape, 1e200))
 
 
 def test_steps_before_a_reset_are_errors():

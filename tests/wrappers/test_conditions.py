@@ -70,6 +70,9 @@ def test_wrong_relative_degrees_are_named():
 def test_ecbf_needs_real_negative_poles():
     assert ECBF((1.0, 2.0)).k == (1.0, 2.0)  # a double pole at -1
     assert ECBF((6.0, 11.0, 6.0)).k == (6.0, 11.0, 6.0)  # -1, -2, -3
+    for p in np.random.default_rng(0).uniform(0.05, 20.0, 50):
+        ECBF.for_gains((p, p))  # double poles, which rounding splits
+        ECBF.for_gains((p, p, p))
     with pytest.raises(ConfigurationError, match="complex poles"):
         ECBF((2.0, 1.0))
     with pytest.raises(ConfigurationError, match="positive"):

@@ -138,3 +138,24 @@ def test_proposal_outside_the_box_is_projected_onto_row_and_box_at_once():
     # Clipping first and projecting then would give (0.5, 0.5).
     u, *_ = project_floats([-1.0, -1.0], 1.0, [3.0, 1.0], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0])
     np.testing.assert_allclose(u, [1.0, 0.0], atol=1e-12)
+
+
+def test_feasibility_is_decided_by_the_reach_of_the_box_and_not_by_rounding():
+    u, _, _, feasible = project_floats(
+        [-1.0202216377232305, 0.14422933038232305], -0.011445797228288595, [2.182723419535889, -0.11143900878845633],
+        [-1.5263859058894809, -0.4477092783909338], [0.27884684919436314, 2.9190568849119978], [1.0, 1.0],
+    )  # fmt: skip
+    assert feasible
+    np.testing.assert_allclose(u, [0.01632375909475714, 0.19482617988487125], rtol=1e-12)
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-200, 1.0, 1e200, 1e300])
+def test_size_of_a_row_does_not_matter(size):
+    arguments = ([0.0, 0.3], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0])
+    u, _, _, feasible = project_floats([size, 2 * size], -1.5 * size, *arguments)
+    assert feasible
+    np.testing.assert_allclose(u, [0.18, 0.66], rtol=1e-12)
+    v, low, high, w = arguments
+    arrays = project_arrays([np.array([size]), np.array([2 * size])], np.array([-1.5 * size]), [np.array([c]) for c in v], low, high, w)
+    np.testing.assert_allclose([c[0] for c in arrays[0]], u, rtol=1e-12)
+    assert arrays[3].tolist() == [True]
