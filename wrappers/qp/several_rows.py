@@ -31,7 +31,7 @@ class Projection(NamedTuple):
     feasible: np.ndarray
 
 
-def project(a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray, threads: int = 1) -> Projection:
+def project(a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray) -> Projection:
     """Project proposed inputs onto k rows a u + b >= 0 and a box.
 
     Args:
@@ -41,7 +41,6 @@ def project(a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: 
         low: lower bounds, shape (m,).
         high: upper bounds, shape (m,).
         w: positive weights, shape (m,).
-        threads: that ProxQP may use.
     """
     u = np.clip(v, low, high)
     margin = (a @ u[:, :, None])[:, :, 0] + b
@@ -50,7 +49,7 @@ def project(a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: 
     acting = np.flatnonzero((margin < 0.0).any(axis=1))
     if acting.size:
         scaled = _Scaled.of(a[acting], b[acting], v[acting], low, high, w)
-        z, met = scaled.solve(threads)
+        z, met = scaled.solve()
         feasible[acting] = met
         u[acting] = np.clip(scaled.center + scaled.half * z, low, high)
         margin[acting] = (a[acting] @ u[acting][:, :, None])[:, :, 0] + b[acting]
@@ -82,9 +81,9 @@ class _Scaled(NamedTuple):
             rows / lengths[:, :, None], offsets / lengths, lengths, (v - center) / half, np.diag(curvature / curvature.max()), center, half
         )
 
-    def solve(self, threads: int) -> tuple[np.ndarray, np.ndarray]:
+    def solve(self) -> tuple[np.ndarray, np.ndarray]:
         """Minimisers (B, m), and whether the rows are met (B,)."""
-        z, met = self._in_batch(threads)
+        z, met = self._in_batch()
         for i in np.flatnonzero(~met).tolist():
             least = self._least_violating(i)
             slack = np.maximum(-(self.rows[i] @ least + self.offsets[i]), 0.0)
@@ -94,7 +93,7 @@ class _Scaled(NamedTuple):
             met[i] = nearest is not None and bool((slack <= _ACCEPTED).all())
         return z, met
 
-    def _in_batch(self, threads: int) -> tuple[np.ndarray, np.ndarray]:
+    def _in_batch(self) -> tuple[np.ndarray, np.ndarray]:
         count, k, m = self.rows.shape
         batch = proxqp.dense.BatchQP(count)
         upper = np.concatenate([np.full(k, _INFINITY), np.ones(m)])
@@ -105,7 +104,7 @@ class _Scaled(NamedTuple):
             rows = np.vstack([self.rows[i], np.eye(m)])
             lower = np.concatenate([-self.offsets[i], -np.ones(m)])
             qp.init(*self._objective(i), None, None, rows, lower, upper)
-        proxqp.dense.solve_in_parallel(batch, threads)
+        proxqp.dense.solve_in_parallel(batch, 1)
         z, met = np.zeros((count, m)), np.zeros(count, dtype=bool)
         for i in range(count):
             results = batch.get(i).results
