@@ -1,6 +1,8 @@
-"""The min-norm law of a control Lyapunov function, in closed form and in symbols."""
+"""A control Lyapunov function as a soft goal, and its min-norm law in closed form."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import sympy as sp
 
@@ -8,30 +10,40 @@ from safe_envs.calculus import generator, input_derivative
 from safe_envs.sde import ControlAffineSDE
 
 
-def min_norm_clf(
-    system: ControlAffineSDE, V: sp.Expr, rate: float, input_weight: sp.Expr | float, slack_weight: sp.Expr | float
-) -> tuple[sp.Expr, ...]:
-    """The input of the smallest cost that makes V decay, with a slack d that keeps the program feasible.
+@dataclass(frozen=True)
+class CLF:
+    """V is to decay at a rate, as far as that is worth its cost.
 
-        min  w_u |u|^2 + w_d d^2   s.t.   a + b u <= d,   a = L_f V + 1/2 tr(sigma sigma' V_xx) + rate V,   b = L_g V
+        min  w_u |u|^2 + w_d d^2   s.t.   AV + rate V <= d
 
-    Its only constraint is inactive where a <= 0. Elsewhere the multiplier follows from a + b u = d, so that
-    u = -b' max(a, 0) / (b b' + w_u / w_d): there is no division by zero, for w_u > 0.
+    The slack d keeps the program feasible: without it AV <= 0 cannot hold at the goal under noise.
 
-    Args:
-        system: whose generator is taken. Its parameters stay symbols in the result.
-        V: the Lyapunov function of the states.
-        rate: wanted decay rate of V, in 1/s.
-        input_weight: w_u.
-        slack_weight: w_d.
+    Attributes:
+        V: Lyapunov function of the states.
+        rate: wanted rate of decay, in 1/s.
+        input_weight: w_u > 0, an expression of the parameters.
+        slack_weight: w_d > 0, likewise.
 
-    Returns:
-        An expression of the states and parameters for each input.
-
-    Source: the CLF part of the quadratic programs in thesis Sec. 4.3.1. The print asks for AV <= d, without the rate,
-    and with the trace of sigma' sigma V_xx.
+    Source: the CLF part of the quadratic programs in thesis Sec. 4.3.1 and 5.4.2. Sec. 4.3.1 asks for AV <= d, without the
+    rate, with the trace of sigma' sigma V_xx and weights of 1/2 each, at which u stays near 0.
     """
-    a = generator(system, V) + sp.sympify(rate) * V
-    b = input_derivative(system, V)
-    scale = sp.Max(a, 0) / ((b * b.T)[0, 0] + sp.sympify(input_weight) / slack_weight)
-    return tuple(-scale * entry for entry in b)
+
+    V: sp.Expr
+    rate: float = 1.0
+    input_weight: sp.Expr | float = 1.0
+    slack_weight: sp.Expr | float = 1.0
+
+    def growth(self, system: ControlAffineSDE) -> tuple[sp.Expr, tuple[sp.Expr, ...]]:
+        """Offset a and coefficients b, one for each input, of AV + rate V = a + b u."""
+        b = input_derivative(system, self.V)
+        return generator(system, self.V) + sp.sympify(self.rate) * self.V, tuple(b)
+
+    def min_norm(self, system: ControlAffineSDE) -> tuple[sp.Expr, ...]:
+        """The input of the smallest cost, without a box: an expression of states and parameters for each input.
+
+        The only constraint is inactive where a <= 0. Elsewhere the multiplier follows from a + b u = d, so that
+        u = -b' max(a, 0) / (b b' + w_u / w_d): there is no division by zero.
+        """
+        a, b = self.growth(system)
+        scale = sp.Max(a, 0) / (sum(entry**2 for entry in b) + sp.sympify(self.input_weight) / self.slack_weight)
+        return tuple(-scale * entry for entry in b)

@@ -29,15 +29,19 @@ def action_box(problem: SafetyProblem) -> gym.spaces.Box:
 
 
 def make_problem(env_class: type[Any], barrier: Mapping[str, Any] | None, options: Mapping[str, Any]) -> SafetyProblem:
-    """Build the problem of a registered env class with the arguments of `gym.make`."""
-    for name, allowed, given in (
-        ("barrier argument", inspect.signature(env_class.problem_factory).parameters, barrier or {}),
-        ("argument", inspect.signature(SafetyProblem.configured).parameters, options),
-    ):
+    """Build the problem of a registered env class with the arguments of `gym.make`.
+
+    The arguments of the problem's factory may be given in `barrier` or by themselves.
+    """
+    of_factory = inspect.signature(env_class.problem_factory).parameters
+    of_problem = [name for name in inspect.signature(SafetyProblem.configured).parameters if name != "self"]
+    shape = {**(barrier or {}), **{key: value for key, value in options.items() if key in of_factory}}
+    settings = {key: value for key, value in options.items() if key not in of_factory}
+    for name, allowed, given in (("barrier argument", of_factory, shape), ("argument", (*of_problem, *of_factory), settings)):
         for key in given:
             if key not in allowed:
                 raise ConfigurationError(f"{env_class.__name__} has no {name} {key!r}; {nearest(key, allowed)}")
-    return env_class.problem_factory(**(barrier or {})).configured(**options)
+    return env_class.problem_factory(**shape).configured(**settings)
 
 
 class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -176,7 +180,7 @@ class SystemEnv(SafeEnv):
         noise: diffusion of plant and model, one number for all channels or one for each; 0 turns it off.
         plant: parameters of the simulated system, by name.
         model: parameters that the designer believes, by name.
-        barrier: arguments of the barrier, by name.
+        barrier: arguments of the barrier, by name; each may also be given by itself.
         dt: control period in s.
         substeps: integration steps in a control period.
         horizon: length of an episode in s.

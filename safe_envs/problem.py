@@ -11,6 +11,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.barrier import Barrier
+from safe_envs.clf import CLF
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
 from safe_envs.sde import ControlAffineSDE, finite_number
 
@@ -85,10 +86,11 @@ class SafetyProblem:
         features: entries of the observation; the states by default.
         goal: the episode ends where this expression is >= 0.
         noise: names of the diffusion parameters, in the order of the `noise` argument.
-        gains: rates p_1..p_r in 1/s that the conditions use unless told otherwise.
+        gains: rates p_1..p_r in 1/s that the conditions use unless told otherwise, for all barriers; or such a tuple for each.
         filter: name of the condition that suits the problem.
         substeps: integration steps in a control period.
         plane: the two states that draw a trajectory, if any.
+        clf: the task as a soft goal, if it is one.
 
     Raises:
         SystemDefinitionError: the parts do not fit together.
@@ -109,10 +111,11 @@ class SafetyProblem:
     start: str = ""
     goal: sp.Expr | None = None
     noise: tuple[str, ...] = ()
-    gains: tuple[float, ...] = (1.0,)
+    gains: tuple[float, ...] | tuple[tuple[float, ...], ...] = (1.0,)
     filter: str = "hocbf"
     substeps: int = 1
     plane: tuple[str, str] | None = None
+    clf: CLF | None = None
     box: tuple[tuple[float, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -130,6 +133,8 @@ class SafetyProblem:
             raise SystemDefinitionError(f"a problem needs a barrier and a nominal expression for each of the {plant.m} inputs")
         for barrier in self.barriers:
             plant.require_known(f"barrier {barrier.name}", barrier.expression.free_symbols, plant.states)
+        if isinstance(self.gains[0], tuple) and len(self.gains) != len(self.barriers):
+            raise SystemDefinitionError(f"gains has {len(self.gains)} tuples for {len(self.barriers)} barriers; give one for each")
         plant.require_known("the reward", self.reward.free_symbols, (*plant.states, *plant.inputs, TIME))
         for feature in self.features:
             plant.require_known(f"feature {feature.name}", feature.expression.free_symbols, (*plant.states, TIME))
@@ -151,6 +156,11 @@ class SafetyProblem:
             raise ConfigurationError(f"horizon = {self.horizon} s; it must hold at least one control period of {self.dt} s")
         if not isinstance(self.substeps, int) or self.substeps < 1:
             raise ConfigurationError(f"substeps = {self.substeps!r}; give a whole number from 1")
+
+    def gains_of(self, barrier: int) -> tuple[float, ...]:
+        """Rates p_1..p_r for a barrier, by its index."""
+        gains: Any = self.gains
+        return gains[barrier] if isinstance(gains[0], tuple) else gains
 
     @property
     def steps(self) -> int:

@@ -7,7 +7,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.barrier import Barrier
-from safe_envs.clf import min_norm_clf
+from safe_envs.clf import CLF
 from safe_envs.env import SystemEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem import SafetyProblem, Start, Variable
@@ -67,13 +67,15 @@ def gap_system() -> ControlAffineSDE:
 def _cruise(name: str, *, system: ControlAffineSDE, speed: sp.Symbol, rate: float, slack_weight: float, **rest: Any) -> SafetyProblem:
     """What both problems have in common: the force's box, and the task of driving at the desired speed."""
     error = speed - _DESIRED_SPEED
+    clf = CLF(error**2, rate, input_weight=2 / M**2, slack_weight=slack_weight)
     return SafetyProblem(
         name=name,
         plant=system,
         model=system,
         inputs=(Variable(u, -_MOST_FORCE, _MOST_FORCE, "N"),),
         reward=sp.exp(-((error / 4) ** 2)),
-        nominal=min_norm_clf(system, error**2, rate, input_weight=2 / M**2, slack_weight=slack_weight),
+        nominal=clf.min_norm(system),
+        clf=clf,
         filter="scbf",
         **rest,
     )

@@ -8,7 +8,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.barrier import Barrier
-from safe_envs.clf import min_norm_clf
+from safe_envs.clf import CLF
 from safe_envs.env import SystemEnv
 from safe_envs.problem import SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
@@ -60,13 +60,15 @@ def cubic_sde(*, offset: float = 1.0) -> SafetyProblem:
     system = cubic(diffusion=[0, k * x_2], noise={k: 0.1})
     h = positive("offset", offset) - x_1 - x_2**2
     first, second = uniforms(2)
+    clf = CLF(x_1**2 + x_2**2)
     return _problem(
         "CubicSDE",
         system=system,
         reward=sp.exp(-(x_1**2) - x_2**2),
         barriers=(Barrier(h),),
         states=(Variable(x_1, -6.0, 6.0), Variable(x_2, -6.0, 6.0)),
-        nominal=min_norm_clf(system, x_1**2 + x_2**2, rate=1, input_weight=1, slack_weight=1),
+        nominal=clf.min_norm(system),
+        clf=clf,
         starts={"near-edge": Start((around(-1.0, 2.0, first), around(0.0, 2.0, second)), (first, second), sp.Min(h, 0.5 - h))},
         horizon=2.0,
         noise=("k",),
