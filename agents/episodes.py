@@ -7,16 +7,19 @@ from typing import Any
 
 import numpy as np
 
+from agents.comparison import Flags
 from agents.policy import Policy
-from agents.statistics import FirstValues, RunningSum, share, wilson_interval
+from agents.statistics import FirstValues, RunningSum, SafetyCurve, rate_interval, share
 from safe_envs.codegen import Components
 from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info
+from safe_envs.problem import SafetyProblem
 from safe_envs.vector import SafeVectorEnv
 from wrappers import SafetyFilterVectorWrapper
 
 Env = SafeVectorEnv | SafetyFilterVectorWrapper
 Progress = Callable[[float], None]
+OnStart = Callable[[Components, int], None]
 Row = dict[str, Any]
 
 _KEPT_BARRIERS = 256
@@ -88,12 +91,26 @@ class Wave:
         np.copyto(self.h_min, np.minimum(self.h_min, h), where=alive)
         self.safe &= (h > 0.0) | ~alive
 
+    def first_violation(self, never: int) -> np.ndarray:
+        """Instant of each episode's first violation, or `never`, shape (B,)."""
+        # The steps that count are those up to it.
+        return np.where(self.safe, never, self.counted)
+
 
 class Totals:
-    """Sums over the episodes of a row, wave by wave."""
+    """Sums over the episodes of a row, wave by wave.
 
-    def __init__(self) -> None:
+    Args:
+        problem: whose episodes they are.
+
+    Attributes:
+        flags: which of the episodes were safe.
+    """
+
+    def __init__(self, problem: SafetyProblem) -> None:
         self.episodes = self.safe = self.steps = 0
+        self.flags = Flags()
+        self._curve, self._dt, self._never = SafetyCurve(problem.steps), problem.dt, problem.steps + 1
         self._counted = self._interventions = self._infeasible = self._with_effort = 0
         self._effort, self._return, self._h_min = RunningSum(), RunningSum(), FirstValues()
 
@@ -101,6 +118,8 @@ class Totals:
         """Add the first `count` episodes of a wave."""
         self.episodes += count
         self.safe += int(wave.safe[:count].sum())
+        self.flags.add(wave.safe[:count])
+        self._curve.add(wave.first_violation(self._never)[:count])
         self.steps += int(wave.lengths[:count].sum())
         self._counted += int(wave.counted[:count].sum())
         self._interventions += int(wave.interventions[:count].sum())
@@ -111,9 +130,9 @@ class Totals:
         self._return.add(wave.returns[:count])
         self._h_min.add(wave.h_min[:count])
 
-    def row(self) -> Row:
-        """The statistics of the episodes; None where no step counts."""
-        low, high = wilson_interval(self.safe, self.episodes)
+    def row(self, confidence: float) -> Row:
+        """The statistics of the episodes, with intervals of a confidence; None where no step counts."""
+        low, high = rate_interval(self.safe, self.episodes, confidence)
         p05, median = self._h_min.quantiles((0.05, 0.5))
         return {
             "episodes": self.episodes,
@@ -128,10 +147,19 @@ class Totals:
             "infeasible_rate": share(self._infeasible, self._counted),
             "effort_mean": share(self._effort.total, self._with_effort),
             "return_mean": self._return.total / self.episodes,
+            "curve": self._curve.row(self._dt, confidence),
         }
 
 
-def run_episodes(env: Env, policy: Any, episodes: int, seed: int, progress: Progress | None, recorder: Recorder | None) -> Totals:
+def run_episodes(
+    env: Env,
+    policy: Any,
+    episodes: int,
+    seed: int,
+    progress: Progress | None = None,
+    recorder: Recorder | None = None,
+    on_start: OnStart | None = None,
+) -> Totals:
     """Simulate episodes 0..episodes-1 in waves of the size of the vector env.
 
     Args:
@@ -141,26 +169,35 @@ def run_episodes(env: Env, policy: Any, episodes: int, seed: int, progress: Prog
         seed: whose children seed the episodes.
         progress: told, after every step, how many episodes are done; the fraction tells of those under way.
         recorder: keeps trajectories, if any.
+        on_start: given the components of the start states of each wave, arrays of shape (num_envs,), and how many
+            of them, from the first, are of episodes that count.
     """
-    totals = Totals()
+    world: SafeVectorEnv = env.unwrapped  # pyright: ignore[reportAssignmentType]
+    totals = Totals(world.problem)
     for first in range(0, episodes, env.num_envs):
         count = min(env.num_envs, episodes - first)
         rows = range(first, first + env.num_envs)
         if isinstance(policy, Policy):
             policy.begin(rows, seed)
-        totals.add(_play(env, policy, rows, count, seed, progress, recorder), count)
+        started = env.reset(seed=[episode_seed(seed, i) for i in rows])
+        if on_start:
+            on_start(world.components, count)
+        totals.add(_play(env, policy, started, first, count, progress, recorder), count)
     return totals
 
 
-def _play(env: Env, policy: Any, rows: range, count: int, seed: int, progress: Progress | None, recorder: Recorder | None) -> Wave:
+def _play(
+    env: Env, policy: Any, started: tuple[np.ndarray, Info], first: int, count: int, progress: Progress | None, recorder: Recorder | None
+) -> Wave:
+    """Simulate a wave that was just reset, and that begins with the episode `first`."""
     world: SafeVectorEnv = env.unwrapped  # pyright: ignore[reportAssignmentType]
-    steps, first = world.problem.steps, rows.start
-    observation, info = env.reset(seed=[episode_seed(seed, i) for i in rows])
+    steps = world.problem.steps
+    observation, info = started
     h = _smallest(info["barrier"])
-    wave = Wave(len(rows), count, h)
+    wave = Wave(len(h), count, h)
     if recorder:
         recorder.note(0, first, wave.alive, h, world.components)
-    state, start = None, np.ones(len(rows), dtype=bool)
+    state, start = None, np.ones(len(h), dtype=bool)
     for k in range(1, steps + 1):
         actions, state = policy.predict(observation, state, start, deterministic=True)
         observation, reward, terminated, truncated, info = env.step(actions)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import platform
+import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,14 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from agents.episodes import Env, Progress, Recorder, Row, run_episodes
+from agents.comparison import Comparison, Flags, compare_all
+from agents.episodes import Env, Progress, Recorder, Row, Totals, run_episodes
 from agents.policy import POLICIES, Policy, make_policy
 from agents.problems import full_id, load_problem
+from agents.statistics import require_confidence
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
 from safe_envs.vector import SafeVectorEnv
-from wrappers import CONDITIONS, SafetyFilterVectorWrapper, parse_condition
+from wrappers import CONDITIONS, SafetyFilterVectorWrapper, parse_conditions, spec_of
 
 BARE = "none"
 """Name of the row without any filter."""
@@ -36,21 +39,31 @@ class Evaluation:
         problem: what was simulated.
         config: everything needed to run it again, as JSON.
         rows: statistics, one row for each filter.
+        comparisons: of every two rows, by which of the same episodes were safe.
         timing: the only part that depends on the machine and on `num_envs`.
         recorders: trajectories for each filter, if asked for.
+        flags: which episodes were safe, for each filter.
         repeats: whether nothing is random, so that all episodes are one and the same.
     """
 
     problem: SafetyProblem
     config: dict[str, Any]
     rows: list[Row]
+    comparisons: list[Comparison]
     timing: dict[str, Any]
     recorders: dict[str, Recorder]
+    flags: dict[str, Flags]
     repeats: bool
 
     def document(self) -> dict[str, Any]:
         """The whole as JSON-able data."""
-        return {"config": self.config, "versions": _versions(), "rows": self.rows, "timing": self.timing}
+        return {
+            "config": self.config,
+            "versions": _versions(),
+            "rows": self.rows,
+            "comparisons": self.comparisons,
+            "timing": self.timing,
+        }
 
 
 def evaluate(
@@ -63,6 +76,8 @@ def evaluate(
     seed: int = 0,
     num_envs: int = 1024,
     knowledge: str = "model",
+    objective: str = "nearest",
+    confidence: float = 0.95,
     progress: Progress | None = None,
     record: bool = False,
 ) -> Evaluation:
@@ -78,12 +93,14 @@ def evaluate(
     Args:
         problem: what to simulate, or the id of a registered env.
         policy: a name or a path for `make_policy`, or anything with Stable-Baselines3's `predict`.
-        filters: texts for `parse_condition`, and "none" for the bare env; by default that and the problem's own.
+        filters: texts for `parse_conditions`, and "none" for the bare env; by default that and the problem's own.
         options: arguments of `gym.make` for an id.
         episodes: number for each filter.
         seed: whole number from 0.
         num_envs: how many episodes to simulate side by side.
         knowledge: what the filters know, "model" or "plant".
+        objective: of the filters, "nearest" to the policy's action or "clf": see `SafetyFilter.for_problem`.
+        confidence: of all intervals, between 0 and 1.
         progress: told the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
 
@@ -94,8 +111,10 @@ def evaluate(
     """
     for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("num_envs", num_envs, 1)):
         _require_whole(name, value, least)
-    if knowledge not in ("model", "plant"):
-        raise ConfigurationError(f"knowledge = {knowledge!r}; {nearest(knowledge, ('model', 'plant'))}")
+    for name, value, allowed in (("knowledge", knowledge, ("model", "plant")), ("objective", objective, ("nearest", "clf"))):
+        if value not in allowed:
+            raise ConfigurationError(f"{name} = {value!r}; {nearest(value, allowed)}")
+    require_confidence(confidence)
     env_id = full_id(problem) if isinstance(problem, str) else None
     if env_id is None and options:
         raise ConfigurationError("options are the arguments of a registered id; configure the problem itself instead")
@@ -103,7 +122,7 @@ def evaluate(
     actor = make_policy(policy, world) if isinstance(policy, str) else policy
     names = list(dict.fromkeys((BARE, world.filter) if filters is None else filters))
     specs = [_spec(name, world) for name in names]
-    envs = [_make_env(world, spec, knowledge, min(num_envs, episodes)) for spec in specs]
+    envs = [_make_env(world, spec, knowledge, objective, min(num_envs, episodes)) for spec in specs]
     config = {
         "env_id": env_id,
         "options": {k: v for k, v in (options or {}).items() if v is not None},
@@ -111,27 +130,32 @@ def evaluate(
         "policy": _describe_policy(policy),
         "filters": [{"name": name, "spec": spec} for name, spec in zip(names, specs, strict=True)],
         "knowledge": knowledge,
+        "objective": objective,
         "episodes": episodes,
         "seed": seed,
+        "confidence": confidence,
     }
-    rows, speeds, recorders = [], [], {}
+    rows, speeds, flags = [], [], {}
+    recorders = {name: Recorder(world.steps, world.plant.n, episodes) for name in names} if record else {}
     for i, (name, env) in enumerate(zip(names, envs, strict=True)):
-        recorder = Recorder(world.steps, world.plant.n, episodes) if record else None
         told = None if progress is None else _part_of(progress, i, len(names), episodes)
         begun = time.perf_counter()
-        totals = run_episodes(env, actor, episodes, seed, told, recorder)
-        seconds = time.perf_counter() - begun
-        rows.append({"filter": name, "policy": config["policy"]["name"], **totals.row()})
-        speeds.append({"filter": name, "seconds": seconds, "steps": totals.steps, "steps_per_second": totals.steps / seconds})
-        if recorder:
-            recorders[name] = recorder
+        totals = run_episodes(env, actor, episodes, seed, told, recorders.get(name))
+        speeds.append(_speed(name, totals, time.perf_counter() - begun))
+        rows.append({"filter": name, "policy": config["policy"]["name"], **totals.row(confidence)})
+        flags[name] = totals.flags
     timing = {"num_envs": num_envs, "rows": speeds}
-    return Evaluation(world, config, rows, timing, recorders, _is_deterministic(world, actor))
+    comparisons = compare_all(flags, confidence)
+    return Evaluation(world, config, rows, comparisons, timing, recorders, flags, _is_deterministic(world, actor))
 
 
 def _part_of(progress: Progress, before: int, parts: int, episodes: int) -> Progress:
     """From episodes done in one of several parts to the share of the whole that is done."""
     return lambda done: progress((before + done / episodes) / parts)
+
+
+def _speed(name: str, totals: Totals, seconds: float) -> dict[str, Any]:
+    return {"filter": name, "seconds": seconds, "steps": totals.steps, "steps_per_second": totals.steps / seconds}
 
 
 def _require_whole(name: str, value: Any, least: int) -> None:
@@ -143,17 +167,19 @@ def _spec(name: str, problem: SafetyProblem) -> str:
     """The text of a filter with all its parameters."""
     if name == BARE:
         return BARE
-    if name.partition(":")[0] not in CONDITIONS:
+    if BARE in name.split("+"):
+        raise ConfigurationError(f"filter {name!r}: {BARE!r} is the bare env and no condition of a barrier; give it alone or leave it out")
+    if re.split("[:+]", name)[0] not in CONDITIONS:
         raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, (BARE, *CONDITIONS))}")
-    return parse_condition(name, problem.gains).spec
+    return spec_of(parse_conditions(name, problem))
 
 
-def _make_env(problem: SafetyProblem, spec: str, knowledge: str, num_envs: int) -> Env:
+def _make_env(problem: SafetyProblem, spec: str, knowledge: str, objective: str, num_envs: int) -> Env:
     env = SafeVectorEnv(problem, num_envs)
     if spec == BARE:
         filtered: Env = env
     else:
-        filtered = SafetyFilterVectorWrapper(env, spec, knowledge)
+        filtered = SafetyFilterVectorWrapper(env, spec, knowledge, objective)
     # The first step compiles what the filter needs: an error shows before a long run, and the timing is of steps.
     filtered.reset(seed=0)
     filtered.step(np.zeros(env.action_space.shape or ()))

@@ -41,7 +41,7 @@ class NominalController(Policy):
             InvalidInputError: the observation has another shape than (k,) or (B, k).
             NumericalError: a law has no finite value at an observation.
         """
-        given = _checked(observation, self._width)
+        given = checked_observation(observation, self._width)
         if given.ndim == 1:
             try:
                 inputs = self._floats(*given.tolist())
@@ -79,7 +79,7 @@ class ZeroController(Policy):
         self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
         """Return the one action, for every observation; see `Policy.predict`."""
-        given = _checked(observation, self._width)
+        given = checked_observation(observation, self._width)
         return np.tile(self._action, (*given.shape[:-1], 1)), state
 
 
@@ -113,7 +113,7 @@ class RandomPolicy(Policy):
         self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
         """Draw actions; see `Policy.predict`. They stay random with `deterministic`."""
-        batch = _checked(observation, self._width).shape[:-1]
+        batch = checked_observation(observation, self._width).shape[:-1]
         if batch != (len(self._streams),):
             return self._generator.uniform(-1.0, 1.0, (*batch, self._m)), state
         if self._position == _CHUNK:
@@ -124,7 +124,12 @@ class RandomPolicy(Policy):
         return 2.0 * self._drawn[:, self._position - 1] - 1.0, state
 
 
-def _checked(observation: Any, width: int) -> np.ndarray:
+def checked_observation(observation: Any, width: int) -> np.ndarray:
+    """Return the observations in double precision.
+
+    Raises:
+        InvalidInputError: they have another shape than (width,) or (B, width).
+    """
     given = np.asarray(observation, dtype=np.float64)
     if given.ndim not in (1, 2) or given.shape[-1] != width:
         raise InvalidInputError(f"the observation has shape {given.shape}; the policy takes ({width},) or (B, {width})")

@@ -11,7 +11,7 @@ import numpy as np
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.problem import SafetyProblem
 
-POLICIES = ("nominal", "zero", "random")
+POLICIES = ("nominal", "clf", "zero", "random")
 """Names that `make_policy` knows besides the path of a file."""
 
 
@@ -63,8 +63,14 @@ def make_policy(name: str, problem: SafetyProblem) -> Policy:
         ConfigurationError: there is neither such a name nor such a file, or the file does not fit the problem.
     """
     from agents import nominal
+    from agents.clf import CLFController
 
-    named = {"nominal": nominal.NominalController, "zero": nominal.ZeroController, "random": nominal.RandomPolicy}
+    named = {
+        "nominal": nominal.NominalController,
+        "clf": CLFController,
+        "zero": nominal.ZeroController,
+        "random": nominal.RandomPolicy,
+    }
     if name in named:
         return named[name](problem)
     if not Path(name).is_file():

@@ -21,7 +21,8 @@ def full_id(env_id: str) -> str:
     for candidate in (env_id, f"safe_envs/{env_id}"):
         if candidate in gym.registry:
             return candidate
-    raise ConfigurationError(f"unknown env {env_id!r}; {nearest(env_id, ENV_IDS)}")
+    name = env_id if "/" in env_id else f"safe_envs/{env_id.removesuffix('-v0')}-v0"
+    raise ConfigurationError(f"unknown env {env_id!r}; {nearest(name, ENV_IDS)}")
 
 
 def make_env(env_id: str, options: Mapping[str, Any] | None = None) -> SafeEnv:

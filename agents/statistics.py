@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 
+from safe_envs.errors import ConfigurationError
+
 _KEPT = 65_536
+_MOST_INTERVALS = 200
+
+
+def require_confidence(confidence: Any) -> None:
+    """Check that a confidence is a number between 0 and 1.
+
+    Raises:
+        ConfigurationError: it is not.
+    """
+    if not isinstance(confidence, int | float) or not 0.0 < confidence < 1.0:
+        raise ConfigurationError(f"confidence = {confidence!r}; give a number above 0 and below 1, such as 0.95")
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -14,11 +30,102 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
         successes: how many of the trials succeeded.
         trials: at least 1.
         confidence: of the two-sided interval.
-    """
-    from scipy.stats import binomtest
 
-    interval = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
-    return float(interval.low), float(interval.high)
+    Raises:
+        ConfigurationError: the counts contradict each other, or the confidence is out of range.
+    """
+    low, high = _wilson(_counts(successes, trials), trials, _deviations(confidence))
+    return float(low), float(high)
+
+
+def rate_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Wilson's interval, or Clopper and Pearson's exact one where all or none of the trials succeeded.
+
+    Arguments and errors as for `wilson_interval`.
+    """
+    low, high = rate_band(_counts(successes, trials), trials, confidence)
+    return float(low), float(high)
+
+
+def rate_band(successes: np.ndarray, trials: int, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+    """`rate_interval` of each count of an array: the lower and the upper ends."""
+    low, high = _wilson(successes, trials, _deviations(confidence))
+    # The tail beyond the end on the one side is p^trials; the other end is 0 or 1.
+    exact = ((1.0 - confidence) / 2.0) ** (1.0 / trials)
+    return np.where(successes == trials, exact, low), np.where(successes == 0, 1.0 - exact, high)
+
+
+def paired_difference_interval(both: int, only_first: int, only_second: int, neither: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Newcombe's interval for the difference p1 - p2 of the rates of two outcomes of the same trials.
+
+    The Wilson intervals of the two rates, squared and added with the outcomes' phi correlation, which is corrected
+    for continuity where it is positive, and 0 where it is not defined.
+
+    Source: R. G. Newcombe, Statistics in Medicine 17 (1998) 2635-2650, method 10.
+
+    Args:
+        both: trials in which both succeeded.
+        only_first: trials in which only the first succeeded.
+        only_second: trials in which only the second succeeded.
+        neither: trials in which neither succeeded.
+        confidence: of the two-sided interval.
+
+    Raises:
+        ConfigurationError: there is no trial or a count is negative, or the confidence is out of range.
+    """
+    trials = both + only_first + only_second + neither
+    if min(both, only_first, only_second, neither) < 0:
+        raise ConfigurationError(f"counts of pairs are {(both, only_first, only_second, neither)}; give whole numbers from 0")
+    first, second = both + only_first, both + only_second
+    together = both * neither - only_first * only_second
+    if together > 0:
+        together = max(together - trials / 2, 0.0)
+    margins = first * (trials - first) * second * (trials - second)
+    phi = together / math.sqrt(margins) if margins else 0.0
+    (low1, high1), (low2, high2) = wilson_interval(first, trials, confidence), wilson_interval(second, trials, confidence)
+    p1, p2 = first / trials, second / trials
+    return p1 - p2 - _third_side(p1 - low1, high2 - p2, phi), p1 - p2 + _third_side(high1 - p1, p2 - low2, phi)
+
+
+def mcnemar_p(only_first: int, only_second: int) -> float:
+    """McNemar's exact two-sided p value: were the pairs that differ fair coins?
+
+    Args:
+        only_first: pairs in which only the first succeeded.
+        only_second: pairs in which only the second succeeded.
+    """
+    from scipy.special import bdtr
+
+    fewer, differing = min(only_first, only_second), only_first + only_second
+    return min(1.0, 2.0 * float(bdtr(fewer, differing, 0.5)))
+
+
+def _third_side(a: float, b: float, cosine: float) -> float:
+    return math.sqrt(max(a * a - 2.0 * cosine * a * b + b * b, 0.0))
+
+
+def _wilson(successes: np.ndarray, trials: int, z: float) -> tuple[np.ndarray, np.ndarray]:
+    return _wilson_low(successes, trials, z), 1.0 - _wilson_low(trials - successes, trials, z)
+
+
+def _wilson_low(successes: np.ndarray, trials: int, z: float) -> np.ndarray:
+    # In this form it is exactly 0 for no success.
+    root = np.sqrt(z * z + 4.0 * successes * ((trials - successes) / trials))
+    return (2.0 * successes + z * z - z * root) / (2.0 * (trials + z * z))
+
+
+def _deviations(confidence: float) -> float:
+    """Half the width of the two-sided interval of a standard normal variable."""
+    from scipy.special import ndtri
+
+    require_confidence(confidence)
+    return -float(ndtri((1.0 - confidence) / 2.0))
+
+
+def _counts(successes: int, trials: int) -> np.ndarray:
+    if not 0 <= successes <= trials or trials < 1:
+        raise ConfigurationError(f"{successes} successes in {trials} trials; give at least one trial, and from 0 to all successes")
+    return np.asarray(successes)
 
 
 class RunningSum:
@@ -50,6 +157,30 @@ class FirstValues:
     def quantiles(self, levels: tuple[float, ...]) -> list[float]:
         """Quantiles at the levels in [0, 1]."""
         return np.quantile(np.concatenate(self._parts), levels).tolist()
+
+
+class SafetyCurve:
+    """How many episodes are safe so far, at instants that are spread over the horizon.
+
+    Attributes:
+        instants: control instants, evenly spaced from 0, and the last one: at most 201, shape (q,).
+    """
+
+    def __init__(self, steps: int) -> None:
+        self.instants = np.append(np.arange(0, steps, -(-steps // _MOST_INTERVALS)), steps)
+        self._lost = np.zeros(len(self.instants) + 1, dtype=np.int64)
+
+    def add(self, first_violation: np.ndarray) -> None:
+        """Add episodes by the instants of their first violations, shape (B,); beyond the last for none."""
+        self._lost += np.bincount(np.searchsorted(self.instants, first_violation), minlength=len(self._lost))
+
+    def row(self, dt: float, confidence: float) -> dict[str, list[Any]]:
+        """Times in s, and for each the episodes safe up to it, their rate, and its pointwise interval."""
+        episodes = int(self._lost.sum())
+        safe = episodes - np.cumsum(self._lost)[:-1]
+        low, high = rate_band(safe, episodes, confidence)
+        columns = {"time": self.instants * dt, "safe": safe, "rate": safe / episodes, "ci_low": low, "ci_high": high}
+        return {name: values.tolist() for name, values in columns.items()}
 
 
 def share(part: float, whole: float) -> float | None:

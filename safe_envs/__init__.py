@@ -3,6 +3,7 @@
 from importlib.metadata import version
 
 from safe_envs.barrier import Barrier
+from safe_envs.clf import CLF
 from safe_envs.env import SafeEnv
 from safe_envs.errors import (
     ConfigurationError,
@@ -18,6 +19,7 @@ from safe_envs.systems import ENV_IDS, register_all
 from safe_envs.vector import SafeVectorEnv
 
 __all__ = [
+    "CLF",
     "ENV_IDS",
     "Barrier",
     "ConfigurationError",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import sympy as sp
 
@@ -35,7 +36,7 @@ class CLF:
 
     def growth(self, system: ControlAffineSDE) -> tuple[sp.Expr, tuple[sp.Expr, ...]]:
         """Offset a and coefficients b, one for each input, of AV + rate V = a + b u."""
-        b = input_derivative(system, self.V)
+        b: Any = input_derivative(system, self.V)
         return generator(system, self.V) + sp.sympify(self.rate) * self.V, tuple(b)
 
     def min_norm(self, system: ControlAffineSDE) -> tuple[sp.Expr, ...]:

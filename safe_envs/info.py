@@ -21,6 +21,7 @@ and with a filter
 | `filter_active` | bool | a barrier row is binding or cannot be met |
 | `feasible` | bool | some action in the box meets every row |
 | `slack` | float | by how much the worst row is violated by the executed action |
+| `active_barrier` | int | index of the barrier that caused the intervention, -1 without one |
 | `episode_interventions` | int | interventions of the episode so far |
 | `episode_infeasible` | int | infeasible steps of the episode so far |
 
@@ -55,6 +56,7 @@ def filter_info(
     filter_active: Any,
     feasible: Any,
     slack: Any,
+    active_barrier: Any,
     episode_interventions: Any,
     episode_infeasible: Any,
 ) -> Info:
@@ -66,6 +68,7 @@ def filter_info(
         "filter_active": filter_active,
         "feasible": feasible,
         "slack": slack,
+        "active_barrier": active_barrier,
         "episode_interventions": episode_interventions,
         "episode_infeasible": episode_infeasible,
     }

@@ -11,15 +11,18 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
+import sympy as sp
 from rich import box
 from rich.table import Table
 
 import safe_envs
+from safe_envs import Barrier, ControlAffineSDE
 from safe_envs.files import require_writable, write_atomically
 from scripts.console import stdout
-from wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
+from wrappers import CBF, HOCBF, SafetyFilter, SafetyFilterVectorWrapper, SafetyFilterWrapper, parse_conditions
 
 _ID = "safe_envs/StochasticDubins-v0"
+_LIMITS = "safe_envs/QuadrotorLimits-v0"
 _BATCHES = (1, 32, 1024, 10_000)
 _NUM_ENVS = 1024
 _ROUNDS = 15
@@ -65,7 +68,7 @@ def benchmark(json_file: Path | None = None) -> None:
 
 def measure() -> Figures:
     """Return microseconds for each state, and the ratios that matter."""
-    times = _times({**_filter_calls(), **_scalar_steps(), **_vector_steps(), "hand-fused loop": _fused_loop()})
+    times = _times({**_filter_calls(), **_several_rows(), **_scalar_steps(), **_vector_steps(), "hand-fused loop": _fused_loop()})
     return {
         **times,
         "filtered / bare env.step": times["env.step, filtered"] / times["env.step, bare"],
@@ -102,6 +105,31 @@ def _filter_calls() -> dict[str, Case]:
         x, u = rng.uniform(-2.0, 2.0, (*leading, 3)), rng.uniform(-10.0, 10.0, (*leading, 1))
         cases[f"filter call, {batch} state{'s' * (batch > 1)}"] = Case(lambda x=x, u=u: safety_filter.filter(x, u), batch)
     return cases
+
+
+def _several_rows() -> dict[str, Case]:
+    """A point mass in the plane with two inputs, an obstacle, a wall and a speed limit; and a quadrotor with four rotors."""
+    x, y, v, w, a, b = sp.symbols("x y v w a b", real=True)
+    point = ControlAffineSDE((x, y, v, w), (a, b), [v, w, 0, 0], [[0, 0], [0, 0], [1, 0], [0, 1]], [0, 0, 0, 0])
+    rows = [(Barrier(x**2 + y**2 - 1), HOCBF((2, 2))), (Barrier(3 - x), HOCBF((1, 1))), (Barrier(1 - v**2 - w**2), CBF(1.0))]
+    in_plane = SafetyFilter(point, rows, [(-2.0, 2.0)] * 2)
+    rng = np.random.default_rng(0)
+    angle, radius = rng.uniform(0, 2 * np.pi, _NUM_ENVS), rng.uniform(1.1, 2.0, _NUM_ENVS)
+    states = np.stack([radius * np.cos(angle), radius * np.sin(angle), *rng.uniform(-0.6, 0.6, (2, _NUM_ENVS))], axis=1)
+    inputs = rng.uniform(-3.0, 3.0, (_NUM_ENVS, 2))
+    acting = np.flatnonzero(in_plane.filter(states, inputs).active.any(axis=1))[0]
+    problem = gym.make(_LIMITS).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]
+    limits = SafetyFilter.for_problem(problem, parse_conditions("hocbf", problem))
+    envs = gym.make_vec(_LIMITS, num_envs=_NUM_ENVS)
+    envs.reset(seed=0)
+    flying = envs.unwrapped.state + rng.normal(0.0, 0.7, (_NUM_ENVS, 12))  # pyright: ignore[reportAttributeAccessIssue]
+    low, high = np.transpose(problem.box)
+    rotors = rng.uniform(low, high, (_NUM_ENVS, 4))
+    return {
+        "three rows, two inputs, 1 state": Case(lambda: in_plane.filter(states[acting], inputs[acting])),
+        f"three rows, two inputs, {_NUM_ENVS} states": Case(lambda: in_plane.filter(states, inputs), _NUM_ENVS),
+        f"three rows, four inputs (ProxQP), {_NUM_ENVS} states": Case(lambda: limits.filter(flying, rotors), _NUM_ENVS),
+    }
 
 
 def _scalar_steps() -> dict[str, Case]:

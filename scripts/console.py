@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from safe_envs.errors import SafeEnvsError
 
-_LEAST_WIDTH = 100
+_LEAST_WIDTH = 104
 _PIPE_WIDTH = 240
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -19,14 +20,15 @@ def evaluate(
         typer.Option(
             "--filter",
             metavar="NAME",
-            help="none, cbf, ecbf, hocbf, scbf; with parameters: hocbf:p=2,8. Repeatable. By default none and the env's own.",
+            help="none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf, scbf; with parameters: hocbf:p=2,8; one for each barrier: "
+            "hocbf:p=2,8+cbf:alpha=1. Repeatable. By default none and the env's own.",
         ),
     ] = None,
     policy: Annotated[
         str,
         typer.Option(
             metavar="NAME|FILE",
-            help="nominal, zero, random, or a .zip of Stable-Baselines3. Loading a file runs code that it contains: trust its source.",
+            help="nominal, clf, zero, random, or a .zip of Stable-Baselines3. Loading a file runs code that it contains: trust its source.",
         ),
     ] = "nominal",
     episodes: Annotated[int, typer.Option(help="Episodes for each filter.")] = 1000,
@@ -38,22 +40,33 @@ def evaluate(
     model: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter that the designer believes. Repeatable.")] = None,
     barrier: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Argument of the barrier. Repeatable.")] = None,
     knowledge: Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")] = "model",
+    objective: Annotated[
+        str,
+        typer.Option(metavar="nearest|clf", help="Of the filters: the action nearest to the policy's, or the joint program with the goal."),
+    ] = "nearest",
     dt: Annotated[float | None, typer.Option(help="Control period in s.")] = None,
     substeps: Annotated[int | None, typer.Option(help="Integration steps in a control period.")] = None,
     horizon: Annotated[float | None, typer.Option(help="Length of an episode in s.")] = None,
     box: Annotated[list[str] | None, typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each.")] = None,
     start: Annotated[str | None, typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution.")] = None,
+    confidence: Annotated[float, typer.Option(metavar="C", help="Of all intervals, above 0 and below 1.")] = 0.95,
+    refine: Annotated[
+        bool, typer.Option("--refine", help="Repeat with dt/2 and dt/4, and say whether the safety rate has converged.")
+    ] = False,
     num_envs: Annotated[int, typer.Option(help="Episodes side by side; it changes the speed, not the answer.")] = 1024,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write configuration, versions, rows and timing.")] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw h over time, and trajectories: .png, .pdf, .svg.")] = None,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write configuration, versions, rows, comparisons and timing.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw h and the safety rate over time, and trajectories: .png, .pdf, .svg.")
+    ] = None,
 ) -> None:
-    """Print the safety rate of a policy under each filter, with its 95 % Wilson interval.
+    """Print the safety rate of a policy under each filter with its interval, and compare the filters pair by pair.
 
     An episode is safe if every barrier is positive at every control instant. After an episode's first violation its
-    interventions, infeasible steps and effort are no longer counted.
+    interventions, infeasible steps and effort are no longer counted. All filters see the same episodes. The intervals
+    are Wilson's (Clopper and Pearson's where all or no episodes are safe), and Newcombe's for differences.
     """
-    from agents import evaluation
-    from scripts.table import print_evaluation, write_json
+    from agents import evaluation, refinement
+    from scripts.table import print_evaluation, print_refinement, write_json
 
     if json is not None:
         require_writable(json)
@@ -74,26 +87,32 @@ def evaluate(
         "start": options.start(start),
     }
     names = list(dict.fromkeys(filters)) if filters else None
+    run_all: Callable[..., Any] = refinement.refine if refine else evaluation.evaluate
     with progress_bar("Evaluating") as tell:
-        answer = evaluation.evaluate(
+        answer = run_all(
             env_id,
             policy,
-            names,
+            filters=names,
             options=arguments,
             episodes=episodes,
             seed=seed,
             num_envs=num_envs,
             knowledge=knowledge,
+            objective=objective,
+            confidence=confidence,
             progress=tell,
             record=plot is not None,
         )
-    print_evaluation(stdout(), answer)
+    given = answer.evaluations[0] if refine else answer
+    print_evaluation(stdout(), given)
+    if refine:
+        print_refinement(stdout(), answer)
     if json is not None:
         write_json(json, answer)
     if plot is not None:
         from scripts.figure import draw
 
-        draw(answer, plot)
+        draw(given, plot)
 
 
 if __name__ == "__main__":

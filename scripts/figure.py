@@ -1,4 +1,4 @@
-"""The picture of an evaluation: h over time, and trajectories with the safe set."""
+"""The picture of an evaluation: h and the safety rate over time, and trajectories with the safe set."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from scripts.table import describe_system
 
 # Okabe and Ito's palette, which the colour-blind can tell apart; the bare env is always the same warm colour.
 _BARE_COLOR = "#D55E00"
-_COLORS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-_UNSAFE = "#B9B9B9"
-_QUIET = "#444444"
+COLORS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+UNSAFE = "#B9B9B9"
+QUIET = "#444444"
 _SHOWN = 8
 _GRID = 300
-_STYLE: Any = {
+STYLE: Any = {
     "font.size": 10,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -53,13 +53,15 @@ def draw(evaluation: Evaluation, path: Path) -> None:
     """Draw an evaluation that recorded trajectories, and write the picture whole or not at all."""
     problem, config = evaluation.problem, evaluation.config
     colors = _colors(evaluation)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(11.0, 5.4) if problem.plane else (7.5, 5.2))
-        panels = figure.subplots(1, 2 if problem.plane else 1, squeeze=False)[0]
-        _draw_barrier(panels[0], evaluation, colors)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.5, 6.6) if problem.plane else (7.5, 6.6))
+        grid = figure.add_gridspec(2, 2 if problem.plane else 1, height_ratios=(3, 2))
+        barrier = figure.add_subplot(grid[0, 0])
+        _draw_barrier(barrier, evaluation, colors)
+        _draw_curve(figure.add_subplot(grid[1, 0], sharex=barrier), evaluation, colors)
         if problem.plane:
-            _draw_plane(panels[1], evaluation, colors)
-        handles, labels = panels[0].get_legend_handles_labels()
+            _draw_plane(figure.add_subplot(grid[:, 1]), evaluation, colors)
+        handles, labels = barrier.get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4))
         title = f"{config['env_id'] or problem.name}, {Path(config['policy']['name']).stem} policy"
         figure.suptitle(f"{title}\n{describe_system(problem)}", fontsize=11)
@@ -68,7 +70,7 @@ def draw(evaluation: Evaluation, path: Path) -> None:
 
 def _colors(evaluation: Evaluation) -> dict[str, str]:
     others = [row["filter"] for row in evaluation.rows if row["filter"] != BARE]
-    return {BARE: _BARE_COLOR} | {name: _COLORS[i % len(_COLORS)] for i, name in enumerate(others)}
+    return {BARE: _BARE_COLOR} | {name: COLORS[i % len(COLORS)] for i, name in enumerate(others)}
 
 
 def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
@@ -90,11 +92,27 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
     # Far below 0 it does not matter how far: what is seen of the filters shall not shrink for that.
     bottom = max(lowest, -highest) if highest > 0.0 else lowest
     margin = 0.05 * max(highest - bottom, 1e-3)
-    axes.set(xlim=(0.0, max(last, evaluation.problem.dt)), ylim=(bottom - margin, highest + margin))
-    axes.axhspan(bottom - margin, 0.0, color=_UNSAFE, alpha=0.35, linewidth=0, zorder=0)
+    # The unsafe side has room for its name in any case.
+    bottom = min(bottom - margin, -2.0 * margin)
+    axes.set(xlim=(0.0, max(last, evaluation.problem.dt)), ylim=(bottom, highest + margin))
+    axes.axhspan(bottom, 0.0, color=UNSAFE, alpha=0.35, linewidth=0, zorder=0)
     axes.axhline(0.0, color="black", linewidth=1.2)
-    axes.text(0.99, 0.02, "unsafe", transform=axes.transAxes, ha="right", va="bottom", color=_QUIET)
-    axes.set(xlabel="time (s)", ylabel="barrier h", title="Barrier: median, and 5 to 95 % of the episodes")
+    axes.text(0.99, 0.02, "unsafe", transform=axes.transAxes, ha="right", va="bottom", color=QUIET)
+    axes.set(ylabel="barrier h", title="Barrier: median, and 5 to 95 % of the episodes")
+
+
+def _draw_curve(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
+    """Rate of the episodes that are safe so far, with its pointwise band, at least until the last violation."""
+    for row in evaluation.rows:
+        curve, color = row["curve"], colors[row["filter"]]
+        low, rate, high = (100 * np.array(curve[key]) for key in ("ci_low", "rate", "ci_high"))
+        axes.fill_between(curve["time"], low, high, color=color, alpha=0.2, linewidth=0)
+        axes.plot(curve["time"], rate, color=color, linewidth=1.8)
+        axes.set_xlim(right=max(axes.get_xlim()[1], curve["time"][curve["safe"].index(curve["safe"][-1])]))
+    lowest = min(row["curve"]["ci_low"][-1] for row in evaluation.rows)
+    bottom = 100 * lowest - 4 * (1 - lowest)
+    axes.set(ylim=(bottom, 100 + 4 * (1 - lowest)), xlabel="time (s)", ylabel="safe so far (%)")
+    axes.set_title(f"Safety rate, with its pointwise {100 * evaluation.config['confidence']:.10g} % band")
 
 
 def _draw_plane(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
@@ -114,7 +132,7 @@ def _draw_plane(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> N
     if units[across] == units[up]:
         axes.set_aspect("equal")
     horizontal, vertical, h = _on_grid(safe, limits)
-    axes.contourf(horizontal, vertical, h, levels=[-np.inf, 0.0], colors=[_UNSAFE], alpha=0.35, zorder=0)
+    axes.contourf(horizontal, vertical, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35, zorder=0)
     axes.contour(horizontal, vertical, h, levels=[0.0], colors="black", linewidths=1.2, zorder=1)
     labels = [f"{names[i]} ({units[i]})" if units[i] else names[i] for i in (across, up)]
     axes.set(xlabel=labels[0], ylabel=labels[1], title=f"Safe set{_when(problem)} and {len(starts)} episodes")

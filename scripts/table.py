@@ -1,4 +1,4 @@
-"""The answer of an evaluation as a table, and as a file."""
+"""The answer of an evaluation, and of its refinement, as a table and as a file."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from agents.comparison import Comparison
 from agents.episodes import Row
 from agents.evaluation import BARE, Evaluation
+from agents.refinement import TOLERANCE, Refinement
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
 
 _COLUMNS = (
-    "safe [95 % interval]",
     "min h\nmedian",
     "min h\n5 %",
     "viola-\ntions",
@@ -26,42 +27,50 @@ _COLUMNS = (
     "return",
     "steps/s",
 )
+_VERDICTS = {
+    "converged": "converged, {}",
+    "not resolved": "not resolved, {}: more episodes are needed",
+    "still changing": "still changing by {}",
+}
 
 
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:
-    """Print a heading, a row for each filter, and what has to be known to read them."""
+    """Print a heading, a row for each filter, comparisons, and what has to be known to read them."""
+    interval = _interval(evaluation)
     console.print(heading(evaluation), soft_wrap=True, highlight=False)
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True)
-    table.add_column("filter", overflow="fold", vertical="bottom")
-    for name in _COLUMNS:
-        table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
+    bounded = any("bound" in row for row in evaluation.rows)
+    table = _table(f"safe [{interval}]", *["bound"] * bounded, *_COLUMNS)
     for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True):
-        table.add_row(*_cells(row, speed["steps_per_second"]))
-    console.print()
-    console.print(table)
-    console.print()
-    whole = evaluation.problem.steps * evaluation.config["episodes"]
-    for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True):
-        if speed["steps"] < 0.99 * whole:
-            length = speed["steps"] / evaluation.config["episodes"]
-            console.print(
-                f"Note: with {row['filter']} the mean episode ends after {length:.1f} of {evaluation.problem.steps} steps, at the goal or "
-                "outside the workspace; its safety is that of the instants until then.",
-                soft_wrap=True,
-                highlight=False,
-            )
-    if evaluation.repeats:
-        console.print(
-            "Note: nothing is random here (no noise, a fixed start, a deterministic policy), so that all episodes are "
-            "one and the same: the interval says nothing.",
-            soft_wrap=True,
-            highlight=False,
-        )
+        table.add_row(*_cells(row, speed["steps_per_second"], bounded))
+    _print_table(console, table)
+    compared = [] if evaluation.repeats else [c for c in evaluation.comparisons if BARE not in (c["first"], c["second"])]
+    if compared:
+        _say(console, f"Difference of the safety rates on the same episodes [{interval}]:")
+    for comparison in compared:
+        _say(console, f"  {_describe(comparison)}")
+    for note in _notes(evaluation):
+        _say(console, f"Note: {note}")
 
 
-def write_json(path: Path, evaluation: Evaluation) -> None:
-    """Write an evaluation as strict JSON, whole or not at all."""
-    text = json.dumps(evaluation.document(), indent=2, allow_nan=False)
+def print_refinement(console: Console, refinement: Refinement) -> None:
+    """Print the safety rates with each control period, and whether they have converged."""
+    interval = _interval(refinement.evaluations[0])
+    _say(console, f"\nRefinement: safe [{interval}] with smaller control periods, from the same seeds but with noise that is not coupled")
+    table = _table(*[f"dt = {dt:g} s" for dt in refinement.periods])
+    for row in refinement.rows:
+        rates = zip(row["safety_rate"], row["ci_low"], row["ci_high"], strict=True)
+        table.add_row(row["filter"], *[_rate(*rate) for rate in rates])
+    _print_table(console, table)
+    for row in refinement.rows:
+        change = _points(row["change"], row["change_low"], row["change_high"])
+        _say(console, f"  {row['filter']}: {_VERDICTS[row['verdict']].format(change)}")
+    reach = f"{100 * TOLERANCE:g} points"
+    _say(console, f"Converged: the {interval} of the change from dt/2 to dt/4 contains 0, and reaches no further than {reach} either way.")
+
+
+def write_json(path: Path, answer: Evaluation | Refinement) -> None:
+    """Write an answer as strict JSON, whole or not at all."""
+    text = json.dumps(answer.document(), indent=2, allow_nan=False)
     write_atomically(path, lambda part: part.write_text(text + "\n"))
 
 
@@ -89,11 +98,66 @@ def describe_system(problem: SafetyProblem) -> str:
     return ", ".join(parts)
 
 
-def _cells(row: Row, speed: float) -> list[str]:
+def _interval(evaluation: Evaluation) -> str:
+    return f"{100 * evaluation.config['confidence']:.10g} % interval"
+
+
+def _table(*columns: str) -> Table:
+    """A table with a column of filters before those named."""
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True)
+    table.add_column("filter", overflow="fold", vertical="bottom")
+    for name in columns:
+        table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
+    return table
+
+
+def _print_table(console: Console, table: Table) -> None:
+    console.print()
+    console.print(table)
+    console.print()
+
+
+def _say(console: Console, text: str) -> None:
+    console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+
+def _describe(comparison: Comparison) -> str:
+    first, second, p = comparison["first"], comparison["second"], comparison["mcnemar_p"]
+    difference = _points(comparison["difference"], comparison["ci_low"], comparison["ci_high"])
+    return (
+        f"{first} - {second}: {difference}, McNemar p {'< 1e-10' if p < 1e-10 else f'= {p:.2g}'} "
+        f"(safe with one only: {first} {comparison['only_first']}, {second} {comparison['only_second']})"
+    )
+
+
+def _notes(evaluation: Evaluation) -> list[str]:
+    """What has to be known to read the table."""
+    steps, episodes = evaluation.problem.steps, evaluation.config["episodes"]
+    notes = [
+        f"no proved bound for {row['filter']}: {row['bound_note']}"
+        for row in evaluation.rows
+        if row["filter"] != BARE and "bound" in row and row["bound"] is None
+    ]
+    notes += [
+        f"with {row['filter']} the mean episode ends after {speed['steps'] / episodes:.1f} of {steps} steps, at the goal or "
+        "outside the workspace; its safety is that of the instants until then."
+        for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True)
+        if speed["steps"] < 0.99 * steps * episodes
+    ]
+    if evaluation.repeats:
+        notes.append(
+            "nothing is random here (no noise, a fixed start, a deterministic policy), so that all episodes are "
+            "one and the same: the interval says nothing."
+        )
+    return notes
+
+
+def _cells(row: Row, speed: float, bounded: bool) -> list[str]:
     filtered = row["filter"] != BARE
     return [
         row["filter"],
-        f"{_percent(row['safety_rate'])} [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]",
+        _rate(row["safety_rate"], row["ci_low"], row["ci_high"]),
+        *[_bound(row)] * bounded,
         f"{row['min_h_median']:.3g}",
         f"{row['min_h_p05']:.3g}",
         str(row["violations"]),
@@ -103,6 +167,20 @@ def _cells(row: Row, speed: float) -> list[str]:
         f"{row['return_mean']:.4g}",
         _thousands(speed),
     ]
+
+
+def _bound(row: Row) -> str:
+    if row["filter"] == BARE or "bound" not in row:
+        return "-"
+    return "none" if row["bound"] is None else f"≥ {_percent(row['bound'])}"
+
+
+def _rate(rate: float, low: float, high: float) -> str:
+    return f"{_percent(rate)} [{100 * low:.1f}, {100 * high:.1f}]"
+
+
+def _points(difference: float, low: float, high: float) -> str:
+    return f"{100 * difference:+.1f} points [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def _percent(rate: float | None) -> str:

@@ -13,7 +13,7 @@ from safe_envs.env import SafeEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info, filter_info
 from safe_envs.problem import SafetyProblem
-from wrappers.conditions import Condition, parse_condition
+from wrappers.conditions import Condition, parse_conditions, spec_of
 from wrappers.safety_filter import SafetyFilter
 
 
@@ -24,8 +24,10 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
 
     Args:
         env: one of this project's envs, possibly wrapped.
-        condition: a `Condition`, or its text, like "scbf" or "hocbf:p=2,8"; without parameters it takes the env's.
+        condition: a `Condition` for every barrier, one for each, or their text, like "scbf", "hocbf:p=2,8" or
+            "hocbf:p=2,8+cbf:alpha=1"; without parameters it takes the env's.
         knowledge: "model" (what the designer believes) or "plant" (the true system).
+        objective: "nearest" to the policy's action, or "clf" for the joint program with the env's goal.
 
     Raises:
         ConfigurationError: the env is not one of this project, or an argument is unknown; or, at a step, a wrapper
@@ -33,12 +35,18 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         RelativeDegreeError: the condition does not suit the env's barrier.
     """
 
-    def __init__(self, env: gym.Env[np.ndarray, np.ndarray], condition: Condition | str, knowledge: str = "model") -> None:
+    def __init__(
+        self,
+        env: gym.Env[np.ndarray, np.ndarray],
+        condition: Condition | Sequence[Condition] | str,
+        knowledge: str = "model",
+        objective: str = "nearest",
+    ) -> None:
         inner = env.unwrapped
         if not isinstance(inner, SafeEnv):
             raise ConfigurationError(f"{inner} is not one of this project's envs, so that the filter cannot read its state")
-        text, self.safety_filter = build_filter(inner.problem, condition, knowledge)
-        gym.utils.RecordConstructorArgs.__init__(self, condition=text, knowledge=knowledge)
+        text, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective)
+        gym.utils.RecordConstructorArgs.__init__(self, condition=text, knowledge=knowledge, objective=objective)
         gym.Wrapper.__init__(self, env)
         self._inner = inner
         self._directly = _only_checks_between(env, inner)
@@ -74,6 +82,7 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
                 active,
                 decision.feasible,
                 max(decision.slack),
+                decision.cause if differs else -1,
                 self._interventions,
                 self._infeasible,
             )
@@ -96,11 +105,15 @@ def changed_action(wrapper: object, decided: Sequence[Any], executed: Sequence[A
     )
 
 
-def build_filter(problem: SafetyProblem, condition: Condition | str, knowledge: str) -> tuple[str, SafetyFilter]:
-    """Return the filter of a condition for a problem, and the text that names it."""
+def build_filter(
+    problem: SafetyProblem, condition: Condition | Sequence[Condition] | str, knowledge: str, objective: str
+) -> tuple[str, SafetyFilter]:
+    """Return the filter of one or several conditions for a problem, and the text that names them."""
     if isinstance(condition, str):
-        condition = parse_condition(condition, problem.gains)
-    return condition.spec, SafetyFilter.for_problem(problem, condition, knowledge)
+        condition = parse_conditions(condition, problem)
+    elif isinstance(condition, Condition):
+        condition = (condition,)
+    return spec_of(condition), SafetyFilter.for_problem(problem, condition[0] if len(condition) == 1 else condition, knowledge, objective)
 
 
 def resting_action(problem: SafetyProblem) -> np.ndarray:
@@ -117,6 +130,7 @@ def rest_info(problem: SafetyProblem) -> Info:
         filter_active=False,
         feasible=True,
         slack=0.0,
+        active_barrier=-1,
         episode_interventions=0,
         episode_infeasible=0,
     )

@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safe_envs.barrier import Barrier
-from safe_envs.codegen import Components, Flavour, compile_function, constants, finite, stacked
-from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, SystemDefinitionError
+from safe_envs.clf import CLF
+from safe_envs.codegen import Components, Flavour, compile_function, stacked
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, SystemDefinitionError, nearest
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
-from wrappers.conditions import Condition
-from wrappers.qp.one_row import project_arrays, project_floats
+from wrappers.conditions import AffineConstraint, Condition
+from wrappers.program import Decision, Program, Solver, UndefinedRowError
 
 
 class FilterResult(NamedTuple):
@@ -29,6 +30,7 @@ class FilterResult(NamedTuple):
         feasible: whether some action in the box meets every row, shape (...). Where it is False, the action is the
             least-violating one.
         slack: by how much the action misses each row where the rows cannot be met, 0 elsewhere, shape (..., k).
+        cause: index of the active row that lies furthest from the proposed input, shape (...); -1 if no row is active.
     """
 
     action: np.ndarray
@@ -37,33 +39,34 @@ class FilterResult(NamedTuple):
     active: np.ndarray
     feasible: Any
     slack: np.ndarray
-
-
-class Decision(NamedTuple):
-    """What the thin wrappers read, by components: floats, or arrays over the batch; entries as in `FilterResult`."""
-
-    action: Sequence[Any]
-    margin: Sequence[Any]
-    active: Sequence[Any]
-    feasible: Any
-    slack: Sequence[Any]
+    cause: Any
 
 
 class SafetyFilter:
     """min 1/2 |u - u_nom|^2_W subject to a_i(x) u + b_i(x) >= 0 for every barrier, and the box.
 
-    One row has a closed form, exact for any number of inputs; several go to ProxQP.
+    Where the rows cannot all be met, the sum of their squared slacks is as small as can be, weighted by the priorities.
+
+    One row has a closed form for any number of inputs, and any number of rows an exact solution for one and two inputs;
+    others go to ProxQP.
+
+    With a control Lyapunov function the objective is its joint program instead, so that the filter pursues the goal by
+    itself: min w_u |u - u_nom|^2 + w_d d^2 subject to AV + rate V <= d, the rows and the box, as in thesis Sec. 4.3.1 with
+    u_nom = 0. The slack d is the goal's; that of a barrier is dearer than any goal, and flagged.
 
     Args:
         model: the system that the filter believes in.
         rows: (barrier, condition) pairs.
         box: (low, high) of each input, in physical units.
         weights: diagonal of W, one positive number for each input; ones by default.
+        priorities: weights of the squared slacks, one positive number for each row; ones by default.
+        dt: control period in s, for conditions with a margin of first order.
+        clf: goal of the joint program, whose weights replace W.
 
     Raises:
         SystemDefinitionError: there is no row, or a barrier does not fit the model.
         RelativeDegreeError: a condition does not suit a barrier.
-        ConfigurationError: the box or the weights are not allowed.
+        ConfigurationError: the box, a weight or a priority is not allowed, or dt is missing.
     """
 
     def __init__(
@@ -72,52 +75,68 @@ class SafetyFilter:
         rows: Sequence[tuple[Barrier, Condition]],
         box: Sequence[tuple[float, float]],
         weights: Sequence[float] | None = None,
+        *,
+        priorities: Sequence[float] | None = None,
+        dt: float | None = None,
+        clf: CLF | None = None,
     ) -> None:
         if not rows:
             raise SystemDefinitionError("a filter needs at least one (barrier, condition) pair")
+        if clf is not None and weights is not None:
+            raise ConfigurationError("weights and clf were given; the weights of a joint program are those of the clf")
         self.model = model
         self.rows = tuple(rows)
-        self._low, self._high = _bounds(model, box)
-        self._low_arrays, self._high_arrays = constants(self._low), constants(self._high)
-        self._weights = _positive_weights(model, weights)
         self.constraints = tuple(condition.constraint(model, barrier) for barrier, condition in self.rows)
+        program = Program(
+            model,
+            self.constraints,
+            *_bounds(model, box),
+            weights=_positive("weights", weights, model.m),
+            priorities=_positive("priorities", priorities, len(self.rows)),
+            dt=_period(self.constraints, dt),
+            clf=clf,
+        )
+        self._floats, self._arrays = Solver(program, "floats"), Solver(program, "arrays")
+        self._single = len(self.rows) == 1 and program.plain
 
     @classmethod
-    def for_problem(cls, problem: SafetyProblem, condition: Condition, knowledge: str = "model") -> SafetyFilter:
-        """The filter that puts one condition on every barrier of a problem.
+    def for_problem(
+        cls, problem: SafetyProblem, conditions: Condition | Sequence[Condition], knowledge: str = "model", objective: str = "nearest"
+    ) -> SafetyFilter:
+        """The filter for the barriers of a problem.
 
         Args:
             problem: whose model, barriers and box are taken.
-            condition: for every barrier.
+            conditions: one for every barrier, or one for all.
             knowledge: "model" for what the designer believes, "plant" for the true system.
+            objective: "nearest" to the proposed action, or "clf" for the joint program with the problem's goal.
+
+        Raises:
+            ConfigurationError: a word is unknown, the number of conditions is wrong, or the problem has no clf.
         """
-        if knowledge not in ("model", "plant"):
-            raise ConfigurationError(f"knowledge = {knowledge!r}; allowed: model, plant")
+        for name, given, allowed in (("knowledge", knowledge, ("model", "plant")), ("objective", objective, ("nearest", "clf"))):
+            if given not in allowed:
+                raise ConfigurationError(f"{name} = {given!r}; {nearest(str(given), allowed)}")
+        if objective == "clf" and problem.clf is None:
+            raise ConfigurationError(f"objective = 'clf', but {problem.name} has no control Lyapunov function; use 'nearest'")
+        count = len(problem.barriers)
+        each = (conditions,) * count if isinstance(conditions, Condition) else tuple(conditions)
+        if len(each) != count:
+            raise ConfigurationError(f"{len(each)} conditions for the {count} barriers of {problem.name}; give one for each")
         known = problem.model if knowledge == "model" else problem.plant
-        return cls(known, [(b, condition) for b in problem.barriers], problem.box)
-
-    @cached_property
-    def _rows_floats(self) -> Any:
-        return self._compile(self._row_expressions(), "floats")
-
-    @cached_property
-    def _rows_arrays(self) -> Any:
-        return self._compile(self._row_expressions(), "arrays")
+        clf = problem.clf if objective == "clf" else None
+        return cls(known, list(zip(problem.barriers, each, strict=True)), problem.box, dt=problem.dt, clf=clf)
 
     @cached_property
     def _barriers_floats(self) -> Any:
-        return self._compile([barrier.expression for barrier, _ in self.rows], "floats")
+        return self._compile_barriers("floats")
 
     @cached_property
     def _barriers_arrays(self) -> Any:
-        return self._compile([barrier.expression for barrier, _ in self.rows], "arrays")
+        return self._compile_barriers("arrays")
 
-    def _row_expressions(self) -> list[Any]:
-        """a_1, ..., a_m, b of each row, one row after the other."""
-        return [e for constraint in self.constraints for e in (*constraint.coefficient, constraint.offset)]
-
-    def _compile(self, expressions: Sequence[Any], flavour: Flavour) -> Any:
-        return compile_function(self.model.states, [self.model.numeric(e) for e in expressions], flavour)
+    def _compile_barriers(self, flavour: Flavour) -> Any:
+        return compile_function(self.model.states, [self.model.numeric(barrier.expression) for barrier, _ in self.rows], flavour)
 
     def filter(self, x: Any, u_nominal: Any) -> FilterResult:
         """Decide for one state (n,) and input (m,), or for batches (..., n) and (..., m).
@@ -140,71 +159,39 @@ class SafetyFilter:
         decision = self.decide_arrays(states, inputs)
         parts = (decision.action, self._barriers_arrays(*states), *decision[1:3], decision.slack)
         action, barrier, margin, active, slack = [stacked(part, len(inputs[0])).reshape(*batch, len(part)) for part in parts]
-        return FilterResult(action, barrier, margin, active > 0.0, decision.feasible.reshape(batch), slack)
+        cause = np.broadcast_to(decision.cause, len(inputs[0])).reshape(batch)
+        return FilterResult(action, barrier, margin, active > 0.0, decision.feasible.reshape(batch), slack, cause)
 
     def _filter_one(self, x: np.ndarray, u: np.ndarray) -> FilterResult:
         state, inputs = x.tolist(), u.tolist()
         if not math.isfinite(sum(state) + sum(inputs)):
             _require_finite(x, u)
-        action, margin, active, feasible, slack = self.decide_floats(state, inputs)
+        action, margin, active, feasible, slack, cause = self.decide_floats(state, inputs)
         barrier = self._barriers_floats(*state)
-        return FilterResult(np.array(action), np.array(barrier), np.array(margin), np.array(active), feasible, np.array(slack))
+        return FilterResult(np.array(action), np.array(barrier), np.array(margin), np.array(active), feasible, np.array(slack), cause)
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> Decision:
         """Decide for one state, given and returned component by component; the components must be finite."""
-        if len(self.rows) > 1:
-            return self._decide_one_of_several(x, u)
         try:
-            *a, b = self._rows_floats(*x)
-        except (OverflowError, ZeroDivisionError, ValueError) as error:
+            found = self._floats.one_row(x, u) if self._single else self._floats.solve(x, u)
+        except (ArithmeticError, ValueError) as error:
             raise self._undefined(x) from error
-        action, margin, active, feasible = project_floats(a, b, u, self._low, self._high, self._weights)
-        if not math.isfinite(margin):
-            raise self._undefined(x)
-        return Decision(action, (margin,), (active,), feasible, (0.0 if feasible else -margin,))
+        return found
 
     def decide_arrays(self, x: Components, u: Components) -> Decision:
         """Decide for a batch, given and returned component by component, each an array (B,) of finite numbers."""
         # What overflows or has no value is found below, which says where.
-        with np.errstate(all="ignore"):
-            values = self._rows_arrays(*x)
-            if len(self.rows) > 1:
-                return self._decide_several(x, u, values)
-            *a, b = values
-            action, margin, active, feasible = project_arrays(a, b, u, self._low_arrays, self._high_arrays, self._weights)
-        if not finite(margin):
-            self._require_defined(x, margin)
-        met = np.count_nonzero(feasible) == len(feasible)
-        slack = np.zeros(len(margin)) if met else np.where(feasible, 0.0, -margin)
-        return Decision(action, (margin,), (active,), feasible, (slack,))
-
-    def _decide_several(self, x: Components, u: Components, values: Components) -> Decision:
-        # Imported here, since a filter of one row needs no solver.
-        from wrappers.qp.several_rows import project
-
-        size = len(u[0])
-        rows = stacked(values, size).reshape(size, -1, self.model.m + 1)
-        self._require_defined(x, rows.sum(axis=(1, 2)))
-        found = project(
-            rows[:, :, :-1], rows[:, :, -1], stacked(u, size), np.array(self._low), np.array(self._high), np.array(self._weights)
-        )
-        slack = np.where(found.feasible[:, None], 0.0, np.maximum(-found.margin, 0.0))
-        return Decision(tuple(found.u.T), tuple(found.margin.T), tuple(found.active.T), found.feasible, tuple(slack.T))
-
-    def _decide_one_of_several(self, x: Sequence[float], u: Sequence[float]) -> Decision:
-        batch = self.decide_arrays(tuple(np.array([c]) for c in x), tuple(np.array([c]) for c in u))
-        action, margin, active, slack = [[c.item() for c in part] for part in (*batch[:3], batch.slack)]
-        return Decision(action, margin, active, batch.feasible.item(), slack)
+        try:
+            with np.errstate(all="ignore"):
+                found = self._arrays.one_row(x, u) if self._single else self._arrays.solve(x, u)
+        except UndefinedRowError as error:
+            raise self._undefined([float(c[error.index]) for c in x]) from error
+        return found
 
     def _undefined(self, x: Sequence[float]) -> NumericalError:
         at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.model.states, x, strict=True))
         names = ", ".join(barrier.name for barrier, _ in self.rows)
         return NumericalError(f"the constraint on {names} has no finite value at {at}; check the barrier and the model there")
-
-    def _require_defined(self, x: Components, totals: np.ndarray) -> None:
-        bad = np.flatnonzero(~np.isfinite(totals))
-        if bad.size:
-            raise self._undefined([float(c[bad[0]]) for c in x])
 
 
 def _require_finite(x: np.ndarray, u: np.ndarray) -> None:
@@ -225,8 +212,18 @@ def _bounds(model: ControlAffineSDE, box: Sequence[tuple[float, float]]) -> tupl
     return low, high
 
 
-def _positive_weights(model: ControlAffineSDE, weights: Sequence[float] | None) -> list[float]:
-    values = [1.0] * model.m if weights is None else [float(w) for w in weights]
-    if len(values) != model.m or not all(math.isfinite(w) and w > 0 for w in values):
-        raise ConfigurationError(f"weights = {values}; give {model.m} positive numbers")
+def _positive(name: str, given: Sequence[float] | None, count: int) -> list[float]:
+    values = [1.0] * count if given is None else [float(v) for v in given]
+    if len(values) != count or not all(math.isfinite(v) and v > 0 for v in values):
+        raise ConfigurationError(f"{name} = {values}; give {count} positive numbers")
     return values
+
+
+def _period(constraints: Sequence[AffineConstraint], dt: float | None) -> float:
+    if dt is None:
+        if any(constraint.change is not None for constraint in constraints):
+            raise ConfigurationError("a sampling margin of first order needs the control period: SafetyFilter(..., dt=...)")
+        return 0.0
+    if not 0 < dt < math.inf:
+        raise ConfigurationError(f"dt = {dt} s; a control period is positive and finite")
+    return float(dt)

@@ -29,11 +29,17 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         RelativeDegreeError: the condition does not suit the env's barrier.
     """
 
-    def __init__(self, env: gym.vector.VectorEnv, condition: Condition | str, knowledge: str = "model") -> None:
+    def __init__(
+        self,
+        env: gym.vector.VectorEnv,
+        condition: Condition | Sequence[Condition] | str,
+        knowledge: str = "model",
+        objective: str = "nearest",
+    ) -> None:
         inner = env.unwrapped
         if not isinstance(inner, SafeVectorEnv):
             raise ConfigurationError(f"{inner} is not one of this project's vector envs, so that the filter cannot read its state")
-        _, self.safety_filter = build_filter(inner.problem, condition, knowledge)
+        _, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective)
         super().__init__(env)
         self._inner = inner
         self._rest = rest_info(inner.problem)
@@ -89,6 +95,7 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             filter_active=active,
             feasible=decision.feasible,
             slack=decision.slack[0] if len(decision.slack) == 1 else np.maximum.reduce(decision.slack),
+            active_barrier=np.where(differs, decision.cause, -1),
             episode_interventions=self._interventions.copy(),
             episode_infeasible=self._infeasible.copy(),
         )

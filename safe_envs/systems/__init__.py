@@ -1,4 +1,4 @@
-"""The systems of the thesis, one file each, and their registration with Gymnasium."""
+"""The systems of the thesis and variations of them, one file each, and their registration with Gymnasium."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import gymnasium as gym
 _CLASSES = {
     "DubinsDisk": "dubins",
     "DubinsObstacle": "dubins_obstacle",
+    "DubinsObstacles": "dubins_obstacles",
     "StochasticDubins": "dubins",
     "QuadrotorAltitude": "quadrotor_altitude",
     "Quadrotor": "quadrotor",
+    "QuadrotorLimits": "quadrotor_limits",
     "ACC": "acc",
     "ACCGap": "acc",
     "Pendulum": "pendulum",

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import sympy as sp
 
@@ -23,21 +25,45 @@ _START = (-2.0, -2.0, 0.0)
 _OBSTACLE_START = (-1.0, 0.0)
 
 
-def vehicle_and_obstacle(speed: float) -> ControlAffineSDE:
-    """The vehicle of Eq. (3.27), and an obstacle that moves along x: dx_o = v_o dt, dy_o = 0.
+def vehicle_among(speed: float, obstacles: Mapping[sp.Symbol, sp.Expr], parameters: Mapping[sp.Symbol, float]) -> ControlAffineSDE:
+    """The vehicle of Eq. (3.27) and obstacles whose coordinates are states with drifts of their own.
+
+    Args:
+        speed: v of the vehicle, in m/s.
+        obstacles: rate of each coordinate, in its unit a second.
+        parameters: value of the symbols in the rates.
 
     Source: thesis Sec. 3.5.1. The print drives the obstacle by the clock and forgets its velocity in the
     derivatives of h; here its position is a state, so that nothing can be forgotten.
     """
     car = vehicle(speed, noise=0.0)
+    rest = [0] * len(obstacles)
     return ControlAffineSDE(
-        states=(*car.states, x_o, y_o),
+        states=(*car.states, *obstacles),
         inputs=car.inputs,
-        drift=[*car.drift, v_o, 0],
-        input_matrix=[*car.input_matrix, 0, 0],
-        diffusion=car.diffusion.col_join(sp.zeros(2, 2)),
-        parameters={**car.parameters, v_o: 0.5},
+        drift=[*car.drift, *obstacles.values()],
+        input_matrix=[*car.input_matrix, *rest],
+        diffusion=car.diffusion.col_join(sp.zeros(len(rest), 2)),
+        parameters={**car.parameters, **parameters},
     )
+
+
+def way_to(goal_x: float, goal_y: float) -> dict[str, Any]:
+    """Reward, nominal controller and goal of a vehicle that is to reach a point."""
+    to_goal_x, to_goal_y = goal_x - x, goal_y - y
+    distance = sp.sqrt(to_goal_x**2 + to_goal_y**2 + 1e-12)  # the small term keeps the goal from a division by zero
+    towards_goal = (to_goal_x * sp.cos(theta) + to_goal_y * sp.sin(theta)) / distance
+    goal = _GOAL_RADIUS**2 - to_goal_x**2 - to_goal_y**2
+    return {
+        "reward": towards_goal + _GOAL_BONUS * (1 + sp.sign(goal)) / 2,
+        "nominal": (turn_rate_towards(to_goal_x, to_goal_y),),
+        "goal": goal,
+    }
+
+
+def separation(x_i: sp.Expr, y_i: sp.Expr, distance: float) -> sp.Expr:
+    """Positive where the vehicle is farther than a distance from a point."""
+    return (x - x_i) ** 2 + (y - y_i) ** 2 - distance**2
 
 
 def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
@@ -49,16 +75,13 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
     Source: thesis Sec. 3.5.1, moving case.
     """
     r = positive("radius", radius)
-    to_goal_x, to_goal_y = _GOAL_X - x, _GOAL_Y - y
-    distance = sp.sqrt(to_goal_x**2 + to_goal_y**2 + 1e-12)  # the small term keeps the goal from a division by zero
-    towards_goal = (to_goal_x * sp.cos(theta) + to_goal_y * sp.sin(theta)) / distance
-    goal = _GOAL_RADIUS**2 - to_goal_x**2 - to_goal_y**2
+    moving = {x_o: v_o, y_o: sp.Integer(0)}
     spread = uniforms(3)
     return SafetyProblem(
         name="DubinsObstacle",
-        plant=vehicle_and_obstacle(0.8),
-        model=vehicle_and_obstacle(0.5),
-        barriers=(Barrier((x - x_o) ** 2 + (y - y_o) ** 2 - r**2),),
+        plant=vehicle_among(0.8, moving, {v_o: 0.5}),
+        model=vehicle_among(0.5, moving, {v_o: 0.5}),
+        barriers=(Barrier(separation(x_o, y_o, r)),),
         states=(
             Variable(x, -5.0, 6.0, "m"),
             Variable(y, -5.0, 5.0, "m"),
@@ -75,19 +98,17 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
             Feature("ahead_x", x_o - x, -11.0, 25.0),
             Feature("ahead_y", y_o - y, -10.0, 10.0),
         ),
-        reward=towards_goal + _GOAL_BONUS * (1 + sp.sign(goal)) / 2,
-        nominal=(turn_rate_towards(to_goal_x, to_goal_y),),
         starts={
             "spread": Start((*(around(s, 0.5, w) for s, w in zip(_START, spread, strict=True)), *map(sp.Float, _OBSTACLE_START)), spread),
             "thesis": Start.at((*_START, *_OBSTACLE_START)),
         },
-        goal=goal,
         dt=0.05,
         horizon=15.0,
         noise=("sigma_1", "sigma_2"),
         gains=(1.0, 1.0),
         filter="hocbf",
         plane=("x", "y"),
+        **way_to(_GOAL_X, _GOAL_Y),
     )
 
 

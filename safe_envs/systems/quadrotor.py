@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import sympy as sp
 
@@ -39,7 +41,19 @@ cos_psi, sin_psi = sp.symbols("cos_psi sin_psi", real=True)
 
 _AIRFRAME = {ell: 0.23, I_x: 7.5e-3, I_y: 7.5e-3, I_z: 1.3e-2, k_t: 3.13e-5, k_d: 7.5e-7}
 _MOST_ROTOR = 1.0e5
-_TILT = math.pi / 3
+
+LARGEST_TILT = math.pi / 3
+"""Largest roll and pitch in the workspace, in rad."""
+
+_STATES = (
+    *(Variable(s, -5.0, 5.0, "m") for s in (x, y)),
+    HEIGHT[0],
+    *(Variable(s, -10.0, 10.0, "m/s") for s in (xdot, ydot)),
+    HEIGHT[1],
+    *(Variable(s, -LARGEST_TILT, LARGEST_TILT, "rad") for s in (phi, theta)),
+    Variable(psi, -math.inf, math.inf, "rad"),
+    *(Variable(s, -15.0, 15.0, "rad/s") for s in (phidot, thetadot, psidot)),
+)
 
 MIXING = sp.ImmutableMatrix([[k_t] * 4, [0, -k_t, 0, k_t], [k_t, 0, -k_t, 0], [k_d, -k_d, k_d, -k_d]])
 """(U_1, U_2, U_3, U_4) = MIXING (Omega_1^2, ..., Omega_4^2). Source: thesis Eq. (3.30)."""
@@ -68,7 +82,7 @@ def quadrotor(mass: float) -> ControlAffineSDE:
     diffusion = sp.zeros(12, 3)
     diffusion[3, 0], diffusion[4, 1], diffusion[5, 2] = sigma_x, sigma_y, sigma_z
     return ControlAffineSDE(
-        states=(x, y, z, xdot, ydot, zdot, phi, theta, psi, phidot, thetadot, psidot),
+        states=tuple(s.symbol for s in _STATES),
         inputs=rotors,
         drift=drift,
         input_matrix=by_force * MIXING,
@@ -77,15 +91,15 @@ def quadrotor(mass: float) -> ControlAffineSDE:
     )
 
 
-def _rotor_laws() -> tuple[sp.Expr, ...]:
-    """Thrust by the altitude, torques that hold position and heading, through the inverse of the mixing.
+def rotor_laws(x_wanted: sp.Expr, x_rate_wanted: sp.Expr) -> tuple[sp.Expr, ...]:
+    """Thrust by the altitude, torques that follow x and hold y and the heading at 0, through the inverse of the mixing.
 
     The position loop asks for a horizontal acceleration, which for small tilts is g times an angle: that angle is
     what the attitude loop, about three times as fast, follows.
     """
-    wanted_x, wanted_y = -x - 2 * xdot, -y - 2 * ydot
-    wanted_phi = (wanted_x * sin_psi - wanted_y * cos_psi) / g
-    wanted_theta = (wanted_x * cos_psi + wanted_y * sin_psi) / g
+    push_x, push_y = x_wanted - x + 2 * (x_rate_wanted - xdot), -y - 2 * ydot
+    wanted_phi = (push_x * sin_psi - push_y * cos_psi) / g
+    wanted_theta = (push_x * cos_psi + push_y * sin_psi) / g
     efforts = sp.Matrix(
         [
             thrust_law(),
@@ -97,6 +111,36 @@ def _rotor_laws() -> tuple[sp.Expr, ...]:
     return tuple(MIXING.inv() * efforts)
 
 
+def start_at(known: Mapping[sp.Symbol, Any], spread: Sequence[sp.Symbol] = ()) -> Start:
+    """Some components of the state, and 0 for all others."""
+    return Start(tuple(sp.sympify(known.get(s.symbol, 0)) for s in _STATES), tuple(spread))
+
+
+def rotor_problem(name: str, *, followed: Sequence[Feature] = (), **rest: Any) -> SafetyProblem:
+    """What the problems with all twelve states have in common.
+
+    Args:
+        name: of the problem.
+        followed: references beside that of the altitude.
+        **rest: see `altitude_problem`.
+    """
+    return altitude_problem(
+        name,
+        states=_STATES,
+        inputs=tuple(Variable(s, 0.0, _MOST_ROTOR, "rad^2/s^2") for s in rotors),
+        features=(
+            *(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in _STATES if s.symbol != psi),
+            Feature("cos_psi", sp.cos(psi), -1.0, 1.0),
+            Feature("sin_psi", sp.sin(psi), -1.0, 1.0),
+            *FOLLOWED,
+            *followed,
+        ),
+        noise=("sigma_x", "sigma_y", "sigma_z"),
+        plane=("x", "z"),
+        **rest,
+    )
+
+
 def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyProblem:
     """All twelve states, for a quadrotor that is heavier than its designer believes.
 
@@ -106,37 +150,14 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
 
     Source: thesis Sec. 3.5.2, Eq. (3.29), (3.30), (3.32).
     """
-    height, climb = uniforms(2)
-    start = dict.fromkeys((x, y, z, xdot, ydot, zdot, phi, theta, psi, phidot, thetadot, psidot), sp.Integer(0))
-    states = (
-        *(Variable(s, -5.0, 5.0, "m") for s in (x, y)),
-        HEIGHT[0],
-        *(Variable(s, -10.0, 10.0, "m/s") for s in (xdot, ydot)),
-        HEIGHT[1],
-        *(Variable(s, -_TILT, _TILT, "rad") for s in (phi, theta)),
-        Variable(psi, -math.inf, math.inf, "rad"),
-        *(Variable(s, -15.0, 15.0, "rad/s") for s in (phidot, thetadot, psidot)),
-    )
-    return altitude_problem(
+    height, climb = spread = uniforms(2)
+    return rotor_problem(
         "Quadrotor",
         plant=quadrotor(PLANT_MASS),
         model=quadrotor(MODEL_MASS),
         barriers=(band(center, half_width),),
-        states=states,
-        inputs=tuple(Variable(s, 0.0, _MOST_ROTOR, "rad^2/s^2") for s in rotors),
-        features=(
-            *(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in states if s.symbol != psi),
-            Feature("cos_psi", sp.cos(psi), -1.0, 1.0),
-            Feature("sin_psi", sp.sin(psi), -1.0, 1.0),
-            *FOLLOWED,
-        ),
-        nominal=_rotor_laws(),
-        starts={
-            "spread": Start(tuple({**start, z: around(5.0, 0.5, height), zdot: around(0.0, 0.5, climb)}.values()), (height, climb)),
-            "thesis": Start(tuple({**start, z: sp.Integer(5)}.values())),
-        },
-        noise=("sigma_x", "sigma_y", "sigma_z"),
-        plane=("x", "z"),
+        nominal=rotor_laws(sp.Integer(0), sp.Integer(0)),
+        starts={"spread": start_at({z: around(5.0, 0.5, height), zdot: around(0.0, 0.5, climb)}, spread), "thesis": start_at({z: 5})},
     )
 
 

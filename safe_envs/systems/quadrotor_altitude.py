@@ -28,6 +28,9 @@ _REFERENCE = sp.Add(5, sp.Rational(5, 2) * sp.sin(TIME))
 HEIGHT = (Variable(z, 0.0, 10.0, "m"), Variable(zdot, -10.0, 10.0, "m/s"))
 """Range of the altitude and of its rate."""
 
+ALTITUDE_REWARD = sp.exp(-((z - _REFERENCE) ** 2))
+"""Reward of a step for the altitude, in (0, 1]."""
+
 FOLLOWED = (Feature("z_ref", _REFERENCE, 2.5, 7.5), Feature("z_ref_rate", _REFERENCE.diff(TIME), -2.5, 2.5))
 """The reference altitude, and its rate."""
 
@@ -65,17 +68,9 @@ def band(center: float, half_width: float) -> Barrier:
     return Barrier(1 - ((z - finite_number("center", center)) / positive("half_width", half_width)) ** 4)
 
 
-def altitude_problem(name: str, **rest: Any) -> SafetyProblem:
-    """What both problems have in common: the task, the timing and the gains."""
-    return SafetyProblem(
-        name=name,
-        reward=sp.exp(-((z - _REFERENCE) ** 2)),
-        dt=0.05,
-        horizon=30.0,
-        gains=(2.0, 8.0),
-        filter="hocbf",
-        **rest,
-    )
+def altitude_problem(name: str, *, reward: sp.Expr = ALTITUDE_REWARD, gains: Any = (2.0, 8.0), **rest: Any) -> SafetyProblem:
+    """What all quadrotors have in common: the task, the timing and the gains."""
+    return SafetyProblem(name=name, reward=reward, dt=0.05, horizon=30.0, gains=gains, filter="hocbf", **rest)
 
 
 def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> SafetyProblem:

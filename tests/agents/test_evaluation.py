@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import tracemalloc
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -12,15 +14,16 @@ import pytest
 from scipy.stats import norm
 
 from agents import NominalController, RandomPolicy, evaluate, load_problem, make_policy
-from agents.episodes import Recorder, episode_seed
-from agents.statistics import wilson_interval
+from agents.episodes import Recorder, episode_seed, run_episodes
+from agents.statistics import mcnemar_p, paired_difference_interval, rate_interval, wilson_interval
 from safe_envs import ConfigurationError, RelativeDegreeError, SafeEnv
+from safe_envs.vector import SafeVectorEnv
 from wrappers import SafetyFilterWrapper
 
 COUNTS = ("episodes", "safe", "violations")
 MEASURES = ("safety_rate", "ci_low", "ci_high", "min_h_median", "min_h_p05", "effort_mean", "return_mean")
 RATES = ("intervention_rate", "infeasible_rate")
-KEYS = {"filter", "policy", *COUNTS, *MEASURES, *RATES}
+KEYS = {"filter", "policy", *COUNTS, *MEASURES, *RATES, "curve"}
 
 
 class Constant:
@@ -112,7 +115,7 @@ def replay(env_id, options, spec, policy_name, episodes, seed, knowledge="model"
         infeasible += sum(s[2] for s in before)
         efforts += [np.mean([s[0] for s in before])] if before else []
         kept.append(h)
-    low, high = wilson_interval(safe, episodes)
+    low, high = rate_interval(safe, episodes)
     row = {
         "episodes": episodes,
         "safe": safe,
@@ -130,8 +133,14 @@ def replay(env_id, options, spec, policy_name, episodes, seed, knowledge="model"
     return row, kept
 
 
+def safe_so_far(trajectories, times, dt):
+    """How many trajectories of h are positive up to each time; one that has ended stays as it was."""
+    return [sum(min(h[: round(t / dt) + 1]) > 0 for h in trajectories) for t in times]
+
+
 def assert_same_to_the_bit(first, second):
     assert json.dumps(first.rows) == json.dumps(second.rows)
+    assert json.dumps(first.comparisons) == json.dumps(second.comparisons)
     assert first.config == second.config
     assert first.recorders.keys() == second.recorders.keys()
     for name, recorder in first.recorders.items():
@@ -146,6 +155,7 @@ def test_answer_is_the_same_for_every_num_envs(env_id):
     for other in answers[1:]:
         assert_same_to_the_bit(answers[0], other)
     assert len(answers[0].rows) == 2
+    assert len(answers[0].comparisons) == 1
 
 
 @pytest.mark.parametrize("policy", ["nominal", "random"])
@@ -203,6 +213,13 @@ def test_episodes_replayed_by_hand(env_id, spec, policy, options):
     for i, h in enumerate(trajectories):
         np.testing.assert_allclose(recorded[: len(h), i], h, rtol=1e-6, atol=1e-7)
         assert np.isnan(recorded[len(h) :, i]).all()
+    curve = answer.rows[0]["curve"]
+    assert curve["safe"] == safe_so_far(trajectories, curve["time"], load_problem(env_id, options).dt)
+    assert curve["rate"] == [count / episodes for count in curve["safe"]]
+    assert all(later <= earlier for earlier, later in itertools.pairwise(curve["safe"]))
+    assert (curve["rate"][-1], curve["ci_low"][-1], curve["ci_high"][-1]) == tuple(
+        answer.rows[0][key] for key in ("safety_rate", "ci_low", "ci_high")
+    )
     timing = answer.timing["rows"][0]
     assert timing["steps"] == sum(len(h) - 1 for h in trajectories)
     assert timing["seconds"] > 0
@@ -238,6 +255,78 @@ def test_counting_ends_with_the_first_violation_and_simulation_goes_on():
     assert row["return_mean"] == pytest.approx(np.exp(-((2 * h[1:]) ** 2)).sum(), rel=1e-6)
     # Two waves of ten steps; a hidden state is None, and an episode starts, at the first of them alone.
     assert policy.starts == 2 * [(True, True, True), *(9 * [(False, False, True)])]
+
+
+def test_curve_of_one_episode_falls_at_its_first_violation_for_good():
+    problem = load_problem("Scalar-v0", {"noise": 0.0, "start": [0.9], "dt": 0.05, "horizon": 0.5})
+    inputs = [-0.5, -1.0, -0.9, 4.0, -9.0, -9.0, 0.0, 0.0, 9.0, 9.0]
+    (row,) = evaluate(problem, Schedule(problem, inputs), ["none"], episodes=3, num_envs=2).rows
+    assert row["curve"]["time"] == [k * 0.05 for k in range(11)]
+    assert row["curve"]["safe"] == [3] * 4 + [0] * 7
+
+
+def test_curve_of_a_long_episode_is_thinned_out():
+    # The inputs let x grow by dt in each of 701 steps: x' = e^dt x + (e^dt - 1) u.
+    options = {"noise": 0.0, "start": [0.0], "dt": 1e-3, "horizon": 0.701, "box": [-2.0, 2.0]}
+    x = np.cumsum([0.0] + [1e-3] * 701)
+    inputs = (x[1:] - math.exp(1e-3) * x[:-1]) / (math.exp(1e-3) - 1)
+    for last in (301, 303, 700, 701):
+        problem = load_problem("Scalar-v0", {**options, "barrier": {"limit": float(x[last - 1] + x[last]) / 2}})
+        (row,) = evaluate(problem, Schedule(problem, inputs), ["none"], episodes=2).rows
+        assert len(row["curve"]["time"]) == 177
+        assert row["curve"]["time"][-1] == pytest.approx(0.701)
+        assert row["curve"]["safe"] == [2 if round(t / 1e-3) < last else 0 for t in row["curve"]["time"]]
+
+
+def test_comparisons_are_of_the_same_episodes():
+    filters = ["none", "hocbf:p=1,2", "scbf"]
+    arguments = {"options": {"horizon": 4.0, "noise": 0.4}, "episodes": 150, "seed": 4}
+    answer = evaluate("StochasticDubins-v0", filters=filters, num_envs=64, record=True, confidence=0.9, **arguments)
+    safe = {name: (answer.recorders[name].barrier > 0).all(axis=0) for name in filters}
+    assert [(c["first"], c["second"]) for c in answer.comparisons] == [
+        ("hocbf:p=1,2", "none"),
+        ("scbf", "none"),
+        ("scbf", "hocbf:p=1,2"),
+    ]
+    for c in answer.comparisons:
+        a, b = safe[c["first"]], safe[c["second"]]
+        table = [int(flags.sum()) for flags in (a & b, a & ~b, ~a & b, ~a & ~b)]
+        assert [c[key] for key in ("both", "only_first", "only_second", "neither")] == table
+        assert c["difference"] == pytest.approx(a.mean() - b.mean())
+        assert (c["ci_low"], c["ci_high"]) == paired_difference_interval(*table, 0.9)
+        assert c["mcnemar_p"] == mcnemar_p(*table[1:3])
+    assert min(answer.comparisons[2][key] for key in ("both", "only_first", "neither")) > 0
+    assert answer.document()["comparisons"] == answer.comparisons
+    assert evaluate("StochasticDubins-v0", filters=["scbf"], **arguments).comparisons == []
+
+
+def test_confidence_is_that_of_every_interval():
+    options = {"horizon": 1.0, "noise": 0.5}
+    narrow, wide = (evaluate("Scalar-v0", filters=["none", "scbf"], options=options, episodes=200, confidence=c) for c in (0.5, 0.999))
+    assert (narrow.config["confidence"], wide.config["confidence"]) == (0.5, 0.999)
+    for a, b in zip(narrow.rows, wide.rows, strict=True):
+        assert (a["ci_low"], a["ci_high"]) == rate_interval(a["safe"], 200, 0.5)
+        assert b["ci_low"] < a["ci_low"] < a["safety_rate"] < a["ci_high"] < b["ci_high"]
+        assert b["curve"]["ci_low"][-1] < a["curve"]["ci_low"][-1]
+        assert a["curve"]["rate"] == b["curve"]["rate"]
+    assert wide.comparisons[0]["ci_low"] < narrow.comparisons[0]["ci_low"]
+
+
+def test_episodes_that_are_all_safe_have_the_exact_interval():
+    (row,) = evaluate("ACC-v0", filters=["scbf"], options={"horizon": 0.2}, episodes=1000).rows
+    assert (row["safe"], row["ci_low"], row["ci_high"]) == (1000, pytest.approx(0.025 ** (1 / 1000)), 1.0)
+
+
+def test_starts_are_told_wave_by_wave():
+    problem = load_problem("StochasticDubins-v0", {"horizon": 0.2})
+    policy = NominalController(problem)
+    told = []
+    totals = run_episodes(SafeVectorEnv(problem, 4), policy, 10, 7, on_start=lambda x, count: told.append((np.stack(x), count)))
+    assert totals.episodes == 10
+    assert [(x.shape, count) for x, count in told] == [((3, 4), 4), ((3, 4), 4), ((3, 4), 2)]
+    starts = np.concatenate([x[:, :count] for x, count in told], axis=1).T
+    recorded = evaluate(problem, policy, ["none"], episodes=10, seed=7, record=True).recorders["none"].states[0]
+    np.testing.assert_array_equal(starts, recorded)
 
 
 def test_interventions_after_a_violation_do_not_count():
@@ -305,6 +394,19 @@ def test_filters_see_the_same_episodes_until_they_act():
     assert parted.any()
     # Together at first, and never together again.
     assert (np.diff(parted.astype(int), axis=0) >= 0).all()
+
+
+def test_a_filter_may_have_a_condition_for_each_barrier():
+    problem = load_problem("StochasticDubins-v0", {"horizon": 1.0, "noise": 0.4})
+    disk = problem.barriers[0]
+    wall = replace(disk, name="wall", expression=1 - problem.plant.states[0])
+    problem = replace(problem, barriers=(disk, wall))
+    filters = ["hocbf:p=1.0,1.0+hocbf:p=2.0,8.0", "hocbf:p=2.0,8.0+hocbf:p=1.0,1.0", "hocbf:p=2.0,8.0"]
+    answer = evaluate(problem, filters=filters, episodes=30)
+    assert [f["spec"] for f in answer.config["filters"]] == filters
+    assert len({row["effort_mean"] for row in answer.rows}) == 3
+    with pytest.raises(ConfigurationError, match="has 3 conditions"):
+        evaluate(problem, filters=["hocbf+hocbf+hocbf"])
 
 
 def test_config_is_enough_to_run_it_again():
@@ -455,6 +557,8 @@ def test_evaluations_of_one_episode_over_and_over_are_marked(env_id, policy, opt
         ({"seed": -1}, "seed = -1"),
         ({"num_envs": 0}, "num_envs = 0"),
         ({"knowledge": "plan"}, "did you mean 'plant'"),
+        ({"confidence": 1.0}, "confidence = 1.0; give a number above 0 and below 1"),
+        ({"filters": ["hocbf+none"]}, "'hocbf\\+none': 'none' is the bare env"),
         ({"filters": ["scb"]}, "unknown filter 'scb'; did you mean 'scbf'"),
         ({"filters": ["non"]}, "did you mean 'none'"),
         ({"filters": ["hocbf:q=1,1"]}, "no parameter 'q'"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import mpmath
 import numpy as np
 import pytest
@@ -14,7 +16,8 @@ from safe_envs.simulation import Simulation
 from tests.conftest import problem_of
 
 DEGREES = {
-    "DubinsDisk": 2, "DubinsObstacle": 2, "StochasticDubins": 2, "QuadrotorAltitude": 2, "Quadrotor": 2,
+    "DubinsDisk": 2, "DubinsObstacle": 2, "DubinsObstacles": 2, "StochasticDubins": 2,
+    "QuadrotorAltitude": 2, "Quadrotor": 2, "QuadrotorLimits": 2,
     "ACC": 1, "ACCGap": 2, "Pendulum": 1, "CubicSDE": 1, "CubicSDEDisk": 1, "Scalar": 1,
 }  # fmt: skip
 
@@ -40,11 +43,11 @@ def test_derivatives_equal_finite_differences(env_id, side):
     step = mpmath.mpf("1e-12")
     with mpmath.workdps(60):
         f, g, sigma = (in_fifty_digits(system, m) for m in (system.drift, system.input_matrix, system.diffusion))
-        for x in states_near_starts(problem):
+        for x, barrier in itertools.product(states_near_starts(problem), problem.barriers):
             columns = [[f(x)[i] for i in range(system.n)]]
             columns += [[g(x)[i, j] for i in range(system.n)] for j in range(system.m)]
             noises = [[sigma(x)[i, j] for i in range(system.n)] for j in range(system.diffusion.cols)]
-            phi = problem.barriers[0].expression
+            phi = barrier.expression
             for _ in range(relative_degree(system, phi, generator)):
                 at = in_fifty_digits(system, phi)
                 slopes = [(at(moved(x, d, step)) - at(moved(x, d, -step))) / (2 * step) for d in columns]
@@ -60,10 +63,10 @@ def test_derivatives_equal_finite_differences(env_id, side):
 def test_relative_degrees_of_the_registered_systems(env_id):
     problem = problem_of(env_id, noise=0.3)
     expected = DEGREES[env_id.removeprefix("safe_envs/").removesuffix("-v0")]
-    h = problem.barriers[0].expression
-    assert relative_degree(problem.plant, h) == expected
-    assert relative_degree(problem.plant, h, generator) == expected
-    assert len(problem.gains) == expected
+    for i, barrier in enumerate(problem.barriers):
+        assert relative_degree(problem.plant, barrier.expression) == expected
+        assert relative_degree(problem.plant, barrier.expression, generator) == expected
+        assert len(problem.gains_of(i)) == expected
 
 
 def test_degrees_are_listed_for_every_id():

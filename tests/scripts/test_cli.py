@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import pty
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 import safe_envs
 from agents import evaluate
 from scripts import cli
+from scripts.table import print_evaluation
 
 ROOT = Path(__file__).parents[2]
 DUBINS = "safe_envs/StochasticDubins-v0"
@@ -33,6 +37,7 @@ ROW_KEYS = [
     "infeasible_rate",
     "effort_mean",
     "return_mean",
+    "curve",
 ]
 
 
@@ -83,7 +88,7 @@ def test_json_has_the_documented_keys(safe_envs_command):
     status, _, err = safe_envs_command("evaluate", DUBINS, "--filter", "none", "--filter", "hocbf:p=1,2", *QUICK, "--json", "out.json")
     assert (status, err) == (0, "")
     document = strictly("out.json")
-    assert list(document) == ["config", "versions", "rows", "timing"]
+    assert list(document) == ["config", "versions", "rows", "comparisons", "timing"]
     assert [list(row) for row in document["rows"]] == [ROW_KEYS, ROW_KEYS]
     assert [row["filter"] for row in document["rows"]] == ["none", "hocbf:p=1,2"]
     assert {row["policy"] for row in document["rows"]} == {"nominal"}
@@ -91,6 +96,13 @@ def test_json_has_the_documented_keys(safe_envs_command):
         assert row["episodes"] == 8 == row["safe"] + row["violations"]
         assert 0 <= row["ci_low"] <= row["safety_rate"] <= row["ci_high"] <= 1
         assert row["min_h_p05"] <= row["min_h_median"]
+        assert list(row["curve"]) == ["time", "safe", "rate", "ci_low", "ci_high"]
+        assert {len(column) for column in row["curve"].values()} == {7}
+    (comparison,) = document["comparisons"]
+    assert list(comparison) == [
+        *("first", "second", "both", "only_first", "only_second", "neither"),
+        *("difference", "ci_low", "ci_high", "mcnemar_p"),
+    ]
     assert {"safe-envs", "python", "numpy", "gymnasium"} <= set(document["versions"])
     assert document["timing"]["num_envs"] == 1024
     assert [row["filter"] for row in document["timing"]["rows"]] == ["none", "hocbf:p=1,2"]
@@ -123,6 +135,7 @@ def test_every_option_reaches_the_evaluation(safe_envs_command):
         *("evaluate", "StochasticDubins-v0", "--filter", "hocbf", "--policy", "zero", "--episodes", "6", "--seed", "5"),
         *("--noise", ".1,.3", "--plant", "v=1.5", "--model", "v=1.7", "--barrier", "radius=2.5", "--knowledge", "plant"),
         *("--dt", ".02", "--substeps", "2", "--horizon", ".4", "--box", "-3,4", "--start", "-0.5,0,1", "--num-envs", "4"),
+        *("--confidence", ".9"),
         *("--json", "out.json"),
     )
     assert status == 0
@@ -137,13 +150,14 @@ def test_every_option_reaches_the_evaluation(safe_envs_command):
         "box": [-3.0, 4.0],
         "start": [-0.5, 0.0, 1.0],
     }
-    wanted = evaluate(DUBINS, "zero", ["hocbf"], options=options, episodes=6, seed=5, knowledge="plant")
+    wanted = evaluate(DUBINS, "zero", ["hocbf"], options=options, episodes=6, seed=5, knowledge="plant", confidence=0.9)
     document = strictly("out.json")
     assert document["rows"] == wanted.rows
     assert document["config"] == json.loads(json.dumps(wanted.config))
     for text in (DUBINS, "policy zero", "6 episodes", "seed 5", "v = 1.5 (model 1.7)", "sigma_1 = 0.1, sigma_2 = 0.3", "dt = 0.02 s"):
         assert text in out
     assert "filters know the plant" in out
+    assert "safe [90 % interval]" in out
 
 
 def test_boxes_for_each_input_and_named_starts(safe_envs_command):
@@ -174,6 +188,69 @@ def test_table_shows_the_rows(safe_envs_command):
             assert shown in line
     assert f"{100 * answer.rows[1]['intervention_rate']:.1f} %" in lines["scbf"]
     assert "Note: nothing is random" not in out
+
+
+def test_filters_are_compared_under_the_table(safe_envs_command):
+    filters = [argument for name in ("none", "hocbf", "scbf", "hocbf:p=1,1") for argument in ("--filter", name)]
+    _, out, _ = safe_envs_command("evaluate", DUBINS, *filters, "--episodes", 200, "--noise", 0.4, "--json", "out.json")
+    shown = out.partition("Difference of the safety rates on the same episodes [95 % interval]:\n")[2].splitlines()
+    comparisons = [c for c in strictly("out.json")["comparisons"] if "none" not in (c["first"], c["second"])]
+    assert len(shown) == len(comparisons) == 3
+    for line, c in zip(shown, comparisons, strict=True):
+        assert f"{c['first']} - {c['second']}: {100 * c['difference']:+.1f} points " in line
+        assert f"[{100 * c['ci_low']:.1f}, {100 * c['ci_high']:.1f}], McNemar p " in line
+        assert line.endswith(f"(safe with one only: {c['first']} {c['only_first']}, {c['second']} {c['only_second']})")
+    assert shown[0].lstrip().startswith("scbf - hocbf: +")
+    assert "McNemar p < 1e-10" in shown[0]
+    assert "Difference" not in safe_envs_command("evaluate", DUBINS, *QUICK)[1]
+
+
+def test_all_safe_shows_the_exact_interval(safe_envs_command):
+    _, out, _ = safe_envs_command("evaluate", "ACC-v0", "--filter", "scbf", "--episodes", "100", "--horizon", "0.2")
+    # Clopper and Pearson's, .025^(1/100) = 96.38 %; Wilson's would begin at 96.3 %.
+    assert "100.0 % [96.4, 100.0]" in out
+
+
+def test_refinement_says_which_rates_have_converged(safe_envs_command):
+    arguments = ("evaluate", "ACC-v0", "--filter", "none", "--filter", "scbf", "--episodes", "200", "--horizon", "0.2")
+    status, out, err = safe_envs_command(*arguments, "--refine", "--confidence", ".9", "--json", "out.json", "--plot", "out.svg")
+    assert (status, err) == (0, "")
+    plain, _, refined = out.partition("Refinement: safe [90 % interval]")
+    assert "safe [90 % interval]" in plain
+    for text in ("dt = 0.05 s", "dt = 0.025 s", "dt = 0.0125 s", "noise that is not coupled", "no further than 3 points"):
+        assert text in refined
+    row = strictly("out.json")["refinement"]["rows"][1]
+    rates = [f"100.0 % [{100 * low:.1f}, 100.0]" for low in row["ci_low"]]
+    (line,) = [line for line in refined.splitlines() if line.startswith("scbf")]
+    assert line.split() == ["scbf", *" ".join(rates).split()]
+    assert f"scbf: converged, +0.0 points [{100 * row['change_low']:.1f}, {100 * row['change_high']:.1f}]" in refined
+    few = safe_envs_command(*arguments, "--episodes", "10", "--refine")[1]
+    assert "  scbf: not resolved, +0.0 points [-27.8, 27.8]: more episodes are needed" in few
+    coarse = ("--dt", ".4", "--horizon", "1.6", "--start", ".5", "--noise", ".8", "--episodes", "2000")
+    changing = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", *coarse, "--refine")[1]
+    assert "  none: still changing by -" in changing
+    picture = Path("out.svg").read_text()
+    assert "dt = 0.05 s" in picture
+    assert "90 % band" in picture
+
+
+def test_bounds_are_shown_where_there_are_any():
+    answer = evaluate(DUBINS, filters=["none", "hocbf", "scbf"], options={"horizon": 0.2}, episodes=5)
+
+    def printed(*changes):
+        console = Console(width=200, file=io.StringIO())
+        rows = [{**row, **change} for row, change in zip(answer.rows, changes, strict=True)]
+        print_evaluation(console, replace(answer, rows=rows))
+        return console.file.getvalue()
+
+    bounded = printed({}, {"bound": None, "bound_note": "it ignores the noise"}, {"bound": 0.492, "bound_note": ""})
+    lines = {line.split()[0]: line for line in bounded.splitlines() if line.startswith(("none", "hocbf", "scbf"))}
+    assert "≥ 49.2 %" in lines["scbf"]
+    assert "] none " in " ".join(lines["hocbf"].split())
+    assert "] - " in " ".join(lines["none"].split())
+    assert "Note: no proved bound for hocbf: it ignores the noise\n" in bounded
+    assert bounded.count("no proved bound") == 1
+    assert "bound" not in printed({}, {}, {})
 
 
 def test_the_plants_mass_saves_the_quadrotor(safe_envs_command):
@@ -210,7 +287,7 @@ def test_plot_writes_a_picture(safe_envs_command, env_id, name, options):
     assert content.startswith(starts[Path(name).suffix.lower()])
     assert len(content) > 5000
     if name == "a.SVG":
-        for text in (b"barrier h", b"none: ", b"hocbf: ", b"scbf: ", b"unsafe"):
+        for text in (b"barrier h", b"safe so far", b"pointwise 95 % band", b"none: ", b"hocbf: ", b"scbf: ", b"unsafe"):
             assert text in content
     assert [p.name for p in Path().iterdir()] == [name]
 
@@ -222,7 +299,7 @@ USER_ERRORS = (
     ([":x"], [":x"]),
     ([DUBINS, "--filter", "hocb"], ["unknown filter 'hocb'", "did you mean 'hocbf'"]),
     ([DUBINS, "--filter", "hocbf:q=1,1"], ["no parameter 'q'", "allowed: p"]),
-    ([DUBINS, "--filter", "hocbf:p=a"], ["p = 'a' is no number"]),
+    ([DUBINS, "--filter", "hocbf:p=a"], ["'a' is not allowed"]),
     ([DUBINS, "--filter", "hocbf:p=-1,1"], ["positive"]),
     ([DUBINS, "--filter", "hocbf:p=1"], ["relative degree 2"]),
     ([DUBINS, "--filter", "scbf:alpha=1"], ["no parameter 'alpha'"]),
@@ -251,6 +328,14 @@ USER_ERRORS = (
     ([DUBINS, "--episodes", "0"], ["episodes = 0"]),
     ([DUBINS, "--num-envs", "0"], ["num_envs = 0"]),
     ([DUBINS, "--seed", "-1"], ["seed = -1"]),
+    ([DUBINS, "--confidence", "1"], ["confidence = 1.0", "above 0 and below 1"]),
+    ([DUBINS, "--confidence", "95"], ["confidence = 95.0", "such as 0.95"]),
+    ([DUBINS, "--confidence", "nan"], ["confidence = nan"]),
+    ([DUBINS, "--filter", "hocbf:p=1,2+scbf"], ["has 2 conditions"]),
+    ([DUBINS, "--filter", "hocbf+none"], ["'hocbf+none'", "'none' is the bare env"]),
+    ([DUBINS, "--filter", "none+hocbf:p=1,2"], ["'none' is the bare env"]),
+    ([DUBINS, "--refine", "--episodes", "0"], ["episodes = 0"]),
+    (["Scalar-v0", "--refine", "--dt", "5e-324", "--horizon", "5e-324"], ["dt = 0.0 s", "positive and finite"]),
     ([DUBINS, "--dt", "0"], ["dt = 0"]),
     ([DUBINS, "--horizon", "nan"], ["horizon = nan"]),
     ([DUBINS, "--substeps", "0"], ["substeps = 0"]),

@@ -8,7 +8,7 @@ import sympy as sp
 
 from safe_envs import ConfigurationError, RelativeDegreeError
 from tests.conftest import problem_of
-from wrappers import CBF, CONDITIONS, ECBF, HOCBF, SCBF, parse_condition
+from wrappers import CBF, CONDITIONS, ECBF, HOCBF, SCBF, SRCBF, SZCBF, parse_condition, parse_conditions, spec_of
 
 
 def constraint(condition, env_id, **arguments):
@@ -72,14 +72,81 @@ def test_ecbf_needs_real_negative_poles():
     assert ECBF((6.0, 11.0, 6.0)).k == (6.0, 11.0, 6.0)  # -1, -2, -3
     for p in np.random.default_rng(0).uniform(0.05, 20.0, 50):
         ECBF.for_gains((p, p))  # double poles, which rounding splits
-        ECBF.for_gains((p, p, p))
-    with pytest.raises(ConfigurationError, match="complex poles"):
-        ECBF((2.0, 1.0))
+        ECBF(k=ECBF.for_gains((p, p, p)).k)
+    for wrong in ({"k": (2.0, 1.0)}, {"poles": (-1 + 1j, -1 - 1j)}, {"poles": (-1.0, 0.0)}, {"poles": (2.0,)}, {"poles": ()}):
+        with pytest.raises(ConfigurationError, match="place real negative poles"):
+            ECBF(**wrong)
     with pytest.raises(ConfigurationError, match="positive"):
         ECBF((-1.0, 2.0))
+    with pytest.raises(ConfigurationError, match="gains or poles"):
+        ECBF((1.0, 2.0), poles=(-1.0, -1.0))
 
 
-@pytest.mark.parametrize("text", ["cbf:alpha=0.3", "ecbf:k=2.0,3.0", "hocbf:p=2.0,8.0", "scbf"])
+def test_ecbf_by_poles_has_the_gains_of_their_polynomial_and_keeps_the_sets_of_the_hocbf():
+    ecbf = ECBF(poles=(-2.0, -8.0))
+    assert ecbf.k == (16.0, 10.0)
+    assert ecbf == ECBF((16.0, 10.0))
+    problem, placed = constraint(ecbf, "safe_envs/DubinsDisk-v0")
+    _, hocbf = constraint(HOCBF((2.0, 8.0)), "safe_envs/DubinsDisk-v0")
+    difference = problem.model.numeric(placed.chain[1] - hocbf.chain[1])
+    assert abs(float(difference.subs(dict(zip(problem.model.states, (0.3, -0.4, 1.1), strict=True))))) < 1e-9
+
+
+def test_szcbf_has_the_corrected_chain():
+    problem, found = constraint(SZCBF((0.7, 3.0)), "safe_envs/StochasticDubins-v0")
+    at = dict(zip(problem.model.states, (0.3, -0.4, 1.1), strict=True))
+    v, sigma, a_1, a_2 = 2.0, 0.2, 0.7, 3.0
+    h = 9 - 0.3**2 - 0.4**2
+    a_h = -2 * v * (0.3 * np.cos(1.1) - 0.4 * np.sin(1.1)) - 2 * sigma**2
+    h_1 = a_h + a_1 * h
+    offset = -2 * v**2 + a_1 * a_h + a_2 * h_1  # A h_1 + alpha_2 h_1, where the print has alpha_2 h
+    assert float(problem.model.numeric(found.chain[1]).subs(at)) == pytest.approx(h_1, rel=1e-12)
+    assert float(problem.model.numeric(found.offset).subs(at)) == pytest.approx(offset, rel=1e-12)
+
+
+@pytest.mark.parametrize(("corrected", "stays"), [(True, True), (False, False)])
+def test_the_printed_szcbf_leaves_the_set_without_any_noise(corrected, stays):
+    # x' = y, y' = u, h = 1 - x. The printed h_2 = A h_1 + alpha_2 h gives x'' + a_1 x' + a_2 x <= a_2: an oscillator.
+    a_1, a_2, dt = 1.0, 4.0, 1e-3
+    x, y, highest = 0.0, 0.5, 0.0
+    for _ in range(10_000):
+        h, h_1 = 1 - x, -y + a_1 * (1 - x)
+        u = -a_1 * y + a_2 * (h_1 if corrected else h)
+        x, y = x + dt * y + 0.5 * dt**2 * u, y + dt * u
+        highest = max(highest, x)
+    assert (highest <= 1.0) is stays
+
+
+def test_several_barriers_take_one_text_or_one_each():
+    problem = problem_of("safe_envs/QuadrotorLimits-v0")
+    same = parse_conditions("scbf", problem)
+    assert same == (SCBF(),) * 3
+    assert spec_of(same) == "scbf"
+    each = parse_conditions("hocbf:p=1,2+ecbf:poles=-1,-2+hocbf:p=s+s**3,2", problem)
+    assert [c.name for c in each] == ["hocbf", "ecbf", "hocbf"]
+    assert parse_conditions(spec_of(each), problem) == each
+    by_gains = parse_conditions("hocbf", problem)
+    assert [c.p for c in by_gains] == [problem.gains_of(i) for i in range(3)]
+    with pytest.raises(ConfigurationError, match="has 2 conditions; QuadrotorLimits takes one for all 3 barriers, or one for each"):
+        parse_conditions("hocbf+scbf", problem)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "cbf:alpha=0.3",
+        "cbf:alpha=2*s**3",
+        "ecbf:k=2.0,3.0",
+        "hocbf:p=2.0,8.0",
+        "hocbf:p=2.0,tanh(s)",
+        "rcbf:gamma=0.5:form=log",
+        "srcbf:gamma=0.1:form=inverse",
+        "szcbf:alphas=1.0,0.5",
+        "scbf",
+        "scbf:sampling_margin=first-order",
+        "cbf:alpha=1.0:sampling_margin=0.25",
+    ],
+)
 def test_text_round_trips(text):
     condition = parse_condition(text, (1.0,))
     assert condition.spec == text
@@ -90,7 +157,9 @@ def test_parameters_default_to_the_gains():
     assert parse_condition("hocbf", (2.0, 8.0)) == HOCBF((2.0, 8.0))
     assert parse_condition("cbf", (5.0,)) == CBF(5.0)
     assert parse_condition("ecbf", (2.0, 8.0)) == ECBF((16.0, 10.0))
-    assert set(CONDITIONS) == {"cbf", "ecbf", "hocbf", "scbf"}
+    assert parse_condition("szcbf", (2.0, 8.0)) == SZCBF((2.0, 8.0))
+    assert parse_condition("srcbf", (5.0,)) == SRCBF(1.0)  # gamma is no rate
+    assert set(CONDITIONS) == {"cbf", "ecbf", "hocbf", "rcbf", "srcbf", "scbf", "szcbf"}
 
 
 @pytest.mark.parametrize(
@@ -98,14 +167,22 @@ def test_parameters_default_to_the_gains():
     [
         ("scfb", "unknown filter 'scfb'; did you mean 'scbf'"),
         ("hocbf:q=1", "no parameter 'q'"),
-        ("hocbf:p=1,x", "p = '1,x' is no number"),
-        ("hocbf:p=", "p = '' is no number"),
+        ("hocbf:p=1,x", "'x' is not allowed; write arithmetic of s"),
+        ("hocbf:p=", "is no expression of s"),
         ("hocbf:p=1,-2", "give positive rates"),
         ("hocbf:p=nan", "give positive rates"),
-        ("cbf:alpha=1,2", "alpha takes one number"),
+        ("cbf:alpha=1,2", "alpha takes one value"),
         ("scbf:alpha=1", "filter scbf has no parameter 'alpha'"),
+        ("hocbf:p=2,8:p=3,3", "names 'p' twice"),
+        ("szcbf:alphas=s", "alphas = s; give positive rates"),
+        ("srcbf:gamma=0", "gamma = 0.0; give positive"),
+        ("rcbf:form=exp", "form = 'exp'; allowed: inverse, log"),
+        ("cbf:sampling_margin=second-order", "sampling_margin = 'second-order'; allowed: none, first-order, or a number >= 0"),
+        ("cbf:sampling_margin=-1", "sampling_margin = -1.0"),
+        ("ecbf:poles=-1+1j,-1-1j", "place real negative poles"),
+        ("scbf+scbf", "unknown filter 'scbf\\+scbf'|has 2 conditions"),
     ],
 )
 def test_text_that_makes_no_condition_is_explained(text, message):
     with pytest.raises(ConfigurationError, match=message):
-        parse_condition(text, (1.0, 1.0))
+        parse_conditions(text, problem_of("safe_envs/StochasticDubins-v0"))

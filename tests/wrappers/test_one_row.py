@@ -159,3 +159,15 @@ def test_size_of_a_row_does_not_matter(size):
     arrays = project_arrays([np.array([size]), np.array([2 * size])], np.array([-1.5 * size]), [np.array([c]) for c in v], low, high, w)
     np.testing.assert_allclose([c[0] for c in arrays[0]], u, rtol=1e-12)
     assert arrays[3].tolist() == [True]
+
+
+def test_weights_and_bounds_of_each_state():
+    rng = np.random.default_rng(4)
+    problems = [random_problem(rng, 3) for _ in range(200)]
+    a, b, v, low, high, w = [np.array(part) for part in zip(*problems, strict=True)]
+    found = project_arrays(list(a.T), b, list(v.T), list(low.T), list(high.T), list(w.T))
+    for i, problem in enumerate(problems):
+        u, margin, active, feasible = project_floats(*[part.tolist() if isinstance(part, np.ndarray) else part for part in problem])
+        np.testing.assert_allclose([c[i] for c in found[0]], u, rtol=1e-12, atol=1e-12)
+        assert found[1][i] == pytest.approx(margin, rel=1e-12, abs=1e-12 * (1 + np.abs(a[i]).max()))
+        assert (found[2][i], found[3][i]) == (active, feasible)

@@ -5,89 +5,151 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
 
 import sympy as sp
 
 from safe_envs.barrier import Barrier
-from safe_envs.calculus import Derivative, input_derivative, relative_degree, tidied
-from safe_envs.errors import ConfigurationError, RelativeDegreeError
+from safe_envs.calculus import Derivative, drift_derivative, generator, input_derivative, relative_degree, tidied
+from safe_envs.errors import ConfigurationError, RelativeDegreeError, SystemDefinitionError
 from safe_envs.sde import ControlAffineSDE
+from wrappers.conditions.class_k import ClassK, Rate, applied
+
+FIRST_ORDER = "first-order"
 
 
-class AffineConstraint(NamedTuple):
-    """a(x) u + b(x) >= 0, with the chain b_0 = h, ..., b_(r-1) that leads to it."""
+@dataclass(frozen=True)
+class AffineConstraint:
+    """The row a(x) u + b(x) >= 0 that a condition asks for.
+
+    Attributes:
+        coefficient: a, an expression for each input.
+        offset: b.
+        chain: b_0 = h, ..., b_(r-1); the condition keeps the intersection of {b_j >= 0}, not C itself.
+        demand: of a reciprocal condition, which asks for a u + b >= demand where h > 0 and has no meaning elsewhere. There
+            a u + b is the rate of h, and all that is left is to make that as large as can be.
+        change: rate of the row while the input is held, an expression of states and inputs, where a margin of first order
+            is asked for.
+    """
 
     coefficient: tuple[sp.Expr, ...]
     offset: sp.Expr
     chain: tuple[sp.Expr, ...]
+    demand: sp.Expr | None = None
+    change: sp.Expr | None = None
 
     @classmethod
-    def after(cls, model: ControlAffineSDE, chain: Sequence[sp.Expr], offset: sp.Expr) -> AffineConstraint:
-        """The constraint L_g b_(r-1) u + offset >= 0 at the end of a chain."""
+    def after(cls, model: ControlAffineSDE, chain: Sequence[sp.Expr], offset: sp.Expr, demand: sp.Expr | None = None) -> AffineConstraint:
+        """The constraint L_g b_(r-1) u + offset >= 0, or >= demand, at the end of a chain."""
         a = input_derivative(model, chain[-1])
-        return cls(tuple(tidied(a[0, j]) for j in range(model.m)), tidied(offset), tuple(chain))
+        return cls(tuple(tidied(a[0, j]) for j in range(model.m)), tidied(offset), tuple(chain), demand)
 
 
+@dataclass(frozen=True)
 class Condition(ABC):
     """Base of the conditions, which are small frozen dataclasses of their parameters.
 
+    A condition holds in continuous time, but an input is held for a control period dt. Along the held input the row
+    psi = a u + b changes by dt psi' + O(dt^2), with psi' the derivative along the flow (for stochastic conditions the
+    generator: then it is the expectation that changes). `sampling_margin` "first-order" therefore asks for
+    psi + dt min(psi', 0) >= 0, so that psi stays nonnegative over the period up to O(dt^2); psi' is quadratic in u and is
+    taken at the action that the condition without a margin allows, which is O(dt) away. A number asks for psi >= that
+    number.
+
     Attributes:
         name: by which `parse_condition` and the command line know it.
+        stochastic: whether it takes the noise into account.
+        sampling_margin: "none", "first-order", or a number >= 0 in the units of the row.
+
+    Raises:
+        ConfigurationError: a parameter is out of its range.
     """
 
     name: ClassVar[str]
+    stochastic: ClassVar[bool] = False
+
+    sampling_margin: str | float = field(default="none", kw_only=True)
+
+    def __post_init__(self) -> None:
+        margin = self.sampling_margin
+        if margin in ("none", FIRST_ORDER):
+            return
+        if isinstance(margin, str) or not 0 <= margin < math.inf:
+            raise ConfigurationError(f"sampling_margin = {margin!r}; allowed: none, {FIRST_ORDER}, or a number >= 0")
+
+    @property
+    def derivative(self) -> Derivative:
+        """D of the chain: the Lie derivative, or the Ito generator."""
+        return generator if self.stochastic else drift_derivative
+
+    def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+        """Derive the constraint for a model and a barrier, in the model's symbols.
+
+        Raises:
+            RelativeDegreeError: the condition does not suit the barrier's relative degree.
+            SystemDefinitionError: a class-K function cannot be differentiated as often as the chain needs.
+        """
+        found = self.derived(model, barrier)
+        if self.sampling_margin == FIRST_ORDER:
+            row = sum(a * u for a, u in zip(found.coefficient, model.inputs, strict=True)) + found.offset - (found.demand or 0)
+            by_input = (input_derivative(model, row) * sp.Matrix(model.inputs))[0, 0]
+            return replace(found, change=self.derivative(model, row) + by_input)
+        if self.sampling_margin != "none":
+            return replace(found, offset=found.offset - sp.Float(self.sampling_margin, 17))
+        return found
 
     @abstractmethod
-    def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
-        """Derive the constraint for a model and a barrier, in the model's symbols."""
+    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+        """Derive the constraint without a margin for sampling."""
 
     @classmethod
     @abstractmethod
     def for_gains(cls, gains: Sequence[float]) -> Condition:
         """The condition with the rates p_1..p_r of a problem for its parameters."""
 
+    def chain_rates(self, degree: int) -> tuple[float, ...] | None:
+        """alpha_1..alpha_r of the chain b_j = D b_(j-1) + alpha_j b_(j-1); None where it is not of this form."""
+        return None
+
     @property
     def spec(self) -> str:
         """The text from which `parse_condition` makes the same condition."""
-        parameters = [
-            f"{key}={','.join(map(repr, value)) if isinstance(value, tuple) else repr(value)}" for key, value in vars(self).items()
-        ]
-        return ":".join([self.name, *parameters])
+        parameters = [f"{key}={_text(value)}" for key, value in vars(self).items() if key != "sampling_margin" or value != "none"]
+        return ":".join([self.name, *sorted(parameters, key=lambda text: text.startswith("sampling_margin"))])
 
 
-def positive_rates(name: str, rates: Sequence[float]) -> tuple[float, ...]:
-    """Return class-K rates as floats, or say which one is not positive.
-
-    Raises:
-        ConfigurationError: there is none, or one is not a positive finite number.
-    """
-    values = tuple(float(r) for r in rates)
-    if not values or not all(math.isfinite(v) and v > 0 for v in values):
-        raise ConfigurationError(f"{name} = {values}; give positive rates in 1/s, one for each relative degree")
-    return values
+def _text(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-def linear_chain(model: ControlAffineSDE, barrier: Barrier, rates: Sequence[float] | None, derivative: Derivative) -> AffineConstraint:
-    """b_0 = h, b_j = D b_(j-1) + p_j b_(j-1), and the constraint b_r >= 0.
+def chain_of(
+    model: ControlAffineSDE, barrier: Barrier, alphas: Sequence[Rate] | None, derivative: Derivative
+) -> tuple[list[sp.Expr], sp.Expr]:
+    """b_0 = h, b_j = D b_(j-1) + alpha_j(b_(j-1)) for j < r, and the part of b_r without the input.
 
     Args:
         model: the system that D differentiates along.
         barrier: h.
-        rates: p_1..p_r; None for zeros, with r computed.
+        alphas: alpha_1..alpha_r; None for zeros, with r computed.
         derivative: D, the Lie derivative or the Ito generator.
 
     Raises:
-        RelativeDegreeError: the number of rates is not the relative degree, or there is none.
+        RelativeDegreeError: the number of functions is not the relative degree, or there is none.
+        SystemDefinitionError: a class-K function cannot be differentiated as often as the chain needs.
     """
     degree = relative_degree(model, barrier.expression, derivative)
-    if rates is None:
-        rates = (0.0,) * degree
-    if len(rates) != degree:
-        raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree} and needs as many rates; {len(rates)} given")
+    if alphas is not None and len(alphas) != degree:
+        raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree} and needs as many rates; {len(alphas)} given")
     chain = [barrier.expression]
-    for p in rates[:-1]:
-        chain.append(derivative(model, chain[-1]) + sp.Float(p, 17) * chain[-1] if p else derivative(model, chain[-1]))
-    last = chain[-1]
-    offset = derivative(model, last) + (sp.Float(rates[-1], 17) * last if rates[-1] else 0)
-    return AffineConstraint.after(model, chain, offset)
+    for alpha in alphas or (None,) * degree:
+        term = 0 if alpha is None else applied(alpha, chain[-1])
+        chain.append(derivative(model, chain[-1]) + term)
+    offset = chain.pop()
+    curved = [str(alpha) for alpha in alphas or () if isinstance(alpha, ClassK)]
+    if curved and sp.Matrix([[offset, *input_derivative(model, chain[-1])]]).has(sp.DiracDelta, sp.Derivative, sp.Subs):
+        raise SystemDefinitionError(
+            f"a class-K function of ({', '.join(curved)}) is not differentiable as often as relative degree {degree} needs: the j-th "
+            f"one needs {degree} - j derivatives (and real symbols: sympy.Symbol(..., real=True))"
+        )
+    return chain, offset

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
+from typing import Any
 
 import sympy as sp
 
@@ -11,33 +12,31 @@ from safe_envs.barrier import Barrier
 from safe_envs.calculus import derivatives, drift_derivative, relative_degree
 from safe_envs.errors import ConfigurationError, RelativeDegreeError
 from safe_envs.sde import ControlAffineSDE
-from wrappers.conditions.base import AffineConstraint, Condition, linear_chain, positive_rates
+from wrappers.conditions.base import AffineConstraint, Condition, chain_of
+from wrappers.conditions.class_k import ClassK, Rate, positive_rates, rates
 
 
 @dataclass(frozen=True)
 class CBF(Condition):
-    """L_f h + L_g h u + alpha h >= 0, for relative degree 1.
+    """L_f h + L_g h u + alpha(h) >= 0, for relative degree 1.
 
     Attributes:
-        alpha: rate in 1/s.
+        alpha: class-K function; a number is its rate in 1/s.
 
     Source: thesis Def. 3.1.2.
     """
 
-    alpha: float = 1.0
+    alpha: Rate = 1.0
     name = "cbf"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "alpha", positive_rates("alpha", (self.alpha,))[0])
+        super().__post_init__()
+        object.__setattr__(self, "alpha", rates("alpha", (self.alpha,))[0])
 
-    def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
-        """Derive the constraint.
-
-        Raises:
-            RelativeDegreeError: the relative degree is not 1.
-        """
+    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+        """Derive the constraint; a relative degree other than 1 is a `RelativeDegreeError`."""
         try:
-            return linear_chain(model, barrier, (self.alpha,), drift_derivative)
+            return AffineConstraint.after(model, *chain_of(model, barrier, (self.alpha,), drift_derivative))
         except RelativeDegreeError as error:
             raise RelativeDegreeError(f"{error}. A cbf is for relative degree 1; use hocbf or ecbf") from error
 
@@ -46,81 +45,122 @@ class CBF(Condition):
         """The CBF with the first rate."""
         return cls(gains[0])
 
+    def chain_rates(self, degree: int) -> tuple[float, ...] | None:
+        """Alpha where it is linear; see `Condition.chain_rates`."""
+        return None if isinstance(self.alpha, ClassK) else (self.alpha,)
+
 
 @dataclass(frozen=True)
 class HOCBF(Condition):
-    """b_0 = h, b_j = L_f b_(j-1) + p_j b_(j-1), and b_r(x, u) >= 0.
+    """b_0 = h, b_j = L_f b_(j-1) + alpha_j(b_(j-1)), and b_r(x, u) >= 0.
 
     The set that it keeps is the intersection of {b_j >= 0}, j < r, not C itself: a start in C alone is no guarantee.
 
     Attributes:
-        p: rates p_1..p_r in 1/s, as many as the relative degree.
+        p: class-K functions alpha_1..alpha_r, as many as the relative degree; a number is the rate of a linear one in 1/s.
 
-    Source: thesis Eq. (3.7), (3.10) with alpha_j(s) = s.
+    Source: thesis Eq. (3.7), (3.10).
     """
 
-    p: tuple[float, ...] = (1.0,)
+    p: tuple[Rate, ...] = (1.0,)
     name = "hocbf"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "p", positive_rates("p", self.p))
+        super().__post_init__()
+        object.__setattr__(self, "p", rates("p", self.p))
 
-    def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
-        """Derive the constraint; see `linear_chain` for what it raises."""
-        return linear_chain(model, barrier, self.p, drift_derivative)
+    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+        """Derive the constraint; see `chain_of` for what it raises."""
+        return AffineConstraint.after(model, *chain_of(model, barrier, self.p, drift_derivative))
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> HOCBF:
         """The HOCBF with all rates."""
         return cls(tuple(gains))
 
+    def chain_rates(self, degree: int) -> tuple[float, ...] | None:
+        """The rates where all are linear; see `Condition.chain_rates`."""
+        linear = tuple(p for p in self.p if not isinstance(p, ClassK))
+        return linear if len(linear) == len(self.p) else None
+
 
 @dataclass(frozen=True)
 class ECBF(Condition):
     """L_f^r h + L_g L_f^(r-1) h u + k_0 h + k_1 L_f h + ... + k_(r-1) L_f^(r-1) h >= 0.
 
-    Attributes:
+    It is the HOCBF whose rates are minus its poles, and keeps the same sets.
+
+    Args:
         k: gains k_0..k_(r-1). The polynomial s^r + k_(r-1) s^(r-1) + ... + k_0 needs real negative roots: stability
             alone, as thesis Def. 3.1.5 prints it, lets h undershoot below 0.
+        poles: these roots, in 1/s, in place of the gains.
+
+    Attributes:
+        k: the gains.
 
     Raises:
-        ConfigurationError: a root is complex or not negative.
+        ConfigurationError: a pole is complex or not negative, or both gains and poles are given.
 
     Source: thesis Eq. (3.6).
     """
 
-    k: tuple[float, ...] = (1.0,)
+    k: tuple[float, ...] | None = None
+    poles: InitVar[Sequence[complex] | None] = None
     name = "ecbf"
 
-    def __post_init__(self) -> None:
-        gains = positive_rates("k", self.k)
+    def __post_init__(self, poles: Sequence[complex] | None) -> None:
+        super().__post_init__()
+        if poles is not None and self.k is not None:
+            raise ConfigurationError(f"ecbf takes gains or poles; k = {self.k} and poles = {tuple(poles)} were given")
+        if poles is not None:
+            _require_real_negative(f"poles = {', '.join(map(str, poles))}", [sp.sympify(pole) for pole in poles])
+            gains = _gains(poles)
+        else:
+            gains = positive_rates("k", (1.0,) if self.k is None else self.k)
+            _require_real_negative(f"k = {gains} places poles there", _roots(gains))
         object.__setattr__(self, "k", gains)
-        s = sp.Symbol("s")
-        polynomial = sp.Poly([1, *(sp.Rational(repr(g)) for g in reversed(gains))], s)
-        roots = polynomial.nroots(maxsteps=200)
-        # Rounding splits a multiple pole into a ring about it: what oscillates a thousand times slower than it decays is real.
-        if any(sp.re(root) >= 0 or abs(sp.im(root)) > 1e-3 * abs(root) for root in roots):
-            roots = ", ".join(str(sp.N(root, 4)) for root in roots)
-            raise ConfigurationError(
-                f"k = {gains} places complex poles ({roots}), so that h would oscillate through 0; place real negative ones"
-            )
 
-    def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint.
 
         Raises:
             RelativeDegreeError: the number of gains is not the relative degree, or there is none.
         """
+        gains: tuple[float, ...] = self.k or ()
         degree = relative_degree(model, barrier.expression)
-        if len(self.k) != degree:
-            raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree} and needs as many gains; {len(self.k)} given")
-        chain = derivatives(model, barrier.expression, degree - 1, drift_derivative)
-        offset = drift_derivative(model, chain[-1]) + sum(sp.Float(k, 17) * eta for k, eta in zip(self.k, chain, strict=True))
+        if len(gains) != degree:
+            raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree} and needs as many gains; {len(gains)} given")
+        eta = derivatives(model, barrier.expression, degree, drift_derivative)
+        offset = eta[-1] + sum(sp.Float(k, 17) * e for k, e in zip(gains, eta, strict=False))
+        chain, _ = chain_of(model, barrier, self.chain_rates(degree), drift_derivative)
         return AffineConstraint.after(model, chain, offset)
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> ECBF:
         """The ECBF with its poles at minus the rates."""
-        s = sp.Symbol("s")
-        polynomial = sp.Poly(sp.Mul(*[s + sp.Rational(repr(float(p))) for p in gains]), s)
-        return cls(tuple(float(c) for c in reversed(polynomial.all_coeffs()[1:])))
+        return cls(poles=tuple(-rate for rate in gains))
+
+    def chain_rates(self, degree: int) -> tuple[float, ...]:
+        """Minus the poles, the slowest first; see `Condition.chain_rates`."""
+        return tuple(sorted(float(-sp.re(root)) for root in _roots(self.k or ())))
+
+
+def _gains(poles: Sequence[Any]) -> tuple[float, ...]:
+    s = sp.Symbol("s")
+    polynomial = sp.Poly(sp.Mul(*[s - sp.Rational(repr(float(p.real))) for p in poles]), s)
+    return tuple(float(c) for c in reversed(polynomial.all_coeffs()[1:]))
+
+
+def _roots(gains: Sequence[float]) -> list[Any]:
+    polynomial = sp.Poly([1, *(sp.Rational(repr(k)) for k in reversed(gains))], sp.Symbol("s"))
+    return polynomial.nroots(maxsteps=200)
+
+
+def _require_real_negative(given: str, roots: Sequence[Any]) -> None:
+    # Rounding splits a multiple pole into a ring about it: what oscillates a thousand times slower than it decays is real.
+    if not roots or any(not root.is_finite or sp.re(root) >= 0 or abs(sp.im(root)) > 1e-3 * abs(root) for root in roots):
+        listing = ", ".join(str(sp.N(root, 4)) for root in roots)
+        raise ConfigurationError(
+            f"{given} ({listing}): place real negative poles, one for each relative degree; with complex poles h would oscillate "
+            "through 0, and with others it would not come back to the safe set"
+        )

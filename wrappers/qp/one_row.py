@@ -75,7 +75,7 @@ def _follow_multiplier(
 
 
 def project_arrays(
-    a: Sequence[Any], b: Any, v: Sequence[np.ndarray], low: Sequence[Any], high: Sequence[Any], w: Sequence[float]
+    a: Sequence[Any], b: Any, v: Sequence[np.ndarray], low: Sequence[Any], high: Sequence[Any], w: Sequence[Any]
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
     """Project the inputs of a batch of B states. A flat row divides by zero: the caller silences that warning.
 
@@ -83,9 +83,9 @@ def project_arrays(
         a: m entries of the row, each a float or an array (B,).
         b: the offset, a float or an array (B,).
         v: m arrays (B,) of proposed inputs.
-        low: m lower bounds.
-        high: m upper bounds.
-        w: m positive weights.
+        low: m lower bounds, each a float or an array (B,).
+        high: m upper bounds, likewise.
+        w: m positive weights, likewise.
 
     Returns:
         As `project_floats`, with arrays (B,) for every number.
@@ -131,17 +131,15 @@ def _follow_multipliers(
     u: list[np.ndarray],
     low: Sequence[Any],
     high: Sequence[Any],
-    w: Sequence[float],
+    w: Sequence[Any],
     rows: np.ndarray,
 ) -> list[np.ndarray]:
     """The general case for the states in `rows`, components in front: shape (m, R), kinks in a third axis (m, R, 2m + 1)."""
     batch = u[0].shape
-    ar = np.array([np.broadcast_to(aj, batch)[rows] for aj in a])
-    vr = np.array([vj[rows] for vj in v])
+    ar, vr, lo, hi, wr = [np.array([np.broadcast_to(cj, batch)[rows] for cj in c]) for c in (a, v, low, high, w)]
     size = np.abs(ar).max(axis=0)
     size[size == 0.0] = 1.0
     ar, br = ar / size, np.broadcast_to(b, batch)[rows] / size  # so that products neither overflow nor vanish
-    lo, hi, wr = (np.array(c)[:, None] for c in (low, high, w))
     d = ar / wr
     near, far = np.where(d > 0.0, lo, hi), np.where(d > 0.0, hi, lo)
     free = d != 0.0

@@ -1,143 +1,127 @@
-"""Several constraint rows and a box: ProxQP, batched, and never wrong silently.
+"""Any number of rows and inputs: each QP goes to the method that is exact for its size.
 
-ProxQP's defaults return feasible points that are not the minimisers, and an infeasible problem ends at the iteration
-limit. So the settings ask for the duality gap and cap the iterations, and every answer is checked against the rows. What
-is left is solved in two exact steps, which serve contradicting rows too: the smallest sum of squared slacks first, then
-the action nearest to the proposed one that needs no more than these.
+    min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a_i . u + b_i >= 0,   low <= u <= high
+
+Where the rows cannot be met together, the answer is the least-violating action, flagged: it minimises sum_i priority_i
+slack_i^2 with slack_i = max(0, -(a_i . u + b_i)), and among the minimisers it is the one nearest to v. One row, one input and
+two inputs have exact methods of their own, and so has a single row that binds; the rest goes to ProxQP, which is imported on
+first use.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-import qpsolvers
-import scipy.optimize
-from proxsuite import proxqp  # pyright: ignore[reportMissingImports]  (it lives in a prefix of its own)
 
-_PRECISION = {"eps_abs": 1e-9, "eps_rel": 0.0, "check_duality_gap": True, "eps_duality_gap_abs": 1e-9}
-_SETTINGS = {**_PRECISION, "eps_primal_inf": 1e-14, "max_iter": 200, "max_iter_in": 50}
-_INFINITY = 1e20
-_ACCEPTED = 1e-7
-"""Largest violation of a normalised row that counts as met: a hundred times what the solver is asked for."""
+from wrappers.qp import interval, one_binding, one_row, plane, plane_batch
+from wrappers.qp.rows import stack
 
 
-class Projection(NamedTuple):
-    """Arrays over a batch of B states: inputs (B, m), margins and binding rows (B, k), whether all can be met (B,)."""
-
-    u: np.ndarray
-    margin: np.ndarray
-    active: np.ndarray
-    feasible: np.ndarray
-
-
-def project(a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray) -> Projection:
-    """Project proposed inputs onto k rows a u + b >= 0 and a box.
+def project_floats(
+    a: Sequence[Sequence[float]],
+    b: Sequence[float],
+    v: Sequence[float],
+    low: Sequence[float],
+    high: Sequence[float],
+    w: Sequence[float],
+    priority: Sequence[float],
+) -> tuple[list[float], list[float], list[bool], bool]:
+    """Project the proposed input of one state.
 
     Args:
-        a: rows, shape (B, k, m).
-        b: offsets, shape (B, k).
-        v: proposed inputs, shape (B, m).
-        low: lower bounds, shape (m,).
-        high: upper bounds, shape (m,).
-        w: positive weights, shape (m,).
+        a: k rows of m coefficients.
+        b: k offsets.
+        v: m proposed inputs.
+        low: m lower bounds.
+        high: m upper bounds.
+        w: m positive weights.
+        priority: k positive weights of the squared slacks.
+
+    Returns:
+        Inputs (m), margins a_i . u + b_i (k), rows that bind or cannot be met (k; none where the clipped proposal meets them
+        all), and whether all rows can be met.
     """
-    u = np.clip(v, low, high)
-    margin = (a @ u[:, :, None])[:, :, 0] + b
-    feasible = np.ones(len(u), dtype=bool)
-    active = np.zeros(margin.shape, dtype=bool)
-    acting = np.flatnonzero((margin < 0.0).any(axis=1))
-    if acting.size:
-        scaled = _Scaled.of(a[acting], b[acting], v[acting], low, high, w)
-        z, met = scaled.solve()
-        feasible[acting] = met
-        u[acting] = np.clip(scaled.center + scaled.half * z, low, high)
-        margin[acting] = (a[acting] @ u[acting][:, :, None])[:, :, 0] + b[acting]
-        active[acting] = margin[acting] <= _ACCEPTED * scaled.lengths
-    return Projection(u, margin, active, feasible)
+    if len(b) == 1:
+        u, margin, active, feasible = one_row.project_floats(a[0], b[0], v, low, high, w)
+        return u, [margin], [active], feasible
+    if len(v) == 2:
+        return plane.project_floats(a, b, v, low, high, w, priority)
+    if len(v) == 1:
+        u, margin, active, feasible = interval.project_floats([ai for (ai,) in a], b, v[0], low[0], high[0], priority)
+        return [u], margin, active, feasible
+    *parts, feasible = project_arrays(a, b, [np.array([c]) for c in v], low, high, w, priority)
+    inputs, margins, binding = [[entry.item() for entry in part] for part in parts]
+    return inputs, margins, binding, feasible.item()
 
 
-class _Scaled(NamedTuple):
-    """The problem in z = (u - center) / half, with the box [-1, 1] and rows of unit length."""
+@np.errstate(all="ignore")
+def project_arrays(
+    a: Sequence[Sequence[Any]],
+    b: Sequence[Any],
+    v: Sequence[np.ndarray],
+    low: Sequence[Any],
+    high: Sequence[Any],
+    w: Sequence[Any],
+    priority: Sequence[float],
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], np.ndarray]:
+    """Project the proposed inputs of a batch of B states.
 
-    rows: np.ndarray
-    offsets: np.ndarray
-    lengths: np.ndarray
-    target: np.ndarray
-    hessian: np.ndarray
-    center: np.ndarray
-    half: np.ndarray
+    Args:
+        a: k rows of m coefficients, each a float or an array (B,).
+        b: k offsets, likewise.
+        v: m arrays (B,) of proposed inputs.
+        low: m lower bounds, each a float or an array (B,).
+        high: m upper bounds, likewise.
+        w: m positive weights, likewise.
+        priority: k positive weights of the squared slacks.
 
-    @classmethod
-    def of(cls, a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray) -> _Scaled:
-        center, half = 0.5 * (low + high), 0.5 * (high - low)
-        rows = a * half
-        offsets = b + a @ center
-        lengths = np.linalg.norm(rows, axis=2)
-        # A flat row says nothing of the input: its offset alone decides, in its own units.
-        lengths = np.where(lengths > np.finfo(float).tiny, lengths, np.maximum(np.abs(offsets), 1.0))
-        curvature = w * half**2
-        return cls(
-            rows / lengths[:, :, None], offsets / lengths, lengths, (v - center) / half, np.diag(curvature / curvature.max()), center, half
+    Returns:
+        As `project_floats`, with an array (B,) for every number.
+    """
+    if len(b) == 1:
+        u, margin, active, feasible = one_row.project_arrays(a[0], b[0], v, low, high, w)
+        return u, [margin], [active], feasible
+    if len(v) == 1:
+        u, margin, active, feasible = interval.project_arrays([ai for (ai,) in a], b, v[0], low[0], high[0], priority)
+        return [u], list(margin), list(active), feasible
+    if len(v) == 2:
+        u, margin, active, feasible = plane_batch.project_arrays(a, b, v, low, high, w, priority)
+        return list(u), list(margin), list(active), feasible
+    return _solver(a, b, v, low, high, w, priority)
+
+
+def _solver(
+    a: Sequence[Sequence[Any]],
+    b: Sequence[Any],
+    v: Sequence[np.ndarray],
+    low: Sequence[Any],
+    high: Sequence[Any],
+    w: Sequence[Any],
+    priority: Sequence[float],
+) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], np.ndarray]:
+    size = len(v[0])
+    rows = [stack(ai, size) for ai in a]
+    offsets, proposed, lower, upper = [stack(part, size) for part in (b, v, low, high)]
+    (u, margin, active, feasible), left = one_binding.project_arrays(rows, offsets, proposed, lower, upper, w)
+    if left.size:
+        # Imported here, since few filters need a solver.
+        from wrappers.qp import proxqp
+
+        def of_left(part: np.ndarray) -> np.ndarray:
+            return part[:, left].T
+
+        found = proxqp.project(
+            np.stack([of_left(row) for row in rows], axis=1),
+            of_left(offsets),
+            of_left(proposed),
+            of_left(lower),
+            of_left(upper),
+            of_left(stack(w, size)),
+            np.array(priority),
         )
-
-    def solve(self) -> tuple[np.ndarray, np.ndarray]:
-        """Minimisers (B, m), and whether the rows are met (B,)."""
-        z, met = self._in_batch()
-        for i in np.flatnonzero(~met).tolist():
-            least = self._least_violating(i)
-            slack = np.maximum(-(self.rows[i] @ least + self.offsets[i]), 0.0)
-            nearest = self._nearest(i, slack + _ACCEPTED)
-            z[i] = least if nearest is None else nearest
-            # Without a certified minimiser the rows may be met, but the step is flagged all the same.
-            met[i] = nearest is not None and bool((slack <= _ACCEPTED).all())
-        return z, met
-
-    def _in_batch(self) -> tuple[np.ndarray, np.ndarray]:
-        count, k, m = self.rows.shape
-        batch = proxqp.dense.BatchQP(count)
-        upper = np.concatenate([np.full(k, _INFINITY), np.ones(m)])
-        for i in range(count):
-            qp = batch.init_qp_in_place(m, 0, k + m)
-            for name, value in _SETTINGS.items():
-                setattr(qp.settings, name, value)
-            rows = np.vstack([self.rows[i], np.eye(m)])
-            lower = np.concatenate([-self.offsets[i], -np.ones(m)])
-            qp.init(*self._objective(i), None, None, rows, lower, upper)
-        proxqp.dense.solve_in_parallel(batch, 1)
-        z, met = np.zeros((count, m)), np.zeros(count, dtype=bool)
-        for i in range(count):
-            results = batch.get(i).results
-            if results.info.status == proxqp.PROXQP_SOLVED and self._meets(i, results.x, 0.0):
-                z[i], met[i] = results.x, True
-        return z, met
-
-    def _objective(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Hessian and gradient, scaled down where the proposal lies far outside the box."""
-        size = max(1.0, float(np.abs(self.target[i]).max()))
-        return self.hessian / size, -self.hessian @ self.target[i] / size
-
-    def _meets(self, i: int, z: np.ndarray, slack: np.ndarray | float) -> bool:
-        rows_met = self.rows[i] @ z + self.offsets[i] + slack >= -_ACCEPTED
-        return bool(rows_met.all() and (np.abs(z) <= 1.0 + _ACCEPTED).all())
-
-    def _nearest(self, i: int, slack: np.ndarray) -> np.ndarray | None:
-        """The minimiser with the rows relaxed until they can be met, without a guess; None where it is not found."""
-        bound = np.ones(self.half.size)
-        problem = qpsolvers.Problem(*self._objective(i), -self.rows[i], self.offsets[i] + slack, lb=-bound, ub=bound)
-        solution = qpsolvers.solve_problem(problem, solver="proxqp", initial_guess=proxqp.NO_INITIAL_GUESS, **_PRECISION)
-        z = solution.x
-        return z if solution.found and z is not None and self._meets(i, z, slack) else None
-
-    def _least_violating(self, i: int) -> np.ndarray:
-        """An action of least sum of squared slacks, these in the rows' own units.
-
-        With p the positive and s the negative part of a row's margin, min |rows z + offsets - p|^2 over z in the box and
-        p >= 0 leaves s as the residual: a bounded least-squares problem, which BVLS solves exactly.
-        """
-        k, m = self.rows.shape[1:]
-        units = (self.lengths[i] / self.lengths[i].max())[:, None]
-        matrix = units * np.hstack([self.rows[i], -np.eye(k)])
-        low, high = np.concatenate([-np.ones(m), np.zeros(k)]), np.concatenate([np.ones(m), np.full(k, np.inf)])
-        fit = scipy.optimize.lsq_linear(matrix, -units[:, 0] * self.offsets[i], (low, high), method="bvls", tol=1e-14)
-        return np.clip(fit.x[:m], -1.0, 1.0)
+        for whole, part in zip((u, margin, active), found[:3], strict=True):
+            whole[:, left] = part.T
+        feasible[left] = found.feasible
+    return list(u), list(margin), list(active), feasible

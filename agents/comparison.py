@@ -1,0 +1,66 @@
+"""Two filters on the same episodes, pair by pair."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from agents.statistics import mcnemar_p, paired_difference_interval
+
+Comparison = dict[str, Any]
+
+
+class Flags:
+    """A bit for each episode, in the order and the portions in which they come."""
+
+    def __init__(self) -> None:
+        self._bits = bytearray()
+        self._count = 0
+
+    def add(self, values: np.ndarray) -> None:
+        """Keep the flags, shape (B,)."""
+        self._bits += np.packbits(values).tobytes()
+        self._count += len(values)
+
+    def table(self, other: Flags) -> tuple[int, int, int, int]:
+        """Count episodes with the flag of both, of this only, of the other only, of neither.
+
+        Args:
+            other: of the same episodes, added in the same portions.
+        """
+        mine, others = np.frombuffer(self._bits, np.uint8), np.frombuffer(other._bits, np.uint8)
+        # A portion is filled up with zeros to whole bytes: they are no flag of either.
+        both, first, second = (int(np.bitwise_count(bits).sum()) for bits in (mine & others, mine & ~others, others & ~mine))
+        return both, first, second, self._count - both - first - second
+
+
+def compare_all(flags: Mapping[str, Flags], confidence: float) -> list[Comparison]:
+    """Compare every two filters by which of the same episodes were safe: each one with those before it.
+
+    A p value is of its pair alone: it is not adjusted for the number of pairs.
+
+    Args:
+        flags: which episodes were safe, by filter.
+        confidence: of the interval of the difference of their rates.
+    """
+    return [_compare(second, first, flags[second].table(flags[first]), confidence) for first, second in combinations(flags, 2)]
+
+
+def _compare(first: str, second: str, table: tuple[int, int, int, int], confidence: float) -> Comparison:
+    both, only_first, only_second, neither = table
+    low, high = paired_difference_interval(*table, confidence)
+    return {
+        "first": first,
+        "second": second,
+        "both": both,
+        "only_first": only_first,
+        "only_second": only_second,
+        "neither": neither,
+        "difference": (only_first - only_second) / sum(table),
+        "ci_low": low,
+        "ci_high": high,
+        "mcnemar_p": mcnemar_p(only_first, only_second),
+    }
