@@ -18,12 +18,14 @@ from agents.comparison import Comparison, Flags, compare_all
 from agents.episodes import Env, Progress, Recorder, Row, Totals, run_episodes
 from agents.policy import POLICIES, Policy, make_policy
 from agents.problems import full_id, load_problem
-from agents.statistics import require_confidence
+from agents.statistics import RunningSum, require_confidence, share
+from safe_envs.codegen import Components
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
 from safe_envs.vector import SafeVectorEnv
 from wrappers import CONDITIONS, SafetyFilterVectorWrapper, parse_conditions, spec_of
+from wrappers.proved import proved_bound
 
 BARE = "none"
 """Name of the row without any filter."""
@@ -87,6 +89,9 @@ def evaluate(
     violation an episode's interventions, infeasible steps and effort are no longer counted: the conditions mean
     nothing outside the safe set. Its simulation goes on, and its return and smallest h are of the whole episode.
 
+    Beside the rate stands the largest bound that is proved for the filter, on average over the starts: see
+    `wrappers.bounds`. It is of continuous time and rests on suprema that are estimated.
+
     Episode i is seeded by its own child of `seed`, the same for all filters; all but `timing` is the same, to the
     last bit, for every `num_envs`.
 
@@ -139,14 +144,39 @@ def evaluate(
     recorders = {name: Recorder(world.steps, world.plant.n, episodes) for name in names} if record else {}
     for i, (name, env) in enumerate(zip(names, envs, strict=True)):
         told = None if progress is None else _part_of(progress, i, len(names), episodes)
+        promised = _Promise(name, world, knowledge)
         begun = time.perf_counter()
-        totals = run_episodes(env, actor, episodes, seed, told, recorders.get(name))
+        totals = run_episodes(env, actor, episodes, seed, told, recorders.get(name), promised.add)
         speeds.append(_speed(name, totals, time.perf_counter() - begun))
-        rows.append({"filter": name, "policy": config["policy"]["name"], **totals.row(confidence)})
+        rows.append({"filter": name, "policy": config["policy"]["name"], **totals.row(confidence), **promised.row()})
         flags[name] = totals.flags
     timing = {"num_envs": num_envs, "rows": speeds}
     comparisons = compare_all(flags, confidence)
     return Evaluation(world, config, rows, comparisons, timing, recorders, flags, _is_deterministic(world, actor))
+
+
+class _Promise:
+    """The proved bound on P(safe up to the horizon) of a filter, averaged over the starts of the episodes."""
+
+    def __init__(self, name: str, problem: SafetyProblem, knowledge: str) -> None:
+        self._horizon = problem.steps * problem.dt
+        self._bound = None if name == BARE else proved_bound(problem, parse_conditions(name, problem), knowledge)
+        self._total, self._count = RunningSum(), 0
+
+    def add(self, start: Components, count: int) -> None:
+        """Take the starts of a wave."""
+        if self._bound is not None and self._bound.note is None:
+            self._total.add(self._bound.at(np.stack(start, axis=1)[:count], self._horizon))
+            self._count += count
+
+    def row(self) -> Row:
+        """The mean bound, None where there is none, and why there is none or why it is weak."""
+        if self._bound is None:
+            return {"bound": None, "bound_note": "there is no filter"}
+        mean = share(self._total.total, self._count)
+        if not mean:
+            return {"bound": None, "bound_note": self._bound.note or self._bound.remark or "it is 0 at these starts up to this horizon"}
+        return {"bound": mean, "bound_note": self._bound.remark}
 
 
 def _part_of(progress: Progress, before: int, parts: int, episodes: int) -> Progress:

@@ -9,6 +9,7 @@ import typer
 
 from scripts.console import run
 from scripts.evaluate import evaluate
+from scripts.verify import verify
 
 app = typer.Typer(
     name="safe-envs",
@@ -18,6 +19,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("evaluate")(evaluate)
+app.command("verify")(verify)
 
 
 @app.command("list")

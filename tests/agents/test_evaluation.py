@@ -23,7 +23,7 @@ from wrappers import SafetyFilterWrapper
 COUNTS = ("episodes", "safe", "violations")
 MEASURES = ("safety_rate", "ci_low", "ci_high", "min_h_median", "min_h_p05", "effort_mean", "return_mean")
 RATES = ("intervention_rate", "infeasible_rate")
-KEYS = {"filter", "policy", *COUNTS, *MEASURES, *RATES, "curve"}
+KEYS = {"filter", "policy", *COUNTS, *MEASURES, *RATES, "curve", "bound", "bound_note"}
 
 
 class Constant:
@@ -382,7 +382,8 @@ def test_a_filter_that_never_acts_leaves_everything_as_it_is():
     answer = evaluate("ACC-v0", "random", ["none", "cbf:alpha=50"], options=options, episodes=40, num_envs=16, record=True)
     bare, filtered = answer.rows
     assert (bare["intervention_rate"], filtered["intervention_rate"]) == (0.0, 0.0)
-    assert {**bare, "filter": ""} == {**filtered, "filter": ""}
+    alike = {"filter": "", "bound_note": ""}
+    assert {**bare, **alike} == {**filtered, **alike}
     np.testing.assert_array_equal(answer.recorders["none"].states, answer.recorders["cbf:alpha=50"].states)
 
 
@@ -593,3 +594,27 @@ def test_random_policy_and_noise_do_not_share_their_numbers():
     actions = policy.predict(np.zeros((400, 1)))[0][:, 0]
     starts = [np.random.default_rng(episode_seed(0, i)).random() for i in range(400)]
     assert abs(np.corrcoef(actions, starts)[0, 1]) < 5 / math.sqrt(400)
+
+
+def test_bounds_stand_beside_the_rates_or_say_why_not():
+    cubic = evaluate("CubicSDEDisk-v0", filters=["none", "scbf", "szcbf", "cbf"], options={"start": [0.3, 0.4]}, episodes=20)
+    bare, scbf, szcbf, cbf = cubic.rows
+    assert (bare["bound"], bare["bound_note"]) == (None, "there is no filter")
+    # h = .75, c = 1, A h >= -.08 at worst, over 1 s; and with A h + 2 h >= 0 everywhere.
+    assert scbf["bound"] == pytest.approx(0.75 - 0.08, abs=1e-4)
+    assert "by up to 0.08" in scbf["bound_note"]
+    assert (szcbf["bound"], szcbf["bound_note"]) == (pytest.approx(0.75 * math.exp(-2.0), abs=1e-4), "")
+    assert (cbf["bound"], cbf["bound_note"]) == (None, "cbf ignores the noise")
+    (acc,) = evaluate("ACC-v0", filters=["scbf"], options={"horizon": 1.0}, episodes=5).rows
+    assert (acc["bound"], acc["bound_note"]) == (None, "sup h is infinite")
+    (mismatch,) = evaluate("DubinsDisk-v0", filters=["hocbf"], options={"horizon": 1.0}, episodes=5).rows
+    assert (mismatch["bound"], mismatch["bound_note"]) == (None, "the model differs from the plant in v")
+
+
+def test_bound_is_the_mean_over_the_starts():
+    answer = evaluate("CubicSDEDisk-v0", filters=["szcbf"], episodes=50, num_envs=16, record=True)
+    starts = answer.recorders["szcbf"].states[0]
+    assert len(starts) == 32
+    first = evaluate("CubicSDEDisk-v0", filters=["szcbf"], episodes=32, num_envs=7)
+    assert first.rows[0]["bound"] == pytest.approx(np.mean(1 - starts[:, 0] ** 2 - starts[:, 1] ** 2) * math.exp(-2.0), rel=1e-3)
+    assert first.rows[0]["bound"] != answer.rows[0]["bound"]

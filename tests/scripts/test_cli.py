@@ -38,6 +38,8 @@ ROW_KEYS = [
     "effort_mean",
     "return_mean",
     "curve",
+    "bound",
+    "bound_note",
 ]
 
 
@@ -78,9 +80,9 @@ def test_list_shows_every_id(safe_envs_command):
 def test_help_names_the_commands(safe_envs_command):
     status, out, _ = safe_envs_command("--help")
     assert status == 0
-    for command in ("list", "evaluate", "demo", "benchmark"):
+    for command in ("list", "evaluate", "verify", "demo", "benchmark"):
         assert command in out
-    for command in ("evaluate", "demo", "benchmark"):
+    for command in ("evaluate", "verify", "demo", "benchmark"):
         assert safe_envs_command(command, "--help")[0] == 0
 
 
@@ -193,7 +195,7 @@ def test_table_shows_the_rows(safe_envs_command):
 def test_filters_are_compared_under_the_table(safe_envs_command):
     filters = [argument for name in ("none", "hocbf", "scbf", "hocbf:p=1,1") for argument in ("--filter", name)]
     _, out, _ = safe_envs_command("evaluate", DUBINS, *filters, "--episodes", 200, "--noise", 0.4, "--json", "out.json")
-    shown = out.partition("Difference of the safety rates on the same episodes [95 % interval]:\n")[2].splitlines()
+    shown = out.partition("Difference of the safety rates on the same episodes [95 % interval]:\n")[2].partition("\n\n")[0].splitlines()
     comparisons = [c for c in strictly("out.json")["comparisons"] if "none" not in (c["first"], c["second"])]
     assert len(shown) == len(comparisons) == 3
     for line, c in zip(shown, comparisons, strict=True):
@@ -250,7 +252,9 @@ def test_bounds_are_shown_where_there_are_any():
     assert "] - " in " ".join(lines["none"].split())
     assert "Note: no proved bound for hocbf: it ignores the noise\n" in bounded
     assert bounded.count("no proved bound") == 1
-    assert "bound" not in printed({}, {}, {})
+    below = printed({}, {}, {"bound": 0.999, "ci_high": 0.98})
+    assert "the rate of scbf lies below its proved bound" in below
+    assert "lies below" not in bounded
 
 
 def test_the_plants_mass_saves_the_quadrotor(safe_envs_command):

@@ -1,0 +1,98 @@
+"""`safe-envs verify`: where a filter's conditions can be met, what they promise, and whether that is true."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from safe_envs.files import require_writable, write_atomically
+from scripts import options
+from scripts.console import progress_bar, run, stdout
+
+
+def verify(
+    env_id: Annotated[str, typer.Argument(metavar="ENV_ID", help="Registered id; `safe-envs list` shows all.")],
+    filter_name: Annotated[
+        str | None,
+        typer.Option("--filter", metavar="NAME", help="As for evaluate: scbf, hocbf:p=2,8, ... By default the env's own."),
+    ] = None,
+    noise: Annotated[
+        str | None, typer.Option(metavar="X", help="Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.")
+    ] = None,
+    plant: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter of the simulated system. Repeatable.")] = None,
+    model: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter that the designer believes. Repeatable.")] = None,
+    barrier: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Argument of the barrier. Repeatable.")] = None,
+    knowledge: Annotated[str, typer.Option(metavar="model|plant", help="What the conditions know.")] = "model",
+    dt: Annotated[float | None, typer.Option(help="Control period in s.")] = None,
+    horizon: Annotated[float | None, typer.Option(help="Length of an episode in s, the first T of the bounds.")] = None,
+    box: Annotated[list[str] | None, typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each.")] = None,
+    start: Annotated[str | None, typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution.")] = None,
+    policy: Annotated[str, typer.Option(metavar="NAME|FILE", help="Who acts in the simulation, as for evaluate.")] = "nominal",
+    episodes: Annotated[int, typer.Option(help="Episodes of the simulation, from each start.")] = 500,
+    seed: Annotated[int, typer.Option(help="Seed of all randomness.")] = 0,
+    simulate: Annotated[bool, typer.Option("--simulate/--no-simulate", help="Measure the safety, and hold it against the bounds.")] = True,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all that was found.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Draw where the conditions cannot be met, h and the boundaries: .png, .pdf, .svg.")
+    ] = None,
+) -> None:
+    """Print where the filter's conditions cannot be met, what is proved of its safety, and what a simulation says to that.
+
+    The safe set C is sampled, and searched for the worst: where the input has no say, where no action in the box meets the
+    conditions, and the suprema on which the bounds rest. Nothing of this depends on the policy; the simulation does.
+    """
+    from agents.problems import full_id, load_problem
+    from agents.verification import measure, starts_of
+    from scripts.verify_report import document, print_report
+    from wrappers import parse_conditions
+    from wrappers.promise import promise
+    from wrappers.verify import require_count
+    from wrappers.verify import verify as find
+
+    require_count("episodes", episodes, 1)
+    if json is not None:
+        require_writable(json)
+    if plot is not None:
+        from scripts.figure import require_format
+
+        require_writable(plot)
+        require_format(plot)
+    arguments: dict[str, Any] = {
+        "noise": options.noise(noise),
+        "plant": options.parameters("--plant", plant or ()),
+        "model": options.parameters("--model", model or ()),
+        "barrier": options.parameters("--barrier", barrier or (), words=True),
+        "dt": dt,
+        "horizon": horizon,
+        "box": options.box(box or ()),
+        "start": options.start(start),
+    }
+    problem = load_problem(env_id, arguments)
+    found = find(problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed)
+    starts = starts_of(problem, seed)
+    bounds = promise(found, starts, problem.horizon)
+    measurements = []
+    if simulate:
+        with progress_bar("Simulating") as tell:
+            measurements = measure(found, policy, episodes=episodes, seed=seed, progress=tell)
+    print_report(stdout(), full_id(env_id), found, starts, bounds, policy, measurements)
+    if json is not None:
+        config = {
+            "env_id": full_id(env_id),
+            "options": {k: v for k, v in arguments.items() if v is not None},
+            "policy": policy,
+            "seed": seed,
+        }
+        text = jsonlib.dumps(document(config, found, bounds, measurements), indent=2, allow_nan=False)
+        write_atomically(json, lambda part: part.write_text(text + "\n"))
+    if plot is not None:
+        from scripts.verify_figure import draw
+
+        draw(full_id(env_id), found, starts, plot)
+
+
+if __name__ == "__main__":
+    run(lambda: typer.run(verify))

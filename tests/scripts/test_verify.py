@@ -1,0 +1,132 @@
+"""`safe-envs verify` as a person types it."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import pytest
+
+from agents import verification
+from scripts import cli
+
+CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
+
+
+@pytest.fixture
+def verify(monkeypatch, capsys, tmp_path):
+    """Runs the command in this process, in an empty folder; returns its exit status and what it printed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(verification, "_LONG_MULTIPLES", ())
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["safe-envs", "verify", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        printed = capsys.readouterr()
+        return ended.value.code or 0, printed.out, printed.err
+
+    return run
+
+
+def strictly(path):
+    def refuse(name):
+        raise ValueError(f"{name} is not JSON")
+
+    return json.loads(path.read_text(), parse_constant=refuse)
+
+
+def test_the_report_names_what_was_found(verify):
+    status, out, err = verify(CUBIC_DISK, "--episodes", 100)
+    assert (status, err) == (0, "")
+    for text in (
+        "relative degree 1 with scbf",
+        "it vanishes at",
+        "the best action misses it by 0.08",
+        "sup h over C = c = 1",
+        "C: 1.6 %, missed by up to 0.08 at (x_1 = 0, x_2 = 0)",
+        "hypothesis fails",
+        "repaired for the shortfall m = 0.08, up to T",
+        "policy nominal",
+        "The measurement contradicts bound 1, hypothesis fails (Prop. 4.2.8: h/c, for ever)",
+        "no proofs",
+    ):
+        assert text in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "texts"),
+    [
+        (("safe_envs/ACC-v0",), ("sup h over C is infinite", "no bound")),
+        (("StochasticDubins-v0",), ("c_0 = 8.9996, c_1 = 11.92", "product of b_j/c_j", "conditions on the future")),
+        (("StochasticDubins-v0", "--filter", "hocbf"), ("hocbf ignores the noise",)),
+        (("DubinsDisk-v0",), ("theta over a period of 2 pi", "the model differs from the plant in v", "the input has no say")),
+        (("DubinsDisk-v0", "--filter", "hocbf:p=1,1", "--knowledge", "plant"), ("the best action misses it by 0.28",)),
+        (("DubinsDisk-v0", "--start", "thesis", "--knowledge", "plant"), ("the start is outside C_1: b_1 = -1.26",)),
+        (("Pendulum-v0", "--start", ".1,.1"), ("nowhere; the least to spare", "proved", "72.7 %")),
+    ],
+)
+def test_reports_without_a_simulation(verify, arguments, texts):
+    status, out, err = verify(*arguments, "--no-simulate")
+    assert (status, err) == (0, "")
+    assert "Measured" not in out
+    for text in texts:
+        assert text in out
+
+
+def test_json_holds_all_of_it(verify, tmp_path):
+    path = tmp_path / "found.json"
+    assert verify("ACC-v0", "--episodes", 5, "--horizon", 1, "--json", path)[0] == 0
+    document = strictly(path)
+    assert document["config"] == {
+        "env_id": "safe_envs/ACC-v0",
+        "options": {"horizon": 1.0},
+        "policy": "nominal",
+        "seed": 0,
+        "filter": "scbf",
+        "knowledge": "model",
+        "horizon": 1.0,
+    }
+    (barrier,) = document["barriers"]
+    assert (barrier["supremum"], barrier["unbounded"], barrier["suprema"]) == (None, True, [None])
+    assert document["bounds"][0]["status"] == "no bound"
+    assert len(document["safe"]["worst"]) == 3
+    (measured,) = document["measurements"]
+    assert [h["time"] for h in measured["horizons"]] == [1.0, 2.0, 5.0, 10.0, 20.0]
+
+
+@pytest.mark.parametrize("env_id", ["StochasticDubins-v0", "CubicSDEDisk-v0", "Scalar-v0", "QuadrotorAltitude-v0"])
+def test_the_picture_is_drawn(verify, env_id, tmp_path):
+    path = tmp_path / "found.svg"
+    assert verify(env_id, "--no-simulate", "--plot", path)[0] == 0
+    picture = path.read_text()
+    assert "no action meets the condition" in picture
+    assert "worst state" in picture
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("Nothing-v0",), "unknown env"),
+        ((CUBIC_DISK, "--filter", "none"), "unknown filter 'none'"),
+        ((CUBIC_DISK, "--filter", "hocbf:p=1,2"), "relative degree 1"),
+        ((CUBIC_DISK, "--knowledge", "guess"), "allowed: model, plant"),
+        ((CUBIC_DISK, "--episodes", "0"), "episodes = 0"),
+        ((CUBIC_DISK, "--seed", "-1"), "seed = -1"),
+        ((CUBIC_DISK, "--box", "1"), "--box"),
+        ((CUBIC_DISK, "--policy", "nobody"), "unknown policy"),
+        ((CUBIC_DISK, "--json", "missing/found.json"), "does not exist"),
+        ((CUBIC_DISK, "--plot", "found.xyz"), "unknown format"),
+    ],
+)
+def test_errors_of_the_user_end_with_status_2(verify, arguments, message):
+    status, out, err = verify(*arguments)
+    assert status == 2
+    assert message in " ".join(err.split())
+    assert not out
+
+
+def test_help_names_the_command(verify):
+    status, out, _ = verify("--help")
+    assert status == 0
+    assert "--no-simulate" in out

@@ -1,0 +1,262 @@
+"""What conditions promise at a start: which bounds hold, which fail and why, and the one that is proved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from wrappers import bounds
+from wrappers.conditions import SRCBF
+from wrappers.formulas import Formulas
+from wrappers.safe_set import largest, sample
+from wrappers.verify import Verification
+
+Status = Literal["proved", "hypothesis fails", "no bound", "unproved"]
+
+_SAMPLES = 2048
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A lower bound on the probability of staying safe.
+
+    Attributes:
+        name: of the result.
+        value: at the start, or its mean over several; None if there is none.
+        status: what it is worth.
+        reason: why, in words; may be empty where it is proved.
+        forever: whether it is of all times, not only up to the horizon.
+    """
+
+    name: str
+    value: float | None
+    status: Status
+    reason: str
+    forever: bool = False
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The chains of all barriers, with what the bounds need of them.
+
+    Attributes:
+        rates: of each stage, in 1/s.
+        suprema: c_j of each, finite.
+        shortfalls: m_j of each, 0 except for the last one of a barrier.
+    """
+
+    rates: tuple[float, ...]
+    suprema: tuple[float, ...]
+    shortfalls: tuple[float, ...]
+
+
+def promise(verification: Verification, starts: np.ndarray, horizon: float) -> list[Bound]:
+    """The bounds of the results that suit the conditions, at a start or on average over several.
+
+    P(safe) from a random start is the mean of P(safe) over it, so that the mean of a bound is a bound.
+
+    Args:
+        verification: of the conditions.
+        starts: states, shape (B, n).
+        horizon: T in s.
+    """
+    formulas = verification.formulas
+    nothing = no_bound(formulas) or _unbounded(verification)
+    if nothing:
+        return [Bound("all of them", None, "no bound", nothing)]
+    kept = verification.kept
+    if kept is None:
+        return [Bound("all of them", None, "no bound", "the sets C_j have no state in common")]
+    b = formulas.chain(starts)
+    inside = (b > 0.0).all(axis=1)
+    if not inside.any():
+        return [Bound("all of them", None, "hypothesis fails", _outside(formulas, b))]
+    partly = "" if inside.all() else f"0 at the {100 * (1 - inside.mean()):.1f} % of the starts that are outside some C_j"
+    failing = [mismatch(formulas), _infeasible(verification)]
+    candidates = _certain(verification, b, horizon) if formulas.certain else _from_chains(verification, b, horizon)
+    return [_judged(candidate, failing, partly) for candidate in candidates]
+
+
+class _Candidate(NamedTuple):
+    """A result that suits the conditions.
+
+    Attributes:
+        name: of it.
+        values: at the starts, shape (B,).
+        forever: whether it is of all times.
+        unproved: why it is not proved even where its hypotheses hold; may be empty.
+        allows_shortfall: whether the conditions may be missed somewhere.
+    """
+
+    name: str
+    values: np.ndarray
+    forever: bool
+    unproved: str = ""
+    allows_shortfall: bool = False
+
+
+def _judged(candidate: _Candidate, failing: Sequence[str], partly: str) -> Bound:
+    differs, infeasible = failing
+    broken = [reason for reason in (differs, "" if candidate.allows_shortfall else infeasible) if reason]
+    status: Status = "hypothesis fails" if broken else "unproved" if candidate.unproved else "proved"
+    reasons = [reason for reason in (*broken, candidate.unproved, partly) if reason]
+    return Bound(candidate.name, float(candidate.values.mean()), status, "; ".join(reasons), candidate.forever)
+
+
+def _certain(verification: Verification, b: np.ndarray, horizon: float) -> list[_Candidate]:
+    """Conditions that keep every path: without noise, or SRCBF."""
+    noisy, stages = verification.formulas.noisy, _stages(verification)
+    name = "Prop. 4.2.2: safe with probability 1" if noisy else "no noise: safe for sure"
+    found = [_Candidate(name, (b > 0.0).all(axis=1).astype(float), forever=True)]
+    if any(stages.shortfalls) and not noisy and not any(map(math.isnan, stages.rates)):
+        values = outlasting(stages, b, horizon)
+        found.append(_Candidate("no noise, in spite of the shortfall: safe up to T", values, forever=False, allows_shortfall=True))
+    return found
+
+
+def _from_chains(verification: Verification, b: np.ndarray, horizon: float) -> list[_Candidate]:
+    """Conditions that know the noise and have a chain of rates: SCBF and SZCBF."""
+    stages = _stages(verification)
+    c, rates, shortfalls = stages.suprema, stages.rates, stages.shortfalls
+    found = _of_order_one(b[:, 0], c[0], rates[0], horizon) if len(c) == 1 else _of_stages(verification, b, stages, horizon)
+    if any(shortfalls):
+        name = f"repaired for the shortfall m = {max(shortfalls):.4g}, up to T"
+        found.append(_Candidate(name, bounds.union_bound(b, c, horizon, rates, shortfalls), forever=False, allows_shortfall=True))
+    return found
+
+
+def _of_order_one(h: np.ndarray, c: float, k: float, horizon: float) -> list[_Candidate]:
+    if not k:
+        return [_Candidate("Prop. 4.2.8: h/c, for ever", bounds.proposition_4_2_8(h, c), forever=True)]
+    # For k <= c the misprinted exponent is merely larger than it has to be.
+    false = f"its exponent is misprinted, and false for k > c: k = {k:g}, c = {c:.4g}" if k > c else ""
+    printed, corrected = bounds.proposition_4_2_5_printed(h, c, horizon), bounds.proposition_4_2_5(h, c, k, horizon)
+    return [
+        _Candidate("Prop. 4.2.5 as printed: (h/c) e^(-c T)", printed, forever=False, unproved=false),
+        _Candidate("Prop. 4.2.5 corrected: (h/c) e^(-k T)", corrected, forever=False),
+    ]
+
+
+def _of_stages(verification: Verification, b: np.ndarray, stages: Stages, horizon: float) -> list[_Candidate]:
+    """The product of the print, for a single barrier, and the union."""
+    forever = not any(stages.rates)
+    time, length = (math.inf, "for ever") if forever else (horizon, "up to T")
+    several = len(verification.barriers) > 1
+    union = bounds.union_bound(b, stages.suprema, time, stages.rates)
+    found = [_Candidate(f"union over the stages{' of all barriers' * several}, {length}", union, forever)]
+    if not several:
+        name = "Thm. 4.2.10 as printed: product of b_j/c_j" if forever else "Thm. 4.2.10, zeroing: product of (b_j/c_j) e^(-a_j T)"
+        product = bounds.theorem_4_2_10_printed(b, stages.suprema, time, stages.rates)
+        found.insert(0, _Candidate(f"{name}, {length}", product, forever, unproved="its proof conditions on the future"))
+    return found
+
+
+def no_bound(formulas: Formulas) -> str:
+    """Why nothing is promised whatever the numbers are, or ""."""
+    if not formulas.noisy:
+        return ""
+    for condition, stage in zip(formulas.conditions, formulas.stages, strict=True):
+        if not condition.stochastic:
+            return f"{condition.name} ignores the noise"
+        if condition.chain_rates(stage.stop - stage.start) is None and not isinstance(condition, SRCBF):
+            return f"{condition.name} has no chain of rates, as the bounds need under noise"
+    if not formulas.certain and any(isinstance(c, SRCBF) for c in formulas.conditions):
+        return "the barriers have conditions of different kinds"
+    return ""
+
+
+def mismatch(formulas: Formulas) -> str:
+    """In what the system that the conditions know differs from the plant, or ""."""
+    plant, known = formulas.problem.plant, formulas.system
+    parts = [n for n in ("drift", "input_matrix", "diffusion") if plant.numeric(getattr(plant, n)) != known.numeric(getattr(known, n))]
+    names = [p.name for p, value in plant.parameters.items() if known.parameters.get(p) != value]
+    return f"the model differs from the plant in {', '.join(names or parts)}" if parts else ""
+
+
+def _unbounded(verification: Verification) -> str:
+    if verification.formulas.certain:
+        return ""
+    for barrier in verification.barriers:
+        growing = np.flatnonzero(np.isinf(barrier.suprema))
+        if growing.size:
+            return infinite(barrier.name, int(growing[0]))
+    return ""
+
+
+def infinite(name: str, stage: int) -> str:
+    """Which supremum is infinite, in words."""
+    return f"sup {name} is infinite" if stage == 0 else f"sup b_{stage} of {name} is infinite"
+
+
+def _outside(formulas: Formulas, b: np.ndarray) -> str:
+    """Where the start is outside, by the value that is lowest."""
+    j = int(b.max(axis=0).argmin())
+    i = next(i for i, stage in enumerate(formulas.stages) if stage.start <= j < stage.stop)
+    name = formulas.problem.barriers[i].name
+    stage = j - formulas.stages[i].start
+    what = name if stage == 0 else f"b_{stage}" + (f" of {name}" if len(formulas.stages) > 1 else "")
+    return f"the start is outside C_{stage}: {what} = {b[:, j].max():.4g}" + (" at most" if len(b) > 1 else "")
+
+
+def _infeasible(verification: Verification) -> str:
+    kept = verification.kept
+    if kept is None or not kept.shortfall:
+        return ""
+    formulas = verification.formulas
+    share = f"{100 * kept.infeasible:.2g} % of" if kept.infeasible else "a thin part of"
+    where = "C" if formulas.first_order else "the intersection of the C_j"
+    conditions = "the condition" if len(formulas.conditions) == 1 else "all conditions"
+    return f"no action meets {conditions} on {share} {where}, {amount(formulas, kept.shortfall)}"
+
+
+def amount(formulas: Formulas, shortfall: float) -> str:
+    """By how much a condition is missed, in words."""
+    if formulas.noisy and formulas.certain:
+        return "where it asks for unbounded control towards the edge"
+    return f"by up to {shortfall:.4g}"
+
+
+def _stages(verification: Verification) -> Stages:
+    kept = verification.kept
+    suprema = np.concatenate([b.suprema for b in verification.barriers])
+    return assembled(verification.formulas, suprema, kept.shortfall if kept else math.nan)
+
+
+def assembled(formulas: Formulas, suprema: np.ndarray, shortfall: float) -> Stages:
+    """The stages of all barriers; rates are NaN where a chain has none."""
+    rates: list[float] = []
+    shortfalls: list[float] = []
+    for condition, stage in zip(formulas.conditions, formulas.stages, strict=True):
+        degree = stage.stop - stage.start
+        rates += condition.chain_rates(degree) or (math.nan,) * degree
+        shortfalls += [*[0.0] * (degree - 1), shortfall]
+    return Stages(tuple(rates), tuple(suprema.tolist()), tuple(shortfalls))
+
+
+def outlasting(stages: Stages, b: np.ndarray, horizon: float) -> np.ndarray:
+    """1 where no path leaves up to T: without noise b is at least what `stage_bound` subtracts from, so that a positive one is enough."""
+    kept = [
+        bounds.stage_bound(b[:, j], 1.0 + abs(b[:, j]), horizon, rate, m) > 0.0 if m else b[:, j] > 0.0
+        for j, (rate, m) in enumerate(zip(stages.rates, stages.shortfalls, strict=True))
+    ]
+    return np.all(kept, axis=0).astype(float)
+
+
+def best_start(verification: Verification, seed: int = 0) -> np.ndarray | None:
+    """The state (n,) where the printed bound is largest; None where there is no such bound.
+
+    Args:
+        verification: of the conditions.
+        seed: of the search.
+    """
+    formulas = verification.formulas
+    if verification.kept is None or formulas.certain or no_bound(formulas) or _unbounded(verification):
+        return None
+    c = _stages(verification).suprema
+    rng = np.random.default_rng(seed)
+    points = sample("the intersection of the C_j", formulas.kept_level, verification.region, _SAMPLES, rng).points
+    return largest(lambda x: bounds.theorem_4_2_10_printed(formulas.chain(x), c), points, verification.region, rng)[1]
