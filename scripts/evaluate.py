@@ -14,7 +14,7 @@ from scripts.console import progress_bar, run, stdout
 
 
 def evaluate(
-    env_id: Annotated[str, typer.Argument(metavar="ENV_ID", help="Registered id; `safe-envs list` shows all.")],
+    env_id: options.EnvId,
     filters: Annotated[
         list[str] | None,
         typer.Option(
@@ -32,23 +32,21 @@ def evaluate(
         ),
     ] = "nominal",
     episodes: Annotated[int, typer.Option(help="Episodes for each filter.")] = 1000,
-    seed: Annotated[int, typer.Option(help="Seed of all randomness.")] = 0,
-    noise: Annotated[
-        str | None, typer.Option(metavar="X", help="Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.")
-    ] = None,
-    plant: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter of the simulated system. Repeatable.")] = None,
-    model: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter that the designer believes. Repeatable.")] = None,
-    barrier: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Argument of the barrier. Repeatable.")] = None,
-    knowledge: Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")] = "model",
+    seed: options.Seed = 0,
+    noise: options.Noise = None,
+    plant: options.Plant = None,
+    model: options.Model = None,
+    barrier: options.BarrierArguments = None,
+    knowledge: options.Knowledge = "model",
     objective: Annotated[
         str,
         typer.Option(metavar="nearest|clf", help="Of the filters: the action nearest to the policy's, or the joint program with the goal."),
     ] = "nearest",
-    dt: Annotated[float | None, typer.Option(help="Control period in s.")] = None,
-    substeps: Annotated[int | None, typer.Option(help="Integration steps in a control period.")] = None,
-    horizon: Annotated[float | None, typer.Option(help="Length of an episode in s.")] = None,
-    box: Annotated[list[str] | None, typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each.")] = None,
-    start: Annotated[str | None, typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution.")] = None,
+    dt: options.Dt = None,
+    substeps: options.Substeps = None,
+    horizon: options.Horizon = None,
+    box: options.Box = None,
+    start: options.StartAt = None,
     confidence: Annotated[float, typer.Option(metavar="C", help="Of all intervals, above 0 and below 1.")] = 0.95,
     refine: Annotated[
         bool, typer.Option("--refine", help="Repeat with dt/2 and dt/4, and say whether the safety rate has converged.")
@@ -75,17 +73,9 @@ def evaluate(
 
         require_writable(plot)
         require_format(plot)
-    arguments = {
-        "noise": options.noise(noise),
-        "plant": options.parameters("--plant", plant or ()),
-        "model": options.parameters("--model", model or ()),
-        "barrier": options.parameters("--barrier", barrier or (), words=True),
-        "dt": dt,
-        "substeps": substeps,
-        "horizon": horizon,
-        "box": options.box(box or ()),
-        "start": options.start(start),
-    }
+    arguments = options.of_env(
+        noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
+    )
     names = list(dict.fromkeys(filters)) if filters else None
     run_all: Callable[..., Any] = refinement.refine if refine else evaluation.evaluate
     with progress_bar("Evaluating") as tell:

@@ -1,11 +1,58 @@
-"""From the text of options to the arguments of `gym.make`."""
+"""The options that say which env is meant, and from their text to the arguments of `gym.make`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from safe_envs.errors import ConfigurationError
+
+EnvId = Annotated[str, typer.Argument(metavar="ENV_ID", help="Registered id; `safe-envs list` shows all.")]
+Noise = Annotated[
+    str | None, typer.Option(metavar="X", help="Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.")
+]
+Plant = Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter of the simulated system. Repeatable.")]
+Model = Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter that the designer believes. Repeatable.")]
+BarrierArguments = Annotated[list[str] | None, typer.Option(metavar="K=V", help="Argument of the barrier. Repeatable.")]
+Knowledge = Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")]
+Dt = Annotated[float | None, typer.Option(help="Control period in s.")]
+Substeps = Annotated[int | None, typer.Option(help="Integration steps in a control period.")]
+Horizon = Annotated[float | None, typer.Option(help="Length of an episode in s.")]
+Box = Annotated[list[str] | None, typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each.")]
+StartAt = Annotated[str | None, typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution.")]
+Seed = Annotated[int, typer.Option(help="Seed of all randomness.")]
+
+
+def of_env(
+    *,
+    noise: str | None,
+    plant: Sequence[str] | None,
+    model: Sequence[str] | None,
+    barrier: Sequence[str] | None,
+    dt: float | None,
+    substeps: int | None,
+    horizon: float | None,
+    box: Sequence[str] | None,
+    start: str | None,
+) -> dict[str, Any]:
+    """The arguments of `gym.make` that the options of the same names stand for.
+
+    Raises:
+        ConfigurationError: a text cannot be read.
+    """
+    return {
+        "noise": read_noise(noise),
+        "plant": parameters("--plant", plant or ()),
+        "model": parameters("--model", model or ()),
+        "barrier": parameters("--barrier", barrier or (), words=True),
+        "dt": dt,
+        "substeps": substeps,
+        "horizon": horizon,
+        "box": read_box(box or ()),
+        "start": read_start(start),
+    }
 
 
 def numbers(option: str, text: str) -> list[float]:
@@ -20,7 +67,7 @@ def numbers(option: str, text: str) -> list[float]:
         raise ConfigurationError(f"{option} {text!r} is no number or list of numbers with commas between") from error
 
 
-def noise(text: str | None) -> float | list[float] | None:
+def read_noise(text: str | None) -> float | list[float] | None:
     """Read --noise: one number for all channels, or one for each."""
     if text is None:
         return None
@@ -28,7 +75,7 @@ def noise(text: str | None) -> float | list[float] | None:
     return levels[0] if len(levels) == 1 else levels
 
 
-def start(text: str | None) -> str | list[float] | None:
+def read_start(text: str | None) -> str | list[float] | None:
     """Read --start: a state, or else the name of a distribution."""
     if text is None:
         return None
@@ -40,7 +87,7 @@ def start(text: str | None) -> str | list[float] | None:
         return text
 
 
-def box(texts: Sequence[str]) -> list[float] | list[list[float]] | None:
+def read_box(texts: Sequence[str]) -> list[float] | list[list[float]] | None:
     """Read --box LO,HI: one for all inputs, or one for each.
 
     Raises:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as jsonlib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -14,25 +14,24 @@ from scripts.console import progress_bar, run, stdout
 
 
 def verify(
-    env_id: Annotated[str, typer.Argument(metavar="ENV_ID", help="Registered id; `safe-envs list` shows all.")],
+    env_id: options.EnvId,
     filter_name: Annotated[
         str | None,
         typer.Option("--filter", metavar="NAME", help="As for evaluate: scbf, hocbf:p=2,8, ... By default the env's own."),
     ] = None,
-    noise: Annotated[
-        str | None, typer.Option(metavar="X", help="Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.")
-    ] = None,
-    plant: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter of the simulated system. Repeatable.")] = None,
-    model: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter that the designer believes. Repeatable.")] = None,
-    barrier: Annotated[list[str] | None, typer.Option(metavar="K=V", help="Argument of the barrier. Repeatable.")] = None,
-    knowledge: Annotated[str, typer.Option(metavar="model|plant", help="What the conditions know.")] = "model",
-    dt: Annotated[float | None, typer.Option(help="Control period in s.")] = None,
-    horizon: Annotated[float | None, typer.Option(help="Length of an episode in s, the first T of the bounds.")] = None,
-    box: Annotated[list[str] | None, typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each.")] = None,
-    start: Annotated[str | None, typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution.")] = None,
+    noise: options.Noise = None,
+    plant: options.Plant = None,
+    model: options.Model = None,
+    barrier: options.BarrierArguments = None,
+    knowledge: options.Knowledge = "model",
+    dt: options.Dt = None,
+    substeps: options.Substeps = None,
+    horizon: options.Horizon = None,
+    box: options.Box = None,
+    start: options.StartAt = None,
     policy: Annotated[str, typer.Option(metavar="NAME|FILE", help="Who acts in the simulation, as for evaluate.")] = "nominal",
     episodes: Annotated[int, typer.Option(help="Episodes of the simulation, from each start.")] = 500,
-    seed: Annotated[int, typer.Option(help="Seed of all randomness.")] = 0,
+    seed: options.Seed = 0,
     simulate: Annotated[bool, typer.Option("--simulate/--no-simulate", help="Measure the safety, and hold it against the bounds.")] = True,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all that was found.")] = None,
     plot: Annotated[
@@ -60,16 +59,9 @@ def verify(
 
         require_writable(plot)
         require_format(plot)
-    arguments: dict[str, Any] = {
-        "noise": options.noise(noise),
-        "plant": options.parameters("--plant", plant or ()),
-        "model": options.parameters("--model", model or ()),
-        "barrier": options.parameters("--barrier", barrier or (), words=True),
-        "dt": dt,
-        "horizon": horizon,
-        "box": options.box(box or ()),
-        "start": options.start(start),
-    }
+    arguments = options.of_env(
+        noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
+    )
     problem = load_problem(env_id, arguments)
     found = find(problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed)
     starts = starts_of(problem, seed)

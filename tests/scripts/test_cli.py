@@ -18,6 +18,7 @@ import safe_envs
 from agents import evaluate
 from scripts import cli
 from scripts.table import print_evaluation
+from tests.scripts.conftest import strictly
 
 ROOT = Path(__file__).parents[2]
 DUBINS = "safe_envs/StochasticDubins-v0"
@@ -41,28 +42,6 @@ ROW_KEYS = [
     "bound",
     "bound_note",
 ]
-
-
-@pytest.fixture
-def safe_envs_command(monkeypatch, capsys, tmp_path):
-    """Runs the command in this process, in an empty folder; returns its exit status and what it printed."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["safe-envs", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        printed = capsys.readouterr()
-        return ended.value.code or 0, printed.out, printed.err
-
-    return run
-
-
-def strictly(path):
-    def refuse(name):
-        raise ValueError(f"{name} is not JSON")
-
-    return json.loads(Path(path).read_text(), parse_constant=refuse)
 
 
 def without_speed(text):

@@ -2,38 +2,19 @@
 
 from __future__ import annotations
 
-import json
-import sys
-
 import pytest
 
 from agents import verification
-from scripts import cli
+from tests.scripts.conftest import strictly
 
 CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
 
 
 @pytest.fixture
-def verify(monkeypatch, capsys, tmp_path):
-    """Runs the command in this process, in an empty folder; returns its exit status and what it printed."""
-    monkeypatch.chdir(tmp_path)
+def verify(monkeypatch, safe_envs_command):
+    """Runs `safe-envs verify` over the shorter horizons."""
     monkeypatch.setattr(verification, "_LONG_MULTIPLES", ())
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["safe-envs", "verify", *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        printed = capsys.readouterr()
-        return ended.value.code or 0, printed.out, printed.err
-
-    return run
-
-
-def strictly(path):
-    def refuse(name):
-        raise ValueError(f"{name} is not JSON")
-
-    return json.loads(path.read_text(), parse_constant=refuse)
+    return lambda *arguments: safe_envs_command("verify", *arguments)
 
 
 def test_the_report_names_what_was_found(verify):

@@ -1,0 +1,33 @@
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+from scripts import cli
+
+
+@pytest.fixture
+def safe_envs_command(monkeypatch, capsys, tmp_path):
+    """Runs the command in this process, in an empty folder; returns its exit status and what it printed."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["safe-envs", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        printed = capsys.readouterr()
+        return ended.value.code or 0, printed.out, printed.err
+
+    return run
+
+
+def strictly(path):
+    """A file's strict JSON: no NaN, no infinity."""
+
+    def refuse(name):
+        raise ValueError(f"{name} is not JSON")
+
+    return json.loads(Path(path).read_text(), parse_constant=refuse)
