@@ -8,7 +8,8 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.calculus import generator, input_derivative
-from safe_envs.sde import ControlAffineSDE
+from safe_envs.errors import ConfigurationError
+from safe_envs.sde import ControlAffineSDE, finite_number
 
 
 @dataclass(frozen=True)
@@ -25,14 +26,33 @@ class CLF:
         input_weight: w_u > 0, an expression of the parameters.
         slack_weight: w_d > 0, likewise.
 
+    Raises:
+        ConfigurationError: the rate is negative or not finite.
+
     Source: the CLF part of the quadratic programs in thesis Sec. 4.3.1 and 5.4.2. Sec. 4.3.1 asks for AV <= d, without the
     rate, with the trace of sigma' sigma V_xx and weights of 1/2 each, at which u stays near 0.
     """
 
-    V: sp.Expr
+    V: Any
     rate: float = 1.0
-    input_weight: sp.Expr | float = 1.0
-    slack_weight: sp.Expr | float = 1.0
+    input_weight: Any = 1.0
+    slack_weight: Any = 1.0
+
+    def __post_init__(self) -> None:
+        if finite_number("rate", self.rate) < 0:
+            raise ConfigurationError(f"rate = {self.rate}; give a rate of decay >= 0 in 1/s")
+        for name in ("V", "input_weight", "slack_weight"):
+            object.__setattr__(self, name, sp.sympify(getattr(self, name)))
+
+    def require_known(self, system: ControlAffineSDE) -> None:
+        """Check that V is a function of the states, and the weights of the parameters.
+
+        Raises:
+            SystemDefinitionError: another symbol is in them.
+        """
+        system.require_known("V of the clf", self.V.free_symbols, system.states)
+        for weight in (self.input_weight, self.slack_weight):
+            system.require_known("a weight of the clf", weight.free_symbols, tuple(system.parameters))
 
     def growth(self, system: ControlAffineSDE) -> tuple[sp.Expr, tuple[sp.Expr, ...]]:
         """Offset a and coefficients b, one for each input, of AV + rate V = a + b u."""

@@ -15,12 +15,13 @@ and with a filter
 
 | key | type | meaning |
 |---|---|---|
-| `nominal_action` | float64 (m,) | what the policy proposed, in physical units |
+| `nominal_action` | float64 (m,) | what the policy proposed, or the goal of a joint program asks for, in physical units |
 | `safe_action` | float64 (m,) | what was executed, in physical units |
 | `intervention` | bool | the two differ |
 | `filter_active` | bool | a barrier row is binding or cannot be met |
 | `feasible` | bool | some action in the box meets every row |
 | `slack` | float | by how much the worst row is violated by the executed action |
+| `slacks` | float64 (k,) | by how much each row is |
 | `active_barrier` | int | index of the barrier that caused the intervention, -1 without one |
 | `episode_interventions` | int | interventions of the episode so far |
 | `episode_infeasible` | int | infeasible steps of the episode so far |
@@ -56,6 +57,7 @@ def filter_info(
     filter_active: Any,
     feasible: Any,
     slack: Any,
+    slacks: np.ndarray,
     active_barrier: Any,
     episode_interventions: Any,
     episode_infeasible: Any,
@@ -68,6 +70,7 @@ def filter_info(
         "filter_active": filter_active,
         "feasible": feasible,
         "slack": slack,
+        "slacks": slacks,
         "active_barrier": active_barrier,
         "episode_interventions": episode_interventions,
         "episode_infeasible": episode_infeasible,

@@ -141,6 +141,8 @@ class SafetyProblem:
         for law in self.nominal:
             known = (*(f.symbol for f in self.features), *model.parameters)
             plant.require_known("the nominal controller", law.free_symbols, known)
+        if self.clf is not None:
+            self.clf.require_known(model)
         for i in self.inputs:
             if not -_WIDEST <= i.low < i.high <= _WIDEST:
                 raise ConfigurationError(

@@ -27,7 +27,9 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         condition: a `Condition` for every barrier, one for each, or their text, like "scbf", "hocbf:p=2,8" or
             "hocbf:p=2,8+cbf:alpha=1"; without parameters it takes the env's.
         knowledge: "model" (what the designer believes) or "plant" (the true system).
-        objective: "nearest" to the policy's action, or "clf" for the joint program with the env's goal.
+        objective: "nearest" to the policy's action; or "clf" for the joint program with the env's goal, in which the policy has
+            no say: `info["nominal_action"]` is what the goal alone asks for.
+        priorities: of the barriers where not all can be kept: weights of their squared slacks, ones by default.
 
     Raises:
         ConfigurationError: the env is not one of this project, or an argument is unknown; or, at a step, a wrapper
@@ -41,12 +43,13 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         condition: Condition | Sequence[Condition] | str,
         knowledge: str = "model",
         objective: str = "nearest",
+        priorities: Sequence[float] | None = None,
     ) -> None:
         inner = env.unwrapped
         if not isinstance(inner, SafeEnv):
             raise ConfigurationError(f"{inner} is not one of this project's envs, so that the filter cannot read its state")
-        text, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective)
-        gym.utils.RecordConstructorArgs.__init__(self, condition=text, knowledge=knowledge, objective=objective)
+        text, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective, priorities)
+        gym.utils.RecordConstructorArgs.__init__(self, condition=text, knowledge=knowledge, objective=objective, priorities=priorities)
         gym.Wrapper.__init__(self, env)
         self._inner = inner
         self._directly = _only_checks_between(env, inner)
@@ -64,24 +67,25 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         """Filter the action and hold it for one control period."""
         proposed = self._inner.physical_action(action)
         decision = self.safety_filter.decide_floats(self._inner.components, proposed)
-        executed, active = decision.action, True in decision.active
+        executed, nominal, active = decision.action, decision.proposed, True in decision.active
         if self._directly:
             observation, reward, terminated, truncated, info = self._inner.step_physical(executed)
         else:
             observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(executed))
             if any([abs(u - v) > 1e-12 + 1e-6 * abs(v) for u, v in zip(executed, self._inner.executed, strict=True)]):  # noqa: C419  (a list is faster here)
                 raise changed_action(self, executed, self._inner.executed)
-        differs = active and executed != proposed
+        differs = active and executed != nominal
         self._interventions += differs
         self._infeasible += not decision.feasible
         info.update(
             filter_info(
-                np.array(proposed),
+                np.array(nominal),
                 np.array(executed),
                 differs,
                 active,
                 decision.feasible,
                 max(decision.slack),
+                np.array(decision.slack),
                 decision.cause if differs else -1,
                 self._interventions,
                 self._infeasible,
@@ -106,14 +110,19 @@ def changed_action(wrapper: object, decided: Sequence[Any], executed: Sequence[A
 
 
 def build_filter(
-    problem: SafetyProblem, condition: Condition | Sequence[Condition] | str, knowledge: str, objective: str
+    problem: SafetyProblem,
+    condition: Condition | Sequence[Condition] | str,
+    knowledge: str,
+    objective: str,
+    priorities: Sequence[float] | None,
 ) -> tuple[str, SafetyFilter]:
     """Return the filter of one or several conditions for a problem, and the text that names them."""
     if isinstance(condition, str):
         condition = parse_conditions(condition, problem)
-    elif isinstance(condition, Condition):
-        condition = (condition,)
-    return spec_of(condition), SafetyFilter.for_problem(problem, condition[0] if len(condition) == 1 else condition, knowledge, objective)
+    each = (condition,) * len(problem.barriers) if isinstance(condition, Condition) else condition
+    if not isinstance(each, Sequence) or not all(isinstance(c, Condition) for c in each):
+        raise ConfigurationError(f"condition = {condition!r}; give a Condition, one for each barrier, or their text, like 'scbf'")
+    return spec_of(each), SafetyFilter.for_problem(problem, each, knowledge, objective, priorities)
 
 
 def resting_action(problem: SafetyProblem) -> np.ndarray:
@@ -130,6 +139,7 @@ def rest_info(problem: SafetyProblem) -> Info:
         filter_active=False,
         feasible=True,
         slack=0.0,
+        slacks=np.zeros(len(problem.barriers)),
         active_barrier=-1,
         episode_interventions=0,
         episode_infeasible=0,

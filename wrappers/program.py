@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ from wrappers.qp import one_row, several_rows
 _LEAST_SCALE = 1e-100
 """A slack scaled by less would have a weight that vanishes."""
 
+_FAR = 1e4
+"""How many times further than the box reaches is far away."""
+
 
 class Decision(NamedTuple):
     """What the thin wrappers read, by components: floats, or arrays over the batch.
@@ -31,7 +35,8 @@ class Decision(NamedTuple):
         active: whether each row binds or cannot be met.
         feasible: whether the rows can be met together.
         slack: by how much each row is missed where they cannot.
-        cause: index of the active row that lies furthest from the proposed input, -1 if no row is active.
+        cause: index of the active row that lies furthest from the proposed input; means something where a row is active.
+        proposed: the input that the rows changed: the given one, or with a goal that which is best without rows.
     """
 
     action: Sequence[Any]
@@ -40,6 +45,7 @@ class Decision(NamedTuple):
     feasible: Any
     slack: Sequence[Any]
     cause: Any
+    proposed: Sequence[Any]
 
 
 class UndefinedRowError(ArithmeticError):
@@ -47,11 +53,12 @@ class UndefinedRowError(ArithmeticError):
 
     Attributes:
         index: of the state in the batch.
+        what: the constraint or the goal.
     """
 
-    def __init__(self, index: int) -> None:
-        super().__init__(index)
-        self.index = index
+    def __init__(self, index: int, what: str) -> None:
+        super().__init__(index, what)
+        self.index, self.what = index, what
 
 
 @dataclass(frozen=True)
@@ -94,6 +101,7 @@ class Solver:
         self._larger: Any = np.maximum if arrays else max
         self._project: Any = several_rows.project_arrays if arrays else several_rows.project_floats
         if program.clf is not None:
+            program.clf.require_known(program.model)
             input_weight, self._slack_weight = [
                 float(program.model.numeric(sp.sympify(w))) for w in (program.clf.input_weight, program.clf.slack_weight)
             ]
@@ -110,48 +118,53 @@ class Solver:
         if self._flavour == "floats":
             action, margin, active, feasible = one_row.project_floats(a, b, u, p.low, p.high, p.weights)
             self._require_finite((margin,))
-            return Decision(action, (margin,), (active,), feasible, (0.0 if feasible else -margin,), 0)
+            return Decision(action, (margin,), (active,), feasible, (0.0 if feasible else -margin,), 0, u)
         action, margin, active, feasible = one_row.project_arrays(a, b, u, self._low, self._high, p.weights)
         self._require_finite((margin,))
         met = np.count_nonzero(feasible) == len(feasible)
         slack = np.zeros(len(margin)) if met else np.where(feasible, 0.0, -margin)
-        return Decision(action, (margin,), (active,), feasible, (slack,), 0)
+        return Decision(action, (margin,), (active,), feasible, (slack,), 0, u)
 
     def solve(self, x: Sequence[Any], u: Sequence[Any]) -> Decision:
         """Solve any program.
 
         Raises:
-            UndefinedRowError: a row has no finite value.
+            UndefinedRowError: a row or the goal has no finite value.
         """
         a, b, goal, h = self._split(self._rows(*x))
-        asked, inside = list(b), {}
-        for i, value in zip(self._reciprocal, h, strict=True):
-            inside[i] = value > 0.0
-            asked[i] = self._ask(i, x, a[i], b[i], inside[i])
-        self._require_finite([*asked, *[aj for ai in a for aj in ai], *goal])
-        action, margin, active, feasible = self._minimise(a, asked, u, goal)
+        inside = dict(zip(self._reciprocal, [value > 0.0 for value in h], strict=True))
+        self._require_finite([*b, *[aj for ai in a for aj in ai]])
+        self._require_finite(goal, "the goal")
+        target = u
+        if goal:
+            target = [0.0 * uj for uj in u]
+            u = self._minimise((), (), target, goal)[0]
+        asked = [self._choose(inside[i], b[i] - self._demand(i, x, inside[i]), 0.0) if i in inside else b[i] for i in range(self._count)]
+        held = [[self._choose(inside[i], aj, 0.0) for aj in a[i]] if i in inside else a[i] for i in range(self._count)]
+        self._require_finite(asked)
+        aim = self._outwards(a, inside, target)
+        action, margin, active, feasible = self._minimise(held, asked, aim, goal)
         if self._sampled:
-            for i, change in zip(self._sampled, self._changes(*x, *action), strict=True):
-                loss = self._program.dt * -self._larger(-change, 0.0)
-                asked[i] = asked[i] + (self._choose(inside[i], loss, 0.0) if i in inside else loss)
+            for i in self._sampled:
+                asked[i] = asked[i] - self._program.dt * self._loss(i, x, action, inside.get(i))
             self._require_finite(asked)
-            action, margin, active, feasible = self._minimise(a, asked, u, goal)
+            action, margin, active, feasible = self._minimise(held, asked, aim, goal)
         for i, defined in inside.items():
             margin[i] = self._choose(defined, margin[i], _dot(a[i], action) + b[i])
+            active[i] = self._choose(defined, active[i], True)
             feasible = feasible & defined
-            active[i] = active[i] | ~defined if self._flavour == "arrays" else active[i] or not defined
         slack = [self._choose(feasible, 0.0, self._larger(-value, 0.0)) for value in margin]
-        return Decision(action, margin, active, feasible, slack, self._cause(a, asked, u, active))
+        return Decision(action, margin, active, feasible, slack, self._cause(a, asked, u, active, inside), u)
 
-    def _require_finite(self, values: Sequence[Any]) -> None:
+    def _require_finite(self, values: Sequence[Any], what: str = "the constraint") -> None:
         total: Any = sum(values)
         if self._flavour == "floats":
             if not math.isfinite(total):
-                raise UndefinedRowError(0)
-        elif not finite(total):
+                raise UndefinedRowError(0, what)
+        elif not finite(np.atleast_1d(total)):
             bad = np.flatnonzero(~np.isfinite(total))
             if bad.size:
-                raise UndefinedRowError(int(bad[0]))
+                raise UndefinedRowError(int(bad[0]), what)
 
     def _split(self, values: Components) -> tuple[list[Any], Sequence[Any], Sequence[Any], Sequence[Any]]:
         """The rows' a and b, the goal's offset and coefficients, and h of the reciprocal conditions."""
@@ -161,12 +174,36 @@ class Solver:
         goal = rest[: len(rest) - len(self._reciprocal)]
         return [row[:-1] for row in rows], [row[-1] for row in rows], goal, rest[len(goal) :]
 
-    def _ask(self, i: int, x: Sequence[Any], a: Sequence[Any], b: Any, inside: Any) -> Any:
-        """Offset of a reciprocal row: less its demand inside C, and outside such that it asks for the largest a u."""
-        most = -sum([self._larger(aj * lo, aj * hi) for aj, lo, hi in zip(a, self._low, self._high, strict=True)])
-        if self._flavour == "floats" and not inside:
-            return most
-        return self._choose(inside, b - self._demands[i](*x)[0], most)
+    def _demand(self, i: int, x: Sequence[Any], inside: Any) -> Any:
+        """What a reciprocal row asks for, where it means something; plain floats have no 1/h or logarithm elsewhere."""
+        return 0.0 if inside is False else self._demands[i](*x)[0]
+
+    def _loss(self, i: int, x: Sequence[Any], action: Sequence[Any], inside: Any) -> Any:
+        """Rate at which a row falls under an action, 0 where it rises or means nothing."""
+        if inside is False:
+            return 0.0
+        loss = self._larger(-self._changes[i](*x, *action)[0], 0.0)
+        return loss if inside is None else self._choose(inside, loss, 0.0)
+
+    def _outwards(self, a: Sequence[Any], inside: dict[int, Any], u: Sequence[Any]) -> Sequence[Any]:
+        """The proposed input, and far away where h of a reciprocal condition rises most, if that is not positive.
+
+        The point of the box and of the rows nearest to one so far off is where h rises most among those that the other rows
+        allow: these are not to suffer from a condition that means nothing.
+        """
+        if all(defined is True or (defined is not False and defined.all()) for defined in inside.values()):
+            return u
+        rise = [0.0] * self._m
+        for i, defined in inside.items():
+            size = functools.reduce(self._larger, [abs(aj) for aj in a[i]])
+            scale = self._choose(defined, 0.0, 1.0 / self._choose(size > 0.0, size, 1.0))
+            rise = [rj + aj * scale for rj, aj in zip(rise, a[i], strict=True)]
+        steepness = sum([rj * rj / wj for rj, wj in zip(rise, self._weights, strict=True)])
+        ends = list(zip(self._low, self._high, strict=True))
+        span = sum([abs(rj) * (hi - lo) for rj, (lo, hi) in zip(rise, ends, strict=True)])
+        far = _FAR * span / self._choose(steepness > 0.0, steepness, 1.0)
+        corner = [self._choose(rj > 0.0, hi, self._choose(rj < 0.0, lo, uj)) for rj, (lo, hi), uj in zip(rise, ends, u, strict=True)]
+        return [c + far * rj / wj for c, rj, wj in zip(corner, rise, self._weights, strict=True)]
 
     def _minimise(self, a: Sequence[Any], b: Sequence[Any], u: Sequence[Any], goal: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
         p = self._program
@@ -177,20 +214,20 @@ class Solver:
         most = growth + sum([self._larger(bj * lo, bj * hi) for bj, lo, hi in zip(along, self._low, self._high, strict=True)])
         scale = self._choose(most > _LEAST_SCALE, most, 1.0)
         rows = [*[(*ai, 0.0) for ai in a], (*[-bj for bj in along], scale)]
-        nothing = 0.0 * u[0]
         low, high, w = (*self._low, 0.0), (*self._high, 1.0), (*self._weights, self._slack_weight * scale * scale)
-        action, margin, active, feasible = self._project(rows, [*b, -growth], (*u, nothing), low, high, w, [*p.priorities, 1.0])
-        return action[: self._m], margin[: self._count], active[: self._count], feasible
+        priorities = [*p.priorities[: len(a)], 1.0]
+        action, margin, active, feasible = self._project(rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities)
+        return action[: self._m], margin[: len(a)], active[: len(a)], feasible
 
-    def _cause(self, a: Sequence[Any], b: Sequence[Any], u: Sequence[Any], active: Sequence[Any]) -> Any:
-        """The active row whose half-space is furthest from the proposed input."""
+    def _cause(self, a: Sequence[Any], b: Sequence[Any], u: Sequence[Any], active: Sequence[Any], inside: dict[int, Any]) -> Any:
+        """The active row whose half-space is furthest from the proposed input; one that means nothing is further than any."""
         cause, furthest = -1, -math.inf
-        if self._count == 1:
-            return self._choose(active[0], 0, -1)
         for i, (ai, bi, acts) in enumerate(zip(a, b, active, strict=True)):
             square = sum([aj * aj / wj for aj, wj in zip(ai, self._weights, strict=True)])
-            some = self._choose(square > 0.0, square, 1.0)
-            distance = self._choose(acts & (square > 0.0), -(_dot(ai, u) + bi) / some**0.5, -math.inf)
+            distance = -(_dot(ai, u) + bi) / self._choose(square > 0.0, square, 1.0) ** 0.5
+            if i in inside:
+                distance = self._choose(inside[i], distance, math.inf)
+            distance = self._choose(acts & (square > 0.0), distance, -math.inf)
             cause = self._choose(distance > furthest, i, cause)
             furthest = self._larger(furthest, distance)
         return cause
@@ -207,12 +244,11 @@ class Solver:
 
     @cached_property
     def _demands(self) -> dict[int, Any]:
-        """By themselves, since plain floats allow no division by h = 0 and no logarithm of a negative one."""
         return {i: self._compiled([self._program.constraints[i].demand]) for i in self._reciprocal}
 
     @cached_property
-    def _changes(self) -> Any:
-        return self._compiled([self._program.constraints[i].change for i in self._sampled], self._program.model.inputs)
+    def _changes(self) -> dict[int, Any]:
+        return {i: self._compiled([self._program.constraints[i].change], self._program.model.inputs) for i in self._sampled}
 
     def _compiled(self, expressions: Sequence[Any], more: Sequence[sp.Symbol] = ()) -> Any:
         model = self._program.model

@@ -25,7 +25,8 @@ class FilterResult(NamedTuple):
     Attributes:
         action: executed input, shape (..., m), inside the box.
         barrier: value of each barrier, shape (..., k).
-        margin: a u + b of each row at the action, shape (..., k).
+        margin: of each row at the action, less what a sampling margin or a reciprocal condition demand, shape (..., k); where
+            a reciprocal condition means nothing, the rate of h.
         active: rows that bind or cannot be met, shape (..., k).
         feasible: whether some action in the box meets every row, shape (...). Where it is False, the action is the
             least-violating one.
@@ -50,9 +51,10 @@ class SafetyFilter:
     One row has a closed form for any number of inputs, and any number of rows an exact solution for one and two inputs;
     others go to ProxQP.
 
-    With a control Lyapunov function the objective is its joint program instead, so that the filter pursues the goal by
-    itself: min w_u |u - u_nom|^2 + w_d d^2 subject to AV + rate V <= d, the rows and the box, as in thesis Sec. 4.3.1 with
-    u_nom = 0. The slack d is the goal's; that of a barrier is dearer than any goal, and flagged.
+    With a control Lyapunov function the objective is its joint program instead, min w_u |u|^2 + w_d d^2 subject to
+    AV + rate V <= d, the rows and the box (thesis Sec. 4.3.1, 5.4.2): the filter pursues the goal by itself, and whatever is
+    proposed does not matter. What takes its place is the action that is best without rows. The slack d is the goal's; that
+    of a barrier is dearer than any goal, and flagged.
 
     Args:
         model: the system that the filter believes in.
@@ -86,6 +88,7 @@ class SafetyFilter:
             raise ConfigurationError("weights and clf were given; the weights of a joint program are those of the clf")
         self.model = model
         self.rows = tuple(rows)
+        self._clf = clf
         self.constraints = tuple(condition.constraint(model, barrier) for barrier, condition in self.rows)
         program = Program(
             model,
@@ -101,7 +104,12 @@ class SafetyFilter:
 
     @classmethod
     def for_problem(
-        cls, problem: SafetyProblem, conditions: Condition | Sequence[Condition], knowledge: str = "model", objective: str = "nearest"
+        cls,
+        problem: SafetyProblem,
+        conditions: Condition | Sequence[Condition],
+        knowledge: str = "model",
+        objective: str = "nearest",
+        priorities: Sequence[float] | None = None,
     ) -> SafetyFilter:
         """The filter for the barriers of a problem.
 
@@ -110,6 +118,7 @@ class SafetyFilter:
             conditions: one for every barrier, or one for all.
             knowledge: "model" for what the designer believes, "plant" for the true system.
             objective: "nearest" to the proposed action, or "clf" for the joint program with the problem's goal.
+            priorities: see the class.
 
         Raises:
             ConfigurationError: a word is unknown, the number of conditions is wrong, or the problem has no clf.
@@ -125,7 +134,7 @@ class SafetyFilter:
             raise ConfigurationError(f"{len(each)} conditions for the {count} barriers of {problem.name}; give one for each")
         known = problem.model if knowledge == "model" else problem.plant
         clf = problem.clf if objective == "clf" else None
-        return cls(known, list(zip(problem.barriers, each, strict=True)), problem.box, dt=problem.dt, clf=clf)
+        return cls(known, list(zip(problem.barriers, each, strict=True)), problem.box, priorities=priorities, dt=problem.dt, clf=clf)
 
     @cached_property
     def _barriers_floats(self) -> Any:
@@ -159,23 +168,27 @@ class SafetyFilter:
         decision = self.decide_arrays(states, inputs)
         parts = (decision.action, self._barriers_arrays(*states), *decision[1:3], decision.slack)
         action, barrier, margin, active, slack = [stacked(part, len(inputs[0])).reshape(*batch, len(part)) for part in parts]
-        cause = np.broadcast_to(decision.cause, len(inputs[0])).reshape(batch)
+        cause = np.where(active.any(axis=-1), np.broadcast_to(decision.cause, len(inputs[0])).reshape(batch), -1)
         return FilterResult(action, barrier, margin, active > 0.0, decision.feasible.reshape(batch), slack, cause)
 
     def _filter_one(self, x: np.ndarray, u: np.ndarray) -> FilterResult:
         state, inputs = x.tolist(), u.tolist()
         if not math.isfinite(sum(state) + sum(inputs)):
             _require_finite(x, u)
-        action, margin, active, feasible, slack, cause = self.decide_floats(state, inputs)
+        action, margin, active, feasible, slack, cause, _ = self.decide_floats(state, inputs)
         barrier = self._barriers_floats(*state)
-        return FilterResult(np.array(action), np.array(barrier), np.array(margin), np.array(active), feasible, np.array(slack), cause)
+        return FilterResult(
+            np.array(action), np.array(barrier), np.array(margin), np.array(active), feasible, np.array(slack), cause if any(active) else -1
+        )
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> Decision:
         """Decide for one state, given and returned component by component; the components must be finite."""
         try:
             found = self._floats.one_row(x, u) if self._single else self._floats.solve(x, u)
+        except UndefinedRowError as error:
+            raise self._undefined(error.what, x) from error
         except (ArithmeticError, ValueError) as error:
-            raise self._undefined(x) from error
+            raise self._undefined("the constraint" if self._clf is None else "the constraint or the goal", x) from error
         return found
 
     def decide_arrays(self, x: Components, u: Components) -> Decision:
@@ -185,13 +198,13 @@ class SafetyFilter:
             with np.errstate(all="ignore"):
                 found = self._arrays.one_row(x, u) if self._single else self._arrays.solve(x, u)
         except UndefinedRowError as error:
-            raise self._undefined([float(c[error.index]) for c in x]) from error
+            raise self._undefined(error.what, [float(c[error.index]) for c in x]) from error
         return found
 
-    def _undefined(self, x: Sequence[float]) -> NumericalError:
+    def _undefined(self, what: str, x: Sequence[float]) -> NumericalError:
         at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.model.states, x, strict=True))
-        names = ", ".join(barrier.name for barrier, _ in self.rows)
-        return NumericalError(f"the constraint on {names} has no finite value at {at}; check the barrier and the model there")
+        names = "" if "goal" in what else f" on {', '.join(barrier.name for barrier, _ in self.rows)}"
+        return NumericalError(f"{what}{names} has no finite value at {at}; check it and the model there")
 
 
 def _require_finite(x: np.ndarray, u: np.ndarray) -> None:

@@ -9,7 +9,6 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from safe_envs.codegen import Components
 from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info, filter_info, with_masks
 from safe_envs.vector import SafeVectorEnv, VectorStep
@@ -35,11 +34,12 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         condition: Condition | Sequence[Condition] | str,
         knowledge: str = "model",
         objective: str = "nearest",
+        priorities: Sequence[float] | None = None,
     ) -> None:
         inner = env.unwrapped
         if not isinstance(inner, SafeVectorEnv):
             raise ConfigurationError(f"{inner} is not one of this project's vector envs, so that the filter cannot read its state")
-        _, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective)
+        _, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective, priorities)
         super().__init__(env)
         self._inner = inner
         self._rest = rest_info(inner.problem)
@@ -68,7 +68,7 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             for u, v in zip(decision.action, self._inner.executed, strict=True):
                 if not np.allclose(u, v, rtol=1e-6, atol=1e-12):
                     raise changed_action(self, decision.action, self._inner.executed)
-        added = self._decided(proposed, decision, active)
+        added = self._decided(decision, active)
         ended = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
             info["final_info"].update(with_masks({key: value.copy() for key, value in added.items()}, ended))
@@ -80,21 +80,23 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         info.update(with_masks(added, info["_cost"]))
         return observation, reward, terminated, truncated, info
 
-    def _decided(self, proposed: Components, decision: Decision, active: np.ndarray) -> Info:
+    def _decided(self, decision: Decision, active: np.ndarray) -> Info:
         """Count, and report what was decided."""
-        differs = decision.action[0] != proposed[0]
-        for u, v in zip(decision.action[1:], proposed[1:], strict=True):
+        nominal = decision.proposed
+        differs = decision.action[0] != nominal[0]
+        for u, v in zip(decision.action[1:], nominal[1:], strict=True):
             differs |= u != v
         differs &= active
         self._interventions += differs
         self._infeasible += ~decision.feasible
         return filter_info(
-            nominal_action=_beside(proposed),
+            nominal_action=_beside(nominal),
             safe_action=_beside(decision.action),
             intervention=differs,
             filter_active=active,
             feasible=decision.feasible,
             slack=decision.slack[0] if len(decision.slack) == 1 else np.maximum.reduce(decision.slack),
+            slacks=_beside(decision.slack),
             active_barrier=np.where(differs, decision.cause, -1),
             episode_interventions=self._interventions.copy(),
             episode_infeasible=self._infeasible.copy(),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, RelativeDegreeError
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, RelativeDegreeError, SystemDefinitionError
 from tests.conftest import problem_of
 from wrappers import CBF, CONDITIONS, ECBF, HOCBF, SCBF, SRCBF, SZCBF, parse_condition, parse_conditions, spec_of
 
@@ -68,18 +68,60 @@ def test_wrong_relative_degrees_are_named():
 
 
 def test_ecbf_needs_real_negative_poles():
-    assert ECBF((1.0, 2.0)).k == (1.0, 2.0)  # a double pole at -1
-    assert ECBF((6.0, 11.0, 6.0)).k == (6.0, 11.0, 6.0)  # -1, -2, -3
+    assert ECBF((1.0, 2.0)).chain_rates(2) == pytest.approx((1.0, 1.0))  # a double pole
+    assert ECBF((6.0, 11.0, 6.0)).chain_rates(3) == pytest.approx((1.0, 2.0, 3.0))
     for p in np.random.default_rng(0).uniform(0.05, 20.0, 50):
-        ECBF.for_gains((p, p))  # double poles, which rounding splits
+        ECBF(k=ECBF.for_gains((p, p)).k)  # double poles, which rounding splits
         ECBF(k=ECBF.for_gains((p, p, p)).k)
-    for wrong in ({"k": (2.0, 1.0)}, {"poles": (-1 + 1j, -1 - 1j)}, {"poles": (-1.0, 0.0)}, {"poles": (2.0,)}, {"poles": ()}):
-        with pytest.raises(ConfigurationError, match="place real negative poles"):
+    complex_pair = {"k": (1.16, 2.0)}  # -1 +- .4 i
+    for wrong in ({"k": (2.0, 1.0)}, complex_pair, {"poles": (-1 + 1j, -1 - 1j)}, {"poles": (-1.0, 0.0)}, {"poles": (2.0,)}, {"poles": ()}):
+        with pytest.raises(ConfigurationError, match="place real negative ones"):
             ECBF(**wrong)
+    with pytest.raises(ConfigurationError, match="place real negative ones"):
+        ECBF(poles=(-1 + 9e-4j, -2))
     with pytest.raises(ConfigurationError, match="positive"):
         ECBF((-1.0, 2.0))
     with pytest.raises(ConfigurationError, match="gains or poles"):
-        ECBF((1.0, 2.0), poles=(-1.0, -1.0))
+        ECBF((1.0, 2.0), poles=(-1.0, -1.5))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
+def test_ecbf_takes_multiple_poles_and_its_text_is_read_as_the_same(count):
+    ecbf = ECBF(poles=(-1 / 3,) * count)
+    assert ecbf.chain_rates(count) == (1 / 3,) * count
+    assert parse_condition(ecbf.spec, ()) == ecbf
+    assert parse_condition(f"ecbf:sampling_margin={0.5}", (1 / 3,) * count).chain_rates(count) == (1 / 3,) * count
+
+
+def test_texts_are_never_run(tmp_path):
+    target = tmp_path / "owned"
+    for text in ("ecbf:poles={}", "ecbf:k={}", "cbf:alpha={}", "hocbf:p={}", "rcbf:gamma={}", "rcbf:form={}", "scbf:sampling_margin={}"):
+        with pytest.raises(ConfigurationError):
+            parse_condition(text.format(f"__import__('pathlib').Path('{target}').touch()"), (1.0,))
+    for wrong in (("-1",), (f"__import__('pathlib').Path('{target}').touch()",)):
+        with pytest.raises(ConfigurationError, match="give numbers"):
+            ECBF(poles=wrong)
+    assert not target.exists()
+
+
+def test_single_numbers_do_for_one_rate():
+    assert HOCBF(2.0) == HOCBF((2.0,))
+    assert SZCBF(2.0) == SZCBF((2.0,))
+    assert ECBF(poles=-2.0) == ECBF((2.0,))
+
+
+def test_barriers_with_kinks_are_refused_where_the_chain_meets_them():
+    x, u = sp.symbols("x u", real=True)
+    y = sp.Symbol("y", real=True)
+    noisy = ControlAffineSDE((x,), (u,), [0], [1], [1])
+    for h in (1 - sp.Abs(x), sp.Min(1 - x, 1 + x)):
+        CBF(1.0).constraint(noisy, Barrier(h))
+        for condition in (SCBF(), SRCBF(), CBF(1.0, sampling_margin="first-order")):
+            with pytest.raises(SystemDefinitionError, match="cannot be differentiated"):
+                condition.constraint(noisy, Barrier(h))
+    chain = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1], [0, 0])
+    with pytest.raises(SystemDefinitionError, match="cannot be differentiated as often as is needed"):
+        HOCBF((1.0, 1.0)).constraint(chain, Barrier(1 - sp.Abs(x)))
 
 
 def test_ecbf_by_poles_has_the_gains_of_their_polynomial_and_keeps_the_sets_of_the_hocbf():
@@ -169,17 +211,17 @@ def test_parameters_default_to_the_gains():
         ("hocbf:q=1", "no parameter 'q'"),
         ("hocbf:p=1,x", "'x' is not allowed; write arithmetic of s"),
         ("hocbf:p=", "is no expression of s"),
-        ("hocbf:p=1,-2", "give positive rates"),
-        ("hocbf:p=nan", "give positive rates"),
+        ("hocbf:p=1,-2", "give positive numbers"),
+        ("hocbf:p=nan", "give positive numbers"),
         ("cbf:alpha=1,2", "alpha takes one value"),
         ("scbf:alpha=1", "filter scbf has no parameter 'alpha'"),
         ("hocbf:p=2,8:p=3,3", "names 'p' twice"),
-        ("szcbf:alphas=s", "alphas = s; give positive rates"),
-        ("srcbf:gamma=0", "gamma = 0.0; give positive"),
+        ("szcbf:alphas=s", "alphas = s; give positive numbers"),
+        ("srcbf:gamma=0", "gamma = 0.0; give positive numbers"),
         ("rcbf:form=exp", "form = 'exp'; allowed: inverse, log"),
         ("cbf:sampling_margin=second-order", "sampling_margin = 'second-order'; allowed: none, first-order, or a number >= 0"),
         ("cbf:sampling_margin=-1", "sampling_margin = -1.0"),
-        ("ecbf:poles=-1+1j,-1-1j", "place real negative poles"),
+        ("ecbf:poles=-1+1j,-1-1j", "place real negative ones"),
         ("scbf+scbf", "unknown filter 'scbf\\+scbf'|has 2 conditions"),
     ],
 )

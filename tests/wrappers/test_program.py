@@ -9,11 +9,11 @@ import sympy as sp
 
 from agents import evaluate
 from agents.clf import CLFController
-from safe_envs import CLF, Barrier, ConfigurationError, ControlAffineSDE, InvalidInputError
+from safe_envs import CLF, Barrier, ConfigurationError, ControlAffineSDE, InvalidInputError, NumericalError, SystemDefinitionError
 from safe_envs.codegen import compile_function
 from safe_envs.integrate import Integrator
 from tests.conftest import problem_of
-from wrappers import CBF, HOCBF, SCBF, SRCBF, SZCBF, SafetyFilter
+from wrappers import CBF, HOCBF, RCBF, SCBF, SRCBF, SZCBF, SafetyFilter, parse_conditions
 
 x, y, u, w = sp.symbols("x y u w", real=True)
 
@@ -106,8 +106,8 @@ def test_joint_program_equals_a_general_solver():
         demand = 2 * ((a - 2) ** 2 + (b + 1) ** 2)
         slope = np.array([2 * (a - 2), 2 * (b + 1)])
 
-        def cost(z, proposed=proposed):
-            return 0.5 * np.sum((z[:2] - proposed) ** 2) + 3 * z[2] ** 2
+        def cost(z):
+            return 0.5 * np.sum(z[:2] ** 2) + 3 * z[2] ** 2
 
         constraints = [
             {"type": "ineq", "fun": lambda z, demand=demand, slope=slope: z[2] - demand - slope @ z[:2]},
@@ -219,3 +219,67 @@ def test_floats_equal_arrays_for_every_kind_of_program(condition, objective):
         single = safety_filter.filter(states[i], inputs[i])
         for ours, theirs in zip(single, batch, strict=True):
             np.testing.assert_allclose(ours, theirs[i], rtol=1e-9, atol=1e-6)
+
+
+@pytest.mark.parametrize("text", ["rcbf", "rcbf:form=log", "srcbf", "srcbf:form=log"])
+def test_reciprocal_rows_with_a_margin_on_both_sides_of_the_edge(text):
+    problem = problem_of("safe_envs/Scalar-v0", noise=0.2)
+    (condition,) = parse_conditions(f"{text}:sampling_margin=first-order", problem)
+    safety_filter = SafetyFilter.for_problem(problem, condition)
+    states = np.array([[-1.0], [0.5], [0.9], [1.0 - 1e-12], [1.0], [1.3]])
+    batch = safety_filter.filter(states, np.full((6, 1), 8.0))
+    for i, state in enumerate(states):
+        single = safety_filter.filter(state, [8.0])
+        np.testing.assert_allclose(single.action, batch.action[i], rtol=1e-9)
+        assert single.feasible == batch.feasible[i]
+    assert batch.action[-2:, 0].tolist() == [-10.0, -10.0]
+    assert not batch.feasible[-2:].any()
+
+
+def test_margin_of_a_reciprocal_row_takes_its_demand_into_account():
+    # x' = x + u, h = 1 - x, B = 1/h: psi = -(x + u) + h^3, psi' = -(x + u)(1 + 3 h^2).
+    system = ControlAffineSDE((x,), (u,), [x], [1], [0])
+    found = RCBF(sampling_margin="first-order").constraint(system, Barrier(1 - x))
+    expected = -(x + u) * (1 + 3 * (1 - x) ** 2)
+    assert sp.simplify(sp.nsimplify(found.change) - expected) == 0
+
+
+def test_a_condition_without_meaning_does_not_harm_another_barrier():
+    # y is beyond its edge, x is not: y is to fall as fast as x allows, however wide the box.
+    both = ControlAffineSDE((x, y), (u,), [0, 0], [1, 1], [0, 0])
+    for half in (10.0, 1e6):
+        safety_filter = SafetyFilter(both, [(Barrier(x), CBF(1.0)), (Barrier(-y), RCBF())], [(-half, half)])
+        for state in ([0.1, 1.0], [[0.1, 1.0]]):
+            result = safety_filter.filter(np.array(state), np.zeros((*np.shape(state)[:-1], 1)))
+            np.testing.assert_allclose(np.ravel(result.action), [-0.1], atol=1e-9)
+            assert np.ravel(result.slack)[0] == pytest.approx(0.0, abs=1e-9)
+            assert np.ravel(result.cause) == [1]
+            assert not np.any(result.feasible)
+
+
+def test_cause_is_measured_in_the_weighted_distance():
+    rows = [(Barrier(1 - x), CBF(1.0)), (Barrier(0.5 - y), CBF(1.0))]
+    proposal = np.array([4.0, 3.0])  # 3 beyond the first row, 2.5 beyond the second
+    for weights, cause in ((None, 0), ([1.0, 4.0], 1)):
+        safety_filter = SafetyFilter(plane(), rows, [(-9.0, 9.0)] * 2, weights=weights)
+        assert safety_filter.filter(np.zeros(2), proposal).cause == cause
+        assert safety_filter.filter(np.zeros((1, 2)), proposal[None]).cause.tolist() == [cause]
+    alone = SafetyFilter(plane(), rows[:1], [(-9.0, 9.0)] * 2)
+    assert alone.filter(np.zeros(2), np.zeros(2)).cause == -1
+    assert alone.filter(np.zeros((2, 2)), np.array([[0.0, 0.0], [4.0, 0.0]])).cause.tolist() == [-1, 0]
+
+
+def test_goals_are_checked_for_their_symbols():
+    q = sp.Symbol("q", real=True)
+    row = [(Barrier(1 - x), CBF(1.0))]
+    for goal in (CLF(q**2), CLF(x**2, input_weight=q)):
+        with pytest.raises(SystemDefinitionError, match="unknown symbol q"):
+            SafetyFilter(plane(), row, [(-1.0, 1.0)] * 2, clf=goal)
+    for rate in (-1.0, float("nan")):
+        with pytest.raises(ConfigurationError, match="rate"):
+            CLF(x**2, rate=rate)
+    undefined = SafetyFilter(plane(), row, [(-1.0, 1.0)] * 2, clf=CLF(1 / x))
+    with pytest.raises(NumericalError, match=r"the goal has no finite value at x = 0"):
+        undefined.filter(np.zeros(2), np.zeros(2))
+    with pytest.raises(NumericalError, match=r"the goal has no finite value at x = 0"):
+        undefined.filter(np.zeros((1, 2)), np.zeros((1, 2)))

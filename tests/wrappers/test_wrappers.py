@@ -20,6 +20,7 @@ FILTER = {
     "filter_active": bool,
     "feasible": bool,
     "slack": float,
+    "slacks": np.ndarray,
     "active_barrier": int,
     "episode_interventions": int,
     "episode_infeasible": int,
@@ -42,7 +43,8 @@ def test_info_has_every_key_with_one_type_at_reset_and_at_each_step(env_id, filt
             assert np.isfinite(value).all()
     infos = [vector.reset(seed=0)[1]] + [vector.step(vector.action_space.sample())[4] for _ in range(5)]
     count = len(env.unwrapped.problem.barriers)
-    shapes = {"barrier": (3, count), "nominal_action": vector.action_space.shape, "safe_action": vector.action_space.shape}
+    shapes = dict.fromkeys(("barrier", "slacks"), (3, count))
+    shapes |= dict.fromkeys(("nominal_action", "safe_action"), vector.action_space.shape)
     for info in infos:
         assert set(info) == set(contract) | {f"_{key}" for key in contract}
         for key, kind in contract.items():

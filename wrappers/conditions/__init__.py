@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest
@@ -83,8 +84,7 @@ def parse_condition(text: str, gains: Sequence[float]) -> Condition:
             raise ConfigurationError(f"filter {reason}")
         given[key] = _value(text, key, value, isinstance(allowed[key].default, float | str))
     if set(given) <= {"sampling_margin"}:
-        by_gains = condition.for_gains(gains)
-        return type(by_gains)(**{**vars(by_gains), **given})
+        return replace(condition.for_gains(gains), **given)
     return condition(**given)
 
 

@@ -17,6 +17,7 @@ from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.class_k import ClassK, Rate, applied
 
 FIRST_ORDER = "first-order"
+_KINKED = (sp.Abs, sp.sign, sp.Min, sp.Max, sp.Heaviside, sp.Piecewise)
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class AffineConstraint:
         offset: b.
         chain: b_0 = h, ..., b_(r-1); the condition keeps the intersection of {b_j >= 0}, not C itself.
         demand: of a reciprocal condition, which asks for a u + b >= demand where h > 0 and has no meaning elsewhere. There
-            a u + b is the rate of h, and all that is left is to make that as large as can be.
+            a u + b is the rate of h, and all that is left is to make that as large as the other rows allow.
         change: rate of the row while the input is held, an expression of states and inputs, where a margin of first order
             is asked for.
     """
@@ -75,7 +76,7 @@ class Condition(ABC):
         margin = self.sampling_margin
         if margin in ("none", FIRST_ORDER):
             return
-        if isinstance(margin, str) or not 0 <= margin < math.inf:
+        if isinstance(margin, bool) or not isinstance(margin, int | float) or not 0 <= margin < math.inf:
             raise ConfigurationError(f"sampling_margin = {margin!r}; allowed: none, {FIRST_ORDER}, or a number >= 0")
 
     @property
@@ -94,7 +95,7 @@ class Condition(ABC):
         if self.sampling_margin == FIRST_ORDER:
             row = sum(a * u for a, u in zip(found.coefficient, model.inputs, strict=True)) + found.offset - (found.demand or 0)
             by_input = (input_derivative(model, row) * sp.Matrix(model.inputs))[0, 0]
-            return replace(found, change=self.derivative(model, row) + by_input)
+            return replace(found, change=resolved(self.derivative(model, row) + by_input, barrier))
         if self.sampling_margin != "none":
             return replace(found, offset=found.offset - sp.Float(self.sampling_margin, 17))
         return found
@@ -113,10 +114,15 @@ class Condition(ABC):
         return None
 
     @property
+    def parameters(self) -> dict[str, Any]:
+        """What makes the same condition again, besides the margin."""
+        return {key: value for key, value in vars(self).items() if key != "sampling_margin"}
+
+    @property
     def spec(self) -> str:
         """The text from which `parse_condition` makes the same condition."""
-        parameters = [f"{key}={_text(value)}" for key, value in vars(self).items() if key != "sampling_margin" or value != "none"]
-        return ":".join([self.name, *sorted(parameters, key=lambda text: text.startswith("sampling_margin"))])
+        margin = {} if self.sampling_margin == "none" else {"sampling_margin": self.sampling_margin}
+        return ":".join([self.name, *(f"{key}={_text(value)}" for key, value in {**self.parameters, **margin}.items())])
 
 
 def _text(value: Any) -> str:
@@ -136,20 +142,35 @@ def chain_of(
 
     Raises:
         RelativeDegreeError: the number of functions is not the relative degree, or there is none.
-        SystemDefinitionError: a class-K function cannot be differentiated as often as the chain needs.
+        SystemDefinitionError: the barrier or a class-K function cannot be differentiated as often as the chain needs.
     """
     degree = relative_degree(model, barrier.expression, derivative)
     if alphas is not None and len(alphas) != degree:
         raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree} and needs as many rates; {len(alphas)} given")
+    for j, alpha in enumerate(alphas or (), start=1):
+        if isinstance(alpha, ClassK) and not alpha.is_smooth(degree - j):
+            raise SystemDefinitionError(
+                f"class-K function {alpha} is the {j}. of {degree} and needs {degree - j} continuous derivatives, which it has not at 0; "
+                "use an odd power or another smooth function there"
+            )
     chain = [barrier.expression]
     for alpha in alphas or (None,) * degree:
         term = 0 if alpha is None else applied(alpha, chain[-1])
-        chain.append(derivative(model, chain[-1]) + term)
-    offset = chain.pop()
-    curved = [str(alpha) for alpha in alphas or () if isinstance(alpha, ClassK)]
-    if curved and sp.Matrix([[offset, *input_derivative(model, chain[-1])]]).has(sp.DiracDelta, sp.Derivative, sp.Subs):
+        chain.append(resolved(derivative(model, chain[-1]), barrier) + term)
+    return chain[:-1], chain[-1]
+
+
+def resolved(expression: Any, barrier: Barrier) -> sp.Expr:
+    """A derivative of a chain without what sympy adds at the kinks of class-K functions like s |s|, where it has no weight.
+
+    Raises:
+        SystemDefinitionError: the kink is the barrier's own: there the chain would jump, and Ito's formula miss a local time.
+    """
+    if not expression.has(sp.DiracDelta, sp.Derivative, sp.Subs):
+        return expression
+    if expression.has(sp.Derivative, sp.Subs) or barrier.expression.has(*_KINKED):
         raise SystemDefinitionError(
-            f"a class-K function of ({', '.join(curved)}) is not differentiable as often as relative degree {degree} needs: the j-th "
-            f"one needs {degree} - j derivatives (and real symbols: sympy.Symbol(..., real=True))"
+            f"barrier {barrier.name} = {barrier.expression} cannot be differentiated as often as is needed; give a smooth one, of real "
+            "symbols, or one barrier for each of its pieces"
         )
-    return chain, offset
+    return expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass, field
+from numbers import Number
 from typing import Any
 
 import sympy as sp
+from mpmath.libmp import NoConvergence  # pyright: ignore[reportMissingImports]
 
 from safe_envs.barrier import Barrier
 from safe_envs.calculus import derivatives, drift_derivative, relative_degree
@@ -90,13 +93,10 @@ class ECBF(Condition):
 
     It is the HOCBF whose rates are minus its poles, and keeps the same sets.
 
-    Args:
+    Attributes:
         k: gains k_0..k_(r-1). The polynomial s^r + k_(r-1) s^(r-1) + ... + k_0 needs real negative roots: stability
             alone, as thesis Def. 3.1.5 prints it, lets h undershoot below 0.
-        poles: these roots, in 1/s, in place of the gains.
-
-    Attributes:
-        k: the gains.
+        poles: these roots, in 1/s, if they are given in place of the gains.
 
     Raises:
         ConfigurationError: a pole is complex or not negative, or both gains and poles are given.
@@ -105,19 +105,20 @@ class ECBF(Condition):
     """
 
     k: tuple[float, ...] | None = None
-    poles: InitVar[Sequence[complex] | None] = None
+    poles: tuple[float, ...] | None = field(default=None, compare=False)
     name = "ecbf"
 
-    def __post_init__(self, poles: Sequence[complex] | None) -> None:
+    def __post_init__(self) -> None:
         super().__post_init__()
-        if poles is not None and self.k is not None:
-            raise ConfigurationError(f"ecbf takes gains or poles; k = {self.k} and poles = {tuple(poles)} were given")
-        if poles is not None:
-            _require_real_negative(f"poles = {', '.join(map(str, poles))}", [sp.sympify(pole) for pole in poles])
-            gains = _gains(poles)
-        else:
+        if self.poles is None:
             gains = positive_rates("k", (1.0,) if self.k is None else self.k)
-            _require_real_negative(f"k = {gains} places poles there", _roots(gains))
+            _real_negative_roots(gains)
+        else:
+            poles = _real_negative_poles(self.poles)
+            gains = _gains(poles)
+            if self.k not in (None, gains):
+                raise ConfigurationError(f"ecbf takes gains or poles; k = {self.k} and poles = {poles} were given")
+            object.__setattr__(self, "poles", poles)
         object.__setattr__(self, "k", gains)
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
@@ -142,25 +143,47 @@ class ECBF(Condition):
 
     def chain_rates(self, degree: int) -> tuple[float, ...]:
         """Minus the poles, the slowest first; see `Condition.chain_rates`."""
-        return tuple(sorted(float(-sp.re(root)) for root in _roots(self.k or ())))
+        return tuple(sorted(-pole for pole in self.poles or _real_negative_roots(self.k or ())))
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """The poles where they are given, else the gains."""
+        return {"poles": self.poles} if self.poles else {"k": self.k}
 
 
-def _gains(poles: Sequence[Any]) -> tuple[float, ...]:
+_WHY = (
+    "place real negative ones, one for each relative degree; with complex poles h would oscillate through 0, and with others it would "
+    "not come back to the safe set"
+)
+
+
+def _gains(poles: Sequence[float]) -> tuple[float, ...]:
+    """k_0..k_(r-1) of the monic polynomial with the given roots."""
     s = sp.Symbol("s")
-    polynomial = sp.Poly(sp.Mul(*[s - sp.Rational(repr(float(p.real))) for p in poles]), s)
+    polynomial = sp.Poly(sp.Mul(*[s - sp.Rational(repr(p)) for p in poles]), s)
     return tuple(float(c) for c in reversed(polynomial.all_coeffs()[1:]))
 
 
-def _roots(gains: Sequence[float]) -> list[Any]:
+def _real_negative_poles(given: Any) -> tuple[float, ...]:
+    entries = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    listing = ", ".join(map(str, entries)) or "none"
+    if not all(isinstance(pole, Number) and not isinstance(pole, bool) for pole in entries):
+        raise ConfigurationError(f"poles = {listing}; give numbers in 1/s, one for each relative degree")
+    poles = [complex(pole) for pole in entries]
+    if not poles or any(pole.imag or not -math.inf < pole.real < 0 for pole in poles):
+        raise ConfigurationError(f"poles = {listing}: {_WHY}")
+    return tuple(pole.real for pole in poles)
+
+
+def _real_negative_roots(gains: Sequence[float]) -> tuple[float, ...]:
     polynomial = sp.Poly([1, *(sp.Rational(repr(k)) for k in reversed(gains))], sp.Symbol("s"))
-    return polynomial.nroots(maxsteps=200)
-
-
-def _require_real_negative(given: str, roots: Sequence[Any]) -> None:
-    # Rounding splits a multiple pole into a ring about it: what oscillates a thousand times slower than it decays is real.
-    if not roots or any(not root.is_finite or sp.re(root) >= 0 or abs(sp.im(root)) > 1e-3 * abs(root) for root in roots):
+    try:
+        # A factor that is repeated exactly is solved once: the iteration does not converge at multiple roots.
+        roots = [root for factor, count in polynomial.sqf_list()[1] for root in factor.nroots(n=50, maxsteps=1000) * count]
+    except NoConvergence as error:
+        raise ConfigurationError(f"the poles of k = {gains} cannot be computed; give poles in place of gains") from error
+    # Rounding of the gains splits a multiple pole into a ring about it: what oscillates so slowly is real.
+    if any(sp.re(root) >= 0 or abs(sp.im(root)) > 1e-3 * abs(root) for root in roots):
         listing = ", ".join(str(sp.N(root, 4)) for root in roots)
-        raise ConfigurationError(
-            f"{given} ({listing}): place real negative poles, one for each relative degree; with complex poles h would oscillate "
-            "through 0, and with others it would not come back to the safe set"
-        )
+        raise ConfigurationError(f"k = {gains} has its poles at {listing}: {_WHY}")
+    return tuple(float(sp.re(root)) for root in roots)

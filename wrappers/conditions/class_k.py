@@ -11,6 +11,7 @@ from typing import Any
 
 import mpmath
 import sympy as sp
+from sympy.printing.str import StrPrinter
 
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.sde import finite_number
@@ -19,8 +20,9 @@ S = sp.Symbol("s", real=True)
 """The argument of a class-K function."""
 
 _FUNCTIONS: dict[str, Any] = {
-    name: getattr(sp, name) for name in ("Abs", "asinh", "atan", "cbrt", "erf", "exp", "log", "sign", "sinh", "sqrt", "tanh")
+    name: getattr(sp, name) for name in ("Abs", "asinh", "atan", "cos", "cosh", "erf", "exp", "log", "sin", "sinh", "sqrt", "tanh")
 }
+_CONSTANTS: dict[str, Any] = {"s": S, "pi": sp.pi, "E": sp.E}
 _OPERATORS: dict[type[ast.AST], Any] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -30,7 +32,9 @@ _OPERATORS: dict[type[ast.AST], Any] = {
     ast.USub: operator.neg,
     ast.UAdd: operator.pos,
 }
+_LARGEST_EXPONENT = 100
 _DIGITS = 150
+_NEAR = 1e-12
 
 
 @dataclass(frozen=True)
@@ -50,20 +54,47 @@ class ClassK:
 
     def __post_init__(self) -> None:
         given = self.expression
-        expression = sp.sympify(_parsed(given) if isinstance(given, str) else given)
-        object.__setattr__(self, "expression", expression)
+        try:
+            expression = _parsed(given) if isinstance(given, str) else given
+            expression = expression.subs({s: S for s in expression.free_symbols if s.name == S.name})
+        except AttributeError:
+            raise ConfigurationError(f"class-K function {given!r} is no expression of s, like 2*s**3 or tanh(s)") from None
         if expression.free_symbols != {S} or expression.has(sp.zoo, sp.nan, sp.oo):
             raise ConfigurationError(f"class-K function {given}: give a finite expression of s alone, like 2*s**3")
+        object.__setattr__(self, "expression", expression)
         _require_increasing(expression)
+        if _parsed(str(self)) != expression:
+            raise ConfigurationError(f"class-K function {given} cannot be written and read again as {self}; write numbers as floats")
 
     def __call__(self, value: sp.Expr) -> sp.Expr:
         """Return alpha(value)."""
         return self.expression.subs(S, value)
 
+    def is_smooth(self, order: int) -> bool:
+        """Whether the derivatives up to an order are finite and continuous at 0, the one place where s |s| and the like are not."""
+        slopes = [sp.diff(self.expression, S, i).replace(sp.DiracDelta, lambda *_: sp.Integer(0)) for i in range(order + 1)]
+        value = sp.lambdify(S, slopes, "mpmath")
+        try:
+            with mpmath.workdps(_DIGITS):
+                middle, below, above, wide = [value(mpmath.mpf(s)) for s in (0, -_NEAR, _NEAR, 1e6 * _NEAR)]
+                return all(
+                    mpmath.isfinite(c) and abs(b - a) <= abs(w - c) + abs(c) / 2
+                    for c, a, b, w in zip(middle, below, above, wide, strict=True)
+                )
+        except (ArithmeticError, TypeError, ValueError):
+            return False
+
     def __str__(self) -> str:
-        return str(self.expression).replace(" ", "")
+        return _Printer().doprint(self.expression).replace(" ", "")
 
     __repr__ = __str__
+
+
+class _Printer(StrPrinter):
+    """Writes floats with all their digits, so that a spec is read as what it was."""
+
+    def _print_Float(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
+        return repr(float(expr))
 
 
 def power(rate: float, exponent: float) -> ClassK:
@@ -88,42 +119,40 @@ Rate = float | ClassK
 """A class-K function, with a number p for the linear one p s."""
 
 
-def rates(name: str, given: Sequence[Any]) -> tuple[Rate, ...]:
+def rates(name: str, given: Any) -> tuple[Rate, ...]:
     """Return class-K functions, the linear ones as positive floats in 1/s, or say which one is none.
 
     Raises:
         ConfigurationError: there is none, or one is neither a positive number nor a class-K function.
     """
-    found = tuple(r if isinstance(r, ClassK) else ClassK(r) if isinstance(r, str | sp.Expr) and _depends(r) else r for r in given)
+    entries = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    found = tuple(ClassK(r) if isinstance(r, str) or getattr(r, "free_symbols", None) else r for r in entries)
     numbers = [r for r in found if not isinstance(r, ClassK)]
-    if len(numbers) == len(found) or numbers:
+    if numbers or not found:
         positive_rates(name, numbers)
     return tuple(r if isinstance(r, ClassK) else float(r) for r in found)
 
 
-def positive_rates(name: str, given: Sequence[Any]) -> tuple[float, ...]:
+def positive_rates(name: str, given: Any) -> tuple[float, ...]:
     """Return linear class-K functions as floats, or say that one is not positive.
 
     Raises:
         ConfigurationError: there is none, or one is not a positive finite number.
     """
+    entries = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
     try:
-        values = tuple(float(r) for r in given)
+        values = tuple(float(r) for r in entries)
     except (TypeError, ValueError):
         values = ()
     if not values or not all(0 < v < float("inf") for v in values):
-        listing = ", ".join(map(str, given)) or "none"
-        raise ConfigurationError(f"{name} = {listing}; give positive rates in 1/s, one for each relative degree")
+        listing = ", ".join(map(str, entries)) or "none"
+        raise ConfigurationError(f"{name} = {listing}; give positive numbers")
     return values
 
 
 def applied(rate: Rate, value: sp.Expr) -> sp.Expr:
     """Return alpha(value) for a rate of either kind."""
     return rate(value) if isinstance(rate, ClassK) else sp.Float(rate, 17) * value
-
-
-def _depends(given: str | sp.Expr) -> bool:
-    return isinstance(given, str) or bool(given.free_symbols)
 
 
 def _require_increasing(alpha: sp.Expr) -> None:
@@ -155,12 +184,15 @@ def _parsed(text: str) -> Any:
 
 def _evaluated(node: ast.AST) -> Any:
     match node:
-        case ast.Name("s"):
-            return S
+        case ast.Name(name) if name in _CONSTANTS:
+            return _CONSTANTS[name]
         case ast.Constant(int() | float() as number):
             return sp.sympify(number)
         case ast.BinOp(left, kind, right) if type(kind) in _OPERATORS:
-            return _OPERATORS[type(kind)](_evaluated(left), _evaluated(right))
+            first, second = _evaluated(left), _evaluated(right)
+            if isinstance(kind, ast.Pow) and not (second.is_number and abs(second) <= _LARGEST_EXPONENT):
+                raise ConfigurationError(f"class-K function: the exponent {ast.unparse(right)} is no number up to {_LARGEST_EXPONENT}")
+            return _OPERATORS[type(kind)](first, second)
         case ast.UnaryOp(kind, operand) if type(kind) in _OPERATORS:
             return _OPERATORS[type(kind)](_evaluated(operand))
         case ast.Call(ast.Name(name), [argument], []):

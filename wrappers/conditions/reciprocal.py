@@ -11,7 +11,7 @@ from safe_envs.barrier import Barrier
 from safe_envs.calculus import gradient, relative_degree
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest
 from safe_envs.sde import ControlAffineSDE
-from wrappers.conditions.base import AffineConstraint, Condition
+from wrappers.conditions.base import AffineConstraint, Condition, resolved
 from wrappers.conditions.class_k import positive_rates
 
 _H = sp.Symbol("h", positive=True)
@@ -57,7 +57,7 @@ class _Reciprocal(Condition):
         if self.stochastic:
             spread = gradient(model, h) * model.diffusion
             demand -= sp.simplify(sp.diff(beta, _H, 2) / slope / 2) * (spread * spread.T)[0, 0]
-        return AffineConstraint.after(model, (h,), self.derivative(model, h), demand.subs(_H, h))
+        return AffineConstraint.after(model, (h,), resolved(self.derivative(model, h), barrier), demand.subs(_H, h))
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> _Reciprocal:
