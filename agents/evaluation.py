@@ -20,7 +20,7 @@ from agents.policy import POLICIES, Policy, make_policy
 from agents.problems import full_id, load_problem
 from agents.statistics import RunningSum, require_confidence, share
 from safe_envs.codegen import Components
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
 from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
 from safe_envs.vector import SafeVectorEnv
@@ -160,22 +160,29 @@ class _Promise:
 
     def __init__(self, name: str, problem: SafetyProblem, knowledge: str) -> None:
         self._horizon = problem.steps * problem.dt
-        self._bound = None if name == BARE else proved_bound(problem, parse_conditions(name, problem), knowledge)
+        self._bound, self._why_none = None, "there is no filter"
         self._total, self._count = RunningSum(), 0
+        if name != BARE:
+            try:
+                self._bound = proved_bound(problem, parse_conditions(name, problem), knowledge)
+                self._why_none = self._bound.note
+            except SafeEnvsError as error:
+                # The bound looks at the whole safe set, where the episodes may never be.
+                self._why_none = str(error)
 
     def add(self, start: Components, count: int) -> None:
         """Take the starts of a wave."""
-        if self._bound is not None and self._bound.note is None:
+        if self._bound is not None and not self._why_none:
             self._total.add(self._bound.at(np.stack(start, axis=1)[:count], self._horizon))
             self._count += count
 
     def row(self) -> Row:
         """The mean bound, None where there is none, and why there is none or why it is weak."""
-        if self._bound is None:
-            return {"bound": None, "bound_note": "there is no filter"}
+        if self._bound is None or self._why_none:
+            return {"bound": None, "bound_note": self._why_none}
         mean = share(self._total.total, self._count)
         if not mean:
-            return {"bound": None, "bound_note": self._bound.note or self._bound.remark or "it is 0 at these starts up to this horizon"}
+            return {"bound": None, "bound_note": self._bound.remark or "it is 0 at these starts up to this horizon"}
         return {"bound": mean, "bound_note": self._bound.remark}
 
 

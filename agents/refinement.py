@@ -49,9 +49,9 @@ def refine(
     number of whole periods dt that is simulated with the first. Episode i has the same seed each time, hence the same
     start, but its noise is not the same path sampled more finely. The change is that of paired episodes.
 
-    The verdict on a rate is "converged" where the interval of its change from dt/2 to dt/4 contains 0 and reaches no
-    further than `TOLERANCE` either way. It is "not resolved" where the interval contains 0 but reaches further, so that
-    more episodes are needed, and "still changing" where it does not contain 0.
+    The verdict on a rate is "converged" where the interval of its change from dt/2 to dt/4 reaches no further than
+    `TOLERANCE` either way. Elsewhere it is "still changing" where the interval does not contain 0, and "not resolved"
+    where it does, so that more episodes are needed. It says nothing of still smaller periods.
 
     Args:
         problem: as for `evaluate`.
@@ -102,6 +102,6 @@ def _row(name: str, evaluations: tuple[Evaluation, ...]) -> Row:
 
 def verdict(low: float, high: float) -> str:
     """What the interval (low, high) of the change of a rate says: see `refine`."""
-    if not low <= 0.0 <= high:
-        return "still changing"
-    return "converged" if max(-low, high) <= TOLERANCE else "not resolved"
+    if max(-low, high) <= TOLERANCE:
+        return "converged"
+    return "not resolved" if low <= 0.0 <= high else "still changing"

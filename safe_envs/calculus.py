@@ -5,6 +5,7 @@ The printed derivations of this field contain sign errors; here nothing is diffe
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable
 from typing import Any
@@ -18,6 +19,7 @@ from safe_envs.sde import ControlAffineSDE
 Derivative = Callable[[ControlAffineSDE, sp.Expr], sp.Expr]
 
 _LARGEST_TIDIED = 100
+_MOST_TERMS = 200
 
 
 def gradient(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
@@ -83,10 +85,22 @@ def derivatives(system: ControlAffineSDE, expression: sp.Expr, order: int, deriv
 
 def tidied(expression: Any) -> sp.Expr:
     """An equal expression with fewer operations, if sin^2 + cos^2 = 1 and common factors give one quickly."""
-    if expression.count_ops() > _LARGEST_TIDIED:
+    if expression.count_ops() > _LARGEST_TIDIED or _expanded_terms(expression) > _MOST_TERMS:
         return expression
     expanded = sp.expand(TR5(sp.expand(expression)))
     return min((expression, sp.factor_terms(expression), sp.factor_terms(expanded)), key=sp.count_ops)
+
+
+def _expanded_terms(expression: Any) -> int:
+    """How many terms an expression has at most, once its products and powers are multiplied out."""
+    parts = [_expanded_terms(part) for part in expression.args]
+    if expression.is_Add:
+        return sum(parts)
+    if expression.is_Mul:
+        return math.prod(parts)
+    if expression.is_Pow and expression.exp.is_Integer and expression.exp > 0:
+        return math.comb(parts[0] + int(expression.exp) - 1, int(expression.exp))
+    return 1
 
 
 def relative_degree(system: ControlAffineSDE, expression: sp.Expr, derivative: Derivative = drift_derivative) -> int:

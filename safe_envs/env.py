@@ -180,7 +180,7 @@ class SystemEnv(SafeEnv):
         noise: diffusion of plant and model, one number for all channels or one for each; 0 turns it off.
         plant: parameters of the simulated system, by name.
         model: parameters that the designer believes, by name.
-        barrier: arguments of the barrier, by name; each may also be given by itself.
+        barrier: arguments of the problem's factory (of the barrier, mostly), by name; each may also be given by itself.
         dt: control period in s.
         substeps: integration steps in a control period.
         horizon: length of an episode in s.

@@ -63,11 +63,14 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
         rates = zip(row["safety_rate"], row["ci_low"], row["ci_high"], strict=True)
         table.add_row(row["filter"], *[_rate(*rate) for rate in rates])
     _print_table(console, table)
+    if refinement.evaluations[0].repeats:
+        _say(console, "Nothing is random here: what changes with the period, changes for sure.")
+        return
     for row in refinement.rows:
         change = _points(row["change"], row["change_low"], row["change_high"])
         _say(console, f"  {row['filter']}: {_VERDICTS[row['verdict']].format(change)}")
     reach = f"{100 * TOLERANCE:g} points"
-    _say(console, f"Converged: the {interval} of the change from dt/2 to dt/4 contains 0, and reaches no further than {reach} either way.")
+    _say(console, f"Converged: the {interval} of the change from dt/2 to dt/4 reaches no further than {reach} either way.")
 
 
 def write_json(path: Path, answer: Evaluation | Refinement) -> None:

@@ -67,7 +67,7 @@ def gap_system() -> ControlAffineSDE:
 def _cruise(name: str, *, system: ControlAffineSDE, speed: sp.Symbol, rate: float, slack_weight: float, **rest: Any) -> SafetyProblem:
     """What both problems have in common: the force's box, and the task of driving at the desired speed."""
     error = speed - _DESIRED_SPEED
-    clf = CLF(error**2, rate, input_weight=2 / M**2, slack_weight=slack_weight)
+    clf = CLF(error**2, rate, input_weight=2 / M**2, slack_weight=positive("slack_weight", slack_weight))
     return SafetyProblem(
         name=name,
         plant=system,
@@ -81,11 +81,13 @@ def _cruise(name: str, *, system: ControlAffineSDE, speed: sp.Symbol, rate: floa
     )
 
 
-def acc(*, tau: float = 1.8) -> SafetyProblem:
+def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> SafetyProblem:
     """Following a slower car at a time headway.
 
     Args:
         tau: shortest allowed headway, in s.
+        rate: wanted decay rate of V, in 1/s.
+        slack_weight: w_d of the goal, whose weight of u^2 is 2/M^2.
 
     Source: thesis Sec. 4.3.1.
     """
@@ -93,8 +95,8 @@ def acc(*, tau: float = 1.8) -> SafetyProblem:
         "ACC",
         system=headway_system(),
         speed=x_1,
-        rate=5,
-        slack_weight=0.02,
+        rate=rate,
+        slack_weight=slack_weight,
         barriers=(Barrier(x_3 - positive("tau", tau) * x_1),),
         states=(Variable(x_1, 0.0, 50.0, "m/s"), Variable(x_2, 0.0, 50.0, "m/s"), Variable(x_3, 0.0, 1000.0, "m")),
         starts={"thesis": Start.at((15.0, _LEAD_SPEED, 150.0))},
@@ -106,12 +108,14 @@ def acc(*, tau: float = 1.8) -> SafetyProblem:
     )
 
 
-def acc_gap(*, distance: float = 10.0, power: int = 5) -> SafetyProblem:
+def acc_gap(*, distance: float = 10.0, power: int = 5, rate: float = 1.0, slack_weight: float = 2.0) -> SafetyProblem:
     """Following a slower car at a minimum distance.
 
     Args:
         distance: D, the shortest allowed gap, in m.
         power: exponent of h = (z - D)^power: odd, so that h is negative below D.
+        rate: wanted decay rate of V, in 1/s.
+        slack_weight: w_d of the goal, whose weight of u^2 is 2/M^2.
 
     Raises:
         ConfigurationError: the power is not a positive odd integer.
@@ -124,8 +128,8 @@ def acc_gap(*, distance: float = 10.0, power: int = 5) -> SafetyProblem:
         "ACCGap",
         system=gap_system(),
         speed=v,
-        rate=1,
-        slack_weight=2,
+        rate=rate,
+        slack_weight=slack_weight,
         barriers=(Barrier((z - positive("distance", distance)) ** power),),
         states=(Variable(v, 0.0, 50.0, "m/s"), Variable(z, 0.0, 500.0, "m")),
         starts={"thesis": Start.at((10.0, 15.0))},
@@ -187,7 +191,7 @@ class ACC(SystemEnv):
     Terminated outside the workspace, so at a crash or a stop; truncated after 100 s = 2000 steps.
 
     ## Arguments
-    `barrier={"tau": 1.8}`, the headway in s; for all others see `SystemEnv`.
+    `tau=1.8`, the headway in s; `rate=5.0` and `slack_weight=0.02` of the goal; for all others see `SystemEnv`.
 
     ## Source
     Thesis Sec. 4.3.1. The print does not give tau; and it has tr(Sigma' Sigma V_xx) where tr(Sigma Sigma' V_xx) is meant.
@@ -249,7 +253,8 @@ class ACCGap(SystemEnv):
     Terminated outside the workspace, so at a crash or a stop; truncated after 30 s = 3000 steps.
 
     ## Arguments
-    `barrier={"distance": 10.0, "power": 5}`, D in m and an odd exponent; for all others see `SystemEnv`.
+    `distance=10.0` in m and `power=5`, an odd exponent, of the barrier; `rate=1.0` and `slack_weight=2.0` of the goal; for all
+    others see `SystemEnv`.
 
     ## Source
     Thesis Sec. 6.3.2, which does not give v_f. Its b_1 lacks the noise term and its b_2 has wrong coefficients; here both are

@@ -49,18 +49,20 @@ def _problem(name: str, *, system: ControlAffineSDE, **rest: Any) -> SafetyProbl
     )
 
 
-def cubic_sde(*, offset: float = 1.0) -> SafetyProblem:
+def cubic_sde(*, offset: float = 1.0, rate: float = 1.0, slack_weight: float = 1.0) -> SafetyProblem:
     """The inside of a parabola, with noise that grows with x_2.
 
     Args:
         offset: where the parabola meets the x_1 axis.
+        rate: wanted decay rate of V, in 1/s.
+        slack_weight: w_d of the goal, whose weight of u^2 is 1.
 
     Source: thesis Sec. 5.4.2.
     """
     system = cubic(diffusion=[0, k * x_2], noise={k: 0.1})
     h = positive("offset", offset) - x_1 - x_2**2
     first, second = uniforms(2)
-    clf = CLF(x_1**2 + x_2**2)
+    clf = CLF(x_1**2 + x_2**2, rate, slack_weight=positive("slack_weight", slack_weight))
     return _problem(
         "CubicSDE",
         system=system,
@@ -149,7 +151,7 @@ class CubicSDE(SystemEnv):
     Terminated outside the workspace, truncated after 2 s = 200 steps.
 
     ## Arguments
-    `barrier={"offset": 1.0}`; for all others see `SystemEnv`.
+    `offset=1.0` of the barrier; `rate=1.0` and `slack_weight=1.0` of the goal; for all others see `SystemEnv`.
 
     ## Source
     Thesis Sec. 5.4.2, which prints the differential of the states' derivatives where that of the states is meant, and calls C

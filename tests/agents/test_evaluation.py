@@ -11,12 +11,14 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
+import sympy as sp
 from scipy.stats import norm
 
 from agents import NominalController, RandomPolicy, evaluate, load_problem, make_policy
 from agents.episodes import Recorder, episode_seed, run_episodes
 from agents.statistics import mcnemar_p, paired_difference_interval, rate_interval, wilson_interval
-from safe_envs import ConfigurationError, RelativeDegreeError, SafeEnv
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, RelativeDegreeError, SafeEnv, SafetyProblem
+from safe_envs.problem import Start, Variable
 from safe_envs.vector import SafeVectorEnv
 from wrappers import SafetyFilterWrapper
 
@@ -618,3 +620,25 @@ def test_bound_is_the_mean_over_the_starts():
     first = evaluate("CubicSDEDisk-v0", filters=["szcbf"], episodes=32, num_envs=7)
     assert first.rows[0]["bound"] == pytest.approx(np.mean(1 - starts[:, 0] ** 2 - starts[:, 1] ** 2) * math.exp(-2.0), rel=1e-3)
     assert first.rows[0]["bound"] != answer.rows[0]["bound"]
+
+
+def test_a_bound_that_cannot_be_computed_does_not_end_an_evaluation():
+    x, u = sp.symbols("x u", real=True)
+    system = ControlAffineSDE((x,), (u,), [-sp.sqrt(x + 0.5)], [1], [sp.Rational(1, 100)])  # no value at x < -.5, which C holds
+    problem = SafetyProblem(
+        "Root",
+        plant=system,
+        model=system,
+        barriers=(Barrier(1 - x**2),),
+        states=(Variable(x, -2.0, 2.0),),
+        inputs=(Variable(u, -3.0, 3.0),),
+        reward=sp.Integer(0),
+        nominal=(sp.Integer(1),),
+        starts={"middle": Start.at((0.5,))},
+        dt=0.05,
+        horizon=0.2,
+    )
+    (row,) = evaluate(problem, filters=["scbf"], episodes=5).rows
+    assert row["safe"] == 5
+    assert row["bound"] is None
+    assert "finite value" in row["bound_note"]

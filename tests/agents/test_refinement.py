@@ -54,7 +54,8 @@ def test_rates_that_do_not_change_have_converged_if_there_are_episodes_enough(ep
         (0.0, 0.02, "converged"),
         (-0.031, 0.01, "not resolved"),
         (-0.01, 0.031, "not resolved"),
-        (0.001, 0.002, "still changing"),
+        (0.001, 0.002, "converged"),
+        (0.001, 0.031, "still changing"),
         (-0.5, -0.4, "still changing"),
     ],
 )

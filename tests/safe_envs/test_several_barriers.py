@@ -144,3 +144,9 @@ def test_natural_filter_keeps_safe_what_the_nominal_controller_does_not(env_id):
     assert bare["safety_rate"] < 0.6
     assert filtered["safety_rate"] > 0.95
     assert filtered["infeasible_rate"] < 0.01
+
+
+def test_neighbours_circle_in_opposite_directions():
+    problem = problem_of("safe_envs/DubinsObstacles-v0", num_obstacles=4)
+    rates = [float(problem.plant.numeric(rate)) for rate in list(problem.plant.drift)[3:]]
+    assert rates == [0.6, -0.6, 0.6, -0.6]

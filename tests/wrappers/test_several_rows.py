@@ -178,3 +178,13 @@ assert several_rows.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0
 assert {"proxsuite", "qpsolvers"} <= set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+
+
+def test_flat_rows_of_many_inputs_are_exact():
+    # Met or not by their sign alone, beside rows that the solver meets to its precision only.
+    rows, box = [[1.0, 0.2, 0.0], [0.3, 1.0, 0.1], [0.0, 0.0, 0.0]], ([0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
+    for flat, met in ((-1e-12, False), (0.0, True), (1e-12, True), (-5.0, False)):
+        u, margin, active, feasible = project_floats(rows, [-0.5, -0.5, flat], *box)
+        assert feasible is met
+        assert (margin[2], active[2]) == (flat, not met)
+        np.testing.assert_allclose(u, project_floats(rows[:2], [-0.5, -0.5], *box[:4], [1.0] * 2)[0], atol=1e-9)

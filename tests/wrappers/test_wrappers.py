@@ -9,7 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from agents.clf import CLFController
 from safe_envs import ConfigurationError, InvalidInputError, RelativeDegreeError
+from tests.conftest import problem_of
 from wrappers import HOCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 
 BASE = {"cost": float, "violation": bool, "barrier": np.ndarray, "h_min": float, "episode_cost": float}
@@ -198,3 +200,61 @@ def test_copies_and_processes():
     np.testing.assert_array_equal(env.step([0.2])[0], twin.step([0.2])[0])
     problem = env.unwrapped.problem
     assert pickle.loads(pickle.dumps(problem)) == problem
+
+
+def test_joint_program_reports_what_the_goal_alone_asks_for():
+    env = SafetyFilterWrapper(gym.make("safe_envs/ACC-v0", start=[21.0, 20.0, 37.9]), "cbf", objective="clf")
+    vector = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/ACC-v0", num_envs=2, start=[21.0, 20.0, 37.9]), "cbf", objective="clf")
+    observation, _ = env.reset(seed=0)
+    vector.reset(seed=0)
+    goal, _ = CLFController(env.unwrapped.problem).predict(observation.astype(np.float64))
+    for proposal in (0.7, -0.4):  # the policy has no say
+        env.reset(seed=0)
+        info = env.step(np.array([proposal]))[-1]
+        np.testing.assert_allclose(info["nominal_action"], goal * env.unwrapped.problem.box[0][1], rtol=1e-4)
+        assert info["intervention"]
+        assert info["safe_action"][0] < info["nominal_action"][0] - 1.0
+    infos = vector.step(np.zeros((2, 1)))[-1]
+    np.testing.assert_allclose(infos["nominal_action"][0], info["nominal_action"], rtol=1e-9)
+    np.testing.assert_allclose(infos["safe_action"][0], info["safe_action"], rtol=1e-9)
+
+
+def test_priorities_and_slacks_reach_the_gym_wrappers():
+    problem = problem_of("safe_envs/QuadrotorLimits-v0")
+    state = [0.0] * 12
+    state[2], state[5], state[6], state[9] = 3.2, -6.0, 0.49, 1.0  # too fast towards the floor, and tilting further
+    slacks = []
+    for priorities in (None, [1.0, 1.0, 1e4]):
+        env = SafetyFilterWrapper(gym.make("safe_envs/QuadrotorLimits-v0", start=state), "hocbf", priorities=priorities)
+        env.reset(seed=0)
+        info = env.step(np.zeros(4))[-1]
+        assert info["slacks"].shape == (len(problem.barriers),)
+        assert info["slack"] == info["slacks"].max() > 0
+        again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))
+        again.reset(seed=0)
+        np.testing.assert_array_equal(again.step(np.zeros(4))[-1]["slacks"], info["slacks"])
+        slacks.append(info["slacks"])
+    assert slacks[0][2] > 1.0
+    assert slacks[1][2] < 1e-2 * slacks[0][2]
+    assert slacks[1][0] > slacks[0][0]
+    with pytest.raises(ConfigurationError, match="priorities"):
+        SafetyFilterWrapper(gym.make("safe_envs/QuadrotorLimits-v0"), "hocbf", priorities=[1.0])
+
+
+def test_an_action_that_is_the_least_violating_one_already_is_no_intervention():
+    # Infeasible, and the proposal is the end of the box that the filter wants: active, but nothing is changed.
+    vector = SafetyFilterVectorWrapper(
+        gym.make_vec("safe_envs/Scalar-v0", num_envs=2, start=[1.9], noise=0.0, box=[-1.0, 1.0]), "cbf:alpha=5"
+    )
+    vector.reset(seed=0)
+    info = vector.step(np.array([[-1.0], [1.0]]))[-1]
+    assert info["filter_active"].tolist() == [True, True]
+    assert info["feasible"].tolist() == [False, False]
+    assert info["intervention"].tolist() == [False, True]
+    assert info["active_barrier"].tolist() == [-1, 0]
+
+
+@pytest.mark.parametrize("condition", [None, 3, [None], ("scbf",)])
+def test_what_is_no_condition_is_explained(condition):
+    with pytest.raises(ConfigurationError, match="give a Condition, one for each barrier, or their text"):
+        SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0"), condition)

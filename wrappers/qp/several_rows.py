@@ -104,7 +104,11 @@ def _solver(
     size = len(v[0])
     rows = [stack(ai, size) for ai in a]
     offsets, proposed, lower, upper = [stack(part, size) for part in (b, v, low, high)]
-    (u, margin, active, feasible), left = one_binding.project_arrays(rows, offsets, proposed, lower, upper, w)
+    # A row that says nothing of the input is met or not, exactly, whatever the solver's precision.
+    flat = np.array([(row == 0.0).all(axis=0) for row in rows])
+    unmet = flat & (offsets < 0.0)
+    solvable = np.where(unmet, 0.0, offsets)
+    (u, margin, active, feasible), left = one_binding.project_arrays(rows, solvable, proposed, lower, upper, w)
     if left.size:
         # Imported here, since few filters need a solver.
         from wrappers.qp import proxqp
@@ -114,7 +118,7 @@ def _solver(
 
         found = proxqp.project(
             np.stack([of_left(row) for row in rows], axis=1),
-            of_left(offsets),
+            of_left(solvable),
             of_left(proposed),
             of_left(lower),
             of_left(upper),
@@ -124,4 +128,4 @@ def _solver(
         for whole, part in zip((u, margin, active), found[:3], strict=True):
             whole[:, left] = part.T
         feasible[left] = found.feasible
-    return list(u), list(margin), list(active), feasible
+    return list(u), list(np.where(unmet, offsets, margin)), list(np.where(flat, unmet, active)), feasible & ~unmet.any(axis=0)
