@@ -57,10 +57,10 @@ class CLFController(Policy):
         x = np.ascontiguousarray(given[..., self._columns].T)
         try:
             if given.ndim == 1:
-                inputs = self._floats.solve(tuple(x.tolist()), [0.0] * len(self._half)).action
+                inputs = self._floats.best(tuple(x.tolist()), [0.0] * len(self._half))
             else:
                 with np.errstate(all="ignore"):
-                    inputs = self._arrays.solve(tuple(x), [np.zeros(len(given))] * len(self._half)).action
+                    inputs = self._arrays.best(tuple(x), [np.zeros(len(given))] * len(self._half))
         except (ArithmeticError, ValueError) as error:
             row = given[error.index] if given.ndim == 2 and isinstance(error, UndefinedRowError) else given
             raise NumericalError(f"the goal of {self._name!r} has no finite value at the observation {row.tolist()}") from error

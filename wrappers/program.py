@@ -132,13 +132,12 @@ class Solver:
             UndefinedRowError: a row or the goal has no finite value.
         """
         a, b, goal, h = self._split(self._rows(*x))
-        inside = dict(zip(self._reciprocal, [value > 0.0 for value in h], strict=True))
-        self._require_finite([*b, *[aj for ai in a for aj in ai]])
-        self._require_finite(goal, "the goal")
         target = u
         if goal:
             target = [0.0 * uj for uj in u]
-            u = self._minimise((), (), target, goal)[0]
+            u = self._best(goal, target)
+        inside = dict(zip(self._reciprocal, [value > 0.0 for value in h], strict=True))
+        self._require_finite([*b, *[aj for ai in a for aj in ai]])
         asked = [self._choose(inside[i], b[i] - self._demand(i, x, inside[i]), 0.0) if i in inside else b[i] for i in range(self._count)]
         held = [[self._choose(inside[i], aj, 0.0) for aj in a[i]] if i in inside else a[i] for i in range(self._count)]
         self._require_finite(asked)
@@ -155,6 +154,14 @@ class Solver:
             feasible = feasible & defined
         slack = [self._choose(feasible, 0.0, self._larger(-value, 0.0)) for value in margin]
         return Decision(action, margin, active, feasible, slack, self._cause(a, asked, u, active, inside), u)
+
+    def best(self, x: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
+        """The input that is best for the goal, without rows; `nothing` is the input 0. Raises as `solve`."""
+        return self._best(self._split(self._rows(*x))[2], nothing)
+
+    def _best(self, goal: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
+        self._require_finite(goal, "the goal")
+        return self._minimise((), (), nothing, goal)[0]
 
     def _require_finite(self, values: Sequence[Any], what: str = "the constraint") -> None:
         total: Any = sum(values)
