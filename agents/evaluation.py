@@ -20,7 +20,7 @@ from agents.policy import POLICIES, Policy, make_policy
 from agents.problems import full_id, load_problem
 from agents.statistics import RunningSum, require_confidence, share
 from safe_envs.codegen import Components
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, require_whole
 from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
 from safe_envs.vector import SafeVectorEnv
@@ -115,7 +115,7 @@ def evaluate(
         NumericalError: a simulation or a condition left the finite numbers.
     """
     for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("num_envs", num_envs, 1)):
-        _require_whole(name, value, least)
+        require_whole(name, value, least)
     for name, value, allowed in (("knowledge", knowledge, ("model", "plant")), ("objective", objective, ("nearest", "clf"))):
         if value not in allowed:
             raise ConfigurationError(f"{name} = {value!r}; {nearest(value, allowed)}")
@@ -193,11 +193,6 @@ def _part_of(progress: Progress, before: int, parts: int, episodes: int) -> Prog
 
 def _speed(name: str, totals: Totals, seconds: float) -> dict[str, Any]:
     return {"filter": name, "seconds": seconds, "steps": totals.steps, "steps_per_second": totals.steps / seconds}
-
-
-def _require_whole(name: str, value: Any, least: int) -> None:
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
-        raise ConfigurationError(f"{name} = {value!r}; give a whole number from {least}")
 
 
 def _spec(name: str, problem: SafetyProblem) -> str:

@@ -145,7 +145,11 @@ def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.E
                 base = symbol
             product = sp.Mul(*[base] * abs(int(expression.exp)), evaluate=False)
             return product if expression.exp > 0 else sp.Pow(product, -1, evaluate=False)
-        return expression if arguments == list(expression.args) else expression.func(*arguments, evaluate=False)
+        if arguments == list(expression.args):
+            return expression
+        # Only these would undo what was done, and not every other function knows the word.
+        as_it_is = {"evaluate": False} if isinstance(expression, sp.Add | sp.Mul | sp.Pow) else {}
+        return expression.func(*arguments, **as_it_is)
 
     for symbol, expression in shared:
         expanded = expand(expression)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
+from typing import Any
 
 
 class SafeEnvsError(Exception):
@@ -36,3 +37,9 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
     listing = ", ".join(names) if names else "none"
     return f"did you mean {close[0]!r}? (allowed: {listing})" if close else f"allowed: {listing}"
+
+
+def require_whole(name: str, value: Any, least: int) -> None:
+    """Raise ConfigurationError unless a value is a whole number from `least`."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        raise ConfigurationError(f"{name} = {value!r}; give a whole number from {least}")

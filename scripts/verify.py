@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from safe_envs.errors import require_whole
 from safe_envs.files import require_writable, write_atomically
 from scripts import options
 from scripts.console import progress_bar, run, stdout
@@ -43,15 +44,15 @@ def verify(
     The safe set C is sampled, and searched for the worst: where the input has no say, where no action in the box meets the
     conditions, and the suprema on which the bounds rest. Nothing of this depends on the policy; the simulation does.
     """
+    from agents.policy import make_policy
     from agents.problems import full_id, load_problem
     from agents.verification import measure, starts_of
     from scripts.verify_report import document, print_report
     from wrappers import parse_conditions
     from wrappers.promise import promise
-    from wrappers.verify import require_count
     from wrappers.verify import verify as find
 
-    require_count("episodes", episodes, 1)
+    require_whole("episodes", episodes, 1)
     if json is not None:
         require_writable(json)
     if plot is not None:
@@ -63,6 +64,7 @@ def verify(
         noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
     )
     problem = load_problem(env_id, arguments)
+    make_policy(policy, problem)  # An unknown one is to show before the search, and without a simulation too.
     found = find(problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed)
     starts = starts_of(problem, seed)
     bounds = promise(found, starts, problem.horizon)

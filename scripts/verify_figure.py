@@ -18,8 +18,9 @@ from safe_envs.problem import SafetyProblem
 from scripts.figure import COLORS, QUIET, STYLE, UNSAFE
 from scripts.table import describe_system
 from wrappers import spec_of
+from wrappers.formulas import Formulas
 from wrappers.safe_set import sample
-from wrappers.verify import Formulas, Verification
+from wrappers.verify import Verification
 
 _INFEASIBLE = "#D55E00"
 _GRID = 300
@@ -27,6 +28,8 @@ _COARSE = 90
 _OTHERS_LOG2 = 7
 _SHOWN_STARTS = 200
 _LISTED = 3
+_NEAREST = 500
+_LEVELS = (0.2, 0.4, 0.6, 0.8)
 
 Evaluate = Callable[[np.ndarray], np.ndarray]
 
@@ -54,22 +57,24 @@ def draw(env_id: str, found: Verification, starts: np.ndarray, path: Path) -> No
         else:
             _draw_slice(panels[0], found, worst, starts)
         if several:
-            _draw_shares(figure, panels[1], found)
-        figure.legend(handles=_legend(formulas), loc="outside lower center", ncols=6 if several else 3)
+            _draw_shares(figure, panels[1], found, worst, starts)
+        figure.legend(handles=_legend(found), loc="outside lower center", ncols=6 if several else 3)
         figure.suptitle(f"{env_id}, {spec_of(formulas.conditions)}\n{describe_system(problem)}", fontsize=11)
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
 
 
-def _legend(formulas: Formulas) -> list[Patch | Line2D]:
+def _legend(found: Verification) -> list[Patch | Line2D]:
+    formulas, missed = found.formulas, (found.safe.shortfall or (found.kept or found.safe).shortfall) > 0.0
     degree = max(stage.stop - stage.start for stage in formulas.stages)
     several = formulas.problem.plant.n > 2
-    handles: list[Patch | Line2D] = [
-        Patch(color=_INFEASIBLE, alpha=0.6, label="no action meets the condition"),
+    handles: list[Patch | Line2D] = [Patch(color=_INFEASIBLE, alpha=0.6, label="no action meets the condition")] if missed else []
+    handles += [
         Patch(color=UNSAFE, alpha=0.5, label="unsafe"),
         Line2D([], [], color="black", linewidth=1.4, label="h = 0"),
     ]
     handles += [Line2D([], [], color=COLORS[j - 1], linestyle="--", label=f"b_{j} = 0") for j in range(1, degree)]
-    handles.append(Line2D([], [], color=_INFEASIBLE, marker="X", markeredgecolor="black", linestyle="", markersize=9, label="worst state"))
+    cross = "worst state" if (found.kept or found.safe).shortfall else "least to spare"
+    handles.append(Line2D([], [], color=_INFEASIBLE, marker="X", markeredgecolor="black", linestyle="", markersize=9, label=cross))
     label = "starts, projected" if several else "starts"
     handles.append(Line2D([], [], color=COLORS[0], marker="o", linestyle="", markersize=4, label=label))
     return handles
@@ -81,22 +86,29 @@ def _plane(problem: SafetyProblem) -> tuple[int, int]:
     return names.index(across), names.index(up)
 
 
-def _window(found: Verification, axes: tuple[int, ...]) -> np.ndarray:
-    """Limits of the axes, shape (len(axes), 2): C within the workspace with some room, or the workspace where it is about as large."""
+def _window(found: Verification, axes: tuple[int, ...], starts: np.ndarray, worst: np.ndarray) -> np.ndarray:
+    """Limits of the axes, shape (len(axes), 2): C within the workspace with some room, or where it has no end what happens in it."""
     region, formulas = found.region, found.formulas
     points = region.draw(14, np.random.default_rng(0))
-    inside = points[formulas.barrier_level(points) >= 0.0][:, axes]
-    low, high = region.low[list(axes)], region.high[list(axes)]
+    inside = points[formulas.barrier_level(points) >= 0.0]
     if not len(inside):
-        return np.stack([low, high], axis=1)
-    room = 0.12 * (inside.max(axis=0) - inside.min(axis=0))
-    return np.stack([np.maximum(low, inside.min(axis=0) - room), np.minimum(high, inside.max(axis=0) + room)], axis=1)
+        return np.stack([region.low, region.high], axis=1)[list(axes)]
+    shown = inside if not found.beyond else np.concatenate([starts, worst[None], _near_edges(found, points)])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    room = 0.12 * (high - low) + 1e-3 * (region.high - region.low)
+    return np.stack([np.maximum(region.low, low - room), np.minimum(region.high, high + room)], axis=1)[list(axes)]
+
+
+def _near_edges(found: Verification, points: np.ndarray) -> np.ndarray:
+    """Those of the points that are nearest to the boundary of C, in the middle of the others."""
+    h = abs(found.formulas.barrier_level(points))
+    return points[np.argsort(h)[: len(points) // _NEAREST]]
 
 
 def _draw_slice(axes: Axes, found: Verification, worst: np.ndarray, starts: np.ndarray) -> None:
     formulas, problem = found.formulas, found.formulas.problem
     across, up = _plane(problem)
-    horizontal, vertical = np.meshgrid(*[np.linspace(low, high, _GRID) for low, high in _window(found, (across, up))])
+    horizontal, vertical = np.meshgrid(*[np.linspace(low, high, _GRID) for low, high in _window(found, (across, up), starts, worst)])
     x = np.tile(worst, (horizontal.size, 1))
     x[:, across], x[:, up] = horizontal.ravel(), vertical.ravel()
     chain = formulas.chain(x)
@@ -110,8 +122,9 @@ def _draw_slice(axes: Axes, found: Verification, worst: np.ndarray, starts: np.n
     axes.contourf(*grid, shaped(missed), levels=[0.5, 2.0], colors=[_INFEASIBLE], alpha=0.6, zorder=1)
     axes.contourf(*grid, shaped(h), levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.5, zorder=0)
     axes.contour(*grid, shaped(h), levels=[0.0], colors="black", linewidths=1.4, zorder=3)
-    inner = np.linspace(0.0, float(np.nanmax(h)), 6)[1:-1]
-    if np.nanmax(h) > 1e-3 * min(b.deepest_h for b in found.barriers):
+    if np.nanmax(h) > 1e-3 * min(b.deepest_h for b in found.barriers) or found.beyond:
+        # Quantiles, since even steps of a steep function crowd together at one end.
+        inner = np.unique(np.quantile(h[h > 0.0], _LEVELS))
         lines = axes.contour(*grid, shaped(h), levels=inner, colors=QUIET, linewidths=0.5, zorder=2)
         axes.clabel(lines, fontsize=7, fmt="%.3g")
     for stage in formulas.stages:
@@ -124,13 +137,13 @@ def _draw_slice(axes: Axes, found: Verification, worst: np.ndarray, starts: np.n
     axes.set_title(f"Contours of h; {listing} as at the worst state" if others else "Contours of h")
 
 
-def _draw_shares(figure: Figure, axes: Axes, found: Verification) -> None:
+def _draw_shares(figure: Figure, axes: Axes, found: Verification, worst: np.ndarray, starts: np.ndarray) -> None:
     """For which part of the other states, within the intersection of the C_j, no action meets the conditions."""
     formulas, problem = found.formulas, found.formulas.problem
     plane = _plane(problem)
     # Several conditions take a solver: a coarser picture of a tenth of the states.
     coarser = len(formulas.stages) > 1
-    ticks = [np.linspace(low, high, _COARSE // 2 if coarser else _COARSE) for low, high in _window(found, plane)]
+    ticks = [np.linspace(low, high, _COARSE // 2 if coarser else _COARSE) for low, high in _window(found, plane, starts, worst)]
     horizontal, vertical = np.meshgrid(*ticks)
     others = _others(found, 2 ** (_OTHERS_LOG2 - 2 * coarser))
     inside, missed = np.zeros(horizontal.size), np.zeros(horizontal.size)
@@ -165,7 +178,7 @@ def _missed(formulas: Formulas, x: np.ndarray, level: Evaluate) -> np.ndarray:
     """1 where a condition is missed and 0 where none is, for states (B, n) with level >= 0; NaN elsewhere."""
     found, inside = np.full(len(x), np.nan), level(x) >= 0.0
     if inside.any():
-        found[inside] = (formulas.missed(x[inside]) > 0.0).any(axis=1)
+        found[inside] = formulas.missed(x[inside]) > 0.0
     return found
 
 
@@ -192,7 +205,7 @@ def _name(name: str, unit: str) -> str:
 def _draw_line(axes: Axes, found: Verification, worst: np.ndarray, starts: np.ndarray) -> None:
     """H and the chain over the only state."""
     formulas, state = found.formulas, found.formulas.problem.states[0]
-    (low, high), *_ = _window(found, (0,))
+    (low, high), *_ = _window(found, (0,), starts, worst)
     x = np.linspace(low, high, 1000)[:, None]
     chain = formulas.chain(x)
     axes.plot(x[:, 0], chain[:, 0], color="black", linewidth=1.4)
@@ -206,4 +219,9 @@ def _draw_line(axes: Axes, found: Verification, worst: np.ndarray, starts: np.nd
     shown = starts[:_SHOWN_STARTS]
     axes.plot(shown[:, 0], formulas.chain(shown)[:, 0], "o", color=COLORS[0], markersize=2.5, alpha=0.7)
     axes.plot(worst[0], 0.0, "X", color=_INFEASIBLE, markeredgecolor="black", markersize=10, zorder=5)
-    axes.set(xlim=(low, high), xlabel=_name(state.symbol.name, state.unit), ylabel="h", title="h, and where no action meets the condition")
+    axes.set(
+        xlim=(low, high),
+        xlabel=_name(state.symbol.name, state.unit),
+        ylabel="h",
+        title="h" + ", and where no action meets the condition" * bool(missed.any()),
+    )

@@ -76,6 +76,7 @@ def document(config: dict[str, Any], found: Verification, bounds: Sequence[Bound
             "drawn": found.drawn,
             "notes": found.region.notes,
             "beyond_workspace": found.beyond,
+            "undefined": found.undefined,
             "safe": vars(found.safe),
             "kept": vars(found.kept) if found.kept else None,
             "barriers": [{**vars(b), "vanishes": b.vanishes, "unbounded": math.isinf(b.supremum)} for b in found.barriers],
@@ -118,6 +119,8 @@ def _set_lines(found: Verification) -> list[str]:
     ]
     if found.beyond:
         lines.append("C reaches beyond the workspace: shares and shortfalls are of the part inside, where the episodes are")
+    if found.undefined:
+        lines.append(f"a condition has no finite value on {_percent(found.undefined)} of C; nothing can be met or missed there")
     if found.kept is None:
         lines.append("the sets C_j = {b_j >= 0} have no state in common: nothing is kept")
     elif not found.formulas.first_order:
@@ -141,7 +144,7 @@ def _barrier_lines(problem: SafetyProblem, b: BarrierFindings) -> list[str]:
         f"deepest state of the workspace: h = {_number(b.deepest_h)} at {_state(problem, b.deepest)}; there the best action {missed}"
     )
     if math.isinf(b.supremum):
-        lines.append("sup h over C is infinite: it grows with the box that is searched")
+        lines.append(f"sup h over C {b.growth}")
     else:
         over = "" if b.degree == 1 else " over the intersection: " + ", ".join(f"c_{j} = {_number(c)}" for j, c in enumerate(b.suprema))
         lines.append(f"sup h over C = {_number(b.supremum)};{over}" if over else f"sup h over C = c = {_number(b.supremum)}")
@@ -168,14 +171,16 @@ def _print_bounds(console: Console, found: Verification, starts: np.ndarray, bou
     where = f"at {_state(problem, starts[0])}" if len(starts) == 1 else f"on average over {len(starts)} starts {problem.start!r}"
     console.print(f"\n[bold]Bounds on the probability of no violation[/] {escape(where)}, T = {problem.horizon:g} s", highlight=False)
     table = _table()
-    for name in ("", "bound", "P >=", "status", "why"):
-        table.add_column(name, justify="right" if name == "P >=" else "left", no_wrap=name in ("", "P >=", "status"))
+    for name in ("", "bound", "P >=", "status with the c and m found", "why"):
+        table.add_column(name, justify="right" if name == "P >=" else "left", no_wrap=name in ("", "P >="))
     for i, bound in enumerate(bounds, start=1):
         empty = bound.status == "proved" and not bound.value
         status = f"[{_COLORS[bound.status]}]{bound.status}[/]{', but empty' if empty else ''}"
         value = _percent(bound.value) if bound.status == "proved" or bound.value is None else f"({_percent(bound.value)})"
         table.add_row(str(i), escape(bound.name), value, status, escape(bound.reason))
     console.print(table)
+    if any(bound.status == "proved" for bound in bounds):
+        _say(console, "Proved is the theorem, with the c and m found: larger ones that the search missed would make the bound smaller.")
 
 
 def _print_measurement(console: Console, problem: SafetyProblem, policy: str, found: Measurement, numbers: dict[str, str]) -> None:

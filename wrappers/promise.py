@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import numpy as np
 
 from wrappers import bounds
-from wrappers.conditions import SRCBF
 from wrappers.formulas import Formulas
-from wrappers.safe_set import largest, sample
+from wrappers.hypotheses import amount, doubts, failures, no_bound, unbounded
+from wrappers.safe_set import sample
+from wrappers.search import largest
 from wrappers.verify import Verification
 
 Status = Literal["proved", "hypothesis fails", "no bound", "unproved"]
@@ -27,6 +27,7 @@ class Bound:
     Attributes:
         name: of the result.
         value: at the start, or its mean over several; None if there is none.
+        error: standard error of that mean as the mean over all starts; 0 for one start.
         status: what it is worth.
         reason: why, in words; may be empty where it is proved.
         forever: whether it is of all times, not only up to the horizon.
@@ -37,6 +38,7 @@ class Bound:
     status: Status
     reason: str
     forever: bool = False
+    error: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ def promise(verification: Verification, starts: np.ndarray, horizon: float) -> l
         horizon: T in s.
     """
     formulas = verification.formulas
-    nothing = no_bound(formulas) or _unbounded(verification)
+    nothing = no_bound(formulas) or unbounded(verification.survey)
     if nothing:
         return [Bound("all of them", None, "no bound", nothing)]
     kept = verification.kept
@@ -76,9 +78,9 @@ def promise(verification: Verification, starts: np.ndarray, horizon: float) -> l
     if not inside.any():
         return [Bound("all of them", None, "hypothesis fails", _outside(formulas, b))]
     partly = "" if inside.all() else f"0 at the {100 * (1 - inside.mean()):.1f} % of the starts that are outside some C_j"
-    failing = [mismatch(formulas), _infeasible(verification)]
+    verdict = _Verdict(failures(verification.survey), _infeasible(verification), doubts(verification.survey), partly)
     candidates = _certain(verification, b, horizon) if formulas.certain else _from_chains(verification, b, horizon)
-    return [_judged(candidate, failing, partly) for candidate in candidates]
+    return [_judged(candidate, verdict) for candidate in candidates]
 
 
 class _Candidate(NamedTuple):
@@ -99,12 +101,29 @@ class _Candidate(NamedTuple):
     allows_shortfall: bool = False
 
 
-def _judged(candidate: _Candidate, failing: Sequence[str], partly: str) -> Bound:
-    differs, infeasible = failing
-    broken = [reason for reason in (differs, "" if candidate.allows_shortfall else infeasible) if reason]
-    status: Status = "hypothesis fails" if broken else "unproved" if candidate.unproved else "proved"
-    reasons = [reason for reason in (*broken, candidate.unproved, partly) if reason]
-    return Bound(candidate.name, float(candidate.values.mean()), status, "; ".join(reasons), candidate.forever)
+class _Verdict(NamedTuple):
+    """What is against all candidates alike.
+
+    Attributes:
+        failures: hypotheses that fail, in words.
+        infeasible: where the conditions cannot be met; may be empty.
+        doubts: what keeps them from being proved, in words.
+        partly: at how many starts they are 0; may be empty.
+    """
+
+    failures: list[str]
+    infeasible: str
+    doubts: list[str]
+    partly: str
+
+
+def _judged(candidate: _Candidate, verdict: _Verdict) -> Bound:
+    broken = [*verdict.failures, *[verdict.infeasible] * (not candidate.allows_shortfall and bool(verdict.infeasible))]
+    unproved = [*verdict.doubts, *[candidate.unproved] * bool(candidate.unproved)]
+    status: Status = "hypothesis fails" if broken else "unproved" if unproved else "proved"
+    reason = "; ".join([*broken, *unproved, *[verdict.partly] * bool(verdict.partly)])
+    error = float(candidate.values.std(ddof=1)) / math.sqrt(len(candidate.values)) if len(candidate.values) > 1 else 0.0
+    return Bound(candidate.name, float(candidate.values.mean()), status, reason, candidate.forever, error)
 
 
 def _certain(verification: Verification, b: np.ndarray, horizon: float) -> list[_Candidate]:
@@ -155,45 +174,10 @@ def _of_stages(verification: Verification, b: np.ndarray, stages: Stages, horizo
     return found
 
 
-def no_bound(formulas: Formulas) -> str:
-    """Why nothing is promised whatever the numbers are, or ""."""
-    if not formulas.noisy:
-        return ""
-    for condition, stage in zip(formulas.conditions, formulas.stages, strict=True):
-        if not condition.stochastic:
-            return f"{condition.name} ignores the noise"
-        if condition.chain_rates(stage.stop - stage.start) is None and not isinstance(condition, SRCBF):
-            return f"{condition.name} has no chain of rates, as the bounds need under noise"
-    if not formulas.certain and any(isinstance(c, SRCBF) for c in formulas.conditions):
-        return "the barriers have conditions of different kinds"
-    return ""
-
-
-def mismatch(formulas: Formulas) -> str:
-    """In what the system that the conditions know differs from the plant, or ""."""
-    plant, known = formulas.problem.plant, formulas.system
-    parts = [n for n in ("drift", "input_matrix", "diffusion") if plant.numeric(getattr(plant, n)) != known.numeric(getattr(known, n))]
-    names = [p.name for p, value in plant.parameters.items() if known.parameters.get(p) != value]
-    return f"the model differs from the plant in {', '.join(names or parts)}" if parts else ""
-
-
-def _unbounded(verification: Verification) -> str:
-    if verification.formulas.certain:
-        return ""
-    for barrier in verification.barriers:
-        growing = np.flatnonzero(np.isinf(barrier.suprema))
-        if growing.size:
-            return infinite(barrier.name, int(growing[0]))
-    return ""
-
-
-def infinite(name: str, stage: int) -> str:
-    """Which supremum is infinite, in words."""
-    return f"sup {name} is infinite" if stage == 0 else f"sup b_{stage} of {name} is infinite"
-
-
 def _outside(formulas: Formulas, b: np.ndarray) -> str:
     """Where the start is outside, by the value that is lowest."""
+    if (b > 0.0).any(axis=0).all():
+        return "no start lies in all C_j at once"
     j = int(b.max(axis=0).argmin())
     i = next(i for i, stage in enumerate(formulas.stages) if stage.start <= j < stage.stop)
     name = formulas.problem.barriers[i].name
@@ -210,20 +194,11 @@ def _infeasible(verification: Verification) -> str:
     share = f"{100 * kept.infeasible:.2g} % of" if kept.infeasible else "a thin part of"
     where = "C" if formulas.first_order else "the intersection of the C_j"
     conditions = "the condition" if len(formulas.conditions) == 1 else "all conditions"
-    return f"no action meets {conditions} on {share} {where}, {amount(formulas, kept.shortfall)}"
-
-
-def amount(formulas: Formulas, shortfall: float) -> str:
-    """By how much a condition is missed, in words."""
-    if formulas.noisy and formulas.certain:
-        return "where it asks for unbounded control towards the edge"
-    return f"by up to {shortfall:.4g}"
+    return f"no action meets {conditions} on {share} {where}, {amount(kept.shortfall)}"
 
 
 def _stages(verification: Verification) -> Stages:
-    kept = verification.kept
-    suprema = np.concatenate([b.suprema for b in verification.barriers])
-    return assembled(verification.formulas, suprema, kept.shortfall if kept else math.nan)
+    return assembled(verification.formulas, verification.survey.suprema, verification.survey.missed[0])
 
 
 def assembled(formulas: Formulas, suprema: np.ndarray, shortfall: float) -> Stages:
@@ -254,7 +229,7 @@ def best_start(verification: Verification, seed: int = 0) -> np.ndarray | None:
         seed: of the search.
     """
     formulas = verification.formulas
-    if verification.kept is None or formulas.certain or no_bound(formulas) or _unbounded(verification):
+    if verification.kept is None or formulas.certain or no_bound(formulas) or unbounded(verification.survey):
         return None
     c = _stages(verification).suprema
     rng = np.random.default_rng(seed)

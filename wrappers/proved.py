@@ -12,11 +12,9 @@ from safe_envs.problem import SafetyProblem
 from wrappers import bounds
 from wrappers.conditions import Condition
 from wrappers.formulas import Formulas
-from wrappers.promise import Stages, amount, assembled, infinite, mismatch, no_bound, outlasting
-from wrappers.safe_set import region_of, sample
-from wrappers.verify import kept_points, supremum, worst
-
-_SAMPLES = 2048
+from wrappers.hypotheses import amount, doubts, failures, mismatch, no_bound, unbounded
+from wrappers.promise import Stages, assembled, outlasting
+from wrappers.survey import Survey
 
 
 @dataclass(frozen=True)
@@ -46,9 +44,9 @@ class ProvedBound:
 
 
 def proved_bound(problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str = "model") -> ProvedBound:
-    """What conditions are proved to promise: quick, deterministic, and without a look at more than that needs.
+    """What conditions are proved to promise: deterministic, and without a look at more than that needs.
 
-    The suprema and the shortfall are estimated as in `verify`, from fewer points.
+    The suprema and the shortfall are those of `verify` with its defaults.
 
     Args:
         problem: as for `verify`.
@@ -56,28 +54,30 @@ def proved_bound(problem: SafetyProblem, conditions: Sequence[Condition], knowle
         knowledge: as for `verify`.
 
     Raises:
-        ConfigurationError: see `verify`; likewise RelativeDegreeError and NumericalError.
+        ConfigurationError: see `verify`; likewise RelativeDegreeError.
     """
     formulas = Formulas(problem, conditions, knowledge)
+    # What needs no search comes first.
     note = no_bound(formulas) or mismatch(formulas)
     if note:
         return ProvedBound(note, "", formulas, None)
-    rng = np.random.default_rng(0)
-    region = region_of(problem, formulas.system, formulas.expressions)
-    safe = sample("C", formulas.barrier_level, region, _SAMPLES, rng)
-    kept = kept_points(formulas, region, safe, rng)
-    if kept is None:
-        return ProvedBound("the sets C_j have no state in common", "", formulas, None)
+    survey = Survey(formulas)
+    note = _note(survey)
+    if note:
+        return ProvedBound(note, "", formulas, None)
+    shortfall, _ = survey.missed
     # Where every path is kept, no supremum matters.
-    suprema = np.ones(formulas.stages[-1].stop)
-    for i, stages in enumerate(() if formulas.certain else formulas.stages):
-        for j in range(stages.start, stages.stop):
-            suprema[j] = supremum(j, formulas, slice(None), kept, region, rng)
-            if np.isinf(suprema[j]):
-                return ProvedBound(infinite(problem.barriers[i].name, j - stages.start), "", formulas, None)
-    shortfall, _ = worst(formulas, formulas.kept_level, kept, region, rng)
+    suprema = np.ones(formulas.stages[-1].stop) if formulas.certain else survey.suprema
     found = assembled(formulas, suprema, shortfall)
-    remark = f"no action meets the condition somewhere, {amount(formulas, shortfall)}" if shortfall else ""
+    remark = f"no action meets the condition somewhere, {amount(shortfall)}" if shortfall else ""
     if formulas.certain and shortfall and (formulas.noisy or any(map(math.isnan, found.rates))):
         return ProvedBound(remark, "", formulas, None)
     return ProvedBound(None, remark, formulas, found)
+
+
+def _note(survey: Survey) -> str:
+    """Why nothing is proved, the first of several reasons; may be empty."""
+    if survey.kept is None:
+        return "the sets C_j have no state in common"
+    against = [*failures(survey), *doubts(survey)]
+    return against[0] if against else unbounded(survey)

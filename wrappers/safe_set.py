@@ -1,30 +1,23 @@
-"""Points of a safe set: quasi-random draws from a box, and the search for the points where a function is largest."""
+"""Points of a safe set: quasi-random draws from a box of states."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from safe_envs.calculus import vanishes
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
 from safe_envs.simulation import Simulation
-
-Score = Callable[[np.ndarray], np.ndarray]
-"""From states (B, n) to numbers (B,)."""
+from wrappers.search import Score, search
 
 _PERIOD = 2.0 * math.pi
 _STARTS = 64
-_ROUNDS = 240
-_CONVERGED = 1e-13
-_FINEST = -10.0
-_POPULATION = 96
 _FIRST_LOG2, _LAST_LOG2 = 12, 18
 _FEW = 16
 
@@ -37,12 +30,14 @@ class Region:
         low: lower ends, shape (n,).
         high: upper ends, shape (n,).
         periodic: the states of which the box holds a whole period, shape (n,).
+        chosen: the states whose range was chosen here, since the workspace is unbounded, shape (n,).
         notes: which of the ranges are not the workspace, in words.
     """
 
     low: np.ndarray
     high: np.ndarray
     periodic: np.ndarray
+    chosen: np.ndarray
     notes: tuple[str, ...] = ()
 
     def scaled(self, factor: float) -> Region:
@@ -79,13 +74,14 @@ def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Seq
         expressions: all that will be asked of a state: where they repeat after 2 pi, a period is enough.
     """
     low, high = [np.array([getattr(v, end) for v in problem.states]) for end in ("low", "high")]
-    periodic, notes = np.zeros(len(low), dtype=bool), []
+    periodic, chosen, notes = np.zeros(len(low), dtype=bool), np.zeros(len(low), dtype=bool), []
     unbounded = np.flatnonzero(~(np.isfinite(low) & np.isfinite(high)))
     for i in unbounded.tolist():
         s = problem.states[i].symbol
-        if not (np.isfinite(low[i]) or np.isfinite(high[i])) and all(_repeats(system, e, s) for e in expressions):
+        if not (np.isfinite(low[i]) or np.isfinite(high[i])) and all(repeats(system.numeric(e), s) for e in expressions):
             periodic[i], low[i], high[i] = True, -_PERIOD / 2.0, _PERIOD / 2.0
             continue
+        chosen[i] = True
         starts = draw_starts(problem, _STARTS)[:, i]
         reach = 10.0 * max(float(np.ptp(starts)), float(abs(starts).max()), 1.0)
         low[i] = low[i] if np.isfinite(low[i]) else starts.min() - reach
@@ -94,11 +90,22 @@ def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Seq
     if periodic.any():
         names = ", ".join(str(problem.states[i].symbol) for i in np.flatnonzero(periodic))
         notes.append(f"{names} over a period of 2 pi, since nothing here tells the periods apart")
-    return Region(low, high, periodic, tuple(notes))
+    return Region(low, high, periodic, chosen, tuple(notes))
 
 
-def _repeats(system: ControlAffineSDE, expression: sp.Expr, s: sp.Symbol) -> bool:
-    return s not in expression.free_symbols or vanishes(system, expression.subs(s, s + 2 * sp.pi) - expression)
+def repeats(expression: Any, s: sp.Symbol) -> bool:
+    """Whether a state appears only within sines, cosines and tangents of whole multiples of it: then 2 pi more change nothing.
+
+    A look at values would not do: what is constant over some of the states may not be elsewhere.
+    """
+
+    def is_wave(part: Any) -> bool:
+        if not isinstance(part, (sp.sin, sp.cos, sp.tan)):
+            return False
+        slope = sp.diff(part.args[0], s)
+        return bool(slope.is_number and float(slope).is_integer())
+
+    return s not in expression.replace(is_wave, lambda _: sp.Integer(1)).free_symbols
 
 
 def draw_starts(problem: SafetyProblem, count: int, seed: int = 0) -> np.ndarray:
@@ -168,66 +175,3 @@ def _climbed(level: Score, tried: np.ndarray, region: Region, rng: np.random.Gen
     """Points with level >= 0, from the population of a search for the largest level, as soon as there are enough."""
     population, values = search(level, tried, region, rng, until=lambda values: int(np.count_nonzero(values >= 0.0)) >= _FEW)
     return population[values >= 0.0]
-
-
-def largest(score: Score, points: np.ndarray, region: Region, rng: np.random.Generator) -> tuple[float, np.ndarray]:
-    """The largest score that is found, and the state (n,) that has it.
-
-    Args:
-        score: -inf or NaN where a state does not count.
-        points: states to begin with, shape (B, n); some of them should count.
-        region: where to look.
-        rng: of all randomness.
-    """
-    population, values = search(score, points, region, rng)
-    best = int(values.argmax())
-    return float(values[best]), population[best]
-
-
-def search(
-    score: Score, points: np.ndarray, region: Region, rng: np.random.Generator, until: Callable[[np.ndarray], bool] | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Differential evolution from the best points and a few others; the final population and its scores.
-
-    Kinks in the score and the edge of the set make ridges here, on which gradients fail. Differences of members take on the
-    shape of such a ridge.
-    """
-    values = _scores(score, points)
-    best = np.argsort(-values)[: _POPULATION // 2]
-    others = rng.choice(len(points), min(len(points), _POPULATION - len(best)), replace=False)
-    chosen = np.concatenate([best, others])
-    x, value = points[chosen], values[chosen]
-    if len(x) < _POPULATION:
-        near = np.resize(x, (_POPULATION - len(x), x.shape[1]))
-        near = region.inside(near + 1e-3 * (region.high - region.low) * rng.standard_normal(near.shape))
-        x, value = np.concatenate([x, near]), np.concatenate([value, _scores(score, near)])
-    for _ in range(_ROUNDS):
-        lowest, highest = float(value.min()), float(value.max())
-        if math.isfinite(lowest) and highest - lowest <= _CONVERGED * abs(highest):
-            break
-        if until is not None and until(value):
-            break
-        trial = region.inside(_moved(x, x[int(value.argmax())], region, rng))
-        reached = _scores(score, trial)
-        better = reached >= value
-        x, value = np.where(better[:, None], trial, x), np.where(better, reached, value)
-    return x, value
-
-
-def _moved(x: np.ndarray, top: np.ndarray, region: Region, rng: np.random.Generator) -> np.ndarray:
-    """A trial for each member, from itself or, of a quarter, from the best one, half of them by a difference and half by a normal step.
-
-    The normal steps are of all sizes, along one axis or all: where a whole ridge is best, differences never get small.
-    """
-    size, n = x.shape
-    base = np.where(rng.random((size, 1)) < 0.25, top, x)
-    difference = rng.uniform(0.3, 1.0, (size, 1)) * (x[rng.permutation(size)] - x[rng.permutation(size)])
-    chosen = (rng.random((size, 1)) < 0.5) | (rng.integers(n, size=(size, 1)) == np.arange(n))
-    length = (region.high - region.low) * 10.0 ** rng.uniform(_FINEST, 0.0, (size, 1))
-    normal = length * chosen * rng.standard_normal((size, n))
-    return base + np.where(rng.random((size, 1)) < 0.5, difference, normal)
-
-
-def _scores(score: Score, x: np.ndarray) -> np.ndarray:
-    values = score(x)
-    return np.where(np.isnan(values), -np.inf, values)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from agents import verification
-from agents.verification import measure, starts_of
+from agents.verification import Horizon, Measurement, measure, starts_of
 from safe_envs.errors import ConfigurationError
 from tests.conftest import problem_of
 from wrappers import parse_conditions
+from wrappers.promise import Bound
 from wrappers.verify import verify
 
 CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
@@ -28,6 +31,7 @@ def contradicted(measurement):
 @pytest.fixture
 def short(monkeypatch):
     monkeypatch.setattr(verification, "_LONG_MULTIPLES", ())
+    monkeypatch.setattr(verification, "STARTS", 1024)
 
 
 def test_the_product_bound_of_the_stochastic_dubins_is_contradicted(monkeypatch):
@@ -105,3 +109,23 @@ def test_an_unknown_policy_is_an_error():
     problem = problem_of(CUBIC_DISK)
     with pytest.raises(ConfigurationError, match="unknown policy"):
         measure(verify(problem, parse_conditions("scbf", problem), samples=256), "nobody")
+
+
+@pytest.mark.parametrize(("trials", "error"), [(50, 0.005), (500, 0.00125)])
+def test_the_upper_end_errs_as_seldom_as_it_says(trials, error):
+    from scipy.stats import binom
+
+    successes = np.arange(trials + 1)
+    ends = np.array([verification._upper_end(int(s), trials, error) for s in successes])
+    for unsafe in np.geomspace(1e-6, 0.5, 60):
+        assert binom.pmf(successes, trials, 1 - unsafe)[ends < 1 - unsafe].sum() <= error * (1 + 1e-9)
+    assert (np.diff(ends) > 0).all()
+
+
+def test_a_mean_over_starts_may_be_off_by_its_error():
+    bound = Bound("a", 0.9, "proved", "", error=0.01)
+    nowhere = Horizon(1.0, 1750, 0.875, 0.87, 0.88, (bound,))
+    measurement = Measurement("s", None, 2000, False, (nowhere,))
+    assert verification._compared(measurement, nowhere, 1).contradicted == ()
+    exact = replace(nowhere, bounds=(replace(bound, error=0.0),))
+    assert verification._compared(measurement, exact, 1).contradicted == ("a",)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import sympy as sp
 
 from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError
+from safe_envs.codegen import compile_function
 
 x, y, u, k = sp.symbols("x y u k", real=True)
 
@@ -62,3 +64,12 @@ def test_with_parameters_returns_another_system_and_knows_its_names():
     assert other.parameters == {k: 3.0}
     with pytest.raises(ConfigurationError, match="unknown parameter 'kk'; did you mean 'k'"):
         system.with_parameters(kk=1.0)
+
+
+def test_functions_by_pieces_compile():
+    x = sp.Symbol("x", real=True)
+    pieces = sp.Piecewise((1 - x**2, x > 0), ((1 + x) ** 3, True))
+    floats, arrays = (compile_function((x,), [pieces], flavour) for flavour in ("floats", "arrays"))
+    for value, expected in ((0.5, 0.75), (-0.5, 0.125)):
+        assert floats(value)[0] == pytest.approx(expected)
+        assert arrays(np.array([value]))[0] == pytest.approx(expected)
