@@ -21,7 +21,7 @@ and with a filter
 | `filter_active` | bool | a barrier row is binding or cannot be met |
 | `feasible` | bool | some action in the box meets every row |
 | `slack` | float | by how much the worst row is violated by the executed action |
-| `slacks` | float64 (k,) | by how much each row is |
+| `slacks` | float64 (k,) | the same for each row |
 | `active_barrier` | int | index of the barrier that caused the intervention, -1 without one |
 | `episode_interventions` | int | interventions of the episode so far |
 | `episode_infeasible` | int | infeasible steps of the episode so far |

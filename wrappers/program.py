@@ -102,9 +102,8 @@ class Solver:
         self._project: Any = several_rows.project_arrays if arrays else several_rows.project_floats
         if program.clf is not None:
             program.clf.require_known(program.model)
-            input_weight, self._slack_weight = [
-                float(program.model.numeric(sp.sympify(w))) for w in (program.clf.input_weight, program.clf.slack_weight)
-            ]
+            weights = (program.clf.input_weight, program.clf.slack_weight)
+            input_weight, self._slack_weight = [float(program.model.numeric(w)) for w in weights]
             if not (0 < input_weight < math.inf and 0 < self._slack_weight < math.inf):
                 raise ConfigurationError(
                     f"the goal weighs inputs by {input_weight} and slack by {self._slack_weight}; give positive numbers"
