@@ -66,7 +66,7 @@ def refine(
         NumericalError: a simulation or a condition left the finite numbers.
     """
     first = evaluate(problem, policy, progress=_share(progress, 0), record=record, **arguments)
-    arguments |= {"options": None, "filters": [row["filter"] for row in first.rows]}
+    arguments |= {"options": None, "filters": [row["filter"] for row in first.rows], "bounds": False}
     finer = [evaluate(_divided(first.problem, d), policy, progress=_share(progress, i), **arguments) for i, d in enumerate(DIVISORS) if i]
     evaluations = (first, *finer)
     rows = [_row(row["filter"], evaluations) for row in first.rows]

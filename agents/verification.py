@@ -117,7 +117,8 @@ def _measure(
     verification: Verification, name: str, world: SafetyProblem, policy: Any, episodes: int, seed: int, progress: Progress | None
 ) -> Measurement:
     formulas, starts = verification.formulas, starts_of(world, seed)
-    runs = _runs(world, promise(verification, starts, world.horizon), episodes)
+    lasting = formulas.noisy and any(b.forever and b.value for b in promise(verification, starts, world.horizon))
+    runs = _runs(world, lasting, episodes)
     horizons: list[Horizon] = []
     repeats = False
     done, whole = 0, sum(run[-1] for run in runs)
@@ -129,6 +130,7 @@ def _measure(
             episodes=episodes,
             seed=seed,
             knowledge=formulas.knowledge,
+            bounds=False,
             progress=None if progress is None else _part_of(progress, done / whole, run[-1] / whole),
         )
         horizons += [_horizon(verification, answer, k * world.horizon, starts) for k in run]
@@ -136,16 +138,15 @@ def _measure(
     return Measurement(name, starts[0] if len(starts) == 1 else None, episodes, repeats, tuple(horizons))
 
 
-def _runs(world: SafetyProblem, bounds: list[Bound], episodes: int) -> list[list[int]]:
-    """Of which horizons to measure, in units of the problem's: a bound that is for ever may take long to fail.
+def _runs(world: SafetyProblem, lasting: bool, episodes: int) -> list[list[int]]:
+    """Of which horizons to measure, in units of the problem's: a lasting bound under noise may take long to fail.
 
     The long ones get a run of their own, since the instants at which a run is read are spread over the whole of it.
     """
     # Several conditions on more than two inputs go to an iterative solver.
     allowed = _MOST_SOLVED if len(world.barriers) > 1 and len(world.inputs) > 2 else _MOST_STEPS
     most = min(_MOST_INSTANTS, allowed // episodes) / world.steps
-    noisy = not world.plant.numeric(world.plant.diffusion).is_zero_matrix
-    lengths = (_MULTIPLES, _LONG_MULTIPLES) if noisy and any(b.forever and b.value for b in bounds) else (_MULTIPLES,)
+    lengths = (_MULTIPLES, _LONG_MULTIPLES) if lasting else (_MULTIPLES,)
     runs = [[k for k in length if k == 1 or k <= most] for length in lengths]
     return [run for run in runs if run]
 

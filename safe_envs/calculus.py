@@ -18,6 +18,7 @@ from safe_envs.sde import ControlAffineSDE
 
 Derivative = Callable[[ControlAffineSDE, sp.Expr], sp.Expr]
 
+_KINKED = (sp.Piecewise, sp.Abs, sp.Min, sp.Max, sp.sign, sp.Heaviside, sp.DiracDelta, sp.floor, sp.ceiling, sp.frac)
 _LARGEST_TIDIED = 100
 _MOST_TERMS = 200
 
@@ -47,6 +48,17 @@ def ito_term(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
         slope = sp.diff(expression, row_state)
         total += sum(covariance[i, j] * sp.diff(slope, s) for j, s in enumerate(system.states) if covariance[i, j] != 0)
     return total / 2
+
+
+def spread(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
+    """|sigma' grad phi|^2, the variance of phi per s that the noise makes."""
+    row = gradient(system, expression) * system.diffusion
+    return (row * row.T)[0, 0]
+
+
+def has_kinks(expression: Any) -> bool:
+    """Whether functions are in it that are not smooth everywhere, so that its derivatives may not say all."""
+    return expression.has(*_KINKED)
 
 
 def generator(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:

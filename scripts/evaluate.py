@@ -8,7 +8,6 @@ from typing import Annotated, Any
 
 import typer
 
-from safe_envs.files import require_writable
 from scripts import options
 from scripts.console import progress_bar, run, stdout
 
@@ -66,13 +65,7 @@ def evaluate(
     from agents import evaluation, refinement
     from scripts.table import print_evaluation, print_refinement, write_json
 
-    if json is not None:
-        require_writable(json)
-    if plot is not None:
-        from scripts.figure import require_format
-
-        require_writable(plot)
-        require_format(plot)
+    options.require_outputs(json, plot)
     arguments = options.of_env(
         noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
     )

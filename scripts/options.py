@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.files import require_writable
 
 EnvId = Annotated[str, typer.Argument(metavar="ENV_ID", help="Registered id; `safe-envs list` shows all.")]
 Noise = Annotated[
@@ -65,6 +67,21 @@ def numbers(option: str, text: str) -> list[float]:
         return [float(entry) for entry in text.split(",")]
     except ValueError as error:
         raise ConfigurationError(f"{option} {text!r} is no number or list of numbers with commas between") from error
+
+
+def require_outputs(json: Path | None, plot: Path | None) -> None:
+    """Check, before any work, that --json and --plot can be written.
+
+    Raises:
+        ConfigurationError: one cannot.
+    """
+    if json is not None:
+        require_writable(json)
+    if plot is not None:
+        from scripts.figure import require_format
+
+        require_writable(plot)
+        require_format(plot)
 
 
 def read_noise(text: str | None) -> float | list[float] | None:

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.files import require_writable, write_atomically
+from safe_envs.files import write_atomically
 from scripts import options
 from scripts.console import progress_bar, run, stdout
 
@@ -53,13 +53,7 @@ def verify(
     from wrappers.verify import verify as find
 
     require_whole("episodes", episodes, 1)
-    if json is not None:
-        require_writable(json)
-    if plot is not None:
-        from scripts.figure import require_format
-
-        require_writable(plot)
-        require_format(plot)
+    options.require_outputs(json, plot)
     arguments = options.of_env(
         noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
     )

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.calculus import gradient
+from safe_envs.calculus import spread
 from safe_envs.codegen import compile_function, stacked
 from safe_envs.problem import SafetyProblem
-from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions import SRCBF, Condition
 from wrappers.safe_set import Region, region_of
 from wrappers.safety_filter import SafetyFilter
@@ -109,7 +108,7 @@ class Formulas:
 
     @cached_property
     def _spreads(self) -> Any:
-        return self._compiled([_spread(self.system, c.chain[0]) for c in self._constraints])
+        return self._compiled([spread(self.system, c.chain[0]) for c in self._constraints])
 
     def spread(self, x: np.ndarray, i: int) -> np.ndarray:
         """|sigma' grad h|^2 of a barrier, the variance of h per s, shape (B,)."""
@@ -250,11 +249,6 @@ def _change(expression: Any, widths: dict[sp.Symbol, float]) -> sp.Expr:
     slopes = [(sp.diff(expression, s), width) for s, width in widths.items()]
     known = [sp.Abs(slope) * width for slope, width in slopes if not slope.has(sp.DiracDelta, sp.Derivative, sp.Subs)]
     return sp.Add(*known).evalf(17)
-
-
-def _spread(system: ControlAffineSDE, h: Any) -> Any:
-    row = gradient(system, h) * system.diffusion
-    return (row * row.T)[0, 0]
 
 
 def _typical(values: np.ndarray) -> np.ndarray:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import sympy as sp
 
+from safe_envs.calculus import has_kinks
 from wrappers.conditions import SRCBF
 from wrappers.formulas import Formulas
 from wrappers.survey import Survey
-
-_KINKED = (sp.Piecewise, sp.Abs, sp.Min, sp.Max, sp.sign, sp.Heaviside, sp.DiracDelta, sp.floor, sp.ceiling, sp.frac)
 
 
 def no_bound(formulas: Formulas) -> str:
@@ -30,7 +28,7 @@ def _kinked(formulas: Formulas) -> str:
     """Which function of a chain has a kink, where the noise adds a local time that the generator does not see."""
     for barrier, row in zip(formulas.problem.barriers, formulas.safety_filter.constraints, strict=True):
         for j, function in enumerate(row.chain):
-            if function.has(*_KINKED):
+            if has_kinks(function):
                 what = barrier.name if j == 0 else f"b_{j} of {barrier.name}"
                 return f"{what} is not twice differentiable, which Ito's formula asks for"
     return ""

@@ -205,11 +205,11 @@ def worst(formulas: Formulas, level: Score, points: np.ndarray, rng: np.random.G
     reach = formulas.reach(points)
     wider = [reach * k for k in _REACHES if reach * k < _WIDE]
     for part in wider:
-        population, _ = search(lambda x, part=part: _where(level, x, lambda y: formulas.missed(y, part)), tried, formulas.region, rng)
+        population, _ = search(lambda x, part=part: where_inside(level, x, lambda y: formulas.missed(y, part)), tried, formulas.region, rng)
         tried = np.concatenate([population, tried])
     if wider:
         tried = np.concatenate([*_without_control(formulas, tried[: _SHARED_OUT * len(wider)]), tried])
-    population, values = search(lambda x: _where(level, x, formulas.missed), tried, formulas.region, rng)
+    population, values = search(lambda x: where_inside(level, x, formulas.missed), tried, formulas.region, rng)
     best = int(values.argmax())
     if formulas.joint or values[best] <= 0.0:
         return max(float(values[best]), 0.0), population[best]
@@ -235,7 +235,7 @@ def _pool(points: np.ndarray, region: Region, rng: np.random.Generator) -> np.nd
     return region.around(points, 1.2).draw(_POOL_LOG2, rng)
 
 
-def _where(level: Score, x: np.ndarray, score: Score) -> np.ndarray:
+def where_inside(level: Score, x: np.ndarray, score: Score) -> np.ndarray:
     """The score where level >= 0, the only states that it is asked for, and -inf elsewhere."""
     values, inside = np.full(len(x), -np.inf), level(x) >= 0.0
     if inside.any():

@@ -12,8 +12,8 @@ from safe_envs.problem import SafetyProblem
 from wrappers.conditions import Condition
 from wrappers.formulas import Formulas
 from wrappers.safe_set import Region
-from wrappers.search import Score, largest
-from wrappers.survey import SAMPLES, Survey, supremum, without_control, worst
+from wrappers.search import largest
+from wrappers.survey import SAMPLES, Survey, supremum, where_inside, without_control, worst
 
 SMALL = 0.01
 """Below this part of its typical size a leading term counts as small."""
@@ -149,10 +149,6 @@ def verify(
     return Verification(survey, found, safe, kept, beyond, len(survey.undefined) / len(survey.safe.points))
 
 
-def _within(level: Score, x: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.where(level(x) >= 0.0, values, -np.inf)
-
-
 def _kept_part(survey: Survey, kept: np.ndarray) -> Part:
     points = survey.safe.points
     share = float((survey.formulas.kept_level(points) >= 0.0).mean())
@@ -173,9 +169,9 @@ def _barrier(i: int, survey: Survey) -> BarrierFindings:
     stages, level = formulas.stages[i], formulas.barrier_level
     size = formulas.leading(safe)[:, i]
     typical = float(np.nanmedian(size))
-    negated, leading_at = largest(lambda x: _within(level, x, -formulas.leading(x)[:, i]), safe, region, rng)
+    negated, leading_at = largest(lambda x: where_inside(level, x, lambda y: -formulas.leading(y)[:, i]), safe, region, rng)
     small = safe[size < SMALL * typical]
-    _, deepest = largest(lambda x: _within(level, x, formulas.chain(x)[:, stages.start]), safe, region, rng)
+    _, deepest = largest(lambda x: where_inside(level, x, lambda y: formulas.chain(y)[:, stages.start]), safe, region, rng)
     deepest = without_control(formulas, i, deepest)
     suprema = survey.suprema[stages]
     highest = suprema[0] if formulas.first_order else supremum(stages.start, formulas, formulas.barriers, safe, rng)

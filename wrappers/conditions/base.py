@@ -11,13 +11,12 @@ from typing import Any, ClassVar
 import sympy as sp
 
 from safe_envs.barrier import Barrier
-from safe_envs.calculus import Derivative, drift_derivative, generator, input_derivative, relative_degree, tidied
+from safe_envs.calculus import Derivative, drift_derivative, generator, has_kinks, input_derivative, relative_degree, tidied
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, SystemDefinitionError
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.class_k import ClassK, Rate, applied
 
 FIRST_ORDER = "first-order"
-_KINKED = (sp.Abs, sp.sign, sp.Min, sp.Max, sp.Heaviside, sp.Piecewise)
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,7 @@ def resolved(expression: Any, barrier: Barrier) -> sp.Expr:
     """
     if not expression.has(sp.DiracDelta, sp.Derivative, sp.Subs):
         return expression
-    if expression.has(sp.Derivative, sp.Subs) or barrier.expression.has(*_KINKED):
+    if expression.has(sp.Derivative, sp.Subs) or has_kinks(barrier.expression):
         raise SystemDefinitionError(
             f"barrier {barrier.name} = {barrier.expression} cannot be differentiated as often as is needed; give a smooth one, of real "
             "symbols, or one barrier for each of its pieces"

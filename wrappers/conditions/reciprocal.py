@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import sympy as sp
 
 from safe_envs.barrier import Barrier
-from safe_envs.calculus import gradient, relative_degree
+from safe_envs.calculus import relative_degree, spread
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.base import AffineConstraint, Condition, resolved
@@ -55,8 +55,7 @@ class _Reciprocal(Condition):
         slope = sp.diff(beta, _H)
         demand = sp.simplify(sp.Float(self.gamma, 17) / beta / slope)
         if self.stochastic:
-            spread = gradient(model, h) * model.diffusion
-            demand -= sp.simplify(sp.diff(beta, _H, 2) / slope / 2) * (spread * spread.T)[0, 0]
+            demand -= sp.simplify(sp.diff(beta, _H, 2) / slope / 2) * spread(model, h)
         return AffineConstraint.after(model, (h,), resolved(self.derivative(model, h), barrier), demand.subs(_H, h))
 
     @classmethod
