@@ -13,6 +13,7 @@ import sympy as sp
 from safe_envs.barrier import Barrier
 from safe_envs.clf import CLF
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
+from safe_envs.exploration import Exploration
 from safe_envs.sde import ControlAffineSDE, finite_number
 
 TIME = sp.Symbol("t", real=True)
@@ -91,6 +92,7 @@ class SafetyProblem:
         substeps: integration steps in a control period.
         plane: the two states that draw a trajectory, if any.
         clf: the task as a soft goal, if it is one.
+        exploration: where and how the system is excited to learn from it; complete once the problem is made.
 
     Raises:
         SystemDefinitionError: the parts do not fit together.
@@ -116,6 +118,7 @@ class SafetyProblem:
     substeps: int = 1
     plane: tuple[str, str] | None = None
     clf: CLF | None = None
+    exploration: Exploration = Exploration()
     box: tuple[tuple[float, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -150,6 +153,14 @@ class SafetyProblem:
                     "Unbounded control is a wide box"
                 )
         self._check_timing()
+        object.__setattr__(self, "exploration", self._completed_exploration())
+
+    def _completed_exploration(self) -> Exploration:
+        ranges = [(s.low, s.high) for s in self.states]
+        angles = [s.unit == "rad" and math.isinf(s.low) and math.isinf(s.high) for s in self.states]
+        for coordinate in self.exploration.coordinates:
+            self.plant.require_known("a coordinate of the exploration", coordinate.free_symbols, self.plant.states)
+        return self.exploration.completed(self.plant.states, ranges, angles, self.box)
 
     def _check_timing(self) -> None:
         if not self.dt > 0 or not math.isfinite(self.dt):

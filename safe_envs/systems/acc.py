@@ -10,6 +10,7 @@ from safe_envs.barrier import Barrier
 from safe_envs.clf import CLF
 from safe_envs.env import SystemEnv
 from safe_envs.errors import ConfigurationError
+from safe_envs.exploration import Exploration
 from safe_envs.problem import SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
 from safe_envs.systems._common import positive
@@ -138,6 +139,7 @@ def acc_gap(*, distance: float = 10.0, power: int = 5, rate: float = 1.0, slack_
         noise=("sigma_1", "sigma_2"),
         gains=(1.0, 1.0),
         plane=("v", "z"),
+        exploration=Exploration(region=((8.0, 24.0), (10.0, 32.0)), inputs=((-4000.0,), (4000.0,))),
     )
 
 

@@ -11,6 +11,7 @@ import sympy as sp
 from safe_envs.barrier import Barrier
 from safe_envs.calculus import drift_derivative, generator
 from safe_envs.env import SystemEnv
+from safe_envs.exploration import Exploration
 from safe_envs.problem import Feature, SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
 from safe_envs.systems._common import in_disk, positive, uniforms
@@ -82,6 +83,7 @@ def _disk(
         starts={**starts, "uniform": Start(_anywhere(r), _UNIFORMS)},
         noise=("sigma_1", "sigma_2"),
         plane=("x", "y"),
+        exploration=Exploration(region=((-r, r), (-r, r), (-math.pi, math.pi))),
         **rest,
     )
 

@@ -10,6 +10,7 @@ import sympy as sp
 
 from safe_envs.barrier import Barrier
 from safe_envs.env import SystemEnv
+from safe_envs.exploration import Exploration
 from safe_envs.problem import Feature, SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
 from safe_envs.systems._common import around, positive, uniforms
@@ -108,6 +109,10 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
         gains=(1.0, 1.0),
         filter="hocbf",
         plane=("x", "y"),
+        exploration=Exploration(
+            region=((-3.0, 4.0), (-3.0, 3.0), (-math.pi, math.pi), (-2.0, 7.0), (-1.0, 1.0)),
+            coordinates=(sp.cos(theta), sp.sin(theta), x_o - x, y_o - y),
+        ),
         **way_to(_GOAL_X, _GOAL_Y),
     )
 

@@ -6,6 +6,7 @@ import sympy as sp
 
 from safe_envs.barrier import Barrier
 from safe_envs.env import SystemEnv
+from safe_envs.exploration import Exploration
 from safe_envs.problem import SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
 from safe_envs.systems._common import around, positive, uniforms
@@ -68,6 +69,7 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         gains=(5.0,),
         filter="scbf",
         plane=("theta", "thetadot"),
+        exploration=Exploration(region=((-reach, reach), (-reach, reach))),
     )
 
 

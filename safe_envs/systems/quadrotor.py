@@ -9,10 +9,12 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.env import SystemEnv
+from safe_envs.exploration import Exploration
 from safe_envs.problem import Feature, SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
 from safe_envs.systems._common import around, uniforms
 from safe_envs.systems.quadrotor_altitude import (
+    CLIMB_RATES,
     FOLLOWED,
     GRAVITY,
     HEIGHT,
@@ -158,6 +160,13 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
         barriers=(band(center, half_width),),
         nominal=rotor_laws(sp.Integer(0), sp.Integer(0)),
         starts={"spread": start_at({z: around(5.0, 0.5, height), zdot: around(0.0, 0.5, climb)}, spread), "thesis": start_at({z: 5})},
+        exploration=Exploration(
+            region=tuple(
+                {z: (center - half_width, center + half_width), zdot: CLIMB_RATES, psi: (-math.pi, math.pi)}.get(s.symbol, (s.low, s.high))
+                for s in _STATES
+            ),
+            coordinates=(z, zdot, phi, theta),
+        ),
     )
 
 

@@ -8,6 +8,7 @@ import sympy as sp
 
 from safe_envs.barrier import Barrier
 from safe_envs.env import SystemEnv
+from safe_envs.exploration import Exploration
 from safe_envs.problem import TIME, Feature, SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE, finite_number
 from safe_envs.systems._common import around, positive, uniforms
@@ -73,6 +74,10 @@ def altitude_problem(name: str, *, reward: sp.Expr = ALTITUDE_REWARD, gains: Any
     return SafetyProblem(name=name, reward=reward, dt=0.05, horizon=30.0, gains=gains, filter="hocbf", **rest)
 
 
+CLIMB_RATES = (-5.0, 5.0)
+"""Where a climb rate is explored, in m/s."""
+
+
 def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> SafetyProblem:
     """The altitude alone, for a quadrotor that is heavier than its designer believes.
 
@@ -95,6 +100,7 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         starts={"spread": Start((around(5.0, 0.5, height), around(0.0, 0.5, climb)), (height, climb)), "thesis": Start.at((5.0, 0.0))},
         noise=("sigma_z",),
         plane=("z", "zdot"),
+        exploration=Exploration(region=((center - half_width, center + half_width), CLIMB_RATES)),
     )
 
 

@@ -1,0 +1,105 @@
+"""What learned models have in common: how they were learned, and how they are kept."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+
+from safe_envs.problem import SafetyProblem
+from wrappers.learning.files import Content, LearnedFileError, Signature, checksum, save
+
+Progress = Callable[[float], None]
+"""Told which part of the work is done, from 0 to 1."""
+
+
+@dataclass(frozen=True)
+class Record:
+    """How something was learned.
+
+    Attributes:
+        transitions: number of one-step transitions that were used.
+        observed: time that they last together, in s.
+        seconds: that learning took, with the collection of the data.
+        seed: of all randomness; None for data from elsewhere.
+        errors: held-out errors by name, in the units of what was learned; JSON-able numbers.
+        settings: JSON-able.
+        warnings: what a user has to know, such as directions that were not excited.
+    """
+
+    transitions: int
+    observed: float
+    seconds: float
+    seed: int | None = None
+    errors: dict[str, float] = field(default_factory=dict)
+    settings: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+class LearnedModel(ABC):
+    """What was learned of a problem.
+
+    Attributes:
+        method: by which the command line knows it.
+        signature: of which system.
+        record: how it was learned.
+    """
+
+    method: ClassVar[str]
+    signature: Signature
+    record: Record
+
+    @abstractmethod
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The numbers, by name."""
+
+    @abstractmethod
+    def details(self) -> dict[str, Any]:
+        """What else `restored` needs, JSON-able."""
+
+    @classmethod
+    @abstractmethod
+    def restored(cls, problem: SafetyProblem, record: Record, details: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Self:
+        """Make the model again for a problem whose signature fits."""
+
+    @classmethod
+    @abstractmethod
+    def check(cls, signature: Signature, problem: SafetyProblem) -> None:
+        """Raise LearnedFileError where a model with a signature is of no use for a problem."""
+
+    @abstractmethod
+    def compare(self, problem: SafetyProblem, x: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """(truth, estimate) of each learned function at states (B, n), by name, values (B,); the plant is the truth."""
+
+    def _saved(self) -> dict[str, Any]:
+        record = asdict(self.record)
+        return {**self.details(), "record": {**record, "warnings": list(record["warnings"])}}
+
+    @cached_property
+    def sha256(self) -> str:
+        """Checksum of the model with its record; the same for the file."""
+        return checksum(self.method, self.signature, self._saved(), self.arrays())
+
+    def save(self, path: Path) -> None:
+        """Write the model as data, without pickle; see `wrappers.learning.files.save`."""
+        save(path, self.method, self.signature, self._saved(), self.arrays())
+
+    @classmethod
+    def from_content(cls, content: Content, problem: SafetyProblem) -> Self:
+        """Make the model of a file again.
+
+        Raises:
+            LearnedFileError: it is of another system, or incomplete.
+        """
+        cls.check(content.signature, problem)
+        try:
+            details = dict(content.details)
+            record = details.pop("record")
+            return cls.restored(problem, Record(**{**record, "warnings": tuple(record["warnings"])}), details, content.arrays)
+        except (KeyError, TypeError, ValueError) as error:
+            raise LearnedFileError(f"the file of {content.kind} is incomplete: {error}. Learn again") from error
