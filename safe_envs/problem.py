@@ -118,7 +118,7 @@ class SafetyProblem:
     substeps: int = 1
     plane: tuple[str, str] | None = None
     clf: CLF | None = None
-    exploration: Exploration = Exploration()
+    exploration: Exploration = field(default_factory=Exploration)
     box: tuple[tuple[float, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:

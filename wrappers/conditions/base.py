@@ -6,17 +6,36 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import sympy as sp
 
 from safe_envs.barrier import Barrier
 from safe_envs.calculus import Derivative, drift_derivative, generator, has_kinks, input_derivative, relative_degree, tidied
+from safe_envs.codegen import Components
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, SystemDefinitionError
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.class_k import ClassK, Rate, applied
 
 FIRST_ORDER = "first-order"
+
+
+class Terms(Protocol):
+    """Numbers that a row takes from something learned: they stand in its expressions as symbols of their own.
+
+    Attributes:
+        symbols: what stands for them.
+    """
+
+    symbols: tuple[sp.Symbol, ...]
+
+    def floats(self, x: Sequence[float]) -> Sequence[float]:
+        """The values at one state, given by components."""
+        ...
+
+    def arrays(self, x: Components) -> Components:
+        """The values at a batch of states, components of shape (B,) in and out."""
+        ...
 
 
 @dataclass(frozen=True)
