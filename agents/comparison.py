@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from agents.statistics import mcnemar_p, paired_difference_interval
+from agents.statistics import mcnemar_p, paired_difference_interval, repeated_interval
 
 Comparison = dict[str, Any]
+Table = tuple[int, int, int, int]
 
 
 class Flags:
@@ -25,7 +26,7 @@ class Flags:
         self._bits += np.packbits(values).tobytes()
         self._count += len(values)
 
-    def table(self, other: Flags) -> tuple[int, int, int, int]:
+    def table(self, other: Flags) -> Table:
         """Count episodes with the flag of both, of this only, of the other only, of neither.
 
         Args:
@@ -37,21 +38,31 @@ class Flags:
         return both, first, second, self._count - both - first - second
 
 
-def compare_all(flags: Mapping[str, Flags], confidence: float) -> list[Comparison]:
+def compare_all(flags: Mapping[str, Sequence[Flags]], confidence: float) -> list[Comparison]:
     """Compare every two filters by which of the same episodes were safe: each one with those before it.
 
     A p value is of its pair alone: it is not adjusted for the number of pairs.
 
     Args:
-        flags: which episodes were safe, by filter.
+        flags: which episodes were safe, by filter: once, or with each of several identifications.
         confidence: of the interval of the difference of their rates.
     """
-    return [_compare(second, first, flags[second].table(flags[first]), confidence) for first, second in combinations(flags, 2)]
+    return [_compare(second, first, _tables(flags[second], flags[first]), confidence) for first, second in combinations(flags, 2)]
 
 
-def _compare(first: str, second: str, table: tuple[int, int, int, int], confidence: float) -> Comparison:
-    both, only_first, only_second, neither = table
-    low, high = paired_difference_interval(*table, confidence)
+def _tables(first: Sequence[Flags], second: Sequence[Flags]) -> list[Table]:
+    """Counts with each identification; what has only one goes with all of the other's."""
+    count = max(len(first), len(second))
+    return [first[r % len(first)].table(second[r % len(second)]) for r in range(count)]
+
+
+def _compare(first: str, second: str, tables: Sequence[Table], confidence: float) -> Comparison:
+    both, only_first, only_second, neither = (sum(counts) for counts in zip(*tables, strict=True))
+    mean = [count / len(tables) for count in (both, only_first, only_second, neither)]
+    low, high = paired_difference_interval(*mean, confidence)
+    if len(tables) > 1:
+        differences = [(table[1] - table[2]) / sum(table) for table in tables]
+        low, high = repeated_interval(differences, (low, high), confidence, (-1.0, 1.0))
     return {
         "first": first,
         "second": second,
@@ -59,8 +70,9 @@ def _compare(first: str, second: str, table: tuple[int, int, int, int], confiden
         "only_first": only_first,
         "only_second": only_second,
         "neither": neither,
-        "difference": (only_first - only_second) / sum(table),
+        "difference": (only_first - only_second) / (both + only_first + only_second + neither),
         "ci_low": low,
         "ci_high": high,
-        "mcnemar_p": mcnemar_p(only_first, only_second),
+        # Repeats on the same episodes are no independent pairs.
+        "mcnemar_p": mcnemar_p(only_first, only_second) if len(tables) == 1 else None,
     }

@@ -16,16 +16,18 @@ import numpy as np
 
 from agents.comparison import Comparison, Flags, compare_all
 from agents.episodes import Env, Progress, Recorder, Row, Totals, run_episodes
+from agents.learning import Learning, describe
 from agents.policy import POLICIES, Policy, make_policy
 from agents.problems import full_id, load_problem
-from agents.statistics import RunningSum, require_confidence, share
-from safe_envs.codegen import Components
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, require_whole
+from agents.promised import Promised, together
+from agents.repeats import pooled
+from agents.statistics import require_confidence
+from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
 from safe_envs.vector import SafeVectorEnv
-from wrappers import CONDITIONS, SafetyFilterVectorWrapper, parse_conditions, spec_of
-from wrappers.proved import proved_bound
+from wrappers import CONDITIONS, LEARNED, Condition, SafetyFilterVectorWrapper, parse_conditions, spec_of
+from wrappers.learning import LearnedModel
 
 BARE = "none"
 """Name of the row without any filter."""
@@ -44,7 +46,8 @@ class Evaluation:
         comparisons: of every two rows, by which of the same episodes were safe.
         timing: the only part that depends on the machine and on `num_envs`.
         recorders: trajectories for each filter, if asked for.
-        flags: which episodes were safe, for each filter.
+        flags: which episodes were safe, for each filter, with each identification of what it rests on.
+        learned: what the first identifications of the filters rest on.
         repeats: whether nothing is random, so that all episodes are one and the same.
     """
 
@@ -54,7 +57,8 @@ class Evaluation:
     comparisons: list[Comparison]
     timing: dict[str, Any]
     recorders: dict[str, Recorder]
-    flags: dict[str, Flags]
+    flags: dict[str, list[Flags]]
+    learned: list[LearnedModel]
     repeats: bool
 
     def document(self) -> dict[str, Any]:
@@ -81,6 +85,8 @@ def evaluate(
     objective: str = "nearest",
     confidence: float = 0.95,
     bounds: bool = True,
+    learned: Sequence[LearnedModel | Path | str] = (),
+    repeats: int = 1,
     progress: Progress | None = None,
     record: bool = False,
 ) -> Evaluation:
@@ -96,6 +102,9 @@ def evaluate(
     Episode i is seeded by its own child of `seed`, the same for all filters; all but `timing` is the same, to the
     last bit, for every `num_envs`.
 
+    What a filter rests on that is learned, is learned first, with the defaults of its method. With `repeats` that is done anew
+    for each repeat, and the intervals are over identifications too: see `agents.statistics.repeated_interval`.
+
     Args:
         problem: what to simulate, or the id of a registered env.
         policy: a name or a path for `make_policy`, or anything with Stable-Baselines3's `predict`.
@@ -107,7 +116,9 @@ def evaluate(
         knowledge: what the filters know, "model" or "plant".
         objective: of the filters, "nearest" to the policy's action or "clf": see `SafetyFilter.for_problem`.
         confidence: of all intervals, between 0 and 1.
-        bounds: look for proved bounds, which takes a search of the safe set for each filter.
+        bounds: look for proved bounds and certificates, which takes a search of the safe set for each filter.
+        learned: models, or files of `safe-envs identify`, to use in place of learning.
+        repeats: number of identifications of what is learned, from the seed and from children of it.
         progress: told the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
 
@@ -128,92 +139,92 @@ def evaluate(
     world = problem if isinstance(problem, SafetyProblem) else load_problem(problem, options)
     actor = make_policy(policy, world) if isinstance(policy, str) else policy
     names = list(dict.fromkeys((BARE, world.filter) if filters is None else filters))
-    specs = [_spec(name, world) for name in names]
-    envs = [_make_env(world, spec, knowledge, objective, min(num_envs, episodes)) for spec in specs]
+    specs = [_checked(name, world) for name in names]
+    learning = Learning(world, learned, repeats, seed)
+    work = _Work(progress, len(learning.missing(names)) + sum(learning.repeats(name) for name in names))
+    for method, repeat in learning.missing(names):
+        learning.learn(method, repeat, work.part())
+    filters_of = {name: [_conditions(name, learning, r) for r in range(learning.repeats(name))] for name in names}
+    envs = {name: [_make_env(world, c, knowledge, objective, min(num_envs, episodes)) for c in each] for name, each in filters_of.items()}
     config = {
         "env_id": env_id,
         "options": {k: v for k, v in (options or {}).items() if v is not None},
         "problem": _describe(world),
         "policy": _describe_policy(policy),
-        "filters": [{"name": name, "spec": spec} for name, spec in zip(names, specs, strict=True)],
+        "filters": [{"name": name, "spec": spec or spec_of(filters_of[name][0])} for name, spec in zip(names, specs, strict=True)],
         "knowledge": knowledge,
         "objective": objective,
         "episodes": episodes,
         "seed": seed,
+        "repeats": repeats,
         "confidence": confidence,
     }
     rows, speeds, flags = [], [], {}
     recorders = {name: Recorder(world.steps, world.plant.n, episodes) for name in names} if record else {}
-    for i, (name, env) in enumerate(zip(names, envs, strict=True)):
-        told = None if progress is None else _part_of(progress, i, len(names), episodes)
-        promised = _Promise(name, world, knowledge, bounds)
+    for name in names:
+        promised = [Promised(conditions, world, knowledge, bounds) for conditions in filters_of[name]]
         begun = time.perf_counter()
-        totals = run_episodes(env, actor, episodes, seed, told, recorders.get(name), promised.add)
+        totals = [
+            run_episodes(env, actor, episodes, seed, work.part(episodes), recorders.get(name) if r == 0 else None, promised[r].add)
+            for r, env in enumerate(envs[name])
+        ]
         speeds.append(_speed(name, totals, time.perf_counter() - begun))
-        rows.append({"filter": name, "policy": config["policy"]["name"], **totals.row(confidence), **promised.row()})
-        flags[name] = totals.flags
+        found = pooled([each.row(confidence) for each in totals], confidence)
+        rows.append(
+            {
+                "filter": name,
+                "policy": config["policy"]["name"],
+                **found,
+                **together([promise.row() for promise in promised]),
+                "learning": describe(filters_of[name], [each.safe / each.episodes for each in totals]),
+            }
+        )
+        flags[name] = [each.flags for each in totals]
     timing = {"num_envs": num_envs, "rows": speeds}
     comparisons = compare_all(flags, confidence)
-    return Evaluation(world, config, rows, comparisons, timing, recorders, flags, _is_deterministic(world, actor))
+    models = learning.models(names)
+    return Evaluation(world, config, rows, comparisons, timing, recorders, flags, models, _is_deterministic(world, actor))
 
 
-class _Promise:
-    """The proved bound on P(safe up to the horizon) of a filter, averaged over the starts of the episodes."""
+class _Work:
+    """Tells the progress of a number of equal parts, one after the other."""
 
-    def __init__(self, name: str, problem: SafetyProblem, knowledge: str, asked: bool) -> None:
-        self._horizon = problem.steps * problem.dt
-        self._bound, self._why_none = None, "there is no filter" if name == BARE else "it was not asked for"
-        self._total, self._count = RunningSum(), 0
-        if name != BARE and asked:
-            try:
-                self._bound = proved_bound(problem, parse_conditions(name, problem), knowledge)
-                self._why_none = self._bound.note
-            except SafeEnvsError as error:
-                # The bound looks at the whole safe set, where the episodes may never be.
-                self._why_none = str(error)
+    def __init__(self, progress: Progress | None, parts: int) -> None:
+        self._progress, self._parts, self._begun = progress, parts, 0
 
-    def add(self, start: Components, count: int) -> None:
-        """Take the starts of a wave."""
-        if self._bound is not None and not self._why_none:
-            self._total.add(self._bound.at(np.stack(start, axis=1)[:count], self._horizon))
-            self._count += count
-
-    def row(self) -> Row:
-        """The mean bound, None where there is none, and why there is none or why it is weak."""
-        if self._bound is None or self._why_none:
-            return {"bound": None, "bound_note": self._why_none}
-        mean = share(self._total.total, self._count)
-        if not mean:
-            return {"bound": None, "bound_note": self._bound.remark or "it is 0 at these starts up to this horizon"}
-        return {"bound": mean, "bound_note": self._bound.remark}
+    def part(self, whole: float = 1.0) -> Progress | None:
+        """The next part, told how much of `whole` is done."""
+        before, self._begun = self._begun, self._begun + 1
+        told = self._progress
+        return None if told is None else lambda done: told((before + done / whole) / self._parts)
 
 
-def _part_of(progress: Progress, before: int, parts: int, episodes: int) -> Progress:
-    """From episodes done in one of several parts to the share of the whole that is done."""
-    return lambda done: progress((before + done / episodes) / parts)
+def _speed(name: str, totals: Sequence[Totals], seconds: float) -> dict[str, Any]:
+    steps = sum(each.steps for each in totals)
+    return {"filter": name, "seconds": seconds, "steps": steps, "steps_per_second": steps / seconds}
 
 
-def _speed(name: str, totals: Totals, seconds: float) -> dict[str, Any]:
-    return {"filter": name, "seconds": seconds, "steps": totals.steps, "steps_per_second": totals.steps / seconds}
-
-
-def _spec(name: str, problem: SafetyProblem) -> str:
-    """The text of a filter with all its parameters."""
+def _checked(name: str, problem: SafetyProblem) -> str | None:
+    """The text of a filter with all its parameters, where it rests on nothing learned; the others are read once that is there."""
     if name == BARE:
         return BARE
     if BARE in name.split("+"):
         raise ConfigurationError(f"filter {name!r}: {BARE!r} is the bare env and no condition of a barrier; give it alone or leave it out")
-    if re.split("[:+]", name)[0] not in CONDITIONS:
-        raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, (BARE, *CONDITIONS))}")
+    if re.split("[:+]", name)[0] not in (*CONDITIONS, *LEARNED):
+        raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, (BARE, *CONDITIONS, *LEARNED))}")
+    if any(re.split(":", part)[0] in LEARNED for part in name.split("+")):
+        return None
     return spec_of(parse_conditions(name, problem))
 
 
-def _make_env(problem: SafetyProblem, spec: str, knowledge: str, objective: str, num_envs: int) -> Env:
+def _conditions(name: str, learning: Learning, repeat: int) -> tuple[Condition, ...]:
+    """The conditions of a filter in a repeat; none of the bare env."""
+    return () if name == BARE else learning.conditions(name, repeat)
+
+
+def _make_env(problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int) -> Env:
     env = SafeVectorEnv(problem, num_envs)
-    if spec == BARE:
-        filtered: Env = env
-    else:
-        filtered = SafetyFilterVectorWrapper(env, spec, knowledge, objective)
+    filtered: Env = SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
     # The first step compiles what the filter needs: an error shows before a long run, and the timing is of steps.
     filtered.reset(seed=0)
     filtered.step(np.zeros(env.action_space.shape or ()))

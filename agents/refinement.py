@@ -8,6 +8,7 @@ from typing import Any
 from agents.episodes import Progress, Row
 from agents.evaluation import Evaluation, evaluate
 from agents.statistics import paired_difference_interval
+from safe_envs.errors import ConfigurationError
 from safe_envs.problem import SafetyProblem
 
 DIVISORS = (1, 2, 4)
@@ -45,6 +46,8 @@ def refine(
 ) -> Refinement:
     """Evaluate with the control period dt of a problem, with dt/2 and with dt/4: has the safety rate converged?
 
+    What filters rest on that is learned, is learned once, with the period dt.
+
     Control, noise and the check of safety go with the period; `substeps` stay as they are. The horizon is the
     number of whole periods dt that is simulated with the first. Episode i has the same seed each time, hence the same
     start, but its noise is not the same path sampled more finely. The change is that of paired episodes.
@@ -65,8 +68,10 @@ def refine(
         RelativeDegreeError: a condition does not suit a barrier.
         NumericalError: a simulation or a condition left the finite numbers.
     """
+    if arguments.get("repeats", 1) != 1:
+        raise ConfigurationError("repeats are of the identification and refinement of the period: ask for one of the two")
     first = evaluate(problem, policy, progress=_share(progress, 0), record=record, **arguments)
-    arguments |= {"options": None, "filters": [row["filter"] for row in first.rows], "bounds": False}
+    arguments |= {"options": None, "filters": [row["filter"] for row in first.rows], "bounds": False, "learned": first.learned}
     finer = [evaluate(_divided(first.problem, d), policy, progress=_share(progress, i), **arguments) for i, d in enumerate(DIVISORS) if i]
     evaluations = (first, *finer)
     rows = [_row(row["filter"], evaluations) for row in first.rows]
@@ -89,7 +94,7 @@ def _divided(problem: SafetyProblem, divisor: int) -> SafetyProblem:
 def _row(name: str, evaluations: tuple[Evaluation, ...]) -> Row:
     cells = [next(row for row in evaluation.rows if row["filter"] == name) for evaluation in evaluations]
     coarse, fine = evaluations[-2:]
-    low, high = paired_difference_interval(*fine.flags[name].table(coarse.flags[name]), fine.config["confidence"])
+    low, high = paired_difference_interval(*fine.flags[name][0].table(coarse.flags[name][0]), fine.config["confidence"])
     return {
         "filter": name,
         **{key: [cell[key] for cell in cells] for key in ("safe", "safety_rate", "ci_low", "ci_high")},

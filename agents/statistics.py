@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ def require_confidence(confidence: Any) -> None:
         raise ConfigurationError(f"confidence = {confidence!r}; give a number above 0 and below 1, such as 0.95")
 
 
-def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
+def wilson_interval(successes: float, trials: float, confidence: float = 0.95) -> tuple[float, float]:
     """Wilson's score interval for the probability of success of independent trials.
 
     Args:
@@ -55,7 +56,9 @@ def rate_band(successes: np.ndarray, trials: int, confidence: float = 0.95) -> t
     return np.where(successes == trials, exact, low), np.where(successes == 0, 1.0 - exact, high)
 
 
-def paired_difference_interval(both: int, only_first: int, only_second: int, neither: int, confidence: float = 0.95) -> tuple[float, float]:
+def paired_difference_interval(
+    both: float, only_first: float, only_second: float, neither: float, confidence: float = 0.95
+) -> tuple[float, float]:
     """Newcombe's interval for the difference p1 - p2 of the rates of two outcomes of the same trials.
 
     The Wilson intervals of the two rates, squared and added with the outcomes' phi correlation, which is corrected
@@ -64,7 +67,7 @@ def paired_difference_interval(both: int, only_first: int, only_second: int, nei
     Source: R. G. Newcombe, Statistics in Medicine 17 (1998) 2635-2650, method 10.
 
     Args:
-        both: trials in which both succeeded.
+        both: trials in which both succeeded; a mean of several counts need not be whole, here and below.
         only_first: trials in which only the first succeeded.
         only_second: trials in which only the second succeeded.
         neither: trials in which neither succeeded.
@@ -87,6 +90,35 @@ def paired_difference_interval(both: int, only_first: int, only_second: int, nei
     return p1 - p2 - _third_side(p1 - low1, high2 - p2, phi), p1 - p2 + _third_side(high1 - p1, p2 - low2, phi)
 
 
+def repeated_interval(
+    values: Sequence[float], of_trials: tuple[float, float], confidence: float, bounds: tuple[float, float]
+) -> tuple[float, float]:
+    """Interval for the mean of a quantity over everything that was drawn once for all its trials, such as an identification.
+
+    All draws see the same trials, so that these do not average out: the distances from the mean to the ends of the interval
+    over trials and those of Student's interval over draws are added as squares. That is a little wide, since the spread of the
+    draws holds noise of the trials too.
+
+    Args:
+        values: one for each draw, at least two.
+        of_trials: the interval that the trials alone would give the mean.
+        confidence: of both.
+        bounds: of what is estimated.
+
+    Raises:
+        ConfigurationError: there are fewer than two draws, or the confidence is out of range.
+    """
+    from scipy.special import stdtrit
+
+    require_confidence(confidence)
+    if len(values) < 2:
+        raise ConfigurationError(f"{len(values)} draws were given; their spread needs at least 2")
+    mean = math.fsum(values) / len(values)
+    half = float(stdtrit(len(values) - 1, 0.5 + confidence / 2.0) * np.std(values, ddof=1) / math.sqrt(len(values)))
+    low, high = of_trials
+    return max(mean - math.hypot(mean - low, half), bounds[0]), min(mean + math.hypot(high - mean, half), bounds[1])
+
+
 def mcnemar_p(only_first: int, only_second: int) -> float:
     """McNemar's exact two-sided p value: were the pairs that differ fair coins?
 
@@ -104,11 +136,11 @@ def _third_side(a: float, b: float, cosine: float) -> float:
     return math.sqrt(max(a * a - 2.0 * cosine * a * b + b * b, 0.0))
 
 
-def _wilson(successes: np.ndarray, trials: int, z: float) -> tuple[np.ndarray, np.ndarray]:
+def _wilson(successes: np.ndarray, trials: float, z: float) -> tuple[np.ndarray, np.ndarray]:
     return _wilson_low(successes, trials, z), 1.0 - _wilson_low(trials - successes, trials, z)
 
 
-def _wilson_low(successes: np.ndarray, trials: int, z: float) -> np.ndarray:
+def _wilson_low(successes: np.ndarray, trials: float, z: float) -> np.ndarray:
     # In this form it is exactly 0 for no success.
     root = np.sqrt(z * z + 4.0 * successes * ((trials - successes) / trials))
     return (2.0 * successes + z * z - z * root) / (2.0 * (trials + z * z))
@@ -122,7 +154,7 @@ def _deviations(confidence: float) -> float:
     return -float(ndtri((1.0 - confidence) / 2.0))
 
 
-def _counts(successes: int, trials: int) -> np.ndarray:
+def _counts(successes: float, trials: float) -> np.ndarray:
     if not 0 <= successes <= trials or trials < 1:
         raise ConfigurationError(f"{successes} successes in {trials} trials; give at least one trial, and from 0 to all successes")
     return np.asarray(successes)

@@ -13,11 +13,11 @@ from safe_envs.errors import SystemDefinitionError
 
 @dataclass(frozen=True)
 class Exploration:
-    """What a problem says about learning it; what it leaves empty is completed by `SafetyProblem.exploration`.
+    """What a problem says about learning it; what it leaves empty, `SafetyProblem.exploration` completes.
 
     Attributes:
         region: (low, high) of each state. States are drawn uniformly from it, and kept where every barrier is positive.
-        inputs: input vectors that are tried, in physical units.
+        inputs: input vectors that are tried, in physical units; clipped to the box.
         coordinates: expressions of the states that a learned function depends on: cosines and sines of angles, relative
             positions.
     """
@@ -47,9 +47,11 @@ class Exploration:
         for state, (low, high) in zip(states, region, strict=True):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise SystemDefinitionError(f"cannot explore {state} in [{low}, {high}]; give Exploration(region=...) finite ranges")
-        inputs = self.inputs or _halfway(box)
-        if any(len(u) != len(box) for u in inputs):
-            raise SystemDefinitionError(f"an input of an exploration needs {len(box)} numbers; given {inputs}")
+        if any(len(u) != len(box) or not all(map(math.isfinite, u)) for u in self.inputs):
+            raise SystemDefinitionError(f"an input of an exploration needs {len(box)} finite numbers; given {self.inputs}")
+        clipped = tuple(tuple(min(max(v, low), high) for v, (low, high) in zip(u, box, strict=True)) for u in self.inputs)
+        # Inputs that a narrow box makes one and the same would tell nothing of the input's effect.
+        inputs = clipped if clipped and len(set(clipped)) == len(set(self.inputs)) else _halfway(box)
         coordinates = self.coordinates or tuple(
             e for s, angle in zip(states, angles, strict=True) for e in ((sp.cos(s), sp.sin(s)) if angle else (s,))
         )

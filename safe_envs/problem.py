@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -92,7 +93,7 @@ class SafetyProblem:
         substeps: integration steps in a control period.
         plane: the two states that draw a trajectory, if any.
         clf: the task as a soft goal, if it is one.
-        exploration: where and how the system is excited to learn from it; complete once the problem is made.
+        explored: where and how the system is excited to learn from it, as far as the defaults do not suit; see `exploration`.
 
     Raises:
         SystemDefinitionError: the parts do not fit together.
@@ -118,7 +119,7 @@ class SafetyProblem:
     substeps: int = 1
     plane: tuple[str, str] | None = None
     clf: CLF | None = None
-    exploration: Exploration = field(default_factory=Exploration)
+    explored: Exploration = field(default_factory=Exploration)
     box: tuple[tuple[float, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -153,14 +154,19 @@ class SafetyProblem:
                     "Unbounded control is a wide box"
                 )
         self._check_timing()
-        object.__setattr__(self, "exploration", self._completed_exploration())
+        for coordinate in self.explored.coordinates:
+            plant.require_known("a coordinate of the exploration", coordinate.free_symbols, plant.states)
 
-    def _completed_exploration(self) -> Exploration:
+    @cached_property
+    def exploration(self) -> Exploration:
+        """Where and how the system is excited to learn from it, complete.
+
+        Raises:
+            SystemDefinitionError: a state without a finite range has none in `explored` either.
+        """
         ranges = [(s.low, s.high) for s in self.states]
         angles = [s.unit == "rad" and math.isinf(s.low) and math.isinf(s.high) for s in self.states]
-        for coordinate in self.exploration.coordinates:
-            self.plant.require_known("a coordinate of the exploration", coordinate.free_symbols, self.plant.states)
-        return self.exploration.completed(self.plant.states, ranges, angles, self.box)
+        return self.explored.completed(self.plant.states, ranges, angles, self.box)
 
     def _check_timing(self) -> None:
         if not self.dt > 0 or not math.isfinite(self.dt):

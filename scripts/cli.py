@@ -9,6 +9,7 @@ import typer
 
 from scripts.console import run
 from scripts.evaluate import evaluate
+from scripts.identify import identify
 from scripts.verify import verify
 
 app = typer.Typer(
@@ -19,6 +20,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("evaluate")(evaluate)
+app.command("identify")(identify)
 app.command("verify")(verify)
 
 

@@ -19,8 +19,8 @@ def evaluate(
         typer.Option(
             "--filter",
             metavar="NAME",
-            help="none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf, scbf; with parameters: hocbf:p=2,8; one for each barrier: "
-            "hocbf:p=2,8+cbf:alpha=1. Repeatable. By default none and the env's own.",
+            help="none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf, scbf, and learned ones: learned-hocbf, ddscbf, bayesian-scbf; with "
+            "parameters: hocbf:p=2,8; one for each barrier: hocbf:p=2,8+cbf:alpha=1. Repeatable. By default none and the env's own.",
         ),
     ] = None,
     policy: Annotated[
@@ -46,6 +46,11 @@ def evaluate(
     horizon: options.Horizon = None,
     box: options.Box = None,
     start: options.StartAt = None,
+    learned: Annotated[
+        list[Path] | None,
+        typer.Option("--learned", metavar="FILE", help="What `safe-envs identify` wrote, for the learned filters. Repeatable."),
+    ] = None,
+    repeats: Annotated[int, typer.Option(help="How often to learn, with new seeds: intervals are over identifications too.")] = 1,
     confidence: Annotated[float, typer.Option(metavar="C", help="Of all intervals, above 0 and below 1.")] = 0.95,
     refine: Annotated[
         bool, typer.Option("--refine", help="Repeat with dt/2 and dt/4, and say whether the safety rate has converged.")
@@ -83,6 +88,8 @@ def evaluate(
             knowledge=knowledge,
             objective=objective,
             confidence=confidence,
+            learned=learned or (),
+            repeats=repeats,
             progress=tell,
             record=plot is not None,
         )

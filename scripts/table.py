@@ -16,6 +16,7 @@ from agents.evaluation import BARE, Evaluation
 from agents.refinement import TOLERANCE, Refinement
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
+from scripts.learned_columns import learned_columns, learned_notes
 
 _COLUMNS = (
     "min h\nmedian",
@@ -27,6 +28,7 @@ _COLUMNS = (
     "return",
     "steps/s",
 )
+_WIDEST = 1000
 _VERDICTS = {
     "converged": "converged, {}",
     "not resolved": "not resolved, {}: more episodes are needed",
@@ -38,9 +40,11 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     """Print a heading, a row for each filter, comparisons, and what has to be known to read them."""
     interval = _interval(evaluation)
     console.print(heading(evaluation), soft_wrap=True, highlight=False)
-    table = _table(f"safe [{interval}]", "bound", *_COLUMNS)
+    learned = learned_columns(evaluation.rows)
+    table = _table(f"safe [{interval}]", *learned, "bound", *_COLUMNS)
     for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True):
-        table.add_row(*_cells(row, speed["steps_per_second"]))
+        name, rate, *rest = _cells(row, speed["steps_per_second"])
+        table.add_row(name, rate, *[cell(row) for cell in learned.values()], *rest)
     _print_table(console, table)
     compared = [] if evaluation.repeats else [c for c in evaluation.comparisons if BARE not in (c["first"], c["second"])]
     if compared:
@@ -83,7 +87,8 @@ def heading(evaluation: Evaluation) -> Text:
     """What was evaluated, in two lines."""
     config = evaluation.config
     title = Text(config["env_id"] or evaluation.problem.name, style="bold")
-    title.append(f" | policy {config['policy']['name']} | {config['episodes']} episodes | seed {config['seed']}", style="not bold")
+    often = f" x {config['repeats']} identifications" if config["repeats"] > 1 else ""
+    title.append(f" | policy {config['policy']['name']} | {config['episodes']} episodes{often} | seed {config['seed']}", style="not bold")
     goal = ", joint program with the goal" if config["objective"] == "clf" else ""
     title.append(f"\n{describe_system(evaluation.problem)}; filters know the {config['knowledge']}{goal}", style="not bold")
     return title
@@ -118,6 +123,8 @@ def _table(*columns: str) -> Table:
 
 
 def _print_table(console: Console, table: Table) -> None:
+    # A column that is cut off would be a number that is wrong.
+    console.width = max(console.width, console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum)
     console.print()
     console.print(table)
     console.print()
@@ -130,6 +137,8 @@ def _say(console: Console, text: str) -> None:
 def _describe(comparison: Comparison) -> str:
     first, second, p = comparison["first"], comparison["second"], comparison["mcnemar_p"]
     difference = _points(comparison["difference"], comparison["ci_low"], comparison["ci_high"])
+    if p is None:
+        return f"{first} - {second}: {difference}, over identifications and episodes"
     return (
         f"{first} - {second}: {difference}, McNemar p {'< 1e-10' if p < 1e-10 else f'= {p:.2g}'} "
         f"(safe with one only: {first} {comparison['only_first']}, {second} {comparison['only_second']})"
@@ -142,8 +151,9 @@ def _notes(evaluation: Evaluation) -> list[str]:
     notes = [
         f"no proved bound for {row['filter']}: {row['bound_note']}"
         for row in evaluation.rows
-        if row["filter"] != BARE and row["bound"] is None
+        if row["filter"] != BARE and row["bound"] is None and row["learning"] is None
     ]
+    notes += learned_notes(evaluation.rows)
     notes += [
         f"the rate of {row['filter']} lies below its proved bound, which asks for the condition at every instant: try --refine, and "
         "--filter NAME:sampling_margin=first-order"

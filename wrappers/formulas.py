@@ -11,8 +11,9 @@ import sympy as sp
 
 from safe_envs.calculus import spread
 from safe_envs.codegen import compile_function, stacked
+from safe_envs.errors import ConfigurationError
 from safe_envs.problem import SafetyProblem
-from wrappers.conditions import SRCBF, Condition
+from wrappers.conditions import SRCBF, Condition, LearnedCondition
 from wrappers.safe_set import Region, region_of
 from wrappers.safety_filter import SafetyFilter
 
@@ -45,6 +46,8 @@ class Formulas:
 
     def __init__(self, problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str) -> None:
         self.problem, self.conditions, self.knowledge = problem, tuple(conditions), knowledge
+        if any(isinstance(c, LearnedCondition) for c in self.conditions):
+            raise ConfigurationError("what a condition promises is known for a known system only; this one rests on something learned")
         self.safety_filter = SafetyFilter.for_problem(problem, self.conditions, knowledge)
         self.system = self.safety_filter.model
         self._constraints = self.safety_filter.constraints

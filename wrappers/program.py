@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,7 +18,8 @@ from safe_envs.codegen import Components, Flavour, compile_function, constants, 
 from safe_envs.errors import ConfigurationError
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions import AffineConstraint
-from wrappers.qp import one_row, several_rows
+from wrappers.conditions.base import Terms
+from wrappers.qp import concave, one_row, several_rows
 
 _LEAST_SCALE = 1e-100
 """A slack scaled by less would have a weight that vanishes."""
@@ -76,8 +78,13 @@ class Program:
 
     @property
     def plain(self) -> bool:
-        """Whether the rows are all there is: no demand of a reciprocal condition, no sampling margin, no goal."""
-        return self.clf is None and all(c.demand is None and c.change is None for c in self.constraints)
+        """Whether the rows are all there is: no demand of a reciprocal condition, no margin, no uncertainty, no goal."""
+        return self.clf is None and all(c.demand is None and c.change is None and c.uncertainty is None for c in self.constraints)
+
+    @property
+    def terms(self) -> list[Terms]:
+        """The learned terms of the rows, each once."""
+        return list({id(c.terms): c.terms for c in self.constraints if c.terms is not None}.values())
 
 
 class Solver:
@@ -93,7 +100,10 @@ class Solver:
         self._count = len(program.constraints)
         self._reciprocal = [i for i, c in enumerate(program.constraints) if c.demand is not None]
         self._sampled = [i for i, c in enumerate(program.constraints) if c.change is not None]
+        self._uncertain = [i for i, c in enumerate(program.constraints) if c.uncertainty is not None]
         arrays = flavour == "arrays"
+        self._terms = [term.arrays if arrays else term.floats for term in program.terms]
+        self._symbols = (*program.model.states, *(s for term in program.terms for s in term.symbols))
         self._low: Sequence[Any] = constants(program.low) if arrays else program.low
         self._high: Sequence[Any] = constants(program.high) if arrays else program.high
         self._weights = program.weights
@@ -112,7 +122,7 @@ class Solver:
 
     def one_row(self, x: Sequence[Any], u: Sequence[Any]) -> Decision:
         """Solve a plain program of one row; raises as `solve`."""
-        *a, b = self._rows(*x)
+        *a, b = self._rows(*self._with_terms(x))
         p = self._program
         if self._flavour == "floats":
             action, margin, active, feasible = one_row.project_floats(a, b, u, p.low, p.high, p.weights)
@@ -130,7 +140,8 @@ class Solver:
         Raises:
             UndefinedRowError: a row or the goal has no finite value.
         """
-        a, b, goal, h = self._split(self._rows(*x))
+        x = self._with_terms(x)
+        a, b, goal, h, forms = self._split(self._rows(*x))
         target = u
         if goal:
             target = [0.0 * uj for uj in u]
@@ -141,12 +152,12 @@ class Solver:
         held = [[self._choose(inside[i], aj, 0.0) for aj in a[i]] if i in inside else a[i] for i in range(self._count)]
         self._require_finite(asked)
         aim = self._outwards(a, inside, target)
-        action, margin, active, feasible = self._minimise(held, asked, aim, goal)
+        action, margin, active, feasible = self._minimise(held, asked, aim, goal, forms)
         if self._sampled:
             for i in self._sampled:
                 asked[i] = asked[i] - self._program.dt * self._loss(i, x, action, inside.get(i))
             self._require_finite(asked)
-            action, margin, active, feasible = self._minimise(held, asked, aim, goal)
+            action, margin, active, feasible = self._minimise(held, asked, aim, goal, forms)
         for i, defined in inside.items():
             margin[i] = self._choose(defined, margin[i], _dot(a[i], action) + b[i])
             active[i] = self._choose(defined, active[i], True)
@@ -156,7 +167,11 @@ class Solver:
 
     def best(self, x: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
         """The input that is best for the goal, without rows; `nothing` is the input 0. Raises as `solve`."""
-        return self._best(self._split(self._rows(*x))[2], nothing)
+        return self._best(self._split(self._rows(*self._with_terms(x)))[2], nothing)
+
+    def _with_terms(self, x: Sequence[Any]) -> Sequence[Any]:
+        """The state, and after it what the learned terms are there."""
+        return (*x, *[value for term in self._terms for value in term(tuple(x))]) if self._terms else x
 
     def _best(self, goal: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
         self._require_finite(goal, "the goal")
@@ -172,13 +187,15 @@ class Solver:
             if bad.size:
                 raise UndefinedRowError(int(bad[0]), what)
 
-    def _split(self, values: Components) -> tuple[list[Any], Sequence[Any], Sequence[Any], Sequence[Any]]:
-        """The rows' a and b, the goal's offset and coefficients, and h of the reciprocal conditions."""
-        width, count = self._m + 1, self._count
+    def _split(self, values: Components) -> tuple[list[Any], list[Any], Sequence[Any], Sequence[Any], dict[int, Components]]:
+        """The rows' a and b, the goal's offset and coefficients, h of the reciprocal conditions, and Q of the uncertain rows."""
+        width, count, entries = self._m + 1, self._count, (self._m + 1) * (self._m + 2) // 2
         rows = [values[i * width : (i + 1) * width] for i in range(count)]
-        rest = values[count * width :]
-        goal = rest[: len(rest) - len(self._reciprocal)]
-        return [row[:-1] for row in rows], [row[-1] for row in rows], goal, rest[len(goal) :]
+        forms_at = len(values) - entries * len(self._uncertain)
+        goal_end = forms_at - len(self._reciprocal)
+        forms = {i: values[forms_at + k * entries : forms_at + (k + 1) * entries] for k, i in enumerate(self._uncertain)}
+        goal, h = values[count * width : goal_end], values[goal_end:forms_at]
+        return [row[:-1] for row in rows], [row[-1] for row in rows], goal, h, forms
 
     def _demand(self, i: int, x: Sequence[Any], inside: Any) -> Any:
         """What a reciprocal row asks for, where it means something; plain floats have no 1/h or logarithm elsewhere."""
@@ -211,8 +228,19 @@ class Solver:
         corner = [self._choose(rj > 0.0, hi, self._choose(rj < 0.0, lo, uj)) for rj, (lo, hi), uj in zip(rise, ends, u, strict=True)]
         return [c + far * rj / wj for c, rj, wj in zip(corner, rise, self._weights, strict=True)]
 
-    def _minimise(self, a: Sequence[Any], b: Sequence[Any], u: Sequence[Any], goal: Sequence[Any]) -> tuple[Any, Any, Any, Any]:
+    def _minimise(
+        self, a: Sequence[Any], b: Sequence[Any], u: Sequence[Any], goal: Sequence[Any], forms: dict[int, Components] | None = None
+    ) -> tuple[Any, Any, Any, Any]:
         p = self._program
+        if forms:
+            for form in forms.values():
+                self._require_finite(form)
+            if self._m == 1 and not goal:
+                q = [forms.get(i, (0.0, 0.0, 0.0)) for i in range(self._count)]
+                project = concave.project_arrays if self._flavour == "arrays" else concave.project_floats
+                action, margin, active, feasible = project([ai[0] for ai in a], b, q, u[0], p.low[0], p.high[0], p.priorities)
+                return [action], list(margin), list(active), feasible
+            a, b = self._on_the_safe_side(a, b, forms)
         if not goal:
             return self._project(a, b, u, self._low, self._high, self._weights, p.priorities)
         # The goal's slack d = D e, with D the most that the box can make it, so that e in [0, 1] always meets the goal's row.
@@ -224,6 +252,17 @@ class Solver:
         priorities = [*p.priorities[: len(a)], 1.0]
         action, margin, active, feasible = self._project(rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities)
         return action[: self._m], margin[: len(a)], active[: len(a)], feasible
+
+    def _on_the_safe_side(self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components]) -> tuple[list[Any], list[Any]]:
+        """Affine rows that are met only where the uncertain ones are, in the box."""
+        a, b, width = list(a), list(b), self._m + 1
+        place = {pair: k for k, pair in enumerate(itertools.combinations_with_replacement(range(width), 2))}
+        for i, form in forms.items():
+            q = [[form[place[min(j, k), max(j, k)]] for k in range(width)] for j in range(width)]
+            slopes, constant = concave.majorant(q, self._program.low, self._program.high)
+            a[i] = [aj - cj for aj, cj in zip(a[i], slopes, strict=True)]
+            b[i] = b[i] - constant
+        return a, b
 
     def _cause(self, a: Sequence[Any], b: Sequence[Any], u: Sequence[Any], active: Sequence[Any], inside: dict[int, Any]) -> Any:
         """The active row whose half-space is furthest from the proposed input; one that means nothing is further than any."""
@@ -240,13 +279,14 @@ class Solver:
 
     @cached_property
     def _rows(self) -> Any:
-        """a_1, ..., a_m, b of each row, then the goal's offset and coefficients, then h of the reciprocal conditions."""
+        """What `_split` takes apart again."""
         p = self._program
         expressions = [e for c in p.constraints for e in (*c.coefficient, c.offset)]
         if p.clf is not None:
             growth, along = p.clf.growth(p.model)
             expressions += [growth, *along]
-        return self._compiled([*expressions, *(p.constraints[i].chain[0] for i in self._reciprocal)])
+        expressions += [p.constraints[i].chain[0] for i in self._reciprocal]
+        return self._compiled([*expressions, *(e for i in self._uncertain for e in p.constraints[i].uncertainty or ())])
 
     @cached_property
     def _demands(self) -> dict[int, Any]:
@@ -258,7 +298,7 @@ class Solver:
 
     def _compiled(self, expressions: Sequence[Any], more: Sequence[sp.Symbol] = ()) -> Any:
         model = self._program.model
-        return compile_function((*model.states, *more), [model.numeric(e) for e in expressions], self._flavour)
+        return compile_function((*self._symbols, *more), [model.numeric(e) for e in expressions], self._flavour)
 
 
 def _choose(condition: bool, chosen: Any, other: Any) -> Any:

@@ -139,7 +139,7 @@ def acc_gap(*, distance: float = 10.0, power: int = 5, rate: float = 1.0, slack_
         noise=("sigma_1", "sigma_2"),
         gains=(1.0, 1.0),
         plane=("v", "z"),
-        exploration=Exploration(region=((8.0, 24.0), (10.0, 32.0)), inputs=((-4000.0,), (4000.0,))),
+        explored=Exploration(region=((8.0, 24.0), (10.0, 32.0)), inputs=((-4000.0,), (4000.0,))),
     )
 
 

@@ -75,7 +75,7 @@ def cubic_sde(*, offset: float = 1.0, rate: float = 1.0, slack_weight: float = 1
         starts={"near-edge": Start((around(-1.0, 2.0, first), around(0.0, 2.0, second)), (first, second), sp.Min(h, 0.5 - h))},
         horizon=2.0,
         noise=("k",),
-        exploration=Exploration(region=((-1.0, 1.0), (-1.0, 1.0)), inputs=((-1.0,), (1.0,))),
+        explored=Exploration(region=((-1.0, 1.0), (-1.0, 1.0)), inputs=((-1.0,), (1.0,))),
     )
 
 
@@ -105,7 +105,7 @@ def cubic_sde_disk(*, radius: float = 1.0) -> SafetyProblem:
         },
         horizon=1.0,
         noise=("sigma_1", "sigma_2"),
-        exploration=Exploration(region=((-r, r), (-r, r)), inputs=((-1.0,), (1.0,))),
+        explored=Exploration(region=((-r, r), (-r, r)), inputs=((-1.0,), (1.0,))),
     )
 
 

@@ -69,7 +69,7 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         gains=(5.0,),
         filter="scbf",
         plane=("theta", "thetadot"),
-        exploration=Exploration(region=((-reach, reach), (-reach, reach))),
+        explored=Exploration(region=((-reach, reach), (-reach, reach))),
     )
 
 

@@ -160,7 +160,7 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
         barriers=(band(center, half_width),),
         nominal=rotor_laws(sp.Integer(0), sp.Integer(0)),
         starts={"spread": start_at({z: around(5.0, 0.5, height), zdot: around(0.0, 0.5, climb)}, spread), "thesis": start_at({z: 5})},
-        exploration=Exploration(
+        explored=Exploration(
             region=tuple(
                 {z: (center - half_width, center + half_width), zdot: CLIMB_RATES, psi: (-math.pi, math.pi)}.get(s.symbol, (s.low, s.high))
                 for s in _STATES

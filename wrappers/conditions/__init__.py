@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,23 +13,34 @@ from safe_envs.problem import SafetyProblem
 from wrappers.conditions.base import AffineConstraint, Condition
 from wrappers.conditions.cbf import CBF, ECBF, HOCBF
 from wrappers.conditions.class_k import ClassK, power
+from wrappers.conditions.learned import DDSCBF, BayesianSCBF, LearnedCondition, LearnedHOCBF
 from wrappers.conditions.reciprocal import RCBF, SRCBF
 from wrappers.conditions.stochastic import SCBF, SZCBF
+from wrappers.learning import LearnedModel, load_learned
 
 CONDITIONS: dict[str, type[Condition]] = {c.name: c for c in (CBF, ECBF, HOCBF, RCBF, SRCBF, SZCBF, SCBF)}
+"""Those that need nothing but a model."""
+
+LEARNED: dict[str, type[LearnedCondition]] = {c.name: c for c in (LearnedHOCBF, DDSCBF, BayesianSCBF)}
+"""Those that rest on something learned."""
 
 __all__ = [
     "CBF",
     "CONDITIONS",
+    "DDSCBF",
     "ECBF",
     "HOCBF",
+    "LEARNED",
     "RCBF",
     "SCBF",
     "SRCBF",
     "SZCBF",
     "AffineConstraint",
+    "BayesianSCBF",
     "ClassK",
     "Condition",
+    "LearnedCondition",
+    "LearnedHOCBF",
     "parse_condition",
     "parse_conditions",
     "power",
@@ -37,11 +48,20 @@ __all__ = [
 ]
 
 # A class-K function or a complex pole may hold a "+" too.
-_BETWEEN = re.compile(rf"\+(?=(?:{'|'.join(CONDITIONS)})(?:[:+]|$))")
+_BETWEEN = re.compile(rf"\+(?=(?:{'|'.join((*CONDITIONS, *LEARNED))})(?:[:+]|$))")
 
 
-def parse_conditions(text: str, problem: SafetyProblem) -> tuple[Condition, ...]:
+Learned = Mapping[str, LearnedModel]
+"""What was learned, by method."""
+
+
+def parse_conditions(text: str, problem: SafetyProblem, learned: Learned | None = None) -> tuple[Condition, ...]:
     """Read a condition for every barrier of a problem: one text for all of them, or one for each with "+" between.
+
+    Args:
+        text: see `parse_condition`; `ddscbf:file=FILE` reads what was learned from a file of `safe-envs identify`.
+        problem: whose barriers and gains are taken.
+        learned: what the conditions rest on that name no file.
 
     Raises:
         ConfigurationError: as `parse_condition`, or there are neither one nor as many texts as barriers.
@@ -52,7 +72,23 @@ def parse_conditions(text: str, problem: SafetyProblem) -> tuple[Condition, ...]
         allowed = "one" if count == 1 else f"one for all {count} barriers, or one for each"
         raise ConfigurationError(f"filter {text!r} has {len(texts)} conditions; {problem.name} takes {allowed}")
     texts = texts * count if len(texts) == 1 else texts
-    return tuple(parse_condition(part, problem.gains_of(i)) for i, part in enumerate(texts))
+    return tuple(
+        _parse_learned(part, problem, problem.gains_of(i), learned or {})
+        if part.split(":")[0] in LEARNED
+        else parse_condition(part, problem.gains_of(i))
+        for i, part in enumerate(texts)
+    )
+
+
+def _parse_learned(text: str, problem: SafetyProblem, gains: Sequence[float], learned: Learned) -> Condition:
+    condition, settings = _settings(text)
+    path = settings.pop("file", None)
+    model = learned.get(condition.method) if path is None else load_learned(path, problem, condition.method)
+    if model is None:
+        raise ConfigurationError(
+            f"filter {text!r} rests on something learned: learn it by `safe-envs identify`, and name the file as {condition.name}:file=FILE"
+        )
+    return condition.from_learned(model, gains, **settings)
 
 
 def spec_of(conditions: Sequence[Condition]) -> str:
@@ -71,21 +107,34 @@ def parse_condition(text: str, gains: Sequence[float]) -> Condition:
     Raises:
         ConfigurationError: the name or a parameter is unknown or comes twice, or a value is not allowed.
     """
+    condition, given = _settings(text)
+    if issubclass(condition, LearnedCondition) or set(given) <= {"sampling_margin"}:
+        return replace(condition.for_gains(gains), **given)
+    return condition(**given)
+
+
+def _settings(text: str) -> tuple[Any, dict[str, Any]]:
+    """The class of a condition, and what its text sets."""
     name, *settings = text.split(":")
-    if name not in CONDITIONS:
-        raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, CONDITIONS)}")
-    condition = CONDITIONS[name]
-    allowed = inspect.signature(condition).parameters
+    known = {**CONDITIONS, **LEARNED}
+    if name not in known:
+        raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, known)}")
+    condition = known[name]
+    allowed = {key: p for key, p in inspect.signature(condition).parameters.items() if key != "learned"}
+    names = [*allowed, "file"] if name in LEARNED else list(allowed)
     given: dict[str, Any] = {}
     for setting in settings:
         key, _, value = setting.partition("=")
-        if key not in allowed or key in given:
-            reason = f"{text!r} names {key!r} twice" if key in given else f"{name} has no parameter {key!r}; {nearest(key, allowed)}"
+        if key not in names or key in given:
+            reason = f"{text!r} names {key!r} twice" if key in given else f"{name} has no parameter {key!r}; {nearest(key, names)}"
             raise ConfigurationError(f"filter {reason}")
-        given[key] = _value(text, key, value, isinstance(allowed[key].default, float | str))
-    if set(given) <= {"sampling_margin"}:
-        return replace(condition.for_gains(gains), **given)
-    return condition(**given)
+        given[key] = value if key == "file" else _value(text, key, value, _takes_one(name, allowed[key].default))
+    return condition, given
+
+
+def _takes_one(name: str, default: Any) -> bool:
+    """Whether a parameter with such a default takes one value, and not a tuple."""
+    return isinstance(default, float | str) or (default is None and name in LEARNED)
 
 
 def _value(text: str, key: str, value: str, single: bool) -> Any:

@@ -50,6 +50,9 @@ class AffineConstraint:
             a u + b is the rate of h, and all that is left is to make that as large as the other rows allow.
         change: rate of the row while the input is held, an expression of states and inputs, where a margin of first order
             is asked for.
+        uncertainty: where a and b are known up to an error only, the entries (i, j), i <= j, of the symmetric Q(x) with which
+            the condition asks for a u + b >= sqrt([1, u]' Q [1, u]).
+        terms: what stands for numbers of something learned in the expressions, besides the states.
     """
 
     coefficient: tuple[sp.Expr, ...]
@@ -57,6 +60,8 @@ class AffineConstraint:
     chain: tuple[sp.Expr, ...]
     demand: sp.Expr | None = None
     change: sp.Expr | None = None
+    uncertainty: tuple[sp.Expr, ...] | None = None
+    terms: Terms | None = None
 
     @classmethod
     def after(cls, model: ControlAffineSDE, chain: Sequence[sp.Expr], offset: sp.Expr, demand: sp.Expr | None = None) -> AffineConstraint:
@@ -109,6 +114,7 @@ class Condition(ABC):
             RelativeDegreeError: the condition does not suit the barrier's relative degree.
             SystemDefinitionError: a class-K function cannot be differentiated as often as the chain needs.
         """
+        model = self.believed(model)
         found = self.derived(model, barrier)
         if self.sampling_margin == FIRST_ORDER:
             row = sum(a * u for a, u in zip(found.coefficient, model.inputs, strict=True)) + found.offset - (found.demand or 0)
@@ -117,6 +123,10 @@ class Condition(ABC):
         if self.sampling_margin != "none":
             return replace(found, offset=found.offset - sp.Float(self.sampling_margin, 17))
         return found
+
+    def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
+        """The system that the condition differentiates along: the model, unless it has learned another."""
+        return model
 
     @abstractmethod
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:

@@ -115,7 +115,7 @@ class ECBF(Condition):
             _real_negative_roots(gains)
         else:
             poles = _real_negative_poles(self.poles)
-            gains = _gains(poles)
+            gains = gains_of_poles(poles)
             if self.k not in (None, gains):
                 raise ConfigurationError(f"ecbf takes gains or poles; k = {self.k} and poles = {poles} were given")
             object.__setattr__(self, "poles", poles)
@@ -157,7 +157,7 @@ _WHY = (
 )
 
 
-def _gains(poles: Sequence[float]) -> tuple[float, ...]:
+def gains_of_poles(poles: Sequence[float]) -> tuple[float, ...]:
     """k_0..k_(r-1) of the monic polynomial with the given roots."""
     s = sp.Symbol("s")
     polynomial = sp.Poly(sp.Mul(*[s - sp.Rational(repr(p)) for p in poles]), s)

@@ -48,11 +48,13 @@ class LearnedModel(ABC):
         method: by which the command line knows it.
         signature: of which system.
         record: how it was learned.
+        path: file that it came from, if any.
     """
 
     method: ClassVar[str]
     signature: Signature
     record: Record
+    path: Path | None = None
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
@@ -20,6 +21,21 @@ from safe_envs.problem import SafetyProblem
 _FORMAT = 1
 _HEADER = "header"
 _PACKAGES = ("safe-envs", "numpy", "sympy", "torch")
+
+
+# What NumPy, zipfile and json are seen to raise on damaged files.
+_DAMAGED = (
+    OSError,
+    EOFError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    RuntimeError,
+    MemoryError,
+    zlib.error,
+    zipfile.BadZipFile,
+)
 
 
 class LearnedFileError(ConfigurationError):
@@ -171,7 +187,7 @@ def load(path: Path) -> Content:
         content = Content(header["kind"], signature, header["details"], arrays, header["sha256"])
     except FileNotFoundError as error:
         raise LearnedFileError(f"{path} does not exist; `safe-envs identify` writes such files") from error
-    except (OSError, EOFError, ValueError, KeyError, TypeError, AttributeError, zipfile.BadZipFile) as error:
+    except _DAMAGED as error:
         if isinstance(error, LearnedFileError):
             raise
         raise LearnedFileError(f"{path} is no file of `safe-envs identify`, or it is truncated ({type(error).__name__})") from error

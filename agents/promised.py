@@ -1,0 +1,90 @@
+"""What theory promises a filter, averaged over the starts of the episodes: proved bounds, and certificates of what was learned."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from agents.episodes import Row
+from agents.statistics import RunningSum, share
+from safe_envs.codegen import Components
+from safe_envs.errors import SafeEnvsError
+from safe_envs.problem import SafetyProblem
+from wrappers import BayesianSCBF, Condition, LearnedCondition
+from wrappers.certificate import Certificate, certificate
+from wrappers.proved import ProvedBound, proved_bound
+
+
+class Promised:
+    """The proved bound on P(safe up to the horizon) of conditions, or their certificate, averaged over the starts.
+
+    Args:
+        conditions: one for each barrier; none of the bare env.
+        problem: whose barriers they keep.
+        knowledge: of the filter, "model" or "plant".
+        asked: whether to look for a bound at all.
+    """
+
+    def __init__(self, conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str, asked: bool) -> None:
+        self._horizon = problem.steps * problem.dt
+        self._certified = any(isinstance(c, BayesianSCBF) and c.simultaneous is not None for c in conditions)
+        self._found: ProvedBound | Certificate | None = None
+        self._why_none: str | None = "there is no filter" if not conditions else "it was not asked for"
+        self._total, self._count = RunningSum(), 0
+        if conditions and asked:
+            self._look(conditions, problem, knowledge)
+
+    def _look(self, conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str) -> None:
+        try:
+            if self._certified:
+                self._found = certificate(problem, conditions)
+                self._why_none = None
+            elif any(isinstance(c, LearnedCondition) for c in conditions):
+                self._why_none = "it rests on something learned; bayesian-scbf:simultaneous=P has a certificate"
+            else:
+                self._found = proved_bound(problem, conditions, knowledge)
+                self._why_none = self._found.note
+        except SafeEnvsError as error:
+            # The bound looks at the whole safe set, where the episodes may never be.
+            self._why_none = str(error)
+
+    def add(self, start: Components, count: int) -> None:
+        """Take the starts of a wave."""
+        if self._found is not None and not self._why_none:
+            self._total.add(self._found.at(np.stack(start, axis=1)[:count], self._horizon))
+            self._count += count
+
+    def row(self) -> Row:
+        """The mean bound or certificate, None where there is none, and why there is none or why it is weak."""
+        bound, note = self._mean()
+        if not self._certified:
+            return {"bound": bound, "bound_note": note, "certificate": None}
+        found = self._found if isinstance(self._found, Certificate) else None
+        sizes = {} if found is None else {"delta": found.delta, "supremum": found.supremum, "shortfall": found.shortfall}
+        return {
+            "bound": None,
+            "bound_note": "it rests on something learned: see its certificate",
+            "certificate": {"probability": bound, "note": note, **sizes},
+        }
+
+    def _mean(self) -> tuple[float | None, str | None]:
+        if self._found is None or self._why_none:
+            return None, self._why_none
+        mean, remark = share(self._total.total, self._count), self._found.remark
+        return (mean, remark) if mean else (None, remark or "it is 0 at these starts up to this horizon")
+
+
+def together(rows: Sequence[Row]) -> Row:
+    """The rows of several identifications as one: the mean of their certificates, with 0 for those that have none."""
+    first = rows[0]
+    certificates = [row["certificate"] for row in rows]
+    if len(rows) == 1 or first["certificate"] is None:
+        return first
+    mean = {
+        key: math.fsum(c[key] or 0.0 for c in certificates) / len(rows)
+        for key in ("probability", "delta", "supremum", "shortfall")
+        if all(key in c for c in certificates)
+    }
+    return {**first, "certificate": {"note": first["certificate"]["note"], **mean}}

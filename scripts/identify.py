@@ -1,0 +1,165 @@
+"""`safe-envs identify`: learn what a model lacks, keep it in a file, and hold it against the truth."""
+
+from __future__ import annotations
+
+import inspect
+import shlex
+import typing
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from safe_envs.errors import ConfigurationError, nearest, require_whole
+from safe_envs.files import require_writable
+from scripts import options
+from scripts.console import progress_bar, run, stdout
+
+_NOT_SETTINGS = ("data", "seed", "step", "progress")
+
+
+def identify(
+    env_id: options.EnvId,
+    method: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="learned-hocbf: residuals of derivatives of the barriers; ddscbf: unknown noise; bayesian: the whole system.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Where what was learned goes: an npz, without pickle.")],
+    data: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Learn from these, an npz of Transitions.save, instead of collecting data.")
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Setting of the method: points=300, hidden=100,30, way=direct, ... Repeatable."),
+    ] = None,
+    noise: options.Noise = None,
+    plant: options.Plant = None,
+    model: options.Model = None,
+    barrier: options.BarrierArguments = None,
+    dt: options.Dt = None,
+    substeps: options.Substeps = None,
+    box: options.Box = None,
+    seed: options.Seed = 0,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write configuration, versions, record and errors.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the truth against the estimate: .png, .pdf, .svg.")] = None,
+) -> None:
+    """Learn of a system by a method, and print how far what was learned is from the truth.
+
+    The plant is only stepped, or not at all with --data. The truth, with which the estimates are compared at states drawn
+    anew from where the problem is explored, is that of the plant.
+    """
+    from agents.problems import full_id, load_problem
+    from scripts.identify_report import Identification, compare, print_report, write_json
+    from wrappers.learning import learner_of
+    from wrappers.learning.identifiability import IdentifiabilityWarning
+
+    require_whole("seed", seed, 0)
+    require_writable(out)
+    options.require_outputs(json, plot)
+    arguments = options.of_env(
+        noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=None, box=box, start=None
+    )
+    learner = learner_of(method)
+    chosen = read_settings(method, learner, settings or ())
+    problem = load_problem(env_id, arguments)
+    source = {} if data is None else {"data": _load_data(method, learner, data)}
+    with progress_bar("Learning") as tell, warnings.catch_warnings():
+        # They are in the record, and printed with the results.
+        warnings.simplefilter("ignore", IdentifiabilityWarning)
+        learned = learner(problem, seed=seed, progress=tell, **source, **chosen)
+    learned.save(out)
+    of_env = {
+        "--noise": noise,
+        "--plant": plant,
+        "--model": model,
+        "--barrier": barrier,
+        "--dt": dt,
+        "--substeps": substeps,
+        "--box": box,
+    }
+    found = Identification(
+        env_id=full_id(env_id),
+        problem=problem,
+        learned=learned,
+        functions=compare(learned, problem, seed),
+        options={name: value for name, value in arguments.items() if value is not None},
+        seed=seed,
+        data=data,
+        out=out,
+        use=_use(env_id, method, out, of_env),
+    )
+    print_report(stdout(), found)
+    if json is not None:
+        write_json(json, found)
+    if plot is not None:
+        from scripts.identify_figure import draw
+
+        draw(found, plot)
+
+
+def read_settings(method: str, learner: Callable[..., Any], texts: Sequence[str]) -> dict[str, Any]:
+    """Read NAME=VALUE entries as keyword arguments of the function that learns by a method.
+
+    Raises:
+        ConfigurationError: the function has no such argument, or the value is not of its kind.
+    """
+    allowed = [name for name in inspect.signature(learner).parameters if name not in ("problem", *_NOT_SETTINGS)]
+    hints = typing.get_type_hints(learner)
+    found = options.parameters("--set", texts, words=True) or {}
+    for name, value in found.items():
+        if name not in allowed:
+            raise ConfigurationError(f"--set {name}={value}: {method} has no setting {name!r}; {nearest(name, allowed)}")
+        found[name] = _of_kind(name, value, hints[name])
+    return found
+
+
+def _of_kind(name: str, value: float | str, hint: Any) -> Any:
+    """A value as an argument with a type hint takes it: a word, a list of whole numbers, or a number."""
+    origins = {typing.get_origin(part) for part in (hint, *typing.get_args(hint))}
+    if typing.Literal in origins:
+        return str(value)
+    if Sequence in origins:
+        try:
+            return [int(entry) for entry in str(value).split(",")]
+        except ValueError as error:
+            raise ConfigurationError(f"--set {name}={value}: give whole numbers with commas between, such as {name}=100,30") from error
+    if isinstance(value, str):
+        raise ConfigurationError(f"--set {name}={value}: {value!r} is not a number")
+    return value
+
+
+def _load_data(method: str, learner: Callable[..., Any], path: Path) -> Any:
+    """The data of a file, for a method that can learn from any.
+
+    Raises:
+        ConfigurationError: the method cannot, or the file holds none.
+    """
+    from wrappers.learning.transitions import Transitions
+
+    if "data" not in inspect.signature(learner).parameters:
+        raise ConfigurationError(
+            f"--data {path}: {method} needs paths of several steps under a held input, which single steps are not; leave --data out, and "
+            "they are collected from the plant"
+        )
+    return Transitions.load(path)
+
+
+def _use(env_id: str, method: str, out: Path, of_env: Mapping[str, Any]) -> str:
+    """A command that puts what was learned to use on the same problem."""
+    from wrappers.conditions import LEARNED
+
+    (name,) = [condition.name for condition in LEARNED.values() if condition.method == method]
+    words = ["safe-envs", "evaluate", env_id, "--filter", name, "--learned", str(out)]
+    for option, given in of_env.items():
+        for value in given if isinstance(given, list) else [given]:
+            words += [] if value is None else [option, str(value)]
+    return shlex.join(words)
+
+
+if __name__ == "__main__":
+    run(lambda: typer.run(identify))

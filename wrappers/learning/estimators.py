@@ -1,0 +1,175 @@
+"""Estimates of what the noise adds to the generator of a function, from one-step transitions; the drift is known."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.codegen import Components, compile_function, filled, stacked
+from safe_envs.errors import ConfigurationError
+from safe_envs.sde import ControlAffineSDE
+from wrappers.learning.network import Network
+from wrappers.learning.transitions import Transitions
+
+Estimator = Literal["printed", "centred", "martingale"]
+"""Which estimate: see `ito_part`."""
+
+Values = Callable[[Components], Any]
+"""A function b at states, from n components (B,) to (B,); a number where it is constant."""
+
+Slopes = Callable[[Components], Components]
+"""Its gradient, from n components (B,) to n of them; a number where one is constant."""
+
+_AT_ONCE = 1 << 15
+"""Successors that are looked at together, unless a point alone has more: few enough for the cache."""
+
+_BULK = 4096
+"""States at which a network is evaluated together: few enough for the cache."""
+
+_SUSPECT = 1.5
+"""Score of a drift, in standard errors, from which it does not fit the data."""
+
+_ROUNDING = 64 * np.finfo(float).eps
+"""Part of the size of a state up to which a residual is taken for a rounding error."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """An estimate at each point.
+
+    Attributes:
+        values: in the units of b per s, shape (P,).
+        deviations: their standard errors, from the spread of the sample, shape (P,); None for a single successor a point.
+    """
+
+    values: np.ndarray
+    deviations: np.ndarray | None
+
+
+def rates(model: ControlAffineSDE, data: Transitions) -> np.ndarray:
+    """f(x) + g(x) u of a model at each point under its input, in units of the states per s, shape (P, n)."""
+    rate = model.numeric(model.drift + model.input_matrix * sp.Matrix(model.inputs))
+    compiled = compile_function((*model.states, *model.inputs), tuple(rate), "arrays")
+    return stacked(compiled(*np.ascontiguousarray(data.x.T), *np.ascontiguousarray(data.u.T)), data.points)
+
+
+def by_parts(data: Transitions) -> Iterator[tuple[slice, list[np.ndarray]]]:
+    """A few points at a time, with the n components (points, K) of their successors."""
+    points = max(1, _AT_ONCE // data.repetitions)
+    for begin in range(0, data.points, points):
+        part = slice(begin, begin + points)
+        yield part, [np.ascontiguousarray(component) for component in np.moveaxis(data.successors[part], 2, 0)]
+
+
+def rounding(data: Transitions, rate: np.ndarray) -> np.ndarray:
+    """The largest residual of each state that may be a rounding error, shape (n,); arguments as for `drift_score`."""
+    return _ROUNDING * (np.abs(data.x) + np.abs(rate) * data.dt[:, None]).max(axis=0)
+
+
+def drift_score(data: Transitions, rate: np.ndarray) -> float:
+    """How far the mean steps are from a drift's, in standard errors: root mean square over points and states; 1 if it is right.
+
+    Steps without repetitions say nothing about it and score 1, and so do residuals within the rounding.
+
+    Args:
+        data: transitions under any inputs.
+        rate: f(x) + g(x) u at each point, shape (P, n).
+    """
+    expected, small = (data.x + rate * data.dt[:, None]).T, rounding(data, rate)
+    scores = np.ones((data.points, len(expected)))
+    for part, successors in by_parts(data):
+        for i, after in enumerate(successors):
+            residual = after - expected[i, part, None]
+            mean, square = residual.mean(axis=1), np.einsum("pk,pk->p", residual, residual) / data.repetitions
+            np.divide(mean**2 * data.repetitions, square, out=scores[part, i], where=square > small[i] ** 2)
+    return float(np.sqrt(scores.mean()))
+
+
+def drift_warnings(data: Transitions, rate: np.ndarray) -> tuple[str, ...]:
+    """What a user has to know where a drift does not fit the data; arguments as for `drift_score`."""
+    score = drift_score(data, rate)
+    if score < _SUSPECT:
+        return ()
+    return (
+        f"the mean steps are {score:.1f} standard errors away from those of the model's f and g, where 1 is expected: the method takes "
+        "both for known, and what is learned of the noise contains their error",
+    )
+
+
+def in_bulk(network: Network, inputs: Sequence[np.ndarray]) -> np.ndarray:
+    """The first output of a tanh network at very many states, in single precision, which is much faster.
+
+    Args:
+        network: with tanh for its activation.
+        inputs: its p inputs, components (B,).
+
+    Returns:
+        Shape (B,), to about 1e-6 of the output's scale.
+    """
+    found = np.empty(len(inputs[0]))
+    layers = [(w.T.astype(np.float32), b.astype(np.float32)) for w, b in zip(network.weights, network.biases, strict=True)]
+    for begin in range(0, len(found), _BULK):
+        part = np.stack([component[begin : begin + _BULK] for component in inputs], axis=1)
+        z = ((part - network.input_mean) / network.input_scale).astype(np.float32)
+        for weights, bias in layers[:-1]:
+            z = z @ weights
+            z += bias
+            np.tanh(z, out=z)
+        found[begin : begin + _BULK] = (z @ layers[-1][0] + layers[-1][1])[:, 0]
+    return found * network.output_scale[0] + network.output_mean[0]
+
+
+def require_estimator(name: str) -> None:
+    """Raise ConfigurationError unless there is an estimator of this name."""
+    if name not in get_args(Estimator):
+        raise ConfigurationError(f"estimator = {name!r}; allowed: {', '.join(get_args(Estimator))}")
+
+
+def ito_part(data: Transitions, rate: np.ndarray, value: Values, slopes: Slopes, estimator: Estimator = "martingale") -> Estimate:
+    """Estimate 1/2 tr(sigma sigma' b_xx) at each point, in one of three ways.
+
+    With x_j the K successors of x, and xbar = x + (f + g u) dt:
+
+    - "printed": mean[b(x_j) - b(x)]/dt - grad b(x).(f + g u), whose bias of order dt, 1/2 (f + g u)' b_xx (f + g u) dt first of all,
+      is far larger than the signal for the thesis' pendulum, and whose standard deviation is |sigma' grad b|/sqrt(K dt).
+    - "centred": mean[b(x_j) - b(xbar)]/dt, without that bias, and with the same standard deviation.
+    - "martingale": mean[b(x_j) - b(xbar) - grad b(xbar).(x_j - xbar)]/dt, without the martingale that makes up that deviation.
+      What is left is sqrt(2/K) of the value itself, for a quadratic b and one channel of noise.
+
+    The last two refer to the data's own Euler-Maruyama step: then they are free of bias for a quadratic b. For a step that was
+    integrated finer, the printed one's bias comes back in the difference between its mean and xbar.
+
+    Args:
+        data: transitions under any inputs.
+        rate: f(x) + g(x) u at each point, shape (P, n); see `rates`.
+        value: b.
+        slopes: its gradient.
+        estimator: one of the three.
+
+    Raises:
+        ConfigurationError: there is no such estimator.
+
+    Source: thesis Eq. (5.17), (5.18), whose sum runs from j = 0 where 1 is meant: one term more adds b/(K dt).
+    """
+    require_estimator(estimator)
+    origin = data.x if estimator == "printed" else data.x + rate * data.dt[:, None]
+    base = np.ascontiguousarray(origin.T)
+    level = filled(value(tuple(base)), (data.points,))
+    gradient = stacked(slopes(tuple(base)), data.points)
+    values, deviations = np.empty(data.points), np.empty(data.points)
+    for part, successors in by_parts(data):
+        shape = successors[0].shape
+        change = filled(value(tuple(c.reshape(-1) for c in successors)), (successors[0].size,)).reshape(shape) - level[part, None]
+        if estimator == "martingale":
+            for component, start, slope in zip(successors, base, gradient.T, strict=True):
+                change -= (component - start[part, None]) * slope[part, None]
+        values[part] = change.mean(axis=1)
+        deviations[part] = change.std(axis=1)
+    if estimator == "printed":
+        values -= (gradient * rate).sum(axis=1) * data.dt
+    more = data.repetitions - 1
+    return Estimate(values / data.dt, deviations / (data.dt * more**0.5) if more else None)

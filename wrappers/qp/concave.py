@@ -1,0 +1,189 @@
+"""Rows with an uncertainty that depends on the single input: each is met on an interval, into which the proposal is clipped.
+
+    min 1/2 (u - v)^2   subject to   a_i u + b_i - sqrt(q_i0 + 2 q_i1 u + q_i2 u^2) >= 0,   low <= u <= high
+
+The left-hand side c_i is concave, so that the rows and the box meet in an interval. Its ends are roots of
+(a^2 - q_2) u^2 + 2 (a b - q_1) u + b^2 - q_0 with a u + b >= 0. Where the interval is empty, the sum of squared slacks is
+convex, and its minimisers are found by bisection of its derivative.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from wrappers.qp.rows import ROUNDING, stack, total
+
+_BISECTIONS = 64
+
+Quadratic = Sequence[Any]
+"""q_0, q_1 and q_2 of a row, a positive semidefinite form of (1, u)."""
+
+
+def project_floats(
+    a: Sequence[float], b: Sequence[float], q: Sequence[Quadratic], v: float, low: float, high: float, priority: Sequence[float]
+) -> tuple[float, list[float], list[bool], bool]:
+    """Project the input of one state; see `project_arrays`."""
+    u = low if v < low else high if v > high else v
+    rows: list[tuple[float, float, Quadratic]] = list(zip(a, b, q, strict=True))
+    margin = [_margin(ai, bi, qi, u) for ai, bi, qi in rows]
+    if min(margin) >= 0.0:
+        return u, margin, [False] * len(margin), True
+    lo, hi = low, high
+    for ai, bi, qi in rows:
+        start, end = _interval(ai, bi, qi)
+        lo, hi = max(lo, start), min(hi, end)
+    if not lo <= hi:
+        found, margins, binding, feasible = project_arrays(a, b, q, np.array([v]), low, high, priority)
+        return found.item(), margins[:, 0].tolist(), binding[:, 0].tolist(), feasible.item()
+    u = lo if v < lo else hi if v > hi else v
+    margin = [_margin(ai, bi, qi, u) for ai, bi, qi in rows]
+    return u, margin, [m <= ROUNDING * _size(ai, bi, qi, u) for m, (ai, bi, qi) in zip(margin, rows, strict=True)], True
+
+
+def _margin(a: float, b: float, q: Quadratic, u: float) -> float:
+    return a * u + b - math.sqrt(max(q[0] + u * (2.0 * q[1] + u * q[2]), 0.0))
+
+
+def _size(a: float, b: float, q: Quadratic, u: float) -> float:
+    return abs(a * u) + abs(b) + math.sqrt(abs(q[0]) + abs(2.0 * q[1] * u) + q[2] * u * u)
+
+
+def _interval(a: float, b: float, q: Quadratic) -> tuple[float, float]:
+    """Where one row is met; an empty interval begins at infinity."""
+    q0, q1, q2 = q
+    empty = (math.inf, -math.inf)
+    leading, middle, last = a * a - q2, a * b - q1, b * b - q0
+    # (a b - q_1)^2 - leading last, without the products that cancel.
+    discriminant = a * a * q0 - 2.0 * a * b * q1 + b * b * q2 - (q0 * q2 - q1 * q1)
+    root = math.sqrt(max(discriminant, 0.0))
+    if leading == 0.0:
+        if a == 0.0:
+            return (-math.inf, math.inf) if b >= math.sqrt(max(q0, 0.0)) else empty
+        if middle * a <= 0.0:
+            return empty
+        end = -last / (2.0 * middle)
+        return (end, math.inf) if a > 0.0 else (-math.inf, end)
+    t = -(middle + math.copysign(root, middle))
+    ends = sorted((t / leading, last / t)) if t else [0.0, 0.0]
+    if leading > 0.0:
+        return (ends[1], math.inf) if a > 0.0 else (-math.inf, ends[0])
+    if discriminant < 0.0 or b - a * middle / leading < 0.0:
+        return empty
+    return ends[0], ends[1]
+
+
+@np.errstate(all="ignore")
+def project_arrays(
+    a: Sequence[Any], b: Sequence[Any], q: Sequence[Quadratic], v: np.ndarray, low: Any, high: Any, priority: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Project the input of each of B states.
+
+    Args:
+        a: k coefficients, each a float or an array (B,).
+        b: k offsets, likewise.
+        q: k forms, whose entries are likewise.
+        v: proposed inputs, shape (B,).
+        low: lower bound, a float.
+        high: upper bound, a float.
+        priority: k positive weights of the squared slacks.
+
+    Returns:
+        Inputs (B,), margins c_i (k, B), rows that bind or cannot be met (k, B), and whether all rows can be met (B,).
+    """
+    size = len(v)
+    slope, offset = stack(a, size), stack(b, size)
+    form = np.stack([stack([row[j] for row in q], size) for j in range(3)])
+    u = np.minimum(np.maximum(v, low), high)
+    margin = _margins(slope, offset, form, u)
+    active, feasible = np.zeros(margin.shape, dtype=bool), np.ones(size, dtype=bool)
+    acting = np.flatnonzero(~(margin >= 0.0).all(axis=0))
+    if acting.size:
+        slope, offset, form = slope[:, acting], offset[:, acting], form[:, :, acting]
+        starts, ends = _intervals(slope, offset, form)
+        lo, hi = np.maximum(starts.max(axis=0), low), np.minimum(ends.min(axis=0), high)
+        found = np.minimum(np.maximum(v[acting], lo), hi)
+        apart = np.flatnonzero(~(lo <= hi))
+        if apart.size:
+            found[apart] = _least_violating(slope[:, apart], offset[:, apart], form[:, :, apart], v[acting][apart], low, high, priority)
+        u[acting], feasible[acting] = found, lo <= hi
+        margin[:, acting] = reached = _margins(slope, offset, form, found)
+        spread = np.sqrt(abs(form[0]) + abs(2.0 * form[1] * found) + form[2] * found * found)
+        active[:, acting] = reached <= ROUNDING * (abs(slope * found) + abs(offset) + spread)
+    return u, margin, active, feasible
+
+
+def _margins(a: np.ndarray, b: np.ndarray, q: np.ndarray, u: np.ndarray) -> np.ndarray:
+    return a * u + b - np.sqrt(np.maximum(q[0] + u * (2.0 * q[1] + u * q[2]), 0.0))
+
+
+def _intervals(a: np.ndarray, b: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`_interval` for arrays (k, B), with the same formulas."""
+    q0, q1, q2 = q
+    leading, middle, last = a * a - q2, a * b - q1, b * b - q0
+    discriminant = a * a * q0 - 2.0 * a * b * q1 + b * b * q2 - (q0 * q2 - q1 * q1)
+    root = np.sqrt(np.maximum(discriminant, 0.0))
+    t = -(middle + np.copysign(root, middle))
+    first, second = np.where(t == 0.0, 0.0, t / leading), np.where(t == 0.0, 0.0, last / t)
+    first, second = np.minimum(first, second), np.maximum(first, second)
+    flat, rising = leading == 0.0, a > 0.0
+    end = -last / (2.0 * middle)
+    start = np.select([flat & rising, flat, leading < 0.0, rising], [end, -np.inf, first, second], -np.inf)
+    stop = np.select([flat & rising, flat, leading < 0.0, rising], [np.inf, end, second, np.inf], first)
+    constant = flat & (a == 0.0)
+    start, stop = np.where(constant, -np.inf, start), np.where(constant, np.inf, stop)
+    between = (discriminant >= 0.0) & (b - a * middle / leading >= 0.0)
+    met = np.select([constant, flat, leading < 0.0], [b >= np.sqrt(np.maximum(q0, 0.0)), middle * a > 0.0, between], True)
+    return np.where(met, start, np.inf), np.where(met, stop, -np.inf)
+
+
+def _least_violating(
+    a: np.ndarray, b: np.ndarray, q: np.ndarray, v: np.ndarray, low: float, high: float, priority: Sequence[float]
+) -> np.ndarray:
+    """Of the minimisers of the sum of squared slacks in the box the one nearest to v."""
+    weights = np.asarray(priority)[:, None]
+
+    def derivative(u: np.ndarray) -> np.ndarray:
+        spread = np.sqrt(np.maximum(q[0] + u * (2.0 * q[1] + u * q[2]), 0.0))
+        rate = a - np.where(spread > 0.0, (q[1] + q[2] * u) / spread, 0.0)
+        return total(weights * np.minimum(a * u + b - spread, 0.0) * rate)
+
+    ends = []
+    for rises in (np.greater_equal, np.greater):
+        lo, hi = np.full(v.shape, low, dtype=float), np.full(v.shape, high, dtype=float)
+        for _ in range(_BISECTIONS):
+            middle = 0.5 * (lo + hi)
+            beyond = rises(derivative(middle), 0.0)
+            lo, hi = np.where(beyond, lo, middle), np.where(beyond, middle, hi)
+        ends.append(0.5 * (lo + hi))
+    return np.minimum(np.maximum(v, ends[0]), ends[1])
+
+
+def majorant(q: Sequence[Sequence[Any]], low: Sequence[Any], high: Sequence[Any]) -> tuple[list[Any], Any]:
+    """A plane c_0 + c . u above sqrt([1, u]' Q [1, u]) on a box of m inputs, so that a row less the plane is on the safe side.
+
+    Its slopes are the mean differences between the faces of the box, and c_0 is as small as the corners allow: the root is
+    convex, so that it is below the plane everywhere if it is at the corners.
+
+    Args:
+        q: symmetric Q, (1 + m) x (1 + m), floats or arrays (B,).
+        low: m lower bounds.
+        high: m upper bounds.
+
+    Returns:
+        c, m entries, and c_0, of the shape of the entries of Q.
+    """
+    m = len(low)
+    corners = [[high[j] if k >> j & 1 else low[j] for j in range(m)] for k in range(2**m)]
+    roots = []
+    for corner in corners:
+        w = (1.0, *corner)
+        square: Any = sum([q[i][j] * (w[i] * w[j]) for i in range(m + 1) for j in range(m + 1)])
+        roots.append(np.sqrt(np.maximum(square, 0.0)))
+    half = 2.0 ** (m - 1)
+    slopes = [sum([r if k >> j & 1 else -r for k, r in enumerate(roots)]) / (half * (high[j] - low[j])) for j in range(m)]
+    above = [r - sum([c * e for c, e in zip(slopes, corner, strict=True)]) for r, corner in zip(roots, corners, strict=True)]
+    return slopes, np.maximum.reduce(above)
