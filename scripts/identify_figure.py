@@ -27,7 +27,7 @@ _MOST_LEVELS = 4
 _ACROSS = 4
 _SAMPLES = 20_000
 _CONSTANT = 1e-9
-_SIDE = 2.9
+_SIDE, _WIDEST_SIDE, _LEAST_WIDTH = 2.9, 3.4, 7.6
 _TINY, _HUGE = 0.02, 2e4
 
 _ESTIMATE_HANDLE = Line2D([], [], color=COLORS[0], marker="o", linestyle="", markersize=4, label="estimate at a state")
@@ -45,12 +45,13 @@ def draw(found: Identification, path: Path) -> None:
     """
     levels = _levels(found)
     rest = [function for function in found.shown if function.name not in levels]
-    shown = sorted(rest, key=lambda function: -function.size)[: _MOST - len(levels)]
+    shown = sorted(rest, key=lambda function: (-function.size, -function.error))[: _MOST - len(levels)]
     count = len(shown) + len(levels)
     down = max(math.ceil(count / _ACROSS), 1)
     across = max(math.ceil(count / down), 1)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(max(_SIDE * across, 7.6), 1.3 + _SIDE * down))
+        side = max(_SIDE, min(_WIDEST_SIDE, _LEAST_WIDTH / across))
+        figure = Figure(figsize=(max(side * across, _LEAST_WIDTH), 1.4 + side * down))
         axes = list(figure.subplots(down, across, squeeze=False).flat)
         handles: dict[Line2D | Patch, None] = {}
         for panel, function in zip(axes, shown, strict=False):
@@ -125,8 +126,8 @@ def _draw_level(axes: Axes, found: Identification, index: int, function: Functio
 def _tidy(axes: Axes) -> None:
     """A square panel with few ticks, so that long numbers do not meet."""
     axes.set_box_aspect(1)
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(4))
+    axes.xaxis.set_major_locator(MaxNLocator(3))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
     axes.ticklabel_format(style="plain", useOffset=False)
 
 

@@ -43,6 +43,7 @@ _ERRORS = {
 }
 """What the held-out errors of each method are."""
 
+_ROUNDING = 1e-8
 _PACKAGES = ("safe-envs", "numpy", "scipy", "sympy", "torch")
 _NAMED = re.compile(r"(f|g|covariance|C)[\[(](\w+)(?:, (\w+))?[\])]")
 
@@ -170,10 +171,8 @@ def print_report(console: Console, found: Identification) -> None:
     title.append(f"\n{describe_system(found.problem)}", style="not bold")
     console.print(title, soft_wrap=True, highlight=False)
     source = "" if found.data is None else f" of {found.data}"
-    _say(
-        console,
-        f"\nLearned in {_seconds(record.seconds)} from {record.transitions} transitions{source} that last {record.observed:g} s together",
-    )
+    amount = f"{record.transitions:,} transitions{source} that last {record.observed:,.6g} s together"
+    _say(console, f"\nLearned in {_seconds(record.seconds)} from {amount}")
     _say(console, f"Settings: {', '.join(f'{name} = {_setting(value)}' for name, value in record.settings.items())}")
     if record.errors:
         _head(console, "Held-out errors", _ERRORS[found.learned.method])
@@ -286,7 +285,9 @@ def _setting(value: Any) -> str:
 
 
 def percent(share: float) -> str:
-    """A share with two digits, without an exponent for a large one."""
+    """A share with two digits, without an exponent for a large one; a rounding error is only bounded."""
+    if share < _ROUNDING:
+        return f"< {100 * _ROUNDING:g} %"
     return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
 
 

@@ -21,13 +21,12 @@ FIRST_ORDER = "first-order"
 
 
 class Terms(Protocol):
-    """Numbers that a row takes from something learned: they stand in its expressions as symbols of their own.
+    """Numbers that a row takes from something learned: they stand in its expressions as symbols of their own."""
 
-    Attributes:
-        symbols: what stands for them.
-    """
-
-    symbols: tuple[sp.Symbol, ...]
+    @property
+    def symbols(self) -> tuple[sp.Symbol, ...]:
+        """What stands for them."""
+        ...
 
     def floats(self, x: Sequence[float]) -> Sequence[float]:
         """The values at one state, given by components."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import sympy as sp
 
 from safe_envs.barrier import Barrier
-from safe_envs.calculus import derivatives, drift_derivative, generator, gradient, input_derivative, relative_degree, tidied
+from safe_envs.calculus import derivatives, drift_derivative, generator, gradient, input_derivative, ito_term, relative_degree, tidied
 from safe_envs.errors import ConfigurationError, RelativeDegreeError
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.base import FIRST_ORDER, AffineConstraint, Condition, chain_of
@@ -183,7 +183,7 @@ class DDSCBF(LearnedCondition):
         part = self.learned.generators[self._number_of(model, barrier)]
         eta = derivatives(model, barrier.expression, part.degree, drift_derivative)
         term, *slopes = part.symbols
-        a = input_derivative(model, eta[-2])
+        a: Any = input_derivative(model, eta[-2])
         if slopes:
             a = a + sp.Matrix([slopes]) * model.input_matrix
         return AffineConstraint(tuple(a[0, j] for j in range(model.m)), eta[-1] + term - margin, (barrier.expression,), terms=part)
@@ -254,17 +254,19 @@ class BayesianSCBF(LearnedCondition):
             )
         if self.sampling_margin == FIRST_ORDER:
             raise ConfigurationError("the robust form has no sampling margin of first order; give a number")
-        slope = gradient(model, barrier.expression)
         mean = self.learned.mean_system
-        a = input_derivative(mean, barrier.expression)
-        offset = drift_derivative(mean, barrier.expression) + self._least_ito_term(barrier)
-        slopes = [slope[0, i] for i in range(model.n)]
+        slopes: Any = gradient(mean, barrier.expression)
+        a: Any = input_derivative(mean, barrier.expression)
         z = self.quantile(sum(1 for entry in slopes if entry != 0))
-        total = sp.zeros(model.m + 1)
-        for entry, form in zip(slopes, self.learned.variance_expressions(), strict=True):
-            total = total + entry**2 * form
-        uncertainty = tuple(sp.Float(z * z, 17) * total[i, j] for i in range(model.m + 1) for j in range(i, model.m + 1))
-        return AffineConstraint(tuple(a[0, j] for j in range(model.m)), offset, (barrier.expression,), uncertainty=uncertainty)
+        total: Any = sp.zeros(mean.m + 1)
+        for slope, form in zip(slopes, self.learned.variance_expressions(), strict=True):
+            total = total + z * z * slope**2 * form
+        return AffineConstraint(
+            tuple(a[0, j] for j in range(mean.m)),
+            drift_derivative(mean, barrier.expression) + self._least_ito_term(mean, barrier),
+            (barrier.expression,),
+            uncertainty=tuple(total[i, j] for i in range(mean.m + 1) for j in range(i, mean.m + 1)),
+        )
 
     def quantile(self, outputs: int) -> float:
         """The z of the robust form, for a barrier that depends on a number of states."""
@@ -284,6 +286,10 @@ class BayesianSCBF(LearnedCondition):
         """Probability that its intervals miss a sigma."""
         return 1.0 - (self.simultaneous or 0.0) - self.delta_theta
 
-    def _least_ito_term(self, barrier: Barrier) -> sp.Expr:
+    def _least_ito_term(self, system: ControlAffineSDE, barrier: Barrier) -> sp.Expr:
         """1/2 tr(sigma sigma' h_xx), for the simultaneous form the least that the intervals of the sigma_i allow."""
-        return self.learned.ito_term(barrier.expression, None if self.simultaneous is None else self.delta_sigma)
+        if self.simultaneous is None:
+            return ito_term(system, barrier.expression)
+        curvatures = [sp.diff(barrier.expression, s, 2) / 2 for s in system.states]
+        intervals = self.learned.diffusion.sigma_intervals(self.delta_sigma).tolist()
+        return sp.Add(*[sp.Min(c * low**2, c * high**2) for c, (low, high) in zip(curvatures, intervals, strict=True)])

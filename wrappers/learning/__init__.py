@@ -17,7 +17,7 @@ __all__ = ["METHODS", "LearnedFileError", "LearnedModel", "Progress", "Record", 
 METHODS = {
     "learned-hocbf": ("residual", "ResidualModel", "learn_residual"),
     "ddscbf": ("generator", "GeneratorModel", "learn_generator"),
-    "bayesian": ("posterior", "Posterior", "identify"),
+    "bayesian": ("bayesian", "Posterior", "identify"),
 }
 """Module, model and function of each method; imported when they are needed, since they are heavy."""
 

@@ -175,8 +175,8 @@ def _correlation(white: np.ndarray) -> np.ndarray:
 def identify(
     problem: SafetyProblem,
     *,
-    starts: int = 10,
-    steps: int = 100,
+    starts: int = 1000,
+    steps: int = 1,
     repetitions: int = 100,
     degree: int | None = None,
     prior: float = 1e4,

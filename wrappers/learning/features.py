@@ -60,9 +60,9 @@ class Features:
                 center, half = 0.5 * (low + high), 0.5 * (high - low)
                 found.append([((state - center) / half if center else state / half, self.degree)])
         coordinates = [entry for entries in found for entry in entries]
-        powers = [p for p in itertools.product(*[range(min(most, self.degree) + 1) for _, most in coordinates]) if sum(p) <= self.degree]
-        powers.sort(key=lambda p: (sum(p), [-k for k in p]))
-        return tuple(sp.Mul(*[c**k for (c, _), k in zip(coordinates, p, strict=True)]) for p in powers)
+        chosen = [c for total in range(self.degree + 1) for c in itertools.combinations_with_replacement(range(len(coordinates)), total)]
+        allowed = [c for c in chosen if all(c.count(k) <= most for k, (_, most) in enumerate(coordinates))]
+        return tuple(sp.Mul(*[coordinates[k][0] for k in c]) for c in allowed)
 
     @property
     def count(self) -> int:

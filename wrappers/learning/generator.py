@@ -252,9 +252,8 @@ def learn_generator(
             generators.append(found)
     told(1.0)
     record = Record(data.count, data.observed, time.perf_counter() - begin, data.seed, errors, settings, drift_warnings(data, rate))
-    signature = Signature.of(problem)
-    # A diffusion belongs to no barrier.
-    return GeneratorModel(replace(signature, barriers=()) if diffusion else signature, record, tuple(generators), diffusion)
+    signature = replace(Signature.of(problem), **({"barriers": ()} if diffusion else {}))
+    return GeneratorModel(signature, record, tuple(generators), diffusion)
 
 
 def _next_order(

@@ -12,12 +12,13 @@ import sympy as sp
 from scipy.stats import chi2
 
 from safe_envs.codegen import compile_function, stacked
+from safe_envs.errors import ConfigurationError
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
 from wrappers.learning.base import LearnedModel, Record
 from wrappers.learning.features import Features
 from wrappers.learning.files import Signature
-from wrappers.learning.regression import Gaussian, sigma_map, sigma_samples
+from wrappers.learning.regression import Gaussian, sigma_map, sigma_quantile, sigma_samples
 
 _SIGNIFICANT = 0.999
 _POINTS = 256
@@ -55,6 +56,20 @@ class Diffusion:
         """The most probable constant levels, (n,). A state without any scatter has none, where the prior would say beta/N."""
         levels = sigma_map(self.squares, np.full(len(self.squares), self.count), self.alpha, self.beta)
         return np.where(self.squares > 0, levels, 0.0)
+
+    def sigma_intervals(self, delta: float) -> np.ndarray:
+        """Intervals that hold all sigma_i of constant, independent noise but for a probability delta, shape (n, 2).
+
+        Raises:
+            ConfigurationError: the noise varies with the state, or is correlated.
+        """
+        if self.features is not None or not np.array_equal(self.correlation, np.eye(len(self.squares))):
+            raise ConfigurationError(
+                "intervals of sigma are known for constant noise of independent states only; ask for confidence instead"
+            )
+        tail = 0.5 * delta / len(self.squares)
+        levels = np.array([tail, 1.0 - tail])
+        return np.array([sigma_quantile(levels, s, self.count, self.alpha, self.beta) if s > 0 else np.zeros(2) for s in self.squares])
 
     def variances(self, x: np.ndarray) -> np.ndarray:
         """Estimated variances per s at states (B, n), without the prior of sigma, shape (B, n)."""
@@ -170,6 +185,11 @@ class Posterior(LearnedModel):
     def system(self) -> ControlAffineSDE:
         """The most probable system, in the problem's own symbols."""
         return self._system(self.weights.mean, self.diffusion.matrix())
+
+    @cached_property
+    def mean_system(self) -> ControlAffineSDE:
+        """The system with the mean of all weights, those of the pruned entries too."""
+        return self._system(self.mean, self.diffusion.matrix())
 
     def sample(self, rng: np.random.Generator) -> ControlAffineSDE:
         """A system drawn from the posterior. What is pruned stays 0."""

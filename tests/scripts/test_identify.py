@@ -1,0 +1,230 @@
+"""`safe-envs identify` as a person types it."""
+
+from __future__ import annotations
+
+import shlex
+
+import numpy as np
+import pytest
+
+from agents.problems import load_problem
+from scripts.identify import read_settings
+from scripts.identify_report import Function, percent, unit_of
+from tests.scripts.conftest import strictly
+from wrappers.learning import METHODS, learner_of, load_learned
+from wrappers.learning.collect import collect
+
+SMALL = ("--set", "starts=10", "--set", "steps=20", "--set", "repetitions=10")
+BAYESIAN = ("CubicSDEDisk-v0", "--method", "bayesian", *SMALL, "--set", "degree=2")
+NETWORK = ("Pendulum-v0", "--method", "ddscbf", "--set", "points=20", "--set", "repetitions=50")
+DIRECT = ("StochasticDubins-v0", "--method", "ddscbf", "--set", "points=20", "--set", "repetitions=50")
+RESIDUAL = ("DubinsDisk-v0", "--method", "learned-hocbf", "--set", "states=60", "--set", "epochs=3", "--set", "hidden=8,4")
+QUICK = {"bayesian": BAYESIAN, "ddscbf": NETWORK, "learned-hocbf": RESIDUAL}
+
+
+@pytest.fixture
+def identify(safe_envs_command):
+    """Runs `safe-envs identify`."""
+    return lambda *arguments: safe_envs_command("identify", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "texts"),
+    [
+        (
+            BAYESIAN,
+            (
+                "safe_envs/CubicSDEDisk-v0 | method bayesian | seed 0",
+                "noise sigma_1 = 0.2, sigma_2 = 0.2, model = plant",
+                "from 4,000 transitions that last 40 s together",
+                "points = 400, repetitions = 10, degree = 2",
+                "error  noise  standardised",
+                "covariance[x_1, x_1]",
+                "0 in truth and estimate: g[x_1, u], covariance[x_1, x_2]",
+                "--filter bayesian-scbf --learned out.npz",
+            ),
+        ),
+        (NETWORK, ("way = network", "M_1(h), standard error of labels", "--filter ddscbf --learned out.npz")),
+        (DIRECT, ("way = direct", "C(x, x)", "m^2/s", "C(theta, theta)")),
+        (RESIDUAL, ("hidden = 8,4", "rms", "q95", "h Delta_1", "h Sigma_omega", "--filter learned-hocbf --learned out.npz")),
+    ],
+)
+def test_the_report_names_what_was_learned(identify, arguments, texts):
+    status, out, err = identify(*arguments, "--out", "out.npz")
+    assert (status, err) == (0, "")
+    for text in (*texts, "Learned in", "Held-out errors", "Truth against estimate", "1000 fresh states", "Written to out.npz"):
+        assert text in out
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_file_loads_again(identify, method, tmp_path):
+    env_id, *rest = QUICK[method]
+    assert identify(env_id, *rest, "--seed", 3, "--json", "out.json", "--out", "out.npz")[0] == 0
+    model = load_learned(tmp_path / "out.npz", load_problem(env_id), method)
+    document = strictly("out.json")
+    assert document["sha256"] == model.sha256
+    assert document["record"]["transitions"] == model.record.transitions
+    assert model.record.seed == 3
+
+
+def test_json_holds_all_of_it(identify):
+    assert identify(*BAYESIAN, "--noise", "0.1,0.3", "--json", "out.json", "--out", "out.npz")[0] == 0
+    document = strictly("out.json")
+    assert document["config"] == {
+        "env_id": "safe_envs/CubicSDEDisk-v0",
+        "options": {"noise": [0.1, 0.3]},
+        "method": "bayesian",
+        "seed": 0,
+        "data": None,
+    }
+    assert set(document["versions"]) == {"python", "safe-envs", "numpy", "scipy", "sympy", "torch"}
+    assert document["record"]["settings"]["repetitions"] == 10
+    functions = {entry["name"]: entry for entry in document["functions"]}
+    assert functions["covariance[x_2, x_2]"]["size"] == pytest.approx(0.09)
+    assert functions["f[x_1]"]["relative"] == pytest.approx(functions["f[x_1]"]["error"] / functions["f[x_1]"]["size"])
+    assert functions["g[x_1, u]"]["relative"] is None
+
+
+def test_the_same_seed_gives_the_same_file(identify, tmp_path):
+    hashes = []
+    for seed in (1, 1, 2):
+        assert identify(*DIRECT, "--seed", seed, "--json", "out.json", "--out", "out.npz")[0] == 0
+        hashes.append([function["error"] for function in strictly(tmp_path / "out.json")["functions"]])
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+def test_learning_from_a_file_of_data(identify, tmp_path):
+    path = "some data.npz"
+    collect(load_problem("CubicSDEDisk-v0"), 40, 5, seed=7).save(tmp_path / path)
+    status, out, err = identify("CubicSDEDisk-v0", "--method", "bayesian", "--data", path, "--out", "out.npz")
+    assert (status, err) == (0, "")
+    assert "transitions of some data.npz that last" in out
+    assert load_learned("out.npz", load_problem("CubicSDEDisk-v0")).record.seed == 7
+
+
+def test_what_is_proposed_keeps_the_options_of_the_env(identify):
+    given = ["--noise", "0.1", "--plant", "sigma_1=0.3", "--dt", "0.02"]
+    status, out, _ = identify(*BAYESIAN, *given, "--out", "my file.npz")
+    assert status == 0
+    expected = ["safe-envs", "evaluate", "CubicSDEDisk-v0", "--filter", "bayesian-scbf", "--learned", "my file.npz", *given]
+    assert shlex.split(out.splitlines()[-1]) == expected
+
+
+def test_warnings_are_printed_as_notes(identify):
+    status, out, err = identify(*BAYESIAN[:-2], "--noise", "0.01", "--set", "degree=1", "--out", "out.npz")
+    assert (status, err) == (0, "")
+    assert "Note: x_2: features of degree 1 miss" in out
+
+
+def test_what_cannot_be_compared_is_said(identify):
+    """Of the second derivative's noise part there is no truth where f and g are not known."""
+    learned = ("--set", "way=network", "--set", "points=20", "--set", "repetitions=20", "--model", "v=1.2")
+    status, out, _ = identify("StochasticDubins-v0", "--method", "ddscbf", *learned, "--plot", "out.svg", "--out", "out.npz")
+    assert status == 0
+    assert "Truth against estimate" not in out
+    assert "differ in f or g" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "texts"),
+    [
+        (BAYESIAN, ("f[x_1]: error", "truth (1/s)", "sigma of x_2", "samples of the posterior")),
+        ((*BAYESIAN, "--set", "diffusion_degree=1"), ("covariance[x_2, x_2]: error",)),
+        (NETWORK, ("M_1(h): error", "estimate at a state")),
+        (DIRECT, ("C(y, y): error",)),
+        (("QuadrotorAltitude-v0", *RESIDUAL[1:]), ("h Delta_2: truth 0", "estimates at all states")),
+    ],
+)
+def test_the_picture_is_drawn(identify, arguments, texts, tmp_path):
+    assert identify(*arguments, "--plot", "out.svg", "--out", "out.npz")[0] == 0
+    picture = (tmp_path / "out.svg").read_text()
+    for text in texts:
+        assert text in picture
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("Nothing-v0", "--method", "bayesian"), "unknown env"),
+        (("Pendulum-v0", "--method", "bayes"), "did you mean 'bayesian'?"),
+        ((*BAYESIAN, "--set", "degre=2"), "did you mean 'degree'?"),
+        ((*BAYESIAN, "--set", "seed=2"), "no setting 'seed'"),
+        ((*BAYESIAN, "--set", "degree"), "give NAME=VALUE"),
+        ((*BAYESIAN, "--set", "prior=wide"), "'wide' is not a number"),
+        ((*BAYESIAN[:-2], "--set", "degree=1.5"), "give a whole number"),
+        ((*BAYESIAN, "--set", "prior=-1"), "must be positive"),
+        ((*RESIDUAL[:-2], "--set", "hidden=8,wide"), "hidden=100,30"),
+        ((*RESIDUAL[:-2], "--noise", "0.1"), "noise"),
+        ((*NETWORK, "--set", "estimator=guess"), "allowed: printed, centred, martingale"),
+        ((*NETWORK, "--set", "way=3"), "way = '3'"),
+        ((*NETWORK[:-4], "--set", "points=3"), "at least 10"),
+        ((*BAYESIAN, "--seed", "-1"), "seed = -1"),
+        ((*BAYESIAN, "--data", "missing.npz"), "does not exist"),
+        ((*BAYESIAN, "--data", "damaged.npz"), "truncated"),
+        ((*BAYESIAN, "--data", "other.npz"), "of another problem"),
+        (("Pendulum-v0", "--method", "ddscbf", "--data", "model.npz"), "holds"),
+        ((*RESIDUAL, "--data", "other.npz"), "leave --data out"),
+        ((*BAYESIAN, "--json", "missing/found.json"), "does not exist"),
+        ((*BAYESIAN, "--plot", "found.xyz"), "unknown format"),
+        ((*BAYESIAN, "--out", "missing/out.npz"), "the folder"),
+        ((*BAYESIAN, "--out", "."), "it is a folder"),
+    ],
+)
+def test_errors_of_the_user_end_with_status_2(identify, arguments, message, tmp_path):
+    (tmp_path / "damaged.npz").write_bytes(b"PK")
+    pendulum = load_problem("Pendulum-v0")
+    collect(pendulum, 5, 2).save(tmp_path / "other.npz")
+    learner_of("ddscbf")(pendulum, points=5, repetitions=2, way="direct").save(tmp_path / "model.npz")
+    status, out, err = identify("--out", "out.npz", *arguments)
+    assert status == 2
+    assert message in " ".join(err.split())
+    assert "Traceback" not in err
+    assert not out
+    assert not (tmp_path / "out.npz").exists()
+
+
+@pytest.mark.parametrize("left_out", ["--method", "--out"])
+def test_what_is_required(identify, left_out):
+    given = {"--method": "bayesian", "--out": "out.npz"}
+    del given[left_out]
+    status, _, err = identify("Pendulum-v0", *[word for pair in given.items() for word in pair])
+    assert status == 2
+    assert left_out in err
+
+
+def test_settings_are_read_by_the_kind_of_the_argument():
+    residual = read_settings("learned-hocbf", learner_of("learned-hocbf"), ["hidden=7", "label_dt=1e-2", "states=50"])
+    assert residual == {"hidden": [7], "label_dt": 0.01, "states": 50}
+    assert read_settings("ddscbf", learner_of("ddscbf"), ["way=direct", "points=20"]) == {"way": "direct", "points": 20}
+    assert read_settings("bayesian", learner_of("bayesian"), ["degree=2"]) == {"degree": 2}
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("f[v]", "m/s^2"),
+        ("f[p]", "1/s"),
+        ("g[v, u]", "m/s^2/N"),
+        ("g[p, w]", ""),
+        ("g[v, r]", "m/rad^2"),
+        ("covariance[v, z]", "m^2/s^2"),
+        ("C(v, v)", "m^2/s^3"),
+        ("h Delta_1", ""),
+        ("M_1(h)", ""),
+    ],
+)
+def test_units(name, unit):
+    assert unit_of(name, {"v": "m/s", "z": "m", "p": "", "u": "N", "w": "1/s", "r": "rad^2/s^2"}) == unit
+
+
+def test_errors_of_a_function():
+    found = Function("f", "", np.array([3.0, -4.0]), np.array([3.0, -3.0]))
+    assert found.size == pytest.approx(12.5**0.5)
+    assert found.error == pytest.approx(0.5**0.5)
+    assert found.relative == pytest.approx(0.2)
+    assert found.largest == 1.0
+    zero = np.zeros(2)
+    assert Function("f", "", zero, zero).vanishes
+    assert Function("f", "", zero, np.ones(2)).relative is None
+    assert Function("f", "", 1e-17 * np.ones(2), np.ones(2)).relative is None
+    assert [percent(share) for share in (0.0, 1e-3, 0.2, 12.0)] == ["< 1e-06 %", "0.1 %", "20 %", "1200 %"]

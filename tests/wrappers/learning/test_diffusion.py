@@ -1,0 +1,145 @@
+"""The covariance of the noise, and what a system makes of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs.calculus import ito_term
+from safe_envs.codegen import compile_function
+from safe_envs.systems.cubic import x_1, x_2
+from tests.conftest import problem_of
+from wrappers.learning.collect import collect
+from wrappers.learning.diffusion import LearnedDiffusion, covariances
+from wrappers.learning.estimators import rates
+
+CORRELATED = [[0.3, 0.0], [0.2, 0.15]]
+VARYING = [[0.3 + 0.1 * x_1, 0], [0.2, 0.1 * x_2]]
+
+
+def made_up(diffusion):
+    """The disk with another plant: its model still believes the noise of the thesis."""
+    problem = problem_of("safe_envs/CubicSDEDisk-v0")
+    return replace(problem, plant=replace(problem.plant, diffusion=diffusion))
+
+
+def learned(problem, points=300, repetitions=1000, inputs=None, seed=0):
+    data = collect(problem, points, repetitions, inputs or [tuple(np.zeros(len(problem.inputs)))], seed=seed)
+    return LearnedDiffusion.learn(problem, data, rates(problem.model, data))
+
+
+def entry_at(problem, expression, x):
+    return np.broadcast_to(compile_function(problem.plant.states, [expression], "arrays")(*x.T)[0], len(x))
+
+
+def largest_error(problem, diffusion):
+    """Of each entry over the region, as part of the largest entry there."""
+    x = np.random.default_rng(5).uniform(*np.array(problem.exploration.region).T, (500, problem.plant.n))
+    truth = problem.plant.numeric(problem.plant.diffusion * problem.plant.diffusion.T)
+    pairs = [(entry_at(problem, a, x), entry_at(problem, b, x)) for a, b in zip(truth, diffusion.covariance, strict=True)]
+    return max(np.abs(a - b).max() for a, b in pairs) / max(np.abs(a).max() for a, _ in pairs)
+
+
+@pytest.mark.parametrize(
+    ("problem", "degrees"),
+    [
+        (problem_of("safe_envs/Pendulum-v0"), {(0, 0): 2}),
+        (problem_of("safe_envs/CubicSDE-v0"), {(1, 1): 2}),
+        (problem_of("safe_envs/ACCGap-v0"), {(0, 0): 0, (1, 1): 0}),
+        (made_up(CORRELATED), {(0, 0): 0, (0, 1): 0, (1, 1): 0}),
+        (made_up(VARYING), {(0, 0): 2, (0, 1): 1, (1, 1): 2}),
+    ],
+    ids=["pendulum", "cubic", "gap", "correlated", "varying"],
+)
+def test_the_covariance_is_recovered_with_its_degree(problem, degrees):
+    diffusion, errors = learned(problem)
+    assert {(e.row, e.column): e.features.degree for e in diffusion.entries} == degrees
+    # An estimate has a relative deviation of sqrt(2/1000) = 4.5 %; the corner of a quadratic in 300 points a few tenths of it.
+    assert largest_error(problem, diffusion) < 0.02
+    assert len(errors) == len(degrees)
+    assert all(0 < error < 0.1 for error in errors.values())
+
+
+def test_constant_entries_are_the_mean_of_the_estimates():
+    problem = problem_of("safe_envs/ACCGap-v0")
+    data = collect(problem, 300, 1000, [(0.0,)])
+    rate = rates(problem.model, data)
+    diffusion, _ = LearnedDiffusion.learn(problem, data, rate)
+    np.testing.assert_allclose(
+        np.array(diffusion.covariance, dtype=float), np.diag(np.diag(covariances(data, rate).mean(axis=0))), rtol=1e-12
+    )
+
+
+def test_covariances_have_their_law():
+    problem = made_up(CORRELATED)
+    data = collect(problem, 400, 100, [(-1.0,)], seed=4)
+    found, truth = covariances(data, rates(problem.model, data)), np.array(CORRELATED) @ np.array(CORRELATED).T
+    law = np.sqrt((truth**2 + np.outer(truth.diagonal(), truth.diagonal())) / 100)
+    scores = (found - truth) / law
+    assert (np.abs(scores.mean(axis=0)) < 5 / 20).all()
+    assert (np.abs((scores**2).mean(axis=0) - 1) < 5 * np.sqrt(2 / 400) + 12 / 100).all()
+
+
+@pytest.mark.parametrize("diffusion", [CORRELATED, VARYING, [[0.3], [0.2]]], ids=["constant", "varying", "one channel"])
+def test_the_factor_of_the_system_returns_the_covariance(diffusion):
+    problem = made_up(diffusion)
+    found, _ = learned(problem, 100, 100)
+    system = found.system(problem.model)
+    product = system.diffusion * system.diffusion.T
+    difference = product - found.covariance
+    assert not difference.free_symbols
+    assert np.abs(np.array(difference, dtype=float)).max() < 1e-12
+    assert system.drift == problem.model.drift
+    h = problem.barriers[0].expression
+    assert all(power.exp.is_Integer for power in ito_term(system, h).atoms(sp.Pow))
+
+
+def test_a_singular_covariance_keeps_a_real_factor():
+    problem = made_up([[0.3], [0.2]])
+    found, _ = learned(problem, 50, 100)
+    assert all(entry.is_real for entry in found.system(problem.model).diffusion)
+
+
+def test_a_variance_that_comes_out_negative_cancels():
+    problem = problem_of("safe_envs/Pendulum-v0")
+    found, _ = learned(problem, 60, 20, seed=1)
+    system = found.system(problem.model)
+    assert system.diffusion * system.diffusion.T == found.covariance
+    assert system.diffusion.cols == 1
+
+
+def test_no_noise_gives_no_entries():
+    problem = problem_of("safe_envs/ACC-v0").configured(noise=0.0)
+    steps = collect(problem, 50, 1)
+    rate = rates(problem.model, steps)
+    exact = replace(steps, successors=(steps.x + rate * steps.dt[:, None])[:, None])
+    found, errors = LearnedDiffusion.learn(problem, exact, rate)
+    assert (found.entries, errors) == ((), {})
+    assert found.system(problem.model).diffusion == sp.zeros(3, 1)
+
+
+def test_passive_logs_are_enough():
+    problem = made_up(VARYING)
+    data = collect(problem, 200, 1, steps=100, seed=2)
+    found, _ = LearnedDiffusion.learn(problem, data, rates(problem.model, data))
+    # 40000 single squares, each with a relative deviation of sqrt(2): under 1 % for a constant, a few times that for a quadratic.
+    assert largest_error(problem, found) < 0.06
+
+
+def test_few_points_fit_a_constant():
+    found, errors = learned(problem_of("safe_envs/ACCGap-v0"), 3, 100)
+    assert [e.features.degree for e in found.entries] == [0, 0]
+    assert errors == {}
+
+
+def test_restored_is_the_same():
+    problem = made_up(VARYING)
+    found, _ = learned(problem, 100, 100)
+    again = LearnedDiffusion.restored(problem.plant.states, found.details(), found.to_arrays())
+    assert again.covariance == found.covariance
+    damaged = {name: weights[1:] for name, weights in found.to_arrays().items()}
+    with pytest.raises(ValueError, match="weights for"):
+        LearnedDiffusion.restored(problem.plant.states, found.details(), damaged)

@@ -1,0 +1,137 @@
+"""The estimates against their sampling laws; tolerances are five standard deviations of the statistic that is compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from safe_envs.calculus import gradient
+from safe_envs.codegen import compile_function
+from safe_envs.errors import ConfigurationError
+from tests.conftest import problem_of
+from wrappers.learning.collect import collect
+from wrappers.learning.estimators import drift_score, drift_warnings, in_bulk, ito_part, rates
+from wrappers.learning.network import Network
+
+K = 200
+P = np.array([[np.sqrt(3), 1.0], [1.0, np.sqrt(3)]])
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    return problem_of("safe_envs/Pendulum-v0")
+
+
+@pytest.fixture(scope="module")
+def data(pendulum):
+    return collect(pendulum, 400, K, inputs=[(-3.0,), (0.0,)], seed=3)
+
+
+def estimated(problem, data, estimator):
+    h = problem.barriers[0].expression
+    value, slopes = (compile_function(problem.model.states, e, "arrays") for e in ([h], list(gradient(problem.model, h))))
+    return ito_part(data, rates(problem.model, data), lambda x: value(*x)[0], lambda x: slopes(*x), estimator)
+
+
+def truth(data):
+    return -np.sqrt(3) * 0.01 * data.x[:, 0] ** 2
+
+
+def near_one(squares):
+    return abs(squares.mean() - 1) < 5 * np.sqrt(2 / len(squares))
+
+
+def test_rates_are_those_of_the_model_under_the_input(pendulum, data):
+    expected = np.column_stack((data.x[:, 1], 10 / 0.7 * np.sin(data.x[:, 0]) + data.u[:, 0] / 0.49))
+    np.testing.assert_allclose(rates(pendulum.model, data), expected, rtol=1e-13)
+
+
+def test_martingale_has_a_relative_deviation_of_sqrt_two_over_n(pendulum, data):
+    found = estimated(pendulum, data, "martingale")
+    relative = found.values / truth(data) - 1
+    # Rounding of h, about 1e-17, over dt shows only where the signal is as good as 0.
+    seen = np.abs(truth(data)) > 1e-9
+    assert seen.mean() > 0.9
+    relative = relative[seen] / np.sqrt(2 / K)
+    assert abs(relative.mean()) < 5 / np.sqrt(len(relative))
+    # The fourth moment of a mean of K squares of normals exceeds that of a normal by 12/K of its own.
+    assert near_one(relative**2)
+
+
+def test_centred_has_no_bias_but_the_whole_martingale(pendulum, data):
+    found = estimated(pendulum, data, "centred")
+    moved = data.x + rates(pendulum.model, data) * data.dt[:, None]
+    law = 0.1 * np.abs(data.x[:, 0]) * np.abs(2 * moved @ P)[:, 0] / np.sqrt(K * data.dt)
+    scores = (found.values - truth(data)) / law
+    typical = law > 1e-3
+    assert abs(scores[typical].mean()) < 5 / np.sqrt(typical.sum())
+    assert near_one(scores[typical] ** 2)
+
+
+@pytest.mark.parametrize("estimator", ["centred", "martingale"])
+def test_standard_errors_are_those_of_the_sample(pendulum, data, estimator):
+    found = estimated(pendulum, data, estimator)
+    seen = np.abs(truth(data)) > 1e-5
+    scores = (found.values - truth(data))[seen] / found.deviations[seen]
+    # A mean of K squares of normals is skewed, and its deviation estimated from itself: up to 20/K more than of a t-score.
+    assert abs((scores**2).mean() - 1) < 5 * np.sqrt(2 / seen.sum()) + 20 / K
+
+
+def test_printed_is_biased_by_half_the_curvature_along_the_step(pendulum):
+    data = collect(pendulum, 8, 100_000, inputs=[(0.0,)], seed=1)
+    found = estimated(pendulum, data, "printed")
+    f = rates(pendulum.model, data)
+    bias = -data.dt * np.einsum("pi,ij,pj->p", f, P, f)
+    assert (np.abs(found.values - truth(data) - bias) < 5 * found.deviations).all()
+    assert np.median(np.abs(bias) / found.deviations) > 20
+
+
+def test_printed_averages_the_successors_alone(pendulum, data):
+    few = collect(pendulum, 20, 4, inputs=[(0.0,)], seed=2)
+    f = rates(pendulum.model, few)
+    still = replace(few, successors=np.repeat((few.x + f * few.dt[:, None])[:, None], 4, axis=1))
+    bias = -few.dt * np.einsum("pi,ij,pj->p", f, P, f)
+    # One term h(x) more, as printed, would add h/(4 dt), some 5 per s.
+    np.testing.assert_allclose(estimated(pendulum, still, "printed").values, bias, atol=1e-12)
+
+
+def test_a_single_successor_gives_no_standard_error(pendulum):
+    found = estimated(pendulum, collect(pendulum, 50, seed=0), "martingale")
+    assert found.deviations is None
+    assert found.values.shape == (100,)
+
+
+def test_parts_do_not_matter(pendulum, data):
+    some = replace(data, x=data.x[300:], u=data.u[300:], successors=data.successors[300:], dt=data.dt[300:])
+    whole, part = (estimated(pendulum, d, "martingale").values for d in (data, some))
+    np.testing.assert_array_equal(whole[300:], part)
+
+
+def test_functions_that_are_constant_have_no_ito_part(data):
+    found = ito_part(data, np.zeros_like(data.x), lambda x: 2.0, lambda x: (0.0, 0.0))
+    assert (found.values == 0).all()
+
+
+def test_unknown_estimators_are_refused(pendulum, data):
+    with pytest.raises(ConfigurationError, match="printed, centred, martingale"):
+        estimated(pendulum, data, "median")
+
+
+def test_a_wrong_drift_is_told(pendulum, data):
+    right, wrong = pendulum.model, pendulum.model.with_parameters(l=0.5)
+    assert abs(drift_score(data, rates(right, data)) - 1) < 0.1
+    assert not drift_warnings(data, rates(right, data))
+    (warning,) = drift_warnings(data, rates(wrong, data))
+    assert "standard errors away" in warning
+
+
+def test_bulk_evaluation_of_a_network_is_the_network():
+    rng = np.random.default_rng(0)
+    sizes = (2, 100, 30, 1)
+    weights = tuple(rng.normal(size=(b, a)) / np.sqrt(a) for a, b in zip(sizes, sizes[1:], strict=False))
+    biases = tuple(rng.normal(size=len(w)) for w in weights)
+    network = Network(weights, biases, "tanh", np.array([3.0, -1.0]), np.array([2.0, 0.5]), np.array([10.0]), np.array([50.0]))
+    x = [3 + 2 * rng.normal(size=10_001), -1 + 0.5 * rng.normal(size=10_001)]
+    np.testing.assert_allclose(in_bulk(network, x), network.arrays(x)[0], atol=1e-5 * 50)
