@@ -58,9 +58,9 @@ def _tables(first: Sequence[Flags], second: Sequence[Flags]) -> list[Table]:
 
 def _compare(first: str, second: str, tables: Sequence[Table], confidence: float) -> Comparison:
     both, only_first, only_second, neither = (sum(counts) for counts in zip(*tables, strict=True))
-    mean = [count / len(tables) for count in (both, only_first, only_second, neither)]
-    low, high = paired_difference_interval(*mean, confidence)
-    if len(tables) > 1:
+    repeats = len(tables)
+    low, high = paired_difference_interval(both / repeats, only_first / repeats, only_second / repeats, neither / repeats, confidence)
+    if repeats > 1:
         differences = [(table[1] - table[2]) / sum(table) for table in tables]
         low, high = repeated_interval(differences, (low, high), confidence, (-1.0, 1.0))
     return {
@@ -74,5 +74,5 @@ def _compare(first: str, second: str, tables: Sequence[Table], confidence: float
         "ci_low": low,
         "ci_high": high,
         # Repeats on the same episodes are no independent pairs.
-        "mcnemar_p": mcnemar_p(only_first, only_second) if len(tables) == 1 else None,
+        "mcnemar_p": mcnemar_p(only_first, only_second) if repeats == 1 else None,
     }

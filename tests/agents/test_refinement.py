@@ -31,7 +31,7 @@ def test_rates_are_those_of_evaluations_with_smaller_periods():
                 assert refined[key][i] == row[key]
     for row in answer.rows:
         assert row["change"] == pytest.approx((row["safe"][2] - row["safe"][1]) / 40)
-        table = answer.evaluations[2].flags[row["filter"]].table(answer.evaluations[1].flags[row["filter"]])
+        table = answer.evaluations[2].flags[row["filter"]][0].table(answer.evaluations[1].flags[row["filter"]][0])
         assert table[0] + table[1] == row["safe"][2]
         assert table[0] + table[2] == row["safe"][1]
         assert (row["change_low"], row["change_high"]) == paired_difference_interval(*table, 0.8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 
 import numpy as np
 import pytest
@@ -26,6 +27,16 @@ QUICK = {"bayesian": BAYESIAN, "ddscbf": NETWORK, "learned-hocbf": RESIDUAL}
 def identify(safe_envs_command):
     """Runs `safe-envs identify`."""
     return lambda *arguments: safe_envs_command("identify", *arguments)
+
+
+@pytest.fixture(scope="module")
+def bad_files(tmp_path_factory):
+    """A folder of files that cannot be learned from."""
+    folder, pendulum = tmp_path_factory.mktemp("bad"), load_problem("Pendulum-v0")
+    (folder / "damaged.npz").write_bytes(b"PK")
+    collect(pendulum, 5, 2).save(folder / "other.npz")
+    learner_of("ddscbf")(pendulum, points=5, repetitions=2, way="direct").save(folder / "model.npz")
+    return folder
 
 
 @pytest.mark.parametrize(
@@ -170,11 +181,8 @@ def test_the_picture_is_drawn(identify, arguments, texts, tmp_path):
         ((*BAYESIAN, "--out", "."), "it is a folder"),
     ],
 )
-def test_errors_of_the_user_end_with_status_2(identify, arguments, message, tmp_path):
-    (tmp_path / "damaged.npz").write_bytes(b"PK")
-    pendulum = load_problem("Pendulum-v0")
-    collect(pendulum, 5, 2).save(tmp_path / "other.npz")
-    learner_of("ddscbf")(pendulum, points=5, repetitions=2, way="direct").save(tmp_path / "model.npz")
+def test_errors_of_the_user_end_with_status_2(identify, bad_files, arguments, message, tmp_path):
+    shutil.copytree(bad_files, tmp_path, dirs_exist_ok=True)
     status, out, err = identify("--out", "out.npz", *arguments)
     assert status == 2
     assert message in " ".join(err.split())

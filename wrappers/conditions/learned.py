@@ -131,8 +131,8 @@ class LearnedHOCBF(LearnedCondition):
         a = input_derivative(model, eta[r - 1])
         deltas, sigmas = part.symbols[:r], part.symbols[r:]
         error = part.eps(self.level).tolist() if self.eps is None else [self.eps] * (r + m)
-        margin = sum(ki * e for ki, e in zip(k[1:], error[:r], strict=True))
-        offset = sum(ki * e for ki, e in zip(k, eta, strict=True)) + sum(ki * d for ki, d in zip(k[1:], deltas, strict=True)) - margin
+        margin: Any = sum(ki * e for ki, e in zip(k[1:], error[:r], strict=True))
+        offset: Any = sum(ki * e for ki, e in zip(k, eta, strict=True)) + sum(ki * d for ki, d in zip(k[1:], deltas, strict=True)) - margin
         form = {(j, j): sp.Float(m * e * e, 17) for j, e in enumerate(error[r:], start=1)}
         uncertainty = tuple(form.get((i, j), sp.Integer(0)) for i in range(m + 1) for j in range(i, m + 1))
         return AffineConstraint(
@@ -254,12 +254,15 @@ class BayesianSCBF(LearnedCondition):
             )
         if self.sampling_margin == FIRST_ORDER:
             raise ConfigurationError("the robust form has no sampling margin of first order; give a number")
-        mean = self.learned.mean_system
+        # What is pruned may yet differ from 0 a little: a statement about all systems that the data allow has to keep it.
+        mean, covariance = (
+            (model, self.learned.weights.covariance) if self.simultaneous is None else (self.learned.mean_system, self.learned.covariance)
+        )
         slopes: Any = gradient(mean, barrier.expression)
         a: Any = input_derivative(mean, barrier.expression)
         z = self.quantile(sum(1 for entry in slopes if entry != 0))
         total: Any = sp.zeros(mean.m + 1)
-        for slope, form in zip(slopes, self.learned.variance_expressions(), strict=True):
+        for slope, form in zip(slopes, self.learned.variance_expressions(covariance), strict=True):
             total = total + z * z * slope**2 * form
         return AffineConstraint(
             tuple(a[0, j] for j in range(mean.m)),

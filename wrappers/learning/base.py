@@ -102,6 +102,11 @@ class LearnedModel(ABC):
         try:
             details = dict(content.details)
             record = details.pop("record")
-            return cls.restored(problem, Record(**{**record, "warnings": tuple(record["warnings"])}), details, content.arrays)
+            model = cls.restored(problem, Record(**{**record, "warnings": tuple(record["warnings"])}), details, content.arrays)
+        except LearnedFileError:
+            raise
         except (KeyError, TypeError, ValueError) as error:
             raise LearnedFileError(f"the file of {content.kind} is incomplete: {error}. Learn again") from error
+        # What may differ from the problem, such as its noise, stays that of the data. The models are frozen.
+        object.__setattr__(model, "signature", content.signature)
+        return model

@@ -45,12 +45,12 @@ class Prior:
     """What is believed before any data.
 
     Attributes:
-        weights: variance of each weight.
+        weights: variance of each weight, (n,).
         alpha: shape of the inverse-gamma distribution of a constant sigma.
         beta: its scale, in the units of sigma.
     """
 
-    weights: float
+    weights: np.ndarray
     alpha: float
     beta: float
 
@@ -138,7 +138,7 @@ def _diffusion(rows: Rows, residual: np.ndarray, count: float, features: Feature
     return Diffusion(squares, count, _correlation(white), prior.alpha, prior.beta, features, variance)
 
 
-def _regressed(phi: np.ndarray, targets: np.ndarray, count: np.ndarray, prior: float) -> Gaussian:
+def _regressed(phi: np.ndarray, targets: np.ndarray, count: np.ndarray, prior: np.ndarray) -> Gaussian:
     """Weights of variances per s, from mean squares (G, n) whose own noise is told by what the fit leaves."""
     weight = np.sqrt(count)[:, None]
     solution, _, rank, _ = np.linalg.lstsq(phi * weight, targets * weight, rcond=None)
@@ -179,7 +179,7 @@ def identify(
     steps: int = 1,
     repetitions: int = 100,
     degree: int | None = None,
-    prior: float = 1e4,
+    prior: float = 10.0,
     diffusion_degree: int = 0,
     alpha: float = 1.0,
     beta: float = 1.0,
@@ -199,7 +199,8 @@ def identify(
         steps: of each.
         repetitions: K of each step.
         degree: of the features; None for the highest up to 3 with at most 200 weights for each state and two rows for each.
-        prior: variance of each weight before, on states scaled to [-1, 1] and inputs scaled by the largest that was tried.
+        prior: variance of each weight before, where each state is scaled from its region to [-1, 1], each input by the largest that
+            was tried, and time is in s.
         diffusion_degree: of the features on which the variances of the noise are regressed; 0 for constant noise.
         alpha: shape of the inverse-gamma prior of a constant sigma.
         beta: its scale, in the units of sigma.
@@ -227,14 +228,23 @@ def identify(
     chosen = _degree(problem, len(rows.x)) if degree is None else degree
     features = Features.of(problem, chosen)
     varying = Features.of(problem, diffusion_degree) if diffusion_degree else None
+    half = 0.5 * np.ptp(problem.exploration.region, axis=1)
     largest = abs(rows.u).max(axis=0)
     scale = 1.0 / np.where(largest > 0, largest, 1.0)
-    design, believed = rows.design(features, scale), Prior(prior, alpha, beta)
+    design, believed = rows.design(features, scale), Prior(prior * half**2, alpha, beta)
     errors = _held_out(data, features, scale, varying, believed)
     found = fit(rows, design, varying, believed)
     names = [u.name for u in problem.plant.inputs]
     told = (
-        *weaknesses(features, names, rows.x, rows.u, design, found.learned, prior),
+        *weaknesses(
+            features,
+            names,
+            rows.x,
+            rows.u,
+            design,
+            Gaussian(found.learned.mean / half[:, None], found.learned.covariance / (half**2)[:, None, None]),
+            prior,
+        ),
         *misfits(features, found.misfit, found.variation),
     )
     for text in told:

@@ -30,6 +30,9 @@ _AT_ONCE = 1 << 15
 _BULK = 4096
 """States at which a network is evaluated together: few enough for the cache."""
 
+_BLOCK = 64
+"""States in a matrix product: few enough for BLAS to stay on one thread, since threads that wait for each other take far longer."""
+
 _SUSPECT = 1.5
 """Score of a drift, in standard errors, from which it does not fit the data."""
 
@@ -114,12 +117,13 @@ def in_bulk(network: Network, inputs: Sequence[np.ndarray]) -> np.ndarray:
     layers = [(w.T.astype(np.float32), b.astype(np.float32)) for w, b in zip(network.weights, network.biases, strict=True)]
     for begin in range(0, len(found), _BULK):
         part = np.stack([component[begin : begin + _BULK] for component in inputs], axis=1)
-        z = ((part - network.input_mean) / network.input_scale).astype(np.float32)
+        z = np.zeros((-(-len(part) // _BLOCK), _BLOCK, len(inputs)), dtype=np.float32)
+        z.reshape(-1, len(inputs))[: len(part)] = (part - network.input_mean) / network.input_scale
         for weights, bias in layers[:-1]:
             z = z @ weights
             z += bias
             np.tanh(z, out=z)
-        found[begin : begin + _BULK] = (z @ layers[-1][0] + layers[-1][1])[:, 0]
+        found[begin : begin + _BULK] = (z @ layers[-1][0] + layers[-1][1]).reshape(-1)[: len(part)]
     return found * network.output_scale[0] + network.output_mean[0]
 
 

@@ -21,7 +21,7 @@ from wrappers.learning.base import LearnedModel, Progress, Record
 from wrappers.learning.collect import Step, collect
 from wrappers.learning.diffusion import LearnedDiffusion
 from wrappers.learning.estimators import Estimator, drift_warnings, in_bulk, ito_part, rates, require_estimator
-from wrappers.learning.files import Content, LearnedFileError, Signature
+from wrappers.learning.files import LearnedFileError, Signature
 from wrappers.learning.network import Network
 from wrappers.learning.training import train
 from wrappers.learning.transitions import Transitions
@@ -130,15 +130,6 @@ class GeneratorModel(LearnedModel):
             return {"way": "direct", "entries": self.diffusion.details()}
         coordinates = [str(c) for c in self.generators[0].coordinates]
         return {"way": "network", "coordinates": coordinates, "degrees": [g.degree for g in self.generators]}
-
-    @classmethod
-    def from_content(cls, content: Content, problem: SafetyProblem) -> Self:
-        """Make the model of a file again, with the signature of the file: the problem's noise may be another.
-
-        Raises:
-            LearnedFileError: it is of another system, or incomplete.
-        """
-        return replace(super().from_content(content, problem), signature=content.signature)
 
     @classmethod
     def restored(cls, problem: SafetyProblem, record: Record, details: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Self:

@@ -212,21 +212,24 @@ class Posterior(LearnedModel):
         """Shape (n, 1 + m, 1 + m, M)."""
         return (len(self.mean), 1 + len(self.inputs), 1 + len(self.inputs), self.features.count)
 
-    @cached_property
-    def _scaled_covariance(self) -> np.ndarray:
-        """Of the weights with the scales of the inputs in them, axes (n, 1 + m, 1 + m, M, M)."""
+    def _scaled(self, covariance: np.ndarray) -> np.ndarray:
+        """A covariance of the weights with the scales of the inputs in it, axes (n, 1 + m, 1 + m, M, M)."""
         n, parts, _, count = self._blocks
         scale = np.array([1.0, *self.input_scale])
-        split = self.covariance.reshape(n, parts, count, parts, count).transpose(0, 1, 3, 2, 4)
+        split = covariance.reshape(n, parts, count, parts, count).transpose(0, 1, 3, 2, 4)
         return split * np.outer(scale, scale)[:, :, None, None]
 
     @cached_property
     def _stretched(self) -> np.ndarray:
         """The same as one matrix (M, n (1 + m)^2 M), so that a batch costs one product of matrices."""
-        return np.ascontiguousarray(np.moveaxis(self._scaled_covariance, 3, 0).reshape(self.features.count, -1))
+        return np.ascontiguousarray(np.moveaxis(self._scaled(self.covariance), 3, 0).reshape(self.features.count, -1))
 
-    def variance_expressions(self) -> tuple[sp.ImmutableMatrix, ...]:
-        """The covariances of `drift_variance` as n matrices (1 + m) x (1 + m) of expressions, multiplied out."""
+    def variance_expressions(self, covariance: np.ndarray) -> tuple[sp.ImmutableMatrix, ...]:
+        """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m) of expressions, multiplied out.
+
+        Args:
+            covariance: of the weights, (n, D, D): `covariance` or, given what is pruned, `weights.covariance`.
+        """
         first, second = np.triu_indices(self.features.count)
         phi = self.features.expressions
         products = [sp.expand(phi[k] * phi[j]) for k, j in zip(first, second, strict=True)]
@@ -236,7 +239,7 @@ class Posterior(LearnedModel):
             weights = (block + block.T)[first, second] * twice
             return sp.expand(sp.Add(*[sp.Float(w, 17) * p for w, p in zip(weights.tolist(), products, strict=True)]))
 
-        return tuple(sp.ImmutableMatrix([[entry(block) for block in row] for row in state]) for state in self._scaled_covariance)
+        return tuple(sp.ImmutableMatrix([[entry(block) for block in row] for row in state]) for state in self._scaled(covariance))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """See `LearnedModel.arrays`."""

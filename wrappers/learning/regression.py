@@ -87,8 +87,8 @@ class Gaussian:
         return self.mean + np.einsum("ide,ie->id", vectors, draws)
 
 
-def posterior(design: np.ndarray, y: np.ndarray, variance: np.ndarray, prior: float) -> Gaussian:
-    """Distribution of the weights of y = design w + noise under the prior N(0, prior I), for every output.
+def posterior(design: np.ndarray, y: np.ndarray, variance: np.ndarray, prior: np.ndarray | float) -> Gaussian:
+    """Distribution of the weights of y = design w + noise under the prior N(0, prior_i I), for every output i.
 
     The whitened rows are reduced by QR and an SVD, not by their Gram matrix: directions that the data do not show keep the
     prior, even where an output is nearly free of noise.
@@ -98,7 +98,7 @@ def posterior(design: np.ndarray, y: np.ndarray, variance: np.ndarray, prior: fl
         y: (P, n).
         variance: of the noise, (n,) or (P, n), positive, in units of y squared. Outputs whose variances differ by a factor
             only share the decomposition.
-        prior: variance of each weight, positive.
+        prior: variance of each weight, positive, one for all outputs or (n,).
 
     Raises:
         ConfigurationError: a variance is not positive and finite.
@@ -106,17 +106,17 @@ def posterior(design: np.ndarray, y: np.ndarray, variance: np.ndarray, prior: fl
     Source: thesis Eq. (6.7), where the noise variance is printed as sigma^2/K for data that are divided by dt: the callers
     here pass sigma^2/(K dt).
     """
-    spread = np.broadcast_to(np.asarray(variance, dtype=float), y.shape)
-    if not (np.isfinite(spread).all() and (spread > 0).all() and np.isfinite(prior) and prior > 0):
+    spread, believed = np.broadcast_to(np.asarray(variance, dtype=float), y.shape), np.broadcast_to(prior, y.shape[1:])
+    if not (np.isfinite(spread).all() and (spread > 0).all() and np.isfinite(believed).all() and (believed > 0).all()):
         raise ConfigurationError(f"the variances of the noise and of the prior ({prior!r}) must be positive and finite")
     ratio = spread / spread[:, :1]
     if (np.ptp(ratio, axis=0) <= _SAME_SHAPE * ratio[0]).all():
-        return _shared(design, y, spread[:, 0], ratio[0], prior)
-    parts = [_shared(design, y[:, [i]], spread[:, i], np.ones(1), prior) for i in range(y.shape[1])]
+        return _shared(design, y, spread[:, 0], ratio[0], believed)
+    parts = [_shared(design, y[:, [i]], spread[:, i], np.ones(1), believed[[i]]) for i in range(y.shape[1])]
     return Gaussian(np.concatenate([p.mean for p in parts]), np.concatenate([p.covariance for p in parts]))
 
 
-def _shared(design: np.ndarray, y: np.ndarray, variance: np.ndarray, ratio: np.ndarray, prior: float) -> Gaussian:
+def _shared(design: np.ndarray, y: np.ndarray, variance: np.ndarray, ratio: np.ndarray, prior: np.ndarray) -> Gaussian:
     """The same where the noise of output i has the variance `variance` (P,) times `ratio` (n,)."""
     count = design.shape[1]
     reduced = np.asarray(np.linalg.qr(np.hstack((design, y)) / np.sqrt(variance)[:, None], mode="r"))
@@ -125,7 +125,7 @@ def _shared(design: np.ndarray, y: np.ndarray, variance: np.ndarray, ratio: np.n
     size[: len(singular)] = singular
     seen = np.zeros((count, y.shape[1]))
     seen[: len(singular)] = left.T[: len(singular)] @ reduced[:, count:]
-    precision = size**2 / ratio[:, None] + 1.0 / prior
+    precision = size**2 / ratio[:, None] + 1.0 / prior[:, None]
     mean = (seen.T * size / ratio[:, None] / precision) @ right
     return Gaussian(mean, np.einsum("ki,nk,kj->nij", right, 1.0 / precision, right, optimize=True))
 

@@ -67,7 +67,7 @@ def test_the_paired_form_of_the_thesis_is_the_same_posterior():
     spread_f = noise * (u_1**2 + u_2**2) / (repetitions * dt * (u_1 - u_2) ** 2)
     spread_g = 2 * noise / (repetitions * dt * (u_1 - u_2) ** 2)
     # The weights of g are for the input in units of `size`, and so is their prior.
-    f, g = posterior(phi, y_f, spread_f, 1e4), posterior(phi, y_g * size, spread_g * size**2, 1e4)
+    f, g = posterior(phi, y_f, spread_f, 10.0), posterior(phi, y_g * size, spread_g * size**2, 10.0)
     assert found.mean == pytest.approx(np.hstack((f.mean, g.mean)), rel=1e-8, abs=1e-10)
     count = found.features.count
     assert found.covariance[:, :count, :count] == pytest.approx(f.covariance, rel=1e-8)
@@ -176,7 +176,7 @@ def test_the_truth_is_within_what_is_known(cubic: Posterior):
 def test_variances_of_the_drift_are_those_of_draws(gap: Posterior):
     x = draw_states(acc_gap(), 3, np.random.default_rng(0))
     variance = gap.drift_variance(x)
-    expressions = gap.variance_expressions()
+    expressions = gap.variance_expressions(gap.covariance)
     for i in range(2):
         symbolic = values(expressions[i], gap.features.states, x).reshape(3, 2, 2)
         assert symbolic == pytest.approx(variance[:, i], rel=1e-6)
@@ -190,7 +190,7 @@ def test_what_is_pruned_is_left_out_of_the_rest():
     found = identify(CUBIC, data=collect(CUBIC, 300, 10, inputs=[[1.0], [2.0]]), degree=1)
     assert found.pruned[0, 0]
     rows = Rows.of(collect(CUBIC, 300, 10, inputs=[[1.0], [2.0]]))
-    alone = posterior(rows.design(found.features, found.input_scale)[:, :3], rows.rate, found.diffusion.variances(rows.x) / 0.1, 1e4)
+    alone = posterior(rows.design(found.features, found.input_scale)[:, :3], rows.rate, found.diffusion.variances(rows.x) / 0.1, 10.0)
     assert found.weights.mean[0, :3] == pytest.approx(alone.mean[0], rel=1e-6)
     assert found.weights.covariance[0, :3, :3] == pytest.approx(alone.covariance[0], rel=1e-5)
 
@@ -256,11 +256,11 @@ def test_the_degree_fits_the_data(cubic: Posterior):
 
 def test_the_record_and_the_progress():
     parts: list[float] = []
-    found = identify(CUBIC, starts=20, steps=2, repetitions=3, seed=4, progress=parts.append)
+    found = identify(CUBIC, starts=20, steps=2, repetitions=3, seed=4, prior=1e4, progress=parts.append)
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
     assert (found.record.transitions, found.record.seed) == (240, 4)
     assert found.record.observed == pytest.approx(2.4)
     assert found.signature == Signature.of(CUBIC)
-    same = identify(CUBIC, starts=20, steps=2, repetitions=3, seed=4)
+    same = identify(CUBIC, starts=20, steps=2, repetitions=3, seed=4, prior=1e4)
     assert np.array_equal(found.mean, same.mean)

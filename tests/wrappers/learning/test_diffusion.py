@@ -131,7 +131,7 @@ def test_passive_logs_are_enough():
 
 def test_few_points_fit_a_constant():
     found, errors = learned(problem_of("safe_envs/ACCGap-v0"), 3, 100)
-    assert [e.features.degree for e in found.entries] == [0, 0]
+    assert {e.features.degree for e in found.entries} == {0}
     assert errors == {}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -130,7 +131,7 @@ def test_a_wrong_drift_is_told(pendulum, data):
 def test_bulk_evaluation_of_a_network_is_the_network():
     rng = np.random.default_rng(0)
     sizes = (2, 100, 30, 1)
-    weights = tuple(rng.normal(size=(b, a)) / np.sqrt(a) for a, b in zip(sizes, sizes[1:], strict=False))
+    weights = tuple(rng.normal(size=(b, a)) / np.sqrt(a) for a, b in itertools.pairwise(sizes))
     biases = tuple(rng.normal(size=len(w)) for w in weights)
     network = Network(weights, biases, "tanh", np.array([3.0, -1.0]), np.array([2.0, 0.5]), np.array([10.0]), np.array([50.0]))
     x = [3 + 2 * rng.normal(size=10_001), -1 + 0.5 * rng.normal(size=10_001)]

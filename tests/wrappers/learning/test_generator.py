@@ -132,7 +132,7 @@ def test_angles_go_through_the_chain_rule():
     model = learn_generator(problem, points=40, repetitions=50, way="network")
     terms, x = model.generators[0], states_in(problem, 30)
     assert len(terms.coordinates) > problem.plant.n
-    turned = x + [0.0, 0.0, 2 * np.pi]
+    turned = x + np.array([0.0, 0.0, 2 * np.pi])
     for a, b in zip(terms.arrays(tuple(x.T)), terms.arrays(tuple(turned.T)), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(a).max())
 
@@ -173,7 +173,7 @@ def test_only_noise_may_differ_from_what_was_learned_of(top, gap, first_order, d
 def test_other_coordinates_are_refused(top, first_order, tmp_path):
     first_order.save(tmp_path / "model.npz")
     coordinates = tuple(2 * s for s in top.plant.states)
-    other = replace(top, exploration=replace(top.exploration, coordinates=coordinates))
+    other = replace(top, explored=replace(top.explored, coordinates=coordinates))
     with pytest.raises(LearnedFileError, match="coordinates"):
         GeneratorModel.from_content(load(tmp_path / "model.npz"), other)
 
