@@ -78,8 +78,10 @@ class Program:
 
     @property
     def plain(self) -> bool:
-        """Whether the rows are all there is: no demand of a reciprocal condition, no margin, no uncertainty, no goal."""
-        return self.clf is None and all(c.demand is None and c.change is None and c.uncertainty is None for c in self.constraints)
+        """Whether the rows are all there is: no demand of a reciprocal condition, no margin, no goal; uncertain only for one input."""
+        return self.clf is None and all(
+            c.demand is None and c.change is None and (c.uncertainty is None or self.model.m == 1) for c in self.constraints
+        )
 
     @property
     def terms(self) -> list[Terms]:
@@ -122,7 +124,10 @@ class Solver:
 
     def one_row(self, x: Sequence[Any], u: Sequence[Any]) -> Decision:
         """Solve a plain program of one row; raises as `solve`."""
-        *a, b = self._rows(*self._with_terms(x))
+        values = self._rows(*self._with_terms(x))
+        if self._uncertain:
+            return self._one_uncertain_row(values, u)
+        *a, b = values
         p = self._program
         if self._flavour == "floats":
             action, margin, active, feasible = one_row.project_floats(a, b, u, p.low, p.high, p.weights)
@@ -133,6 +138,14 @@ class Solver:
         met = np.count_nonzero(feasible) == len(feasible)
         slack = np.zeros(len(margin)) if met else np.where(feasible, 0.0, -margin)
         return Decision(action, (margin,), (active,), feasible, (slack,), 0, u)
+
+    def _one_uncertain_row(self, values: Components, u: Sequence[Any]) -> Decision:
+        a, b, *form = values
+        p = self._program
+        project = concave.project_floats if self._flavour == "floats" else concave.project_arrays
+        action, margin, active, feasible = project((a,), (b,), (form,), u[0], p.low[0], p.high[0], p.priorities)
+        self._require_finite((margin[0], *form))
+        return Decision((action,), tuple(margin), tuple(active), feasible, (self._choose(feasible, 0.0, -margin[0]),), 0, u)
 
     def solve(self, x: Sequence[Any], u: Sequence[Any]) -> Decision:
         """Solve any program.
@@ -255,14 +268,25 @@ class Solver:
 
     def _on_the_safe_side(self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components]) -> tuple[list[Any], list[Any]]:
         """Affine rows that are met only where the uncertain ones are, in the box."""
-        a, b, width = list(a), list(b), self._m + 1
-        place = {pair: k for k, pair in enumerate(itertools.combinations_with_replacement(range(width), 2))}
+        a, b = list(a), list(b)
         for i, form in forms.items():
-            q = [[form[place[min(j, k), max(j, k)]] for k in range(width)] for j in range(width)]
-            slopes, constant = concave.majorant(q, self._program.low, self._program.high)
+            slopes, constant = self._planes[i] if i in self._planes else self._plane(form)
             a[i] = [aj - cj for aj, cj in zip(a[i], slopes, strict=True)]
             b[i] = b[i] - constant
         return a, b
+
+    def _plane(self, form: Components) -> tuple[list[Any], Any]:
+        """What `wrappers.qp.concave.majorant` puts above the uncertainty of a row."""
+        width = self._m + 1
+        place = {pair: k for k, pair in enumerate(itertools.combinations_with_replacement(range(width), 2))}
+        q = [[form[place[min(j, k), max(j, k)]] for k in range(width)] for j in range(width)]
+        return concave.majorant(q, self._program.low, self._program.high)
+
+    @cached_property
+    def _planes(self) -> dict[int, tuple[list[Any], Any]]:
+        """Those that are the same at every state."""
+        forms = {i: self._program.constraints[i].uncertainty or () for i in self._uncertain}
+        return {i: self._plane(tuple(map(float, form))) for i, form in forms.items() if all(e.is_number for e in form)}
 
     def _cause(self, a: Sequence[Any], b: Sequence[Any], u: Sequence[Any], active: Sequence[Any], inside: dict[int, Any]) -> Any:
         """The active row whose half-space is furthest from the proposed input; one that means nothing is further than any."""

@@ -36,8 +36,10 @@ from wrappers.learning.base import Record
 from wrappers.learning.bayesian import identify
 from wrappers.learning.collect import draw_states
 from wrappers.learning.files import LearnedFileError, Signature
-from wrappers.learning.generator import GeneratorModel, learn_generator
-from wrappers.learning.residual import ResidualModel, learn_residual
+from wrappers.learning.generator import GeneratorModel, LearnedGenerator, learn_generator
+from wrappers.learning.network import Network
+from wrappers.learning.regression import Gaussian
+from wrappers.learning.residual import LearnedResidual, ResidualModel
 from wrappers.proved import proved_bound
 from wrappers.verify import verify
 
@@ -69,14 +71,24 @@ def rotors():
     return problem_of("safe_envs/Quadrotor-v0")
 
 
+def some_network(rng, inputs, outputs, activation):
+    """As training might have left it; none of these tests asks what it is good for."""
+    weights, biases = (rng.normal(size=(12, inputs)), rng.normal(size=(outputs, 12)) / 12), (rng.normal(size=12), rng.normal(size=outputs))
+    return Network(weights, biases, activation, np.zeros(inputs), np.ones(inputs), np.zeros(outputs), np.full(outputs, 0.3))
+
+
 @pytest.fixture(scope="module")
 def residual(disk):
-    return learn_residual(disk, states=200, hidden=(20,), epochs=5)
+    rng, coordinates = np.random.default_rng(0), disk.exploration.coordinates
+    network, heldout = some_network(rng, len(coordinates), 3, "relu"), abs(rng.normal(size=(40, 3))) * 0.05
+    return ResidualModel(Signature.of(disk), NO_RECORD, (LearnedResidual(disk.plant.states, coordinates, 2, network, heldout),))
 
 
 @pytest.fixture(scope="module")
 def network(top):
-    return learn_generator(top, points=30, repetitions=30)
+    coordinates = top.exploration.coordinates
+    network = some_network(np.random.default_rng(1), len(coordinates), 1, "tanh")
+    return GeneratorModel(Signature.of(top), NO_RECORD, (LearnedGenerator(top.plant.states, coordinates, (network,)),))
 
 
 @pytest.fixture(scope="module")
@@ -165,7 +177,7 @@ def situations(problem, count, seed=0):
     return draw_states(problem, count, rng), rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, (count, len(low)))
 
 
-def assert_same_decisions(problem, one, other, count=300, tolerance=1e-9):
+def assert_same_decisions(problem, one, other, count=200, tolerance=1e-9):
     """In both flavours; relative to the box, and to what the margins reach."""
     x, u = situations(problem, count)
     width = np.ptp(problem.box, axis=1)
@@ -187,13 +199,14 @@ def assert_same_decisions(problem, one, other, count=300, tolerance=1e-9):
 def test_the_most_probable_system_is_filtered_as_if_it_were_known(request, name):
     problem = request.getfixturevalue(name)
     learned = request.getfixturevalue("posterior" if name == "cubic" else "gap_posterior")
-    for margin in ("none", 0.02):
+    for margin in ("none", 0.02) if name == "cubic" else ("none",):
         ours = SafetyFilter.for_problem(problem, BayesianSCBF(learned, sampling_margin=margin))
         known = SafetyFilter(learned.system, [(problem.barriers[0], SCBF(sampling_margin=margin))], problem.box)
         assert_same_decisions(problem, ours, known, tolerance=1e-12)
-    stiff = [SCBF(sampling_margin="first-order"), BayesianSCBF(learned, sampling_margin="first-order")]
-    known = SafetyFilter(learned.system, [(problem.barriers[0], stiff[0])], problem.box, dt=problem.dt)
-    assert_same_decisions(problem, SafetyFilter.for_problem(problem, stiff[1]), known, tolerance=1e-12)
+    if name == "cubic":
+        ours = SafetyFilter.for_problem(problem, BayesianSCBF(learned, sampling_margin="first-order"))
+        known = SafetyFilter(learned.system, [(problem.barriers[0], SCBF(sampling_margin="first-order"))], problem.box, dt=problem.dt)
+        assert_same_decisions(problem, ours, known, tolerance=1e-12)
 
 
 def curved_barrier(cubic):
@@ -208,92 +221,74 @@ def linear_form(learned, x, u):
     return np.hstack([phi, *(learned.input_scale[j] * u[:, [j]] * phi for j in range(u.shape[1]))])
 
 
-def robust_rows(learned, barrier, x, u, ito, z):
-    """mean - z deviation of A h for weights of the posterior, and the two."""
-    system, design = learned.system, linear_form(learned, x, u)
-    slopes = values(system, [sp.diff(barrier.expression, s) for s in system.states], x)
-    mean = (slopes * (design @ learned.mean.T)).sum(axis=1) + ito
-    deviation = np.sqrt((slopes**2 * np.einsum("bd,nde,be->bn", design, learned.covariance, design)).sum(axis=1))
-    return mean - z * deviation, mean, deviation
+def slopes_of(learned, barrier, x):
+    return values(learned.system, [sp.diff(barrier.expression, s) for s in learned.system.states], x)
+
+
+def curvatures_of(learned, barrier, x):
+    return values(learned.system, [sp.diff(barrier.expression, s, 2) for s in learned.system.states], x)
+
+
+def robust_row(learned, law, barrier, x, u, z):
+    """mean - z deviation of L_f h + L_g h u, for weights of a Gaussian law."""
+    design, slopes = linear_form(learned, x, u), slopes_of(learned, barrier, x)
+    mean = (slopes * (design @ law.mean.T)).sum(axis=1)
+    spread = np.stack([((design @ c) * design).sum(axis=1) for c in law.covariance], axis=1)
+    return mean - z * np.sqrt((slopes**2 * spread).sum(axis=1))
 
 
 def least_ito(learned, barrier, x, intervals):
     """The least of 1/2 sum_i sigma_i^2 d^2 h/dx_i^2 over the corners of the intervals."""
-    curvatures = values(learned.system, [sp.diff(barrier.expression, s, 2) for s in learned.system.states], x)
+    curvatures = curvatures_of(learned, barrier, x)
     return np.min([0.5 * curvatures @ np.square(corner) for corner in itertools.product(*intervals)], axis=0)
 
 
 @pytest.mark.parametrize("which", ["disk", "curved"])
 def test_the_robust_row_is_mean_less_deviations(cubic, posterior, which):
-    if which == "curved":
-        cubic = replace(cubic, barriers=(curved_barrier(cubic),))
-    barrier, (x, u) = cubic.barriers[0], situations(cubic, 3000)
-    weights = 2 * posterior.mean.shape[1]
-    intervals = posterior.diffusion.sigma_intervals(0.05)
-    assert (intervals[:, 0] < posterior.diffusion.sigma).all()
-    assert (intervals[:, 1] > posterior.diffusion.sigma).all()
-    fixed = np.column_stack([posterior.diffusion.sigma] * 2)
+    problem = cubic if which == "disk" else replace(cubic, barriers=(curved_barrier(cubic),))
+    barrier, (x, u) = problem.barriers[0], situations(problem, 700)
+    everything, kept = Gaussian(posterior.mean, posterior.covariance), posterior.weights
+    all_sure = math.sqrt(stats.chi2.ppf(0.95, 2 * posterior.mean.shape[1]))
+    intervals, fixed = posterior.diffusion.sigma_intervals(0.05), np.column_stack([posterior.diffusion.sigma] * 2)
+    assert (intervals[:, 0] < fixed[:, 0]).all()
+    assert (intervals[:, 1] > fixed[:, 1]).all()
     cases = [
-        (BayesianSCBF(posterior, confidence=0.97), stats.norm.ppf(0.97), fixed),
-        (BayesianSCBF(posterior, confidence=0.3), 0.0, fixed),
-        (BayesianSCBF(posterior, simultaneous=0.9), math.sqrt(stats.chi2.ppf(0.95, weights)), intervals),
-        (BayesianSCBF(posterior, simultaneous=0.9, sampling_margin=0.1), math.sqrt(stats.chi2.ppf(0.95, weights)), intervals),
+        (BayesianSCBF(posterior, confidence=0.97), kept, stats.norm.ppf(0.97), fixed),
+        (BayesianSCBF(posterior, simultaneous=0.9, sampling_margin=0.1), everything, all_sure, intervals),
+        (BayesianSCBF(posterior, simultaneous=0.9), everything, all_sure, intervals),
+        (BayesianSCBF(posterior, confidence=0.3), kept, 0.0, fixed),
     ]
-    for condition, z, levels in cases:
-        found = SafetyFilter.for_problem(cubic, condition).filter(x, u)
-        expected, _, deviation = robust_rows(posterior, barrier, x, found.action, least_ito(posterior, barrier, x, levels), z)
-        expected = expected - (0.1 if condition.sampling_margin == 0.1 else 0.0)
-        # The variance is a polynomial of degree 8 in states up to 2: its coefficients cancel to some 1e-13 of their size.
+    for condition, law, z, levels in cases if which == "disk" else cases[:2]:
+        found = SafetyFilter.for_problem(problem, condition).filter(x, u)
+        rest = least_ito(posterior, barrier, x, levels) - (0.1 if condition.sampling_margin == 0.1 else 0.0)
+        expected = robust_row(posterior, law, barrier, x, found.action, z) + rest
+        # The variance is a polynomial whose coefficients cancel by some digits, and its root is known to half of the rest.
         np.testing.assert_allclose(found.margin[:, 0], expected, atol=1e-6)
         assert found.feasible.any()
-        assert (found.action != u).any()
-        # Nothing in the box is better where the condition cannot be met, or is nearer where it can.
-        for low, high in cubic.box:
-            tried = np.linspace(low, high, 201)
-            ito = least_ito(posterior, barrier, x, levels)
-            rows = np.array([robust_rows(posterior, barrier, x, np.full_like(u, t), ito, z)[0] for t in tried]) - (
-                0.1 if condition.sampling_margin == 0.1 else 0.0
-            )
-            assert (rows <= 1e-6)[:, ~found.feasible].all()
-            assert (rows.max(axis=0) <= np.maximum(found.margin[:, 0], 0.0) + 1e-6)[~found.feasible].all()
-            nearer = abs(tried[:, None] - u[:, 0]) < abs(found.action - u)[:, 0] - 1e-6
-            assert (rows <= 1e-6)[nearer & found.feasible].all()
-        assert deviation.min() > 0.0
+        assert found.active.any()
+        for tried in np.linspace(*problem.box[0], 21):
+            row = robust_row(posterior, law, barrier, x, np.full_like(u, tried), z) + rest
+            # Nothing in the box meets or misses it by less where it cannot be met, or is met and nearer where it can.
+            assert (row <= found.margin[:, 0] + 1e-6)[~found.feasible].all()
+            nearer = abs(tried - u[:, 0]) < abs(found.action - u)[:, 0] - 1e-6
+            assert (row <= 1e-6)[nearer & found.feasible].all()
 
 
 def test_mean_and_deviation_are_those_of_draws_of_the_weights(cubic, posterior):
-    rng, (x, u) = np.random.default_rng(4), situations(cubic, 50, seed=8)
-    barrier, draws = curved_barrier(cubic), 4000
-    factors = np.linalg.cholesky(posterior.covariance)
-    weights = posterior.mean[:, None] + np.einsum("nde,nke->nkd", factors, rng.standard_normal((2, draws, posterior.mean.shape[1])))
-    rates = np.einsum("bd,nkd->bkn", linear_form(posterior, x, u), weights)
-    slopes = values(posterior.system, [sp.diff(barrier.expression, s) for s in posterior.system.states], x)
-    drawn = np.einsum("bn,bkn->bk", slopes, rates)
-    rows = {}
-    for confidence in (0.5, 0.9):
-        condition = BayesianSCBF(posterior, confidence=confidence)
-        problem = replace(cubic, barriers=(barrier,), inputs=(replace(cubic.inputs[0], low=-1e3, high=1e3),))
-        row = condition.constraint(problem.model, barrier)
-        q: Any = row.uncertainty
-        a, b, q0, q1, q2 = values(posterior.system, [*row.coefficient, row.offset, *q], x).T
-        v = u[:, 0]
-        rows[confidence] = a * v + b, np.sqrt(q0 + 2 * q1 * v + q2 * v * v)
-    ito = values(
-        posterior.system,
-        [
-            sp.Add(
-                *[
-                    s**2 * sp.diff(barrier.expression, e, 2) / 2
-                    for s, e in zip(posterior.diffusion.sigma.tolist(), posterior.system.states, strict=True)
-                ]
-            )
-        ],
-        x,
-    )[:, 0]
-    mean, deviation = drawn.mean(axis=1) + ito, drawn.std(axis=1)
-    np.testing.assert_array_less(abs(rows[0.9][0] - mean), 5 * deviation / math.sqrt(draws))
-    np.testing.assert_allclose(rows[0.9][1], stats.norm.ppf(0.9) * deviation, rtol=5 / math.sqrt(2 * draws))
-    assert abs(rows[0.5][1]).max() == 0.0
+    rng, (x, u) = np.random.default_rng(4), situations(cubic, 1000, seed=8)
+    barrier, draws = curved_barrier(cubic), 2000
+    design, slopes, v = linear_form(posterior, x, u), slopes_of(posterior, barrier, x), u[:, 0]
+    weights = np.stack([rng.multivariate_normal(m, c, draws) for m, c in zip(posterior.mean, posterior.covariance, strict=True)])
+    drawn = sum(slopes[:, [i]] * (design @ weights[i].T) for i in range(2))
+    condition = BayesianSCBF(posterior, simultaneous=0.9)
+    row = condition.constraint(cubic.model, barrier)
+    q: Any = row.uncertainty
+    a, b, q_0, q_1, q_2 = values(posterior.system, [*row.coefficient, row.offset, *q], x).T
+    ito = least_ito(posterior, barrier, x, posterior.diffusion.sigma_intervals(0.05))
+    mean, deviation = np.mean(drawn, axis=1), np.std(drawn, axis=1)
+    # Five standard errors, of a mean and of a deviation.
+    assert (abs(a * v + b - ito - mean) < 5 * deviation / math.sqrt(draws) + 1e-9).all()
+    np.testing.assert_allclose(np.sqrt(q_0 + 2 * q_1 * v + q_2 * v * v), condition.quantile(2) * deviation, rtol=5 / math.sqrt(2 * draws))
 
 
 def test_the_simultaneous_form_holds_for_its_share_of_the_weights(cubic, posterior):
@@ -303,23 +298,22 @@ def test_the_simultaneous_form_holds_for_its_share_of_the_weights(cubic, posteri
     condition = BayesianSCBF(posterior, simultaneous=0.5)
     found = SafetyFilter.for_problem(cubic, condition).filter(x, u)
     design = linear_form(posterior, x, found.action)
-    slopes = values(posterior.system, [sp.diff(barrier.expression, s) for s in posterior.system.states], x)
-    curvatures = values(posterior.system, [sp.diff(barrier.expression, s, 2) for s in posterior.system.states], x)
-    below, times = 0, 200
+    slopes, curvatures = slopes_of(posterior, barrier, x), curvatures_of(posterior, barrier, x)
+    below, times = 0, 100
     for _ in range(times):
         weights = np.array([rng.multivariate_normal(m, c) for m, c in zip(posterior.mean, posterior.covariance, strict=True)])
         levels = posterior.diffusion._levels(rng)
         truth = (slopes * (design @ weights.T)).sum(axis=1) + 0.5 * curvatures @ levels**2
         below += bool((truth < found.margin[:, 0]).any())
     assert below <= 0.5 * times
-    with_half = condition.quantile(2), BayesianSCBF(posterior, simultaneous=0.99).quantile(2)
-    assert with_half[0] < with_half[1]
+    assert condition.quantile(2) < BayesianSCBF(posterior, simultaneous=0.99).quantile(2)
+    assert condition.quantile(1) < condition.quantile(2)
     assert (condition.delta_theta, condition.delta_sigma) == (0.25, 0.25)
 
 
 def test_the_robust_form_is_for_relative_degree_one(cubic, gap, posterior, gap_posterior):
     for how in ({"confidence": 0.9}, {"simultaneous": 0.9}):
-        with pytest.raises(RelativeDegreeError, match="relative degree 2.*Leave out confidence"):
+        with pytest.raises(RelativeDegreeError, match=r"relative degree 2.*Leave out confidence"):
             SafetyFilter.for_problem(gap, BayesianSCBF(gap_posterior, **how))
         with pytest.raises(ConfigurationError, match="first order"):
             SafetyFilter.for_problem(cubic, BayesianSCBF(posterior, sampling_margin="first-order", **how))
@@ -363,7 +357,7 @@ def test_the_margin_is_what_the_errors_can_do_to_one_input(disk):
     for errors, eps in (([0.1, 0.3, 0.5], None), ([0.2, 0.2, 0.2], 0.2)):
         condition = LearnedHOCBF(residual_of(disk, errors), p=disk.gains_of(0), eps=eps)
         found = SafetyFilter.for_problem(disk, condition).filter(x, u)
-        assert 0.1 < found.feasible.mean()
+        assert found.feasible.mean() > 0.1
         # For one input nothing is given away.
         np.testing.assert_allclose(found.margin[:, 0], worst_row(disk, x, found.action, errors), atol=1e-10)
         assert found.margin[found.feasible].min() >= -1e-10
@@ -377,7 +371,7 @@ def test_the_margin_covers_what_the_errors_can_do_to_several_inputs(rotors):
     found = SafetyFilter.for_problem(rotors, condition).filter(x, u)
     worst = worst_row(rotors, x, found.action, errors)
     size = abs(worst).max()
-    assert 0.1 < found.feasible.mean()
+    assert found.feasible.mean() > 0.1
     assert (found.active[:, 0] & found.feasible).any()
     assert worst[found.feasible].min() >= -1e-12 * size
     # sqrt(m) |(e_j u_j)| is at most sqrt(m) times, and the plane above it at the far corner no more than, sum e_j |u_j|.
@@ -409,7 +403,7 @@ def test_what_does_not_suit_the_residuals_is_refused(disk, residual):
         with pytest.raises(RelativeDegreeError, match=f"relative degree 2.*{len(rates)} given"):
             SafetyFilter.for_problem(disk, LearnedHOCBF(residual, p=rates))
     other = replace(disk, barriers=(Barrier(disk.barriers[0].expression - 1, "smaller"),))
-    with pytest.raises(ConfigurationError, match="learned for the barriers.*smaller"):
+    with pytest.raises(ConfigurationError, match=r"learned for the barriers.*smaller"):
         SafetyFilter.for_problem(other, LearnedHOCBF(residual, p=(1.0, 2.0)))
     for settings in (
         {"eps": -0.1},
@@ -457,14 +451,15 @@ def test_what_the_model_says_of_the_noise_does_not_matter(request, tmp_path, nam
     learned.save(tmp_path / "file")
     (read,) = parse_conditions(f"ddscbf:file={tmp_path / 'file'}", other)
     expected = SafetyFilter.for_problem(problem, DDSCBF(learned))
-    assert_same_decisions(problem, SafetyFilter.for_problem(other, read), expected, tolerance=0.0)
+    # Arrays and floats add in another order.
+    assert_same_decisions(problem, SafetyFilter.for_problem(other, read), expected, tolerance=1e-14)
 
 
 def test_what_does_not_suit_the_generators_is_refused(top, network):
     with pytest.raises(ConfigurationError, match="first order"):
         SafetyFilter.for_problem(top, DDSCBF(network, sampling_margin="first-order"))
     other = replace(top, barriers=(Barrier(top.barriers[0].expression - 0.1, "smaller"),))
-    with pytest.raises(ConfigurationError, match="learned for the barriers.*smaller"):
+    with pytest.raises(ConfigurationError, match=r"learned for the barriers.*smaller"):
         SafetyFilter.for_problem(other, DDSCBF(network))
     for margin in (-1.0, math.nan, True):
         with pytest.raises(ConfigurationError, match="margin = "):
@@ -494,7 +489,7 @@ def assert_floats_are_arrays(safety_filter, x, u, tolerance=1e-9):
 def test_a_learned_row_stands_beside_a_plain_one(disk, errors):
     both = with_two_barriers(disk)
     learned, plain = LearnedHOCBF(residual_of(both, errors), p=both.gains_of(0)), HOCBF(both.gains_of(1))
-    x, u = situations(both, 100)
+    x, u = situations(both, 40)
     for conditions in (
         (learned, plain),
         (learned, replace(plain, sampling_margin="first-order")),
@@ -517,26 +512,23 @@ def test_a_learned_row_stands_beside_a_plain_one(disk, errors):
         assert_same_decisions(both, SafetyFilter.for_problem(both, ours), known)
 
 
-def test_learned_rows_stand_beside_reciprocal_ones(top, network, cubic, posterior):
-    for problem, learned in (
-        (top, DDSCBF(network)),
-        (cubic, BayesianSCBF(posterior)),
-        (cubic, BayesianSCBF(posterior, confidence=0.9)),
-    ):
-        first = problem.barriers[0]
-        second = Barrier(1.2 * first.expression - 0.1 * sp.Abs(first.expression.coeff(problem.plant.states[0], 0) * 0 + 1), "second")
-        both = replace(problem, barriers=(first, second))
-        rng = np.random.default_rng(0)
-        x = rng.uniform(*np.array(problem.exploration.region).T, (60, 2))  # on both sides of the edge
-        u = rng.uniform(-9, 9, (60, 1))
-        alone = SafetyFilter.for_problem(problem, learned).filter(x, u)
-        for conditions in ((learned, SRCBF()), (learned, SRCBF(sampling_margin="first-order")), (learned, SCBF())):
-            found = assert_floats_are_arrays(SafetyFilter.for_problem(both, conditions), x, u, 1e-8)
-            free = ~found.active[:, 1]
-            assert free.any()
-            np.testing.assert_allclose(found.action[free], alone.action[free], atol=1e-9)
-            turned = SafetyFilter.for_problem(replace(both, barriers=(second, first)), conditions[::-1]).filter(x, u)
-            np.testing.assert_allclose(turned.action, found.action, atol=1e-9)
+@pytest.mark.parametrize("name", ["network", "posterior"])
+def test_learned_rows_stand_beside_reciprocal_ones(request, top, cubic, name):
+    model = request.getfixturevalue(name)
+    problem, learned = (top, DDSCBF(model)) if name == "network" else (cubic, BayesianSCBF(model, confidence=0.9))
+    first = problem.barriers[0]
+    second = Barrier(1.2 * first.expression - 0.1, "second")
+    both, turned = (replace(problem, barriers=pair) for pair in ((first, second), (second, first)))
+    rng = np.random.default_rng(0)
+    x, u = rng.uniform(*np.array(problem.exploration.region).T, (25, 2)), rng.uniform(-9, 9, (25, 1))  # on both sides of the edge
+    alone = SafetyFilter.for_problem(problem, learned).filter(x, u)
+    for other in (SRCBF(), SRCBF(sampling_margin="first-order")):
+        found = assert_floats_are_arrays(SafetyFilter.for_problem(both, (learned, other)), x, u, 1e-8)
+        free = ~found.active[:, 1]
+        assert 0 < np.count_nonzero(free) < 25
+        np.testing.assert_allclose(found.action[free], alone.action[free], atol=1e-9)
+        swapped = SafetyFilter.for_problem(turned, (other, learned)).filter(x, u)
+        np.testing.assert_allclose(swapped.action, found.action, atol=1e-9)
 
 
 def test_a_goal_stands_beside_a_learned_row():
@@ -629,7 +621,7 @@ def test_a_condition_from_a_file_is_the_one_from_memory_to_the_last_bit(kept):
 def test_a_condition_from_memory_is_named_by_its_checksum_which_cannot_be_read(kept):
     problem, condition, _ = kept
     assert f"sha256={condition.learned.sha256[:12]}" in condition.spec
-    with pytest.raises(ConfigurationError, match="sha256.*file"):
+    with pytest.raises(ConfigurationError, match=r"sha256.*file"):
         parse_conditions(condition.spec, problem)
     with pytest.raises(ConfigurationError, match=f"{condition.name}.*learned.*identify.*file=FILE"):
         parse_conditions(condition.name, problem)
@@ -687,9 +679,6 @@ def test_files_of_something_else_are_refused(tmp_path, disk, top, gap, cubic, re
         (condition,) = parse_conditions(text.format(tmp_path), problem)
         x, u = situations(problem, 50)
         assert np.isfinite(SafetyFilter.for_problem(problem, condition).filter(x, u).action).all()
-
-
-ENVS = {"DubinsDisk": 1.5, "Pendulum": 1.0, "ACCGap": 1.0, "CubicSDEDisk": 1.0}
 
 
 def test_the_wrappers_take_text_and_conditions(kept):

@@ -3,8 +3,8 @@
     min 1/2 (u - v)^2   subject to   a_i u + b_i - sqrt(q_i0 + 2 q_i1 u + q_i2 u^2) >= 0,   low <= u <= high
 
 The left-hand side c_i is concave, so that the rows and the box meet in an interval. Its ends are roots of
-(a^2 - q_2) u^2 + 2 (a b - q_1) u + b^2 - q_0 with a u + b >= 0. Where the interval is empty, the sum of squared slacks is
-convex, and its minimisers are found by bisection of its derivative.
+(a^2 - q_2) u^2 + 2 (a b - q_1) u + b^2 - q_0 with a u + b >= 0. Where it is empty, a single row is missed least at the maximiser
+of c; for several rows the sum of squared slacks is convex, and its minimisers are found by bisection of its derivative.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def project_floats(
 ) -> tuple[float, list[float], list[bool], bool]:
     """Project the input of one state; see `project_arrays`."""
     u = low if v < low else high if v > high else v
-    rows: list[tuple[float, float, Quadratic]] = list(zip(a, b, q, strict=True))
+    rows = [(a[i], b[i], q[i]) for i in range(len(b))]
     margin = [_margin(ai, bi, qi, u) for ai, bi, qi in rows]
     if min(margin) >= 0.0:
         return u, margin, [False] * len(margin), True
@@ -36,12 +36,29 @@ def project_floats(
     for ai, bi, qi in rows:
         start, end = _interval(ai, bi, qi)
         lo, hi = max(lo, start), min(hi, end)
+    if not lo <= hi and len(rows) == 1:
+        u = _maximiser(a[0], q[0], v, low, high)
+        return u, [_margin(a[0], b[0], q[0], u)], [True], False
     if not lo <= hi:
         found, margins, binding, feasible = project_arrays(a, b, q, np.array([v]), low, high, priority)
         return found.item(), margins[:, 0].tolist(), binding[:, 0].tolist(), feasible.item()
     u = lo if v < lo else hi if v > hi else v
     margin = [_margin(ai, bi, qi, u) for ai, bi, qi in rows]
     return u, margin, [m <= ROUNDING * _size(ai, bi, qi, u) for m, (ai, bi, qi) in zip(margin, rows, strict=True)], True
+
+
+def _maximiser(a: float, q: Quadratic, v: float, low: float, high: float) -> float:
+    """Where c is largest in the box: with w = u + q_1/q_2 and s the least sqrt(q/q_2), a = sqrt(q_2) w/sqrt(w^2 + s^2) there."""
+    q0, q1, q2 = q
+    if a * a == q2 and q0 * q2 <= q1 * q1:
+        # From the kink on nothing changes any more.
+        kink = -q1 / q2 if q2 else v
+        u = max(v, kink) if a > 0.0 else min(v, kink)
+    elif a * a >= q2:
+        u = high if a > 0.0 else low
+    else:
+        u = -q1 / q2 + a * math.sqrt(max(q0 - q1 * q1 / q2, 0.0) / (q2 * (q2 - a * a)))
+    return low if u < low else high if u > high else u
 
 
 def _margin(a: float, b: float, q: Quadratic, u: float) -> float:
@@ -108,7 +125,11 @@ def project_arrays(
         found = np.minimum(np.maximum(v[acting], lo), hi)
         apart = np.flatnonzero(~(lo <= hi))
         if apart.size:
-            found[apart] = _least_violating(slope[:, apart], offset[:, apart], form[:, :, apart], v[acting][apart], low, high, priority)
+            lost, wish = (slope[:, apart], offset[:, apart], form[:, :, apart]), v[acting][apart]
+            if len(slope) == 1:
+                found[apart] = _maximisers(lost[0], lost[2], wish, low, high)
+            else:
+                found[apart] = _least_violating(*lost, wish, low, high, priority)
         u[acting], feasible[acting] = found, lo <= hi
         margin[:, acting] = reached = _margins(slope, offset, form, found)
         spread = np.sqrt(abs(form[0]) + abs(2.0 * form[1] * found) + form[2] * found * found)
@@ -138,6 +159,18 @@ def _intervals(a: np.ndarray, b: np.ndarray, q: np.ndarray) -> tuple[np.ndarray,
     between = (discriminant >= 0.0) & (b - a * middle / leading >= 0.0)
     met = np.select([constant, flat, leading < 0.0], [b >= np.sqrt(np.maximum(q0, 0.0)), middle * a > 0.0, between], True)
     return np.where(met, start, np.inf), np.where(met, stop, -np.inf)
+
+
+def _maximisers(a: np.ndarray, q: np.ndarray, v: np.ndarray, low: float, high: float) -> np.ndarray:
+    """`_maximiser` for arrays (1, B), with the same formulas."""
+    slope, (q0, q1, q2) = a[0], q[:, 0]
+    inside = -q1 / q2 + slope * np.sqrt(np.maximum(q0 - q1 * q1 / q2, 0.0) / (q2 * (q2 - slope * slope)))
+    end = np.where(slope > 0.0, high, low)
+    kink = np.where(q2 > 0.0, -q1 / q2, v)
+    level = np.where(slope > 0.0, np.maximum(v, kink), np.minimum(v, kink))
+    square = slope * slope
+    found = np.select([(square == q2) & (q0 * q2 <= q1 * q1), square >= q2], [level, end], inside)
+    return np.minimum(np.maximum(found, low), high)
 
 
 def _least_violating(

@@ -1,0 +1,163 @@
+"""Certificates of identified systems: by hand, against a dense grid, and against what happens."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy import stats
+
+from agents.statistics import rate_interval
+from safe_envs import Barrier, ConfigurationError
+from tests.conftest import problem_of
+from wrappers import SCBF, BayesianSCBF, SafetyFilterVectorWrapper
+from wrappers.certificate import certificate
+from wrappers.learning.bayesian import identify
+
+START = (0.0, 0.6)
+
+
+@pytest.fixture(scope="module")
+def cubic():
+    return problem_of("safe_envs/CubicSDEDisk-v0")
+
+
+@pytest.fixture(scope="module")
+def posterior(cubic):
+    return identify(cubic)
+
+
+@pytest.fixture(scope="module")
+def found(cubic, posterior):
+    return certificate(cubic, [BayesianSCBF(posterior, simultaneous=0.95)])
+
+
+@pytest.fixture(scope="module")
+def looser(cubic, posterior):
+    return certificate(cubic, [BayesianSCBF(posterior, simultaneous=0.5)])
+
+
+def best_rows(problem, posterior, simultaneous, x):
+    """The most over the inputs of the box of the least that A h may be, at states of a disk, without the filter or its rows."""
+    share = 0.5 * (1.0 - simultaneous)
+    levels = posterior.diffusion.sigma_intervals(share)[:, 1]
+    z = math.sqrt(stats.chi2.ppf(1.0 - share, 2 * posterior.mean.shape[1]))
+    phi, slopes = posterior.features.matrix(x), -2.0 * x
+
+    def row(u):
+        design = np.hstack((phi, posterior.input_scale[0] * u[:, None] * phi))
+        mean = (slopes * (design @ posterior.mean.T)).sum(axis=1) - (levels**2).sum()
+        variance = sum(slopes[:, i] ** 2 * ((design @ posterior.covariance[i]) * design).sum(axis=1) for i in range(2))
+        return mean - z * np.sqrt(variance)
+
+    # The row is concave in the input, so that the best one is a step from the best that was tried.
+    low, high = (np.full(len(x), end) for end in problem.box[0])
+    for _ in range(3):
+        tried = low + (high - low) * np.linspace(0.0, 1.0, 21)[:, None]
+        best = np.array([row(u) for u in tried])
+        at, step = tried[best.argmax(axis=0), np.arange(len(x))], (high - low) / 20.0
+        low, high = np.maximum(at - step, low), np.minimum(at + step, high)
+    return best.max(axis=0)
+
+
+def test_its_parts(found):
+    assert found.delta == pytest.approx(0.05, abs=1e-15)
+    assert found.supremum == pytest.approx(1.0, abs=1e-6)
+    assert found.supremum <= 1.0
+    assert f"{found.shortfall:.3g}" in found.remark
+
+
+@pytest.mark.parametrize("simultaneous", [0.5, 0.95])
+def test_the_shortfall_is_the_worst_of_a_dense_grid(cubic, posterior, found, looser, simultaneous):
+    searched = found if simultaneous == 0.95 else looser
+    # Where the input does little, and everywhere.
+    axis = np.linspace(-1, 1, 81)
+    grid = np.concatenate([np.stack(np.meshgrid(axis, along), -1).reshape(-1, 2) for along in (np.linspace(-0.1, 0.1, 21), axis[::2])])
+    grid = grid[(grid**2).sum(axis=1) <= 1.0]
+    worst = -best_rows(cubic, posterior, simultaneous, grid).min()
+    assert worst > 0.05
+    # The inputs of the last grid are less than .01 from the best one: its slope is that of the row, a few units.
+    assert searched.shortfall >= worst - 1e-4
+    assert searched.shortfall <= 1.05 * worst
+
+
+def test_the_probability_by_hand(found):
+    starts = np.array([[0.0, 0.0], [-0.1, 0.7], [0.6, -0.5], [0.0, 1.0], [0.9, 0.9], [1.5, 0.0]])
+    for horizon in (0.0, 0.5, 1.0, 5.0, 50.0):
+        h = 1.0 - (starts**2).sum(axis=1)
+        expected = 0.95 * np.clip((h - found.shortfall * horizon) / found.supremum, 0.0, 1.0)
+        expected[3:] = 0.0
+        np.testing.assert_allclose(found.at(starts, horizon), expected, atol=1e-12)
+    assert found.at(starts, 1.0)[0] > 0.5
+    assert (found.at(starts, 50.0) == 0.0).all()
+    assert ((found.at(starts, 0.0) >= 0.0) & (found.at(starts, 0.0) <= 0.95)).all()
+
+
+def test_it_is_hardly_another_with_another_seed(cubic, posterior, found):
+    other = certificate(cubic, [BayesianSCBF(posterior, simultaneous=0.95)], seed=1)
+    assert other.shortfall == pytest.approx(found.shortfall, rel=1e-3)
+
+
+def test_plant_and_model_do_not_matter(cubic, posterior, found):
+    blind = cubic.configured(model={"a": 5.0}, plant={"a": 9.0}, noise=3.0)
+    other = certificate(blind, [BayesianSCBF(posterior, simultaneous=0.95)])
+    assert (other.shortfall, other.supremum) == (found.shortfall, found.supremum)
+
+
+def test_more_data_certify_more(cubic, found):
+    few = certificate(cubic, [BayesianSCBF(identify(cubic, starts=200, repetitions=50), simultaneous=0.95)])
+    assert few.shortfall > 1.2 * found.shortfall
+    assert few.at(np.array([START]), 0.5) < found.at(np.array([START]), 0.5)
+
+
+def test_a_smaller_probability_of_the_regions_asks_for_less(found, looser):
+    assert looser.shortfall < found.shortfall
+    assert looser.delta == pytest.approx(0.5)
+
+
+def test_what_has_no_certificate_is_refused(cubic, posterior):
+    robust = BayesianSCBF(posterior, simultaneous=0.9)
+    twice = replace(cubic, barriers=(cubic.barriers[0], Barrier(2 * cubic.barriers[0].expression, "twice")))
+    for problem, conditions in (
+        (twice, [robust, robust]),
+        (cubic, [BayesianSCBF(posterior)]),
+        (cubic, [BayesianSCBF(posterior, confidence=0.9)]),
+        (cubic, [SCBF()]),
+        (cubic, []),
+    ):
+        with pytest.raises(ConfigurationError, match="one barrier with bayesian-scbf:simultaneous=P"):
+            certificate(problem, conditions)
+
+
+def test_an_unbounded_set_has_none(cubic, posterior):
+    problem = problem_of("safe_envs/CubicSDE-v0")
+    # Its noise varies with the state: no intervals of sigma are known.
+    varying = identify(problem, starts=200, repetitions=20, diffusion_degree=2)
+    with pytest.raises(ConfigurationError, match="intervals of sigma are known for constant noise"):
+        certificate(problem, [BayesianSCBF(varying, simultaneous=0.9)])
+    # The same set with the noise of the disk, which is constant.
+    parabola = replace(cubic, barriers=problem.barriers)
+    with pytest.raises(ConfigurationError, match="beyond the workspace"):
+        certificate(parabola, [BayesianSCBF(posterior, simultaneous=0.9)])
+
+
+def test_what_is_certified_happens(cubic, monkeypatch):
+    """From one start, with identifications that know little; a shorter search finds less of the shortfall, and promises more."""
+    monkeypatch.setattr("wrappers.search._ROUNDS", (30, 10))
+    envs, horizon, promised = 100, 0.5, []
+    for seed in range(6):
+        condition = BayesianSCBF(identify(cubic, starts=300, repetitions=50, degree=3, seed=seed), simultaneous=0.9)
+        (bound,) = certificate(cubic, [condition]).at(np.array([START]), horizon)
+        env = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/CubicSDEDisk-v0", num_envs=envs, start=START, horizon=horizon), condition)
+        env.reset(seed=seed)
+        safe = np.ones(envs, dtype=bool)
+        for _ in range(round(horizon / cubic.dt)):
+            _, _, _, _, info = env.step(np.zeros((envs, 1), dtype=np.float32))
+            safe &= info["cost"] == 0.0
+        promised.append(bound)
+        assert rate_interval(np.count_nonzero(safe), envs, 0.99)[1] >= bound
+    assert min(promised) > 0.2
+    assert max(promised) < 0.9
