@@ -20,7 +20,7 @@ x, theta, w = sp.symbols("x theta w", real=True)
 
 def bare(**changes):
     """The disk, of whose exploration nothing is said."""
-    return replace(DISK, **{"exploration": Exploration(), **changes})
+    return replace(DISK, **{"explored": Exploration(), **changes})
 
 
 def test_defaults_are_the_workspace_and_halfway_inputs():
@@ -47,9 +47,9 @@ def test_only_unbounded_radians_are_angles():
     assert turning.exploration.region == ((-1.0, 1.0), (-math.pi, math.pi))
     assert turning.exploration.coordinates == (x_1, sp.cos(x_2), sp.sin(x_2))
     with pytest.raises(SystemDefinitionError, match=r"cannot explore x_2 in \[-inf, inf\]"):
-        bare(states=(Variable(x_1, -1.0, 1.0), Variable(x_2, -math.inf, math.inf, "m")))
+        _ = bare(states=(Variable(x_1, -1.0, 1.0), Variable(x_2, -math.inf, math.inf, "m"))).exploration
     with pytest.raises(SystemDefinitionError, match=r"cannot explore x_2 in \[0\.0, inf\]"):
-        bare(states=(Variable(x_1, -1.0, 1.0), Variable(x_2, 0.0, math.inf, "rad")))
+        _ = bare(states=(Variable(x_1, -1.0, 1.0), Variable(x_2, 0.0, math.inf, "rad"))).exploration
 
 
 def test_each_input_goes_halfway_with_the_others_at_the_centre():
@@ -65,14 +65,14 @@ def test_each_input_goes_halfway_with_the_others_at_the_centre():
         (Exploration(region=((0.0, math.inf), (0.0, 1.0))), r"cannot explore x_1 in \[0\.0, inf\]; give Exploration\(region"),
         (Exploration(region=((0.0, 1.0), (math.nan, 1.0))), "cannot explore x_2"),
         (Exploration(region=((0.0, 1.0), (1.0, 1.0))), r"cannot explore x_2 in \[1\.0, 1\.0\]"),
-        (Exploration(inputs=((1.0, 2.0),)), "an input of an exploration needs 1 numbers"),
-        (Exploration(inputs=((1.0,), ())), "an input of an exploration needs 1 numbers"),
+        (Exploration(inputs=((1.0, 2.0),)), "an input of an exploration needs 1 finite numbers"),
+        (Exploration(inputs=((1.0,), ())), "an input of an exploration needs 1 finite numbers"),
         (Exploration(coordinates=(w,)), r"(?s)a coordinate of the exploration.*w"),
     ],
 )
 def test_what_does_not_fit_is_refused(given, message):
     with pytest.raises(SystemDefinitionError, match=message):
-        bare(explored=given)
+        _ = bare(explored=given).exploration
 
 
 def test_every_problem_can_be_explored(env_id):

@@ -41,6 +41,8 @@ ROW_KEYS = [
     "curve",
     "bound",
     "bound_note",
+    "certificate",
+    "learning",
 ]
 
 

@@ -4,7 +4,8 @@
 
 The left-hand side c_i is concave, so that the rows and the box meet in an interval. Its ends are roots of
 (a^2 - q_2) u^2 + 2 (a b - q_1) u + b^2 - q_0 with a u + b >= 0. Where it is empty, a single row is missed least at the maximiser
-of c; for several rows the sum of squared slacks is convex, and its minimisers are found by bisection of its derivative.
+of c_1; for several rows the sum of squared slacks is convex, and its minimisers are found by bisection of its derivative between
+the inputs at which each row alone is missed least.
 """
 
 from __future__ import annotations
@@ -29,36 +30,51 @@ def project_floats(
     """Project the input of one state; see `project_arrays`."""
     u = low if v < low else high if v > high else v
     rows = [(a[i], b[i], q[i]) for i in range(len(b))]
-    margin = [_margin(ai, bi, qi, u) for ai, bi, qi in rows]
+    margin = [_margin(*row, u) for row in rows]
     if min(margin) >= 0.0:
         return u, margin, [False] * len(margin), True
+    rows_in_unit = [_in_unit(*row) for row in rows]
+    intervals = [_interval(*row) for row in rows_in_unit]
     lo, hi = low, high
-    for ai, bi, qi in rows:
-        start, end = _interval(ai, bi, qi)
+    for start, end in intervals:
         lo, hi = max(lo, start), min(hi, end)
-    if not lo <= hi and len(rows) == 1:
-        u = _maximiser(a[0], q[0], v, low, high)
-        return u, [_margin(a[0], b[0], q[0], u)], [True], False
-    if not lo <= hi:
-        found, margins, binding, feasible = project_arrays(a, b, q, np.array([v]), low, high, priority)
-        return found.item(), margins[:, 0].tolist(), binding[:, 0].tolist(), feasible.item()
-    u = lo if v < lo else hi if v > hi else v
-    margin = [_margin(ai, bi, qi, u) for ai, bi, qi in rows]
-    return u, margin, [m <= ROUNDING * _size(ai, bi, qi, u) for m, (ai, bi, qi) in zip(margin, rows, strict=True)], True
+    feasible = lo - hi <= ROUNDING * min(abs(lo), abs(hi))
+    if len(rows) == 1:
+        u = _nearest(rows_in_unit[0], intervals[0], v, low, high)
+    elif feasible:
+        u = max(min(max(v, lo), hi), low)
+    else:
+        found, margins, binding, _ = project_arrays(a, b, q, np.array([v]), low, high, priority)
+        return found.item(), margins[:, 0].tolist(), binding[:, 0].tolist(), False
+    margin = [_margin(*row, u) for row in rows]
+    # An end may be rounded by more than the margin that is nothing but rounding.
+    active = [m <= ROUNDING * _size(*row, u) or u in ends for row, m, ends in zip(rows, margin, intervals, strict=True)]
+    return u, margin, active, feasible
+
+
+def _in_unit(a: float, b: float, q: Quadratic) -> tuple[float, float, Quadratic]:
+    """A row over its largest coefficient, so that products of four neither overflow nor vanish."""
+    unit = max(abs(a), abs(b), math.sqrt(abs(q[0])), math.sqrt(abs(q[2]))) or 1.0
+    return a / unit, b / unit, [entry / unit / unit for entry in q]
+
+
+def _nearest(row: tuple[float, float, Quadratic], interval: tuple[float, float], v: float, low: float, high: float) -> float:
+    """Of the inputs in the box at which a row is missed least the nearest to v."""
+    start, end = interval
+    u = _maximiser(row[0], row[2], v, low, high) if start == math.inf else max(min(v, end), start)
+    return low if u < low else high if u > high else u
 
 
 def _maximiser(a: float, q: Quadratic, v: float, low: float, high: float) -> float:
-    """Where c is largest in the box: with w = u + q_1/q_2 and s the least sqrt(q/q_2), a = sqrt(q_2) w/sqrt(w^2 + s^2) there."""
+    """Where c is largest: with w = u + q_1/q_2 and s the least sqrt(q/q_2), a = sqrt(q_2) w/sqrt(w^2 + s^2) there, or at an end."""
     q0, q1, q2 = q
     if a * a == q2 and q0 * q2 <= q1 * q1:
         # From the kink on nothing changes any more.
         kink = -q1 / q2 if q2 else v
-        u = max(v, kink) if a > 0.0 else min(v, kink)
-    elif a * a >= q2:
-        u = high if a > 0.0 else low
-    else:
-        u = -q1 / q2 + a * math.sqrt(max(q0 - q1 * q1 / q2, 0.0) / (q2 * (q2 - a * a)))
-    return low if u < low else high if u > high else u
+        return max(v, kink) if a > 0.0 else min(v, kink)
+    if a * a >= q2:
+        return high if a > 0.0 else low
+    return -q1 / q2 + a * math.sqrt(max(q0 - q1 * q1 / q2, 0.0) / (q2 * (q2 - a * a)))
 
 
 def _margin(a: float, b: float, q: Quadratic, u: float) -> float:
@@ -72,14 +88,17 @@ def _size(a: float, b: float, q: Quadratic, u: float) -> float:
 def _interval(a: float, b: float, q: Quadratic) -> tuple[float, float]:
     """Where one row is met; an empty interval begins at infinity."""
     q0, q1, q2 = q
-    empty = (math.inf, -math.inf)
+    empty = (math.inf, math.inf)
+    if q2 == 0.0:
+        least = math.sqrt(max(q0, 0.0)) - b
+        if a == 0.0:
+            return empty if least > 0.0 else (-math.inf, math.inf)
+        return (least / a, math.inf) if a > 0.0 else (-math.inf, least / a)
     leading, middle, last = a * a - q2, a * b - q1, b * b - q0
     # (a b - q_1)^2 - leading last, without the products that cancel.
     discriminant = a * a * q0 - 2.0 * a * b * q1 + b * b * q2 - (q0 * q2 - q1 * q1)
     root = math.sqrt(max(discriminant, 0.0))
     if leading == 0.0:
-        if a == 0.0:
-            return (-math.inf, math.inf) if b >= math.sqrt(max(q0, 0.0)) else empty
         if middle * a <= 0.0:
             return empty
         end = -last / (2.0 * middle)
@@ -119,26 +138,35 @@ def project_arrays(
     active, feasible = np.zeros(margin.shape, dtype=bool), np.ones(size, dtype=bool)
     acting = np.flatnonzero(~(margin >= 0.0).all(axis=0))
     if acting.size:
-        slope, offset, form = slope[:, acting], offset[:, acting], form[:, :, acting]
-        starts, ends = _intervals(slope, offset, form)
+        slope, offset, form, wish = slope[:, acting], offset[:, acting], form[:, :, acting], v[acting]
+        in_unit = _all_in_unit(slope, offset, form)
+        starts, ends = _intervals(*in_unit)
         lo, hi = np.maximum(starts.max(axis=0), low), np.minimum(ends.min(axis=0), high)
-        found = np.minimum(np.maximum(v[acting], lo), hi)
-        apart = np.flatnonzero(~(lo <= hi))
+        feasible[acting] = met = lo - hi <= ROUNDING * np.minimum(abs(lo), abs(hi))
+        found = np.maximum(np.minimum(np.maximum(wish, lo), hi), low)
+        apart = np.flatnonzero(~met)
         if apart.size:
-            lost, wish = (slope[:, apart], offset[:, apart], form[:, :, apart]), v[acting][apart]
-            if len(slope) == 1:
-                found[apart] = _maximisers(lost[0], lost[2], wish, low, high)
-            else:
-                found[apart] = _least_violating(*lost, wish, low, high, priority)
-        u[acting], feasible[acting] = found, lo <= hi
+            row, interval = tuple(part[..., apart] for part in in_unit), (starts[:, apart], ends[:, apart])
+            nearest = _all_nearest(row, interval, wish[apart], low, high)
+            lost = slope[:, apart], offset[:, apart], form[:, :, apart]
+            found[apart] = nearest[0] if len(slope) == 1 else _least_violating(*lost, nearest, wish[apart], priority)
+        u[acting] = found
         margin[:, acting] = reached = _margins(slope, offset, form, found)
         spread = np.sqrt(abs(form[0]) + abs(2.0 * form[1] * found) + form[2] * found * found)
-        active[:, acting] = reached <= ROUNDING * (abs(slope * found) + abs(offset) + spread)
+        rounded = reached <= ROUNDING * (abs(slope * found) + abs(offset) + spread)
+        active[:, acting] = rounded | (found == starts) | (found == ends)
     return u, margin, active, feasible
 
 
 def _margins(a: np.ndarray, b: np.ndarray, q: np.ndarray, u: np.ndarray) -> np.ndarray:
     return a * u + b - np.sqrt(np.maximum(q[0] + u * (2.0 * q[1] + u * q[2]), 0.0))
+
+
+def _all_in_unit(a: np.ndarray, b: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`_in_unit` for arrays (k, B), with the same formulas."""
+    unit = np.maximum(np.maximum(abs(a), abs(b)), np.maximum(np.sqrt(abs(q[0])), np.sqrt(abs(q[2]))))
+    unit = np.where(unit == 0.0, 1.0, unit)
+    return a / unit, b / unit, q / unit / unit
 
 
 def _intervals(a: np.ndarray, b: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,33 +178,39 @@ def _intervals(a: np.ndarray, b: np.ndarray, q: np.ndarray) -> tuple[np.ndarray,
     t = -(middle + np.copysign(root, middle))
     first, second = np.where(t == 0.0, 0.0, t / leading), np.where(t == 0.0, 0.0, last / t)
     first, second = np.minimum(first, second), np.maximum(first, second)
-    flat, rising = leading == 0.0, a > 0.0
-    end = -last / (2.0 * middle)
-    start = np.select([flat & rising, flat, leading < 0.0, rising], [end, -np.inf, first, second], -np.inf)
-    stop = np.select([flat & rising, flat, leading < 0.0, rising], [np.inf, end, second, np.inf], first)
-    constant = flat & (a == 0.0)
-    start, stop = np.where(constant, -np.inf, start), np.where(constant, np.inf, stop)
+    least, linear, rising = np.sqrt(np.maximum(q0, 0.0)) - b, q2 == 0.0, a > 0.0
+    level, flat = linear & (a == 0.0), leading == 0.0
+    end = np.where(linear, least / a, -last / (2.0 * middle))
+    ray = linear | flat
+    start = np.select([level, ray & rising, ray, leading < 0.0, rising], [-np.inf, end, -np.inf, first, second], -np.inf)
+    stop = np.select([level, ray & rising, ray, leading < 0.0, rising], [np.inf, np.inf, end, second, np.inf], first)
     between = (discriminant >= 0.0) & (b - a * middle / leading >= 0.0)
-    met = np.select([constant, flat, leading < 0.0], [b >= np.sqrt(np.maximum(q0, 0.0)), middle * a > 0.0, between], True)
-    return np.where(met, start, np.inf), np.where(met, stop, -np.inf)
+    met = np.select([level, linear, flat, leading < 0.0], [least <= 0.0, True, middle * a > 0.0, between], True)
+    return np.where(met, start, np.inf), np.where(met, stop, np.inf)
+
+
+def _all_nearest(
+    row: tuple[np.ndarray, ...], interval: tuple[np.ndarray, np.ndarray], v: np.ndarray, low: float, high: float
+) -> np.ndarray:
+    """`_nearest` for arrays (k, B), with the same formulas."""
+    start, end = interval
+    u = np.where(start == np.inf, _maximisers(row[0], row[2], v, low, high), np.maximum(np.minimum(v, end), start))
+    return np.minimum(np.maximum(u, low), high)
 
 
 def _maximisers(a: np.ndarray, q: np.ndarray, v: np.ndarray, low: float, high: float) -> np.ndarray:
-    """`_maximiser` for arrays (1, B), with the same formulas."""
-    slope, (q0, q1, q2) = a[0], q[:, 0]
-    inside = -q1 / q2 + slope * np.sqrt(np.maximum(q0 - q1 * q1 / q2, 0.0) / (q2 * (q2 - slope * slope)))
-    end = np.where(slope > 0.0, high, low)
+    """`_maximiser` for arrays (k, B), with the same formulas."""
+    q0, q1, q2 = q
+    inside = -q1 / q2 + a * np.sqrt(np.maximum(q0 - q1 * q1 / q2, 0.0) / (q2 * (q2 - a * a)))
     kink = np.where(q2 > 0.0, -q1 / q2, v)
-    level = np.where(slope > 0.0, np.maximum(v, kink), np.minimum(v, kink))
-    square = slope * slope
-    found = np.select([(square == q2) & (q0 * q2 <= q1 * q1), square >= q2], [level, end], inside)
-    return np.minimum(np.maximum(found, low), high)
+    still = np.where(a > 0.0, np.maximum(v, kink), np.minimum(v, kink))
+    return np.select([(a * a == q2) & (q0 * q2 <= q1 * q1), a * a >= q2], [still, np.where(a > 0.0, high, low)], inside)
 
 
 def _least_violating(
-    a: np.ndarray, b: np.ndarray, q: np.ndarray, v: np.ndarray, low: float, high: float, priority: Sequence[float]
+    a: np.ndarray, b: np.ndarray, q: np.ndarray, nearest: np.ndarray, v: np.ndarray, priority: Sequence[float]
 ) -> np.ndarray:
-    """Of the minimisers of the sum of squared slacks in the box the one nearest to v."""
+    """Of the minimisers of the sum of squared slacks the nearest to v, which lies between the nearest ones of each row."""
     weights = np.asarray(priority)[:, None]
 
     def derivative(u: np.ndarray) -> np.ndarray:
@@ -186,7 +220,7 @@ def _least_violating(
 
     ends = []
     for rises in (np.greater_equal, np.greater):
-        lo, hi = np.full(v.shape, low, dtype=float), np.full(v.shape, high, dtype=float)
+        lo, hi = nearest.min(axis=0), nearest.max(axis=0)
         for _ in range(_BISECTIONS):
             middle = 0.5 * (lo + hi)
             beyond = rises(derivative(middle), 0.0)
