@@ -1,0 +1,194 @@
+"""Evaluations of filters that rest on something learned: once or several times, from files or from memory."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from agents import evaluate, load_problem
+from agents.learning import Learning, learned_of
+from safe_envs import ConfigurationError
+from wrappers import BayesianSCBF, LearnedHOCBF
+from wrappers.learning import LearnedFileError, learner_of
+
+DISK = load_problem("CubicSDEDisk-v0", {"start": [-0.1, 0.7]})
+LEARNED = ("bayesian-scbf", "bayesian-scbf:confidence=0.9")
+
+
+@pytest.fixture(scope="module")
+def posterior():
+    """Identified by default, with the seed that the first repeat of an evaluation with seed 0 has."""
+    return learner_of("bayesian")(DISK, seed=0)
+
+
+@pytest.fixture(scope="module")
+def repeated():
+    """Three identifications."""
+    return evaluate(DISK, filters=["none", "scbf", *LEARNED], episodes=60, repeats=3)
+
+
+def timeless(row):
+    return {**row, "learning": {**row["learning"], "seconds": None}} if row["learning"] else row
+
+
+def test_what_several_filters_rest_on_is_learned_once():
+    learning = Learning(DISK, (), 2, 5)
+    names = ["none", *LEARNED, "bayesian-scbf+scbf"]
+    assert learning.missing(names) == [("bayesian", 0), ("bayesian", 1)]
+    learning.learn("bayesian", 0, None)
+    assert learning.missing(names) == [("bayesian", 1)]
+    first, second = (learning.conditions(name, 0)[0] for name in LEARNED)
+    assert isinstance(first, BayesianSCBF)
+    assert learned_of([first, second]) == [first.learned]
+    assert learning.models(names) == [first.learned]
+
+
+def test_each_repeat_has_a_seed_of_its_own(posterior):
+    learning = Learning(DISK, (), 4, 0)
+    for repeat in range(4):
+        learning.learn("bayesian", repeat, None)
+    found = [learned_of(learning.conditions("bayesian-scbf", repeat))[0] for repeat in range(4)]
+    assert found[0].sha256 != posterior.sha256  # the time it took is part of its record
+    assert np.array_equal(found[0].mean, posterior.mean)
+    seeds = [model.record.seed for model in found]
+    assert seeds[0] == 0
+    assert len(set(seeds)) == 4
+    assert len({model.mean.tobytes() for model in found}) == 4
+    # Evaluations with other seeds have other ones.
+    assert not set(seeds) & {Learning(DISK, (), 4, seed)._child(repeat) for seed in range(1, 50) for repeat in range(4)}
+
+
+def test_what_is_given_is_not_learned(posterior, tmp_path):
+    posterior.save(tmp_path / "disk.npz")
+    for given in (posterior, tmp_path / "disk.npz", str(tmp_path / "disk.npz")):
+        learning = Learning(DISK, [given], 5, 0)
+        assert learning.missing(LEARNED) == []
+        assert learning.repeats("bayesian-scbf") == learning.repeats("scbf") == 1
+        assert learning.repeats("ddscbf") == learning.repeats("ddscbf+bayesian-scbf") == 5
+        assert learned_of(learning.conditions("bayesian-scbf", 3))[0].sha256 == posterior.sha256
+    assert Learning(DISK, (), 5, 0).missing([f"bayesian-scbf:file={tmp_path}/disk.npz"]) == []
+
+
+def test_what_does_not_fit_is_refused(posterior):
+    with pytest.raises(ConfigurationError, match="two learned models of the method bayesian"):
+        Learning(DISK, [posterior, posterior], 1, 0)
+    with pytest.raises(LearnedFileError, match="Pendulum"):
+        Learning(load_problem("Pendulum-v0"), [posterior], 1, 0)
+    for repeats in (0, -1, 1.5, True):
+        with pytest.raises(ConfigurationError, match="repeats"):
+            Learning(DISK, (), repeats, 0)
+
+
+def test_the_filter_from_a_file_gives_the_same_as_from_memory(posterior, tmp_path):
+    posterior.save(tmp_path / "disk.npz")
+    names = [*LEARNED, "bayesian-scbf:simultaneous=0.9"]
+    memory, file, learned, named = (
+        evaluate(DISK, filters=filters, episodes=40, learned=given)
+        for filters, given in (
+            (names, [posterior]),
+            (names, [tmp_path / "disk.npz"]),
+            (names, ()),
+            ([f"{n}:file={tmp_path}/disk.npz" for n in names], ()),
+        )
+    )
+    ignored = {"learning", "filter"}
+    for rows in zip(*(each.rows for each in (memory, file, learned, named)), strict=True):
+        first, *others = ({k: v for k, v in row.items() if k not in ignored} for row in rows)
+        assert all(other == first for other in others)
+    assert [row["learning"]["files"] for row in file.rows] == [[str(tmp_path / "disk.npz")]] * 3
+    assert [row["learning"]["files"] for row in memory.rows] == [[]] * 3
+    assert file.rows[0]["learning"]["sha256"] == memory.rows[0]["learning"]["sha256"] == [posterior.sha256]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name", "settings"),
+    [
+        ("CubicSDE-v0", "ddscbf", {"points": 30, "repetitions": 40}),
+        ("ACCGap-v0", "ddscbf", {"points": 30, "repetitions": 40}),
+        ("QuadrotorAltitude-v0", "learned-hocbf", {"states": 80, "epochs": 5, "hidden": (8, 4)}),
+        ("CubicSDEDisk-v0", "bayesian-scbf", {"starts": 100}),
+        ("CubicSDEDisk-v0", "bayesian-scbf:confidence=0.9", {"starts": 100}),
+        ("CubicSDEDisk-v0", "bayesian-scbf:simultaneous=0.9", {"starts": 100}),
+    ],
+)
+def test_the_answer_is_the_same_for_every_num_envs_and_from_a_file(env_id, name, settings, tmp_path):
+    problem = load_problem(env_id, {"horizon": 0.5})
+    model = learner_of("bayesian" if name.startswith("bayesian") else name)(problem, seed=1, **settings)
+    model.save(tmp_path / "model.npz")
+    rows = [
+        evaluate(problem, filters=[name], episodes=9, num_envs=num_envs, bounds=False, learned=[given]).rows[0]
+        for num_envs, given in ((1, model), (4, model), (9, tmp_path / "model.npz"))
+    ]
+    first, *others = ({k: v for k, v in row.items() if k != "learning"} for row in rows)
+    assert all(other == first for other in others)
+
+
+def test_rows_of_repeats_are_sums_means_and_wider_intervals(repeated):
+    once = evaluate(DISK, filters=["none", "scbf", *LEARNED], episodes=60)
+    for row, single in zip(repeated.rows, once.rows, strict=True):
+        if row["learning"] is None:
+            assert row == single
+            continue
+        learning = row["learning"]
+        assert (learning["repeats"], len(learning["seeds"]), len(set(learning["sha256"]))) == (3, 3, 3)
+        assert row["episodes"] == 180
+        assert row["safe"] == round(60 * sum(learning["rates"]))
+        assert row["safety_rate"] == pytest.approx(np.mean(learning["rates"]))
+        assert learning["rates"][0] == single["safety_rate"]
+        assert row["ci_low"] <= row["safety_rate"] <= row["ci_high"]
+        assert row["curve"]["rate"][-1] == pytest.approx(row["safety_rate"])
+        assert row["curve"]["ci_low"][-1] == pytest.approx(row["ci_low"])
+        # Three identifications on the same 60 episodes are not 180 independent ones.
+        half = 1.96 * math.sqrt(row["safety_rate"] * (1 - row["safety_rate"]) / 180)
+        assert row["ci_high"] - row["ci_low"] > 2 * half
+
+
+def test_comparisons_of_repeats_have_no_p_value(repeated):
+    for comparison in repeated.comparisons:
+        learned = any(name in LEARNED for name in (comparison["first"], comparison["second"]))
+        assert (comparison["mcnemar_p"] is None) == learned
+        pairs = sum(comparison[key] for key in ("both", "only_first", "only_second", "neither"))
+        assert pairs == (180 if learned else 60)
+        assert comparison["ci_low"] <= comparison["difference"] <= comparison["ci_high"]
+
+
+def test_it_is_repeatable(repeated):
+    again = evaluate(DISK, filters=[*LEARNED], episodes=60, repeats=3, num_envs=7)
+    known = {row["filter"]: timeless(row) for row in repeated.rows}
+    for row in again.rows:
+        row, other = timeless(row), dict(known[row["filter"]])
+        # The checksum is of the record too, in which stands how long it took.
+        assert row["learning"].pop("sha256") != other["learning"].pop("sha256")
+        assert row == other
+
+
+def test_certificates_stand_beside_the_rates():
+    name = "bayesian-scbf:simultaneous=0.9"
+    found = evaluate(DISK, filters=["bayesian-scbf", name], episodes=60, repeats=2)
+    plain, row = found.rows
+    assert plain["certificate"] is None
+    assert "certificate" in row["bound_note"]
+    assert row["certificate"]["delta"] == pytest.approx(0.1)
+    # (1 - delta)(h_0 - m T)/c, of h = 1 - x_1^2 - x_2^2 with c = 1, for the mean m of both identifications.
+    expected = 0.9 * (1 - 0.1**2 - 0.7**2 - row["certificate"]["shortfall"] * DISK.horizon)
+    assert row["certificate"]["supremum"] == pytest.approx(1.0, abs=1e-6)
+    assert row["certificate"]["probability"] == pytest.approx(expected, abs=1e-6)
+    assert row["ci_high"] >= row["certificate"]["probability"] > 0
+
+
+def test_progress_goes_from_the_learning_to_the_end():
+    told = []
+    evaluate(DISK, filters=["scbf", "bayesian-scbf"], episodes=8, num_envs=4, repeats=2, progress=told.append)
+    assert told == sorted(told)
+    assert told[-1] == pytest.approx(1.0)
+    assert sum(0 < part <= 2 / 5 for part in told) >= 2  # two of five parts are the learning
+
+
+def test_a_residual_may_be_of_another_plant_than_the_first_barrier_alone():
+    model = learner_of("learned-hocbf")(load_problem("QuadrotorAltitude-v0"), states=60, epochs=2, hidden=(4,))
+    condition = LearnedHOCBF(model, (1.0, 2.0), eps=0.0)
+    heavier = load_problem("QuadrotorAltitude-v0", {"barrier": {"half_width": 1.25}})
+    with pytest.raises(ConfigurationError, match="was learned for the barriers"):
+        condition.constraint(heavier.model, heavier.barriers[0])
