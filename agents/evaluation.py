@@ -16,7 +16,7 @@ import numpy as np
 
 from agents.comparison import Comparison, Flags, compare_all
 from agents.episodes import Env, Progress, Recorder, Row, Totals, run_episodes
-from agents.learning import Learning, describe
+from agents.learning import Learning, describe, seconds_of
 from agents.policy import POLICIES, Policy, make_policy
 from agents.problems import full_id, load_problem
 from agents.promised import Promised, together
@@ -26,7 +26,7 @@ from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
 from safe_envs.vector import SafeVectorEnv
-from wrappers import CONDITIONS, LEARNED, Condition, SafetyFilterVectorWrapper, parse_conditions, spec_of
+from wrappers import CONDITIONS, LEARNED, Condition, SafetyFilterVectorWrapper, parse_conditions, require_readable, spec_of
 from wrappers.learning import LearnedModel
 
 BARE = "none"
@@ -113,12 +113,12 @@ def evaluate(
         episodes: number for each filter.
         seed: whole number from 0.
         num_envs: how many episodes to simulate side by side.
-        knowledge: what the filters know, "model" or "plant".
+        knowledge: what the filters know, "model" or "plant"; those that correct the model start from it in any case.
         objective: of the filters, "nearest" to the policy's action or "clf": see `SafetyFilter.for_problem`.
         confidence: of all intervals, between 0 and 1.
         bounds: look for proved bounds and certificates, which takes a search of the safe set for each filter.
         learned: models, or files of `safe-envs identify`, to use in place of learning.
-        repeats: number of identifications of what is learned, from the seed and from children of it.
+        repeats: number of identifications of what is learned, from the seed and from children of it; 1 where nothing is.
         progress: told the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
 
@@ -140,9 +140,9 @@ def evaluate(
     actor = make_policy(policy, world) if isinstance(policy, str) else policy
     names = list(dict.fromkeys((BARE, world.filter) if filters is None else filters))
     specs = [_checked(name, world) for name in names]
-    learning = Learning(world, learned, repeats, seed)
-    work = _Work(progress, len(learning.missing(names)) + sum(learning.repeats(name) for name in names))
-    for method, repeat in learning.missing(names):
+    learning = Learning(world, names, learned, repeats, seed)
+    work = _Work(progress, len(learning.missing()) + sum(learning.repeats(name) for name in names))
+    for method, repeat in learning.missing():
         learning.learn(method, repeat, work.part())
     filters_of = {name: [_conditions(name, learning, r) for r in range(learning.repeats(name))] for name in names}
     envs = {name: [_make_env(world, c, knowledge, objective, min(num_envs, episodes)) for c in each] for name, each in filters_of.items()}
@@ -168,7 +168,7 @@ def evaluate(
             run_episodes(env, actor, episodes, seed, work.part(episodes), recorders.get(name) if r == 0 else None, promised[r].add)
             for r, env in enumerate(envs[name])
         ]
-        speeds.append(_speed(name, totals, time.perf_counter() - begun))
+        speeds.append({**_speed(name, totals, time.perf_counter() - begun), "learning_seconds": seconds_of(filters_of[name])})
         found = pooled([each.row(confidence) for each in totals], confidence)
         rows.append(
             {
@@ -176,14 +176,13 @@ def evaluate(
                 "policy": config["policy"]["name"],
                 **found,
                 **together([promise.row() for promise in promised]),
-                "learning": describe(filters_of[name], [each.safe / each.episodes for each in totals]),
+                "learning": describe(filters_of[name], [each.safe / each.episodes for each in totals], world, knowledge),
             }
         )
         flags[name] = [each.flags for each in totals]
     timing = {"num_envs": num_envs, "rows": speeds}
     comparisons = compare_all(flags, confidence)
-    models = learning.models(names)
-    return Evaluation(world, config, rows, comparisons, timing, recorders, flags, models, _is_deterministic(world, actor))
+    return Evaluation(world, config, rows, comparisons, timing, recorders, flags, learning.models(), _is_deterministic(world, actor))
 
 
 class _Work:
@@ -213,6 +212,7 @@ def _checked(name: str, problem: SafetyProblem) -> str | None:
     if re.split("[:+]", name)[0] not in (*CONDITIONS, *LEARNED):
         raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, (BARE, *CONDITIONS, *LEARNED))}")
     if any(re.split(":", part)[0] in LEARNED for part in name.split("+")):
+        require_readable(name, problem)
         return None
     return spec_of(parse_conditions(name, problem))
 

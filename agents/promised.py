@@ -77,14 +77,17 @@ class Promised:
 
 
 def together(rows: Sequence[Row]) -> Row:
-    """The rows of several identifications as one: the mean of their certificates, with 0 for those that have none."""
+    """The rows of several identifications as one: the mean of their certificates, with 0 for those that have none, and the worst's note."""
     first = rows[0]
     certificates = [row["certificate"] for row in rows]
     if len(rows) == 1 or first["certificate"] is None:
         return first
+    worst = min(certificates, key=lambda c: (c["probability"] or 0.0, -c.get("shortfall", math.inf)))
+    if worst["probability"] is None and all(c["probability"] is None for c in certificates):
+        return {**first, "certificate": worst}
     mean = {
         key: math.fsum(c[key] or 0.0 for c in certificates) / len(rows)
         for key in ("probability", "delta", "supremum", "shortfall")
         if all(key in c for c in certificates)
     }
-    return {**first, "certificate": {"note": first["certificate"]["note"], **mean}}
+    return {**first, "certificate": {"note": worst["note"], **mean}}

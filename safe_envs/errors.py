@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import numbers
 from collections.abc import Iterable
 from typing import Any
 
@@ -40,6 +41,6 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
 
 
 def require_whole(name: str, value: Any, least: int) -> None:
-    """Raise ConfigurationError unless a value is a whole number from `least`."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < least:
+    """Raise ConfigurationError unless a value is a whole number from `least`; NumPy's integers are such, truth values are not."""
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or int(value) < least:
         raise ConfigurationError(f"{name} = {value!r}; give a whole number from {least}")

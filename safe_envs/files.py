@@ -16,6 +16,9 @@ def require_writable(path: Path) -> None:
     if path.is_dir():
         raise ConfigurationError(f"cannot write {path}: it is a folder; name a file in it")
     if not folder.is_dir():
+        there = next(place for place in (folder, *folder.parents) if place.exists())
+        if not there.is_dir():
+            raise ConfigurationError(f"cannot write {path}: {there} is a file and no folder; choose another folder")
         raise ConfigurationError(f"cannot write {path}: the folder {folder} does not exist; create it or choose another")
     try:
         with tempfile.TemporaryFile(dir=folder):

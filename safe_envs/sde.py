@@ -82,6 +82,9 @@ class ControlAffineSDE:
             object.__setattr__(self, name, value)
         self._check_symbols()
 
+    def __hash__(self) -> int:
+        return hash((self.states, self.inputs, self.drift, self.input_matrix, self.diffusion, tuple(self.parameters.items())))
+
     def _check_symbols(self) -> None:
         symbols = [*self.states, *self.inputs, *self.parameters]
         names = [s.name for s in symbols]

@@ -1,11 +1,12 @@
-"""How fast are a filter call, an env step and a vector env, next to a hand-written loop with nothing else in it?"""
+"""How fast are a filter call, an env step and a vector env, next to a hand-written loop with nothing else in it? And learning?"""
 
 from __future__ import annotations
 
 import json
 import os
+import time
 import timeit
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,10 +17,23 @@ from rich import box
 from rich.table import Table
 
 import safe_envs
+from agents.problems import load_problem
 from safe_envs import Barrier, ControlAffineSDE
 from safe_envs.files import require_writable, write_atomically
 from scripts.console import stdout
-from wrappers import CBF, HOCBF, SafetyFilter, SafetyFilterVectorWrapper, SafetyFilterWrapper, parse_conditions
+from wrappers import (
+    CBF,
+    DDSCBF,
+    HOCBF,
+    BayesianSCBF,
+    LearnedHOCBF,
+    SafetyFilter,
+    SafetyFilterVectorWrapper,
+    SafetyFilterWrapper,
+    parse_conditions,
+)
+from wrappers.learning import LearnedModel, learner_of
+from wrappers.learning.collect import draw_states
 
 _ID = "safe_envs/StochasticDubins-v0"
 _LIMITS = "safe_envs/QuadrotorLimits-v0"
@@ -27,6 +41,14 @@ _BATCHES = (1, 32, 1024, 10_000)
 _NUM_ENVS = 1024
 _ROUNDS = 15
 _SECONDS_PER_ROUND = 0.08
+_LEARNED: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "learned-hocbf": ("DubinsDisk-v0", "learned-hocbf", {}),
+    "ddscbf, network": ("Pendulum-v0", "ddscbf", {}),
+    "ddscbf, degree 2, direct": ("ACCGap-v0", "ddscbf", {"points": 300, "repetitions": 10_000, "way": "direct"}),
+    "ddscbf, degree 2, recursion": ("ACCGap-v0", "ddscbf", {"points": 300, "repetitions": 10_000, "way": "network"}),
+    "bayesian-scbf, confidence": ("CubicSDEDisk-v0", "bayesian", {}),
+}
+"""Env, method and settings of each learned filter."""
 
 Figures = dict[str, float]
 
@@ -48,7 +70,7 @@ class Case(NamedTuple):
 
 
 def benchmark(json_file: Path | None = None) -> None:
-    """Measure, print and, if asked, write the speed of filter calls, scalar and vector steps, and the fused limit.
+    """Measure, print and, if asked, write the speed of filter calls, scalar and vector steps, the fused limit, and of learning.
 
     Args:
         json_file: where the figures go.
@@ -68,13 +90,16 @@ def benchmark(json_file: Path | None = None) -> None:
 
 def measure() -> Figures:
     """Return microseconds for each state, and the ratios that matter."""
-    times = _times({**_filter_calls(), **_several_rows(), **_scalar_steps(), **_vector_steps(), "hand-fused loop": _fused_loop()})
+    learned, seconds = _learn()
+    cases = {**_filter_calls(), **_several_rows(), **_learned_calls(learned), **_scalar_steps(), **_vector_steps()}
+    times = _times({**cases, "hand-fused loop": _fused_loop()})
     return {
         **times,
         "filtered / bare env.step": times["env.step, filtered"] / times["env.step, bare"],
         "vector env, bare, million steps a second": 1.0 / times["vector env, bare"],
         "vector env, filtered, million steps a second": 1.0 / times["vector env, filtered"],
         "speed of the filtered vector env / fused loop": times["hand-fused loop"] / times["vector env, filtered"],
+        **seconds,
     }
 
 
@@ -132,6 +157,39 @@ def _several_rows() -> dict[str, Case]:
     }
 
 
+def _learn() -> tuple[dict[str, LearnedModel], Figures]:
+    """What the learned filters rest on, and how many seconds each took; for the two ways of the generator the thesis' amount of data.
+
+    The thesis reports more than 5 hours for the recursion and 15 s for the Bayesian identification.
+    """
+    learned, seconds = {}, {}
+    for name, (env_id, method, settings) in _LEARNED.items():
+        problem = load_problem(env_id)
+        began = time.perf_counter()
+        learned[name] = learner_of(method)(problem, **settings)
+        seconds[f"{name}, learned in s"] = time.perf_counter() - began
+    return learned, seconds
+
+
+def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
+    """Filter calls of each learned condition, at states where the problem is explored."""
+    conditions: dict[str, Callable[[Any, Any], Any]] = {
+        "learned-hocbf": lambda model, problem: LearnedHOCBF(model, problem.gains),
+        "ddscbf": lambda model, _: DDSCBF(model),
+        "bayesian": lambda model, _: BayesianSCBF(model, confidence=0.95),
+    }
+    cases, rng = {}, np.random.default_rng(0)
+    for name, (env_id, method, _) in _LEARNED.items():
+        problem = load_problem(env_id)
+        safety_filter = SafetyFilter.for_problem(problem, conditions[method](learned[name], problem))
+        low, high = np.transpose(problem.box)
+        x, u = draw_states(problem, _NUM_ENVS, rng), rng.uniform(low, high, (_NUM_ENVS, len(low)))
+        acting = np.flatnonzero(safety_filter.filter(x, u).active.any(axis=1))[0]
+        cases[f"{name}, 1 state"] = Case(lambda f=safety_filter, x=x[acting], u=u[acting]: f.filter(x, u))
+        cases[f"{name}, {_NUM_ENVS} states"] = Case(lambda f=safety_filter, x=x, u=u: f.filter(x, u), _NUM_ENVS)
+    return cases
+
+
 def _scalar_steps() -> dict[str, Case]:
     # No episode may end within a round: the vehicle turns on the spot, with little noise.
     bare = gym.make(_ID, horizon=1e9, start=[0.0, 0.0, 0.0], noise=0.01)
@@ -182,7 +240,7 @@ def _fused_loop() -> Case:
 
 def _table(figures: Figures) -> Table:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    table.add_column(f"microseconds for each state, or a ratio; vector envs of {_NUM_ENVS}")
+    table.add_column(f"microseconds for each state, seconds where they are named, or a ratio; vector envs of {_NUM_ENVS}")
     table.add_column("figure", justify="right")
     for name, value in figures.items():
         table.add_row(name, f"{value:.3g}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import NoReturn
 
 from gymnasium.error import Error as GymnasiumError
 from rich.console import Console
@@ -15,6 +16,8 @@ from safe_envs.errors import SafeEnvsError
 
 _LEAST_WIDTH = 104
 _PIPE_WIDTH = 240
+_TOO_LARGE = ("can't allocate memory", "Maximum allowed dimension exceeded", "Maximum allowed size exceeded", "array is too big")
+"""What PyTorch and NumPy say of sizes beyond the memory, where it is no MemoryError."""
 
 
 def stdout() -> Console:
@@ -29,8 +32,17 @@ def run(command: Callable[[], object]) -> None:
     try:
         command()
     except (SafeEnvsError, GymnasiumError) as error:
-        Console(stderr=True).print(f"[bold red]Error:[/] [red]{escape(str(error))}[/]", soft_wrap=True, highlight=False)
-        sys.exit(2)
+        _fail(str(error))
+    except (MemoryError, RuntimeError, ValueError) as error:
+        if not isinstance(error, MemoryError) and not any(text in str(error) for text in _TOO_LARGE):
+            raise
+        reason = str(error) or type(error).__name__
+        _fail(f"not enough memory for what was asked ({reason}); choose smaller settings, or fewer episodes")
+
+
+def _fail(message: str) -> NoReturn:
+    Console(stderr=True).print(f"[bold red]Error:[/] [red]{escape(message)}[/]", soft_wrap=True, highlight=False)
+    sys.exit(2)
 
 
 @contextmanager

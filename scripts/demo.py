@@ -42,14 +42,14 @@ def demo(folder: Path, episodes: int = 1000) -> None:
     begun = time.perf_counter()
     with progress_bar("Training PPO") as tell:
         train(policy, tell)
-    console.print(f"Trained in {time.perf_counter() - begun:.0f} s and saved as {policy}\n", highlight=False)
+    console.print(f"Trained in {time.perf_counter() - begun:.0f} s and saved as {policy}\n", highlight=False, markup=False)
     for actor in ("nominal", str(policy)):
         with progress_bar("Evaluating") as tell:
             answer = evaluate(ENV_ID, actor, FILTERS, episodes=episodes, progress=tell, record=True)
         print_evaluation(console, answer)
         picture = folder / f"{Path(actor).stem}.png"
         draw(answer, picture)
-        console.print(f"Picture: {picture}\n", highlight=False)
+        console.print(f"Picture: {picture}\n", highlight=False, markup=False)
 
 
 def train(path: Path, tell: Callable[[float], None] | None = None, steps: int = _STEPS, seed: int = 0) -> None:

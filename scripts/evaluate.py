@@ -11,6 +11,12 @@ import typer
 from scripts import options
 from scripts.console import progress_bar, run, stdout
 
+LEARNED_PARAMETERS = (
+    "learned-hocbf:p=..:level=.95:eps=.. (quantile of the held-out errors that is the margin, or the margin itself), ddscbf:margin=0, "
+    "bayesian-scbf:confidence=P or bayesian-scbf:simultaneous=P (robust at each state by itself, or at all at once), and with each "
+    "file=FILE, as by --learned, and sampling_margin=M"
+)
+
 
 def evaluate(
     env_id: options.EnvId,
@@ -20,7 +26,8 @@ def evaluate(
             "--filter",
             metavar="NAME",
             help="none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf, scbf, and learned ones: learned-hocbf, ddscbf, bayesian-scbf; with "
-            "parameters: hocbf:p=2,8; one for each barrier: hocbf:p=2,8+cbf:alpha=1. Repeatable. By default none and the env's own.",
+            "parameters: hocbf:p=2,8; one for each barrier: hocbf:p=2,8+cbf:alpha=1. Repeatable. By default none and the env's own. "
+            f"Parameters of learned ones: {LEARNED_PARAMETERS}.",
         ),
     ] = None,
     policy: Annotated[
@@ -58,7 +65,7 @@ def evaluate(
     num_envs: Annotated[int, typer.Option(help="Episodes side by side; it changes the speed, not the answer.")] = 1024,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write configuration, versions, rows, comparisons and timing.")] = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw h and the safety rate over time, and trajectories: .png, .pdf, .svg.")
+        Path | None, typer.Option(metavar="FILE", help=f"Draw h and the safety rate over time, and trajectories: {options.FORMATS}")
     ] = None,
 ) -> None:
     """Print the safety rate of a policy under each filter with its interval, and compare the filters pair by pair.
@@ -70,7 +77,7 @@ def evaluate(
     from agents import evaluation, refinement
     from scripts.table import print_evaluation, print_refinement, write_json
 
-    options.require_outputs(json, plot)
+    options.require_outputs(json, plot, inputs=options.inputs_of(policy, filters or (), learned or ()))
     arguments = options.of_env(
         noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ UNSAFE = "#B9B9B9"
 QUIET = "#444444"
 _SHOWN = 8
 _GRID = 300
+_MOST_COLUMNS = 4
 STYLE: Any = {
     "font.size": 10,
     "axes.spines.top": False,
@@ -61,11 +62,22 @@ def draw(evaluation: Evaluation, path: Path) -> None:
         _draw_curve(figure.add_subplot(grid[1, 0], sharex=barrier), evaluation, colors)
         if problem.plane:
             _draw_plane(figure.add_subplot(grid[:, 1]), evaluation, colors)
-        handles, labels = barrier.get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 4))
+        add_legend(figure, barrier.get_legend_handles_labels()[0])
         title = f"{config['env_id'] or problem.name}, {Path(config['policy']['name']).stem} policy"
         figure.suptitle(f"{title}\n{describe_system(problem)}", fontsize=11)
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+
+
+def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
+    """A legend of handles with labels below the panels, in as many columns as fit; a label too long for one is written smaller."""
+    size, share = mpl.rcParams["font.size"], 1.0
+    for columns in range(min(len(handles), _MOST_COLUMNS), 0, -1):
+        legend = figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=size)
+        share = legend.get_window_extent().width / figure.bbox.width
+        if share <= 1.0:
+            return
+        legend.remove()
+    figure.legend(handles=handles, loc="outside lower center", fontsize=size / share)
 
 
 def _colors(evaluation: Evaluation) -> dict[str, str]:

@@ -13,11 +13,24 @@ from typing import Annotated, Any
 import typer
 
 from safe_envs.errors import ConfigurationError, nearest, require_whole
-from safe_envs.files import require_writable
 from scripts import options
 from scripts.console import progress_bar, run, stdout
 
-_NOT_SETTINGS = ("data", "seed", "step", "progress")
+_NOT_SETTINGS = ("problem", "data", "seed", "step", "progress")
+_OF_COLLECTING = ("starts", "steps", "points", "repetitions")
+"""Settings that say which data are collected."""
+
+SETTINGS = {
+    "learned-hocbf": "states=3000, label_dt=0.001, hidden=100,30, epochs=500",
+    "ddscbf": "points=200, repetitions=50000, estimator=martingale (or centred, printed), way=network or direct (by default what suits)",
+    "bayesian": (
+        "starts=1000, steps=1, repetitions=100, degree=1 to 3 or more (by default by the number of rows), prior=10.0, diffusion_degree=0, "
+        "alpha=1.0, beta=1.0"
+    ),
+}
+"""What `--set` takes for each method, for the help: the functions themselves are too heavy to import for it."""
+
+_SETTINGS_HELP = "\n\n".join(("Setting of the method, repeatable; with the defaults:", *(f"{m}: {text}." for m, text in SETTINGS.items())))
 
 
 def identify(
@@ -31,11 +44,12 @@ def identify(
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Where what was learned goes: an npz, without pickle.")],
     data: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Learn from these, an npz of Transitions.save, instead of collecting data.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Learn from these, an npz of Transitions.save, instead of collecting data."),
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Setting of the method: points=300, hidden=100,30, way=direct, ... Repeatable."),
+        typer.Option("--set", metavar="NAME=VALUE", help=_SETTINGS_HELP),
     ] = None,
     noise: options.Noise = None,
     plant: options.Plant = None,
@@ -46,28 +60,31 @@ def identify(
     box: options.Box = None,
     seed: options.Seed = 0,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write configuration, versions, record and errors.")] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Draw the truth against the estimate: .png, .pdf, .svg.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="FILE", help=f"Draw the truth against the estimate: {options.FORMATS}")] = None,
 ) -> None:
     """Learn of a system by a method, and print how far what was learned is from the truth.
 
-    The plant is only stepped, or not at all with --data. The truth, with which the estimates are compared at states drawn
-    anew from where the problem is explored, is that of the plant.
+    The plant is only stepped, or not at all with --data: then --dt, --substeps, --box and settings of what is collected are
+    refused. The truth, with which the estimates are compared at states drawn anew from where the problem is explored, is that of
+    the plant, with its --noise.
     """
     from agents.problems import full_id, load_problem
-    from scripts.identify_report import Identification, compare, print_report, write_json
+    from scripts.identify_report import Identification, Source, compare, print_report, write_json
     from wrappers.learning import learner_of
     from wrappers.learning.identifiability import IdentifiabilityWarning
 
     require_whole("seed", seed, 0)
-    require_writable(out)
-    options.require_outputs(json, plot)
+    options.require_outputs(json, plot, out=out, inputs=[] if data is None else [("--data", data)])
     arguments = options.of_env(
         noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=None, box=box, start=None
     )
     learner = learner_of(method)
     chosen = read_settings(method, learner, settings or ())
+    source: dict[str, Any] = {}
+    if data is not None:
+        _refuse_collecting(chosen, {"--dt": dt, "--substeps": substeps, "--box": box})
+        source = {"data": _load_data(method, learner, data)}
     problem = load_problem(env_id, arguments)
-    source = {} if data is None else {"data": _load_data(method, learner, data)}
     with progress_bar("Learning") as tell, warnings.catch_warnings():
         # They are in the record, and printed with the results.
         warnings.simplefilter("ignore", IdentifiabilityWarning)
@@ -89,7 +106,7 @@ def identify(
         functions=compare(learned, problem, seed),
         options={name: value for name, value in arguments.items() if value is not None},
         seed=seed,
-        data=data,
+        source=None if data is None else Source.of(data, source["data"]),
         out=out,
         use=_use(env_id, method, out, of_env),
     )
@@ -108,7 +125,7 @@ def read_settings(method: str, learner: Callable[..., Any], texts: Sequence[str]
     Raises:
         ConfigurationError: the function has no such argument, or the value is not of its kind.
     """
-    allowed = [name for name in inspect.signature(learner).parameters if name not in ("problem", *_NOT_SETTINGS)]
+    allowed = settings_of(learner)
     hints = typing.get_type_hints(learner)
     found = options.parameters("--set", texts, words=True) or {}
     for name, value in found.items():
@@ -118,19 +135,41 @@ def read_settings(method: str, learner: Callable[..., Any], texts: Sequence[str]
     return found
 
 
+def settings_of(learner: Callable[..., Any]) -> dict[str, inspect.Parameter]:
+    """The settings of the function that learns by a method, by name."""
+    return {name: found for name, found in inspect.signature(learner).parameters.items() if name not in _NOT_SETTINGS}
+
+
+def _refuse_collecting(settings: Mapping[str, Any], given: Mapping[str, Any]) -> None:
+    """Raise ConfigurationError if a setting or an option only says how data are collected."""
+    idle = [f"--set {name}" for name in _OF_COLLECTING if name in settings] + [
+        option for option, value in given.items() if value is not None
+    ]
+    if idle:
+        raise ConfigurationError(f"{', '.join(idle)}: not allowed with --data, since nothing is collected then; leave it out")
+
+
 def _of_kind(name: str, value: float | str, hint: Any) -> Any:
     """A value as an argument with a type hint takes it: a word, a list of whole numbers, or a number."""
-    origins = {typing.get_origin(part) for part in (hint, *typing.get_args(hint))}
+    parts = (hint, *typing.get_args(hint))
+    origins = {typing.get_origin(part) for part in parts}
     if typing.Literal in origins:
         return str(value)
     if Sequence in origins:
         try:
-            return [int(entry) for entry in str(value).split(",")]
+            return [_whole(float(entry)) for entry in str(value).split(",")]
         except ValueError as error:
             raise ConfigurationError(f"--set {name}={value}: give whole numbers with commas between, such as {name}=100,30") from error
     if isinstance(value, str):
         raise ConfigurationError(f"--set {name}={value}: {value!r} is not a number")
-    return value
+    # A whole number may be written as 1e3; what is not whole, the method refuses.
+    return int(value) if int in parts and float(value).is_integer() else value
+
+
+def _whole(value: float) -> int:
+    if not value.is_integer():
+        raise ValueError(f"{value} is not whole")
+    return int(value)
 
 
 def _load_data(method: str, learner: Callable[..., Any], path: Path) -> Any:

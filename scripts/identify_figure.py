@@ -15,9 +15,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from safe_envs.files import write_atomically
-from scripts.figure import COLORS, STYLE
+from scripts.figure import COLORS, QUIET, STYLE, add_legend
 from scripts.identify_report import Function, Identification, percent
-from scripts.table import describe_system
 from wrappers.learning.posterior import Diffusion, Posterior
 from wrappers.learning.regression import sigma_samples
 
@@ -27,6 +26,8 @@ _MOST_LEVELS = 4
 _ACROSS = 4
 _SAMPLES = 20_000
 _CONSTANT = 1e-9
+_AROUND = 0.1
+_HEADROOM = 1.3
 _SIDE, _WIDEST_SIDE, _LEAST_WIDTH = 2.9, 3.4, 7.6
 _TINY, _HUGE = 0.02, 2e4
 
@@ -63,9 +64,10 @@ def draw(found: Identification, path: Path) -> None:
             panel.axis("off")
         if not count:
             axes[0].text(0.5, 0.5, "There is nothing to compare.", ha="center", va="center")
-        figure.legend(handles=list(handles), loc="outside lower center", ncols=4)
+        if handles:
+            add_legend(figure, list(handles))
         left = f", the largest {len(shown)} of {len(rest)} functions" if len(shown) < len(rest) else ""
-        figure.suptitle(f"{found.env_id}, {found.learned.method}{left}\n{describe_system(found.problem)}", fontsize=11)
+        figure.suptitle(f"{found.env_id}, {found.learned.method}{left}\n{found.setup}", fontsize=11)
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
 
 
@@ -93,16 +95,19 @@ def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
     power = _power(np.concatenate([function.truth, function.estimate]))
     truth, estimate = function.truth / 10.0**power, function.estimate / 10.0**power
     alone = _constant(truth) and _constant(estimate)
+    if _constant(truth):
+        numbers = f"{_range('truth', function.truth)}\n{_range('estimate', function.estimate)}"
+        axes.text(0.04, 0.97, numbers, transform=axes.transAxes, va="top", fontsize=9, color=QUIET)
     if _constant(truth) and not alone:
         axes.hist(estimate, bins=30, color=COLORS[0], alpha=0.6)
-        axes.axvline(truth[0], color=_TRUTH, linewidth=1.4)
-        axes.set(xlabel=_label("estimate", function.unit, power), ylabel="states")
+        axes.axvline(truth[0], ymax=1.0 / _HEADROOM, color=_TRUTH, linewidth=1.4)
+        axes.set(xlabel=_label("estimate", function.unit, power), ylabel="states", ylim=(0.0, _HEADROOM * axes.get_ylim()[1]))
         _tidy(axes)
         return _COUNTS_HANDLE
-    # Around a single point there is no scale but its distance from 0.
-    all_values = np.concatenate([truth, estimate, [0.0] * alone])
-    room = 0.05 * np.ptp(all_values)
-    limits = (all_values.min() - room, all_values.max() + room)
+    both = np.concatenate([truth, estimate])
+    # Around a single point there is no scale but that of the value itself, unless the error is larger.
+    room = max(np.ptp(both), _AROUND * abs(both).max()) if alone else 0.05 * np.ptp(both)
+    limits = (both.min() - room, both.max() + room)
     axes.plot(limits, limits, color=_TRUTH, linewidth=1.0)
     size, opacity = (6.0, 1.0) if alone else (2.5, 0.45)
     axes.plot(truth, estimate, "o", color=COLORS[0], markersize=size, markeredgewidth=0, alpha=opacity, rasterized=True)
@@ -141,6 +146,11 @@ def _label(name: str, unit: str, power: int) -> str:
     raised = re.sub(r"\^(\d+)", r"$^{\1}$", unit)
     inside = (f"$10^{{{power}}}$ {raised}" if power else raised).strip()
     return f"{name} ({inside})" if inside else name
+
+
+def _range(name: str, values: np.ndarray) -> str:
+    """Values in words: the number where they are constant, else from where to where they reach."""
+    return f"{name} {values[0]:.4g}" if _constant(values) else f"{name} {values.min():.3g} to {values.max():.3g}"
 
 
 def _constant(values: np.ndarray) -> bool:

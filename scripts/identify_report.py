@@ -22,15 +22,16 @@ from rich.text import Text
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
-from scripts.table import describe_system
+from scripts.table import describe_plant, describe_system
 from wrappers.learning import LearnedModel
 from wrappers.learning.collect import draw_states
+from wrappers.learning.transitions import Transitions
 
 STATES = 1000
 """States at which truth and estimate are compared."""
 
 _FRESH = 2
-"""Second entry of the seed of these states; `wrappers.learning.collect` has 0 and 1."""
+"""Second entry of the seed of these states; see `wrappers.learning.checks.Purpose`."""
 
 _VANISHING = 1e-9
 """A truth smaller than this part of its estimate's error is 0, but for rounding."""
@@ -38,10 +39,11 @@ _VANISHING = 1e-9
 _MOST_NAMED = 8
 _ERRORS = {
     "learned-hocbf": "of the residuals: root mean square and 95 % quantile",
-    "ddscbf": "of the network in the median, or of the covariances in the root mean square",
+    "network": "of the network against the labels, median; and what noise in the data makes of the labels, as their standard error",
+    "direct": "of the covariances, root mean square",
     "bayesian": "of the rates per s, root mean square; what noise in the data makes of it; and in standard deviations of the prediction",
 }
-"""What the held-out errors of each method are."""
+"""What the held-out errors of each method are, or of its way."""
 
 _ROUNDING = 1e-8
 _PACKAGES = ("safe-envs", "numpy", "scipy", "sympy", "torch")
@@ -90,6 +92,32 @@ class Function:
         return not (self.truth.any() or self.estimate.any())
 
 
+@dataclass(frozen=True)
+class Source:
+    """A file of data that was learned from.
+
+    Attributes:
+        path: of the file.
+        shortest: of the steps, in s.
+        longest: of the steps, in s.
+        seed: of the data; None for data from elsewhere.
+    """
+
+    path: Path
+    shortest: float
+    longest: float
+    seed: int | None
+
+    @classmethod
+    def of(cls, path: Path, data: Transitions) -> Source:
+        """What there is to say of data from a file."""
+        return cls(path, float(data.dt.min()), float(data.dt.max()), data.seed)
+
+    def __str__(self) -> str:
+        steps = f"{self.shortest:g} s" if self.shortest == self.longest else f"{self.shortest:g} to {self.longest:g} s"
+        return f"in steps of {steps}, {'from elsewhere' if self.seed is None else f'of the seed {self.seed}'}"
+
+
 @dataclass(frozen=True, eq=False)
 class Identification:
     """What was learned, and how well.
@@ -101,7 +129,7 @@ class Identification:
         functions: truth and estimate of each learned function; or why they cannot be compared.
         options: arguments of `gym.make` that were given.
         seed: that was given.
-        data: file that was learned from, if any.
+        source: file of data that was learned from, if any.
         out: where the model was written.
         use: a command that uses it.
     """
@@ -112,7 +140,7 @@ class Identification:
     functions: tuple[Function, ...] | str
     options: dict[str, Any]
     seed: int
-    data: Path | None
+    source: Source | None
     out: Path
     use: str
 
@@ -120,6 +148,13 @@ class Identification:
     def shown(self) -> list[Function]:
         """The functions that are not 0 in truth and estimate."""
         return [] if isinstance(self.functions, str) else [function for function in self.functions if not function.vanishes]
+
+    @property
+    def setup(self) -> str:
+        """What was stepped; with data from a file, only what they are compared with."""
+        if self.source is None:
+            return describe_system(self.problem)
+        return f"compared with {describe_plant(self.problem)}, at states of the seed {self.seed}"
 
     @property
     def notes(self) -> list[str]:
@@ -167,15 +202,16 @@ def print_report(console: Console, found: Identification) -> None:
     """Print what was learned from what, its errors, and how to use it."""
     record = found.learned.record
     title = Text(found.env_id, style="bold")
-    title.append(f" | method {found.learned.method} | seed {found.seed}", style="not bold")
-    title.append(f"\n{describe_system(found.problem)}", style="not bold")
+    origin = f"seed {found.seed}" if found.source is None else f"data {found.source.path}"
+    title.append(f" | method {found.learned.method} | {origin}", style="not bold")
+    title.append(f"\n{found.setup}", style="not bold")
     console.print(title, soft_wrap=True, highlight=False)
-    source = "" if found.data is None else f" of {found.data}"
-    amount = f"{record.transitions:,} transitions{source} that last {record.observed:,.6g} s together"
+    of, details = ("", "") if found.source is None else (f" of {found.source.path}", f", {found.source}")
+    amount = f"{record.transitions:,} transitions{of} that last {record.observed:,.6g} s together{details}"
     _say(console, f"\nLearned in {_seconds(record.seconds)} from {amount}")
     _say(console, f"Settings: {', '.join(f'{name} = {_setting(value)}' for name, value in record.settings.items())}")
     if record.errors:
-        _head(console, "Held-out errors", _ERRORS[found.learned.method])
+        _head(console, "Held-out errors", _ERRORS[record.settings.get("way", found.learned.method)])
         console.print(_errors_table(record.errors))
     if found.shown:
         _head(console, "Truth against estimate", f"the plant and what was learned of it at {STATES} fresh states")
@@ -210,7 +246,7 @@ def document(found: Identification) -> dict[str, Any]:
             "options": found.options,
             "method": found.learned.method,
             "seed": found.seed,
-            "data": None if found.data is None else str(found.data),
+            "data": None if found.source is None else str(found.source.path),
         },
         "versions": {"python": platform.python_version(), **{package: version(package) for package in _PACKAGES}},
         "file": str(found.out),

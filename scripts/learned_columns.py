@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from agents.episodes import Row
+from safe_envs.calculus import input_derivative, vanishes
+from safe_envs.problem import SafetyProblem
 
-Cell = Callable[[Row], str]
+Cell = Callable[[Row, Mapping[str, Any]], str]
+"""From a row, and what was timed of it, to a text."""
 
 _NONE = "-"
 
@@ -14,20 +18,29 @@ _NONE = "-"
 def learned_columns(rows: Sequence[Row]) -> dict[str, Cell]:
     """The columns that the rows need, by title; none where nothing was learned."""
     columns: dict[str, Cell] = {}
-    if any(row["learning"] for row in rows):
-        columns["learned\nin"] = _seconds
-    if any(row["learning"] and row["learning"]["repeats"] > 1 for row in rows):
+    repeats = _repeats(rows)
+    if repeats:
+        columns["learned\nin" if repeats == 1 else "learned in,\nmean"] = _seconds
+    if repeats > 1:
         columns["worst\nident."] = _worst
     if any(row["certificate"] for row in rows):
         columns["certificate"] = _certificate
     return columns
 
 
-def learned_notes(rows: Sequence[Row]) -> list[str]:
-    """What has to be known of what was learned, and of certificates."""
-    notes = []
-    if any(row["learning"] for row in rows):
-        notes.append("no proved bound for what rests on something learned; bayesian-scbf:simultaneous=P has a certificate.")
+def learned_notes(rows: Sequence[Row], problem: SafetyProblem) -> list[str]:
+    """What has to be known of what was learned of a problem, and of certificates."""
+    repeats = _repeats(rows)
+    if not repeats:
+        return []
+    untried = not any(row["certificate"] for row in rows) and _may_be_certified(problem)
+    hint = "; bayesian-scbf:simultaneous=P may have a certificate" if untried else ""
+    notes = [f"no proved bound for what rests on something learned{hint}."]
+    if repeats > 1:
+        notes.append(
+            f"the intervals take the rates of the {repeats} identifications for nearly normal: bad ones that are rarer than about 1 in "
+            f'{repeats} go unseen, and "worst ident." is the worst of those seen.'
+        )
     for row in rows:
         learning, certificate = row["learning"], row["certificate"]
         if learning and learning["files"]:
@@ -37,7 +50,7 @@ def learned_notes(rows: Sequence[Row]) -> list[str]:
         elif learning:
             each = " each" if learning["repeats"] > 1 else ""
             notes.append(f"{row['filter']} was learned from {learning['transitions']:,} transitions{each}.")
-        notes += [f"{row['filter']}: {warning}" for warning in (learning["warnings"] if learning else ())]
+        notes += [f"{row['filter']}: {warning}" for warning in ([*learning["remarks"], *learning["warnings"]] if learning else ())]
         if certificate and certificate["note"]:
             notes.append(f"certificate of {row['filter']}: {certificate['note']}")
         if certificate and "delta" in certificate:
@@ -48,17 +61,30 @@ def learned_notes(rows: Sequence[Row]) -> list[str]:
     return notes
 
 
-def _seconds(row: Row) -> str:
-    learning = row["learning"]
-    return f"{learning['seconds']:.2f} s" if learning else _NONE
+def _repeats(rows: Sequence[Row]) -> int:
+    """The number of identifications of what was learned; 0 where nothing was."""
+    return max((row["learning"]["repeats"] for row in rows if row["learning"]), default=0)
 
 
-def _worst(row: Row) -> str:
+def _may_be_certified(problem: SafetyProblem) -> bool:
+    """Whether a problem has one barrier, of relative degree 1: for others there is no robust condition, on which a certificate rests."""
+    if len(problem.barriers) != 1:
+        return False
+    (barrier,) = problem.barriers
+    return not all(vanishes(problem.plant, entry) for entry in input_derivative(problem.plant, barrier.expression))
+
+
+def _seconds(_: Row, speed: Mapping[str, Any]) -> str:
+    seconds = speed["learning_seconds"]
+    return _NONE if seconds is None else f"{seconds:.2f} s"
+
+
+def _worst(row: Row, _: Mapping[str, Any]) -> str:
     learning = row["learning"]
     return f"{100 * min(learning['rates']):.1f} %" if learning and learning["repeats"] > 1 else _NONE
 
 
-def _certificate(row: Row) -> str:
+def _certificate(row: Row, _: Mapping[str, Any]) -> str:
     certificate = row["certificate"]
     if certificate is None:
         return _NONE

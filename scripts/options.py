@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,6 +26,7 @@ Horizon = Annotated[float | None, typer.Option(help="Length of an episode in s."
 Box = Annotated[list[str] | None, typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each.")]
 StartAt = Annotated[str | None, typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution.")]
 Seed = Annotated[int, typer.Option(help="Seed of all randomness.")]
+FORMATS = ".png, .pdf, .svg, or another format of matplotlib."
 
 
 def of_env(
@@ -69,19 +71,46 @@ def numbers(option: str, text: str) -> list[float]:
         raise ConfigurationError(f"{option} {text!r} is no number or list of numbers with commas between") from error
 
 
-def require_outputs(json: Path | None, plot: Path | None) -> None:
-    """Check, before any work, that --json and --plot can be written.
+def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = None, inputs: Iterable[tuple[str, Path]] = ()) -> None:
+    """Check, before any work, that --out, --json and --plot can be written, each to a file of its own.
+
+    Args:
+        json: of --json, if given.
+        plot: of --plot, if given.
+        out: of --out, where a command has it.
+        inputs: options and the files that they read, which are not to be overwritten.
 
     Raises:
         ConfigurationError: one cannot.
     """
-    if json is not None:
-        require_writable(json)
+    taken = {path.resolve(): f"{option} {path}" for option, path in inputs}
+    for option, path in (("--out", out), ("--json", json), ("--plot", plot)):
+        if path is None:
+            continue
+        require_writable(path)
+        place = path.resolve()
+        if place in taken:
+            raise ConfigurationError(f"{option} {path} would overwrite the file of {taken[place]}; name another file")
+        taken[place] = f"{option} {path}"
     if plot is not None:
         from scripts.figure import require_format
 
-        require_writable(plot)
         require_format(plot)
+
+
+def inputs_of(policy: str, filters: Iterable[str], learned: Iterable[Path] = ()) -> Iterator[tuple[str, Path]]:
+    """Options and the files that a simulation may read: of a policy, of filters with file=FILE, and of --learned."""
+    from agents.policy import POLICIES
+
+    if policy not in POLICIES:
+        yield "--policy", Path(policy)
+    for path in learned:
+        yield "--learned", path
+    for name in filters:
+        for text in re.findall("file=([^:]+)", name):
+            # A plus sign may be in the file's name, or come before the next condition.
+            parts = text.split("+")
+            yield from (("--filter", Path("+".join(parts[: i + 1]))) for i in range(len(parts)))
 
 
 def read_noise(text: str | None) -> float | list[float] | None:

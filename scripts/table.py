@@ -44,7 +44,7 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     table = _table(f"safe [{interval}]", *learned, "bound", *_COLUMNS)
     for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True):
         name, rate, *rest = _cells(row, speed["steps_per_second"])
-        table.add_row(name, rate, *[cell(row) for cell in learned.values()], *rest)
+        table.add_row(Text(name), rate, *[cell(row, speed) for cell in learned.values()], *rest)
     _print_table(console, table)
     compared = [] if evaluation.repeats else [c for c in evaluation.comparisons if BARE not in (c["first"], c["second"])]
     if compared:
@@ -65,7 +65,7 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
     table = _table(*[f"dt = {dt:g} s" for dt in refinement.periods])
     for row in refinement.rows:
         rates = zip(row["safety_rate"], row["ci_low"], row["ci_high"], strict=True)
-        table.add_row(row["filter"], *[_rate(*rate) for rate in rates])
+        table.add_row(Text(row["filter"]), *[_rate(*rate) for rate in rates])
     _print_table(console, table)
     if refinement.evaluations[0].repeats:
         _say(console, "Nothing is random here: what changes with the period, changes for sure.")
@@ -87,7 +87,8 @@ def heading(evaluation: Evaluation) -> Text:
     """What was evaluated, in two lines."""
     config = evaluation.config
     title = Text(config["env_id"] or evaluation.problem.name, style="bold")
-    often = f" x {config['repeats']} identifications" if config["repeats"] > 1 else ""
+    repeats = max((row["learning"]["repeats"] for row in evaluation.rows if row["learning"]), default=1)
+    often = f" x {repeats} identifications" if repeats > 1 else ""
     title.append(f" | policy {config['policy']['name']} | {config['episodes']} episodes{often} | seed {config['seed']}", style="not bold")
     goal = ", joint program with the goal" if config["objective"] == "clf" else ""
     title.append(f"\n{describe_system(evaluation.problem)}; filters know the {config['knowledge']}{goal}", style="not bold")
@@ -96,17 +97,18 @@ def heading(evaluation: Evaluation) -> Text:
 
 def describe_system(problem: SafetyProblem) -> str:
     """Noise, mismatch and timing of a problem."""
+    return f"{describe_plant(problem)}, dt = {problem.dt:g} s, horizon {problem.horizon:g} s"
+
+
+def describe_plant(problem: SafetyProblem) -> str:
+    """Noise and mismatch of a problem."""
     plant = {p.name: value for p, value in problem.plant.parameters.items()}
     model = {p.name: value for p, value in problem.model.parameters.items()}
     noise = ", ".join(f"{name} = {plant[name]:g}" for name in problem.noise)
     differing = [f"{name} = {plant[name]:g} (model {model[name]:g})" for name in plant if plant[name] != model[name]]
-    parts = [
-        f"noise {noise}" if any(plant[name] for name in problem.noise) else "no noise",
-        f"plant {', '.join(differing)}" if differing else "model = plant",
-        f"dt = {problem.dt:g} s",
-        f"horizon {problem.horizon:g} s",
-    ]
-    return ", ".join(parts)
+    told = f"noise {noise}" if any(plant[name] for name in problem.noise) else "no noise"
+    mismatch = f"plant {', '.join(differing)}" if differing else "model = plant"
+    return f"{told}, {mismatch}"
 
 
 def _interval(evaluation: Evaluation) -> str:
@@ -153,7 +155,7 @@ def _notes(evaluation: Evaluation) -> list[str]:
         for row in evaluation.rows
         if row["filter"] != BARE and row["bound"] is None and row["learning"] is None
     ]
-    notes += learned_notes(evaluation.rows)
+    notes += learned_notes(evaluation.rows, evaluation.problem)
     notes += [
         f"the rate of {row['filter']} lies below its proved bound, which asks for the condition at every instant: try --refine, and "
         "--filter NAME:sampling_margin=first-order"

@@ -36,7 +36,7 @@ def verify(
     simulate: Annotated[bool, typer.Option("--simulate/--no-simulate", help="Measure the safety, and hold it against the bounds.")] = True,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all that was found.")] = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw where the conditions cannot be met, h and the boundaries: .png, .pdf, .svg.")
+        Path | None, typer.Option(metavar="FILE", help=f"Draw where the conditions cannot be met, h and the boundaries: {options.FORMATS}")
     ] = None,
 ) -> None:
     """Print where the filter's conditions cannot be met, what is proved of its safety, and what a simulation says to that.
@@ -53,7 +53,7 @@ def verify(
     from wrappers.verify import verify as find
 
     require_whole("episodes", episodes, 1)
-    options.require_outputs(json, plot)
+    options.require_outputs(json, plot, inputs=options.inputs_of(policy, [filter_name or ""]))
     arguments = options.of_env(
         noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
     )

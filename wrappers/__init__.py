@@ -20,6 +20,7 @@ from wrappers.conditions import (
     parse_condition,
     parse_conditions,
     power,
+    require_readable,
     spec_of,
 )
 from wrappers.env_wrapper import SafetyFilterWrapper
@@ -50,5 +51,6 @@ __all__ = [
     "parse_condition",
     "parse_conditions",
     "power",
+    "require_readable",
     "spec_of",
 ]

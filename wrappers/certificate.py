@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from wrappers.safe_set import Region, region_of, sample
 from wrappers.safety_filter import SafetyFilter
 from wrappers.search import largest
 
+if TYPE_CHECKING:
+    from wrappers.learning.posterior import Posterior
+
 _SAMPLES = 8192
 _BEYOND = 10.0
 _BEYOND_LOG2 = 12
@@ -27,8 +30,8 @@ class Certificate:
     """P(safe on [0, T]) >= (1 - delta) (h_0 - m T)/c for a simultaneous `BayesianSCBF`.
 
     With probability 1 - delta of the posterior, A h of the true system is at least -m wherever X is in C, and h/c less what m
-    costs is then a lower bound (`wrappers.bounds.stage_bound`). The posterior takes the prior, the features and the noise's
-    being Gaussian for granted; c and m are found by sampling C and by a search, so that they are estimates from below.
+    costs is then a lower bound (`wrappers.bounds.stage_bound`). The posterior takes the prior, the features and constant Gaussian
+    noise for granted; c and m are found by sampling C and by a search, so that they are estimates from below.
 
     Attributes:
         delta: probability that the identification is outside its regions, delta_theta + delta_sigma.
@@ -58,12 +61,13 @@ def certificate(problem: SafetyProblem, conditions: Sequence[Condition], seed: i
         seed: of the search.
 
     Raises:
-        ConfigurationError: there is another condition or more than one barrier, or C reaches beyond the workspace, where neither
-            c nor m is known.
+        ConfigurationError: there is another condition or more than one barrier, the data contradict what the posterior takes for
+            granted, or C reaches beyond the workspace, where neither c nor m is known.
     """
     if len(conditions) != 1 or not isinstance(conditions[0], BayesianSCBF) or conditions[0].simultaneous is None:
         raise ConfigurationError("a certificate is for one barrier with bayesian-scbf:simultaneous=P")
     condition = conditions[0]
+    _require_consistent(condition.learned)
     robust = SafetyFilter.for_problem(problem, condition)
     expression = condition.learned.system.numeric(problem.barriers[0].expression)
     barrier = compile_function(problem.plant.states, [expression], "arrays")
@@ -84,6 +88,17 @@ def certificate(problem: SafetyProblem, conditions: Sequence[Condition], seed: i
     shortfall, _ = largest(missed, points, region, np.random.default_rng([seed, 3]))
     remark = f"no action meets the robust condition somewhere, by up to {shortfall:.3g}" if shortfall else ""
     return Certificate(condition.delta_theta + condition.delta_sigma, highest, shortfall, remark, barrier)
+
+
+def _require_consistent(posterior: Posterior) -> None:
+    """Whatever is beyond chance counts: the regions of the weights and of sigma are for exact features and constant noise."""
+    for state, missed, varying in zip(posterior.features.states, posterior.misfit, posterior.variation, strict=True):
+        if missed:
+            raise ConfigurationError(f"the features miss {100 * missed:.3g} % of the rate of {state}, beyond chance; raise the degree")
+        if varying:
+            raise ConfigurationError(
+                f"the variance of the noise of {state} varies by {100 * varying:.3g} %, beyond chance; a certificate is for constant noise"
+            )
 
 
 def _values(barrier: Any, x: np.ndarray) -> np.ndarray:

@@ -116,12 +116,14 @@ class SafetyFilter:
         Args:
             problem: whose model, barriers and box are taken.
             conditions: one for every barrier, or one for all.
-            knowledge: "model" for what the designer believes, "plant" for the true system.
+            knowledge: "model" for what the designer believes, "plant" for the true system. Conditions that correct the model start
+                from it in any case.
             objective: "nearest" to the proposed action, or "clf" for the joint program with the problem's goal.
             priorities: see the class.
 
         Raises:
-            ConfigurationError: a word is unknown, the number of conditions is wrong, or the problem has no clf.
+            ConfigurationError: a word is unknown, the number of conditions is wrong, a condition is made for another problem or
+                corrects the model beside one that knows the plant, or the problem has no clf.
         """
         for name, given, allowed in (("knowledge", knowledge, ("model", "plant")), ("objective", objective, ("nearest", "clf"))):
             if given not in allowed:
@@ -132,7 +134,14 @@ class SafetyFilter:
         each = (conditions,) * count if isinstance(conditions, Condition) else tuple(conditions)
         if len(each) != count:
             raise ConfigurationError(f"{len(each)} conditions for the {count} barriers of {problem.name}; give one for each")
-        known = problem.model if knowledge == "model" else problem.plant
+        for condition in each:
+            condition.require_fit(problem)
+        correcting = [condition.name for condition in each if condition.corrects_model]
+        if knowledge == "plant" and 0 < len(correcting) < count:
+            raise ConfigurationError(
+                f"{correcting[0]} corrects the model, and the other barriers' conditions know the plant; use knowledge='model'"
+            )
+        known = problem.model if knowledge == "model" or correcting else problem.plant
         clf = problem.clf if objective == "clf" else None
         return cls(known, list(zip(problem.barriers, each, strict=True)), problem.box, priorities=priorities, dt=problem.dt, clf=clf)
 

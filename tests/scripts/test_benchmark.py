@@ -17,6 +17,12 @@ from wrappers import SafetyFilterWrapper
 def quick(monkeypatch):
     monkeypatch.setattr(benchmark, "_ROUNDS", 1)
     monkeypatch.setattr(benchmark, "_SECONDS_PER_ROUND", 1e-4)
+    few = {"learned-hocbf": {"states": 200, "epochs": 2}, "ddscbf": {"points": 30, "repetitions": 20}, "bayesian": {"starts": 50}}
+    learned = {
+        name: (env_id, method, {**few[method], **{k: v for k, v in settings.items() if k == "way"}})
+        for name, (env_id, method, settings) in benchmark._LEARNED.items()
+    }
+    monkeypatch.setattr(benchmark, "_LEARNED", learned)
 
 
 def test_figures_are_finite_and_positive_and_ratios_fit(quick):
@@ -33,7 +39,8 @@ def test_figures_are_finite_and_positive_and_ratios_fit(quick):
     )
 
 
-def test_command_prints_and_writes_the_figures(quick, tmp_path, capsys):
+def test_command_prints_and_writes_the_figures(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(benchmark, "measure", lambda: {"filter call, 1 state": 5.0, "a ratio": 0.5})
     benchmark.benchmark(tmp_path / "out.json")
     figures = json.loads((tmp_path / "out.json").read_text())
     out = capsys.readouterr().out

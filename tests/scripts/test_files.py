@@ -40,5 +40,10 @@ def test_places_that_cannot_be_written_are_named(tmp_path):
             require_writable(path)
         with pytest.raises(ConfigurationError, match="cannot write"):
             write_atomically(path, lambda part: part.write_text("x"))
+    (tmp_path / "plain").touch()
+    for path in (tmp_path / "plain" / "file.json", tmp_path / "plain" / "no" / "file.json"):
+        with pytest.raises(ConfigurationError, match="plain is a file and no folder"):
+            require_writable(path)
+    (tmp_path / "plain").unlink()
     require_writable(tmp_path / "file.json")
     assert list(tmp_path.iterdir()) == []

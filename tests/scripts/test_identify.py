@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from agents.problems import load_problem
-from scripts.identify import read_settings
-from scripts.identify_report import Function, percent, unit_of
+from scripts.identify import SETTINGS, read_settings, settings_of
+from scripts.identify_report import Function, Source, percent, unit_of
 from tests.scripts.conftest import strictly
 from wrappers.learning import METHODS, learner_of, load_learned
 from wrappers.learning.collect import collect
+from wrappers.learning.transitions import Transitions
 
 SMALL = ("--set", "starts=10", "--set", "steps=20", "--set", "repetitions=10")
 BAYESIAN = ("CubicSDEDisk-v0", "--method", "bayesian", *SMALL, "--set", "degree=2")
 NETWORK = ("Pendulum-v0", "--method", "ddscbf", "--set", "points=20", "--set", "repetitions=50")
 DIRECT = ("StochasticDubins-v0", "--method", "ddscbf", "--set", "points=20", "--set", "repetitions=50")
 RESIDUAL = ("DubinsDisk-v0", "--method", "learned-hocbf", "--set", "states=60", "--set", "epochs=3", "--set", "hidden=8,4")
+PLAIN = BAYESIAN[:3]
 QUICK = {"bayesian": BAYESIAN, "ddscbf": NETWORK, "learned-hocbf": RESIDUAL}
 
 
@@ -48,15 +52,18 @@ def bad_files(tmp_path_factory):
                 "safe_envs/CubicSDEDisk-v0 | method bayesian | seed 0",
                 "noise sigma_1 = 0.2, sigma_2 = 0.2, model = plant",
                 "from 4,000 transitions that last 40 s together",
-                "points = 400, repetitions = 10, degree = 2",
+                "starts = 10, steps = 20, repetitions = 10, degree = 2",
                 "error  noise  standardised",
                 "covariance[x_1, x_1]",
                 "0 in truth and estimate: g[x_1, u], covariance[x_1, x_2]",
                 "--filter bayesian-scbf --learned out.npz",
             ),
         ),
-        (NETWORK, ("way = network", "M_1(h), standard error of labels", "--filter ddscbf --learned out.npz")),
-        (DIRECT, ("way = direct", "C(x, x)", "m^2/s", "C(theta, theta)")),
+        (
+            NETWORK,
+            ("way = network", "against the labels, median; and", "M_1(h), standard error of labels", "--filter ddscbf --learned out.npz"),
+        ),
+        (DIRECT, ("way = direct", "errors: of the covariances, root mean square\n", "C(x, x)", "m^2/s", "C(theta, theta)")),
         (RESIDUAL, ("hidden = 8,4", "rms", "q95", "h Delta_1", "h Sigma_omega", "--filter learned-hocbf --learned out.npz")),
     ],
 )
@@ -106,11 +113,23 @@ def test_the_same_seed_gives_the_same_file(identify, tmp_path):
 
 def test_learning_from_a_file_of_data(identify, tmp_path):
     path = "some data.npz"
-    collect(load_problem("CubicSDEDisk-v0"), 40, 5, seed=7).save(tmp_path / path)
-    status, out, err = identify("CubicSDEDisk-v0", "--method", "bayesian", "--data", path, "--out", "out.npz")
+    collect(load_problem("CubicSDEDisk-v0"), 40, 5, seed=7, dt=0.02).save(tmp_path / path)
+    status, out, err = identify(*PLAIN, "--data", path, "--noise", "0.3", "--json", "out.json", "--plot", "out.svg", "--out", "out.npz")
     assert (status, err) == (0, "")
-    assert "transitions of some data.npz that last" in out
+    assert "| method bayesian | data some data.npz\n" in out
+    assert "transitions of some data.npz that last 8 s together, in steps of 0.02 s, of the seed 7\n" in out
+    compared = "compared with noise sigma_1 = 0.3, sigma_2 = 0.3, model = plant, at states of the seed 0"
+    assert compared in out
+    assert compared in (tmp_path / "out.svg").read_text()
+    assert "dt = 0.01" not in out
+    assert strictly("out.json")["config"]["data"] == path
     assert load_learned("out.npz", load_problem("CubicSDEDisk-v0")).record.seed == 7
+
+
+def test_what_is_said_of_data_from_elsewhere():
+    data = collect(load_problem("CubicSDEDisk-v0"), 4)
+    logged = Transitions.from_log(data.signature, data.x, data.u, data.successors[:, 0], 0.01 * np.arange(1, data.points + 1))
+    assert str(Source.of(Path("log.npz"), logged)) == f"in steps of 0.01 to {0.01 * data.points:g} s, from elsewhere"
 
 
 def test_what_is_proposed_keeps_the_options_of_the_env(identify):
@@ -142,8 +161,8 @@ def test_what_cannot_be_compared_is_said(identify):
         (BAYESIAN, ("f[x_1]: error", "truth (1/s)", "sigma of x_2", "samples of the posterior")),
         ((*BAYESIAN, "--set", "diffusion_degree=1"), ("covariance[x_2, x_2]: error",)),
         (NETWORK, ("M_1(h): error", "estimate at a state")),
-        (DIRECT, ("C(y, y): error",)),
-        (("QuadrotorAltitude-v0", *RESIDUAL[1:]), ("h Delta_2: truth 0", "estimates at all states")),
+        (DIRECT, ("C(y, y): error", "truth 0.04<", "estimate 0.0")),
+        (("QuadrotorAltitude-v0", *RESIDUAL[1:]), ("h Delta_2: truth 0", "estimates at all states", "truth 0<", " to ")),
     ],
 )
 def test_the_picture_is_drawn(identify, arguments, texts, tmp_path):
@@ -163,16 +182,22 @@ def test_the_picture_is_drawn(identify, arguments, texts, tmp_path):
         ((*BAYESIAN, "--set", "degree"), "give NAME=VALUE"),
         ((*BAYESIAN, "--set", "prior=wide"), "'wide' is not a number"),
         ((*BAYESIAN[:-2], "--set", "degree=1.5"), "give a whole number"),
-        ((*BAYESIAN, "--set", "prior=-1"), "must be positive"),
+        ((*BAYESIAN, "--set", "prior=-1"), "positive and finite"),
         ((*RESIDUAL[:-2], "--set", "hidden=8,wide"), "hidden=100,30"),
+        ((*RESIDUAL[:-2], "--set", "hidden=8,1.5"), "hidden=100,30"),
         ((*RESIDUAL[:-2], "--noise", "0.1"), "noise"),
         ((*NETWORK, "--set", "estimator=guess"), "allowed: printed, centred, martingale"),
         ((*NETWORK, "--set", "way=3"), "way = '3'"),
         ((*NETWORK[:-4], "--set", "points=3"), "at least 10"),
         ((*BAYESIAN, "--seed", "-1"), "seed = -1"),
-        ((*BAYESIAN, "--data", "missing.npz"), "does not exist"),
-        ((*BAYESIAN, "--data", "damaged.npz"), "truncated"),
-        ((*BAYESIAN, "--data", "other.npz"), "of another problem"),
+        ((*PLAIN, "--data", "missing.npz"), "does not exist"),
+        ((*PLAIN, "--data", "damaged.npz"), "truncated"),
+        ((*PLAIN, "--data", "other.npz"), "of another problem"),
+        ((*BAYESIAN, "--data", "other.npz"), "--set starts, --set steps, --set repetitions: not allowed with --data"),
+        ((*PLAIN, "--data", "other.npz", "--dt", "0.1", "--substeps", "2", "--box", "0,1"), "--dt, --substeps, --box: not allowed"),
+        ((*PLAIN, "--data", "other.npz", "--out", "other.npz"), "--out other.npz would overwrite the file of --data other.npz"),
+        ((*BAYESIAN, "--json", "./out.npz"), "--json out.npz would overwrite the file of --out out.npz"),
+        ((*BAYESIAN, "--json", "found.svg", "--plot", "found.svg"), "--plot found.svg would overwrite the file of --json found.svg"),
         (("Pendulum-v0", "--method", "ddscbf", "--data", "model.npz"), "holds"),
         ((*RESIDUAL, "--data", "other.npz"), "leave --data out"),
         ((*BAYESIAN, "--json", "missing/found.json"), "does not exist"),
@@ -205,6 +230,32 @@ def test_settings_are_read_by_the_kind_of_the_argument():
     assert residual == {"hidden": [7], "label_dt": 0.01, "states": 50}
     assert read_settings("ddscbf", learner_of("ddscbf"), ["way=direct", "points=20"]) == {"way": "direct", "points": 20}
     assert read_settings("bayesian", learner_of("bayesian"), ["degree=2"]) == {"degree": 2}
+
+
+def test_whole_numbers_may_be_written_as_floats():
+    found = read_settings("bayesian", learner_of("bayesian"), ["starts=1e3", "degree=2.0", "steps=1.5", "prior=2.0"])
+    assert found == {"starts": 1000, "degree": 2, "steps": 1.5, "prior": 2.0}
+    assert [type(value) for value in found.values()] == [int, int, float, float]
+    assert read_settings("learned-hocbf", learner_of("learned-hocbf"), ["hidden=1e2,30.0"]) == {"hidden": [100, 30]}
+    assert read_settings("learned-hocbf", learner_of("learned-hocbf"), ["hidden=1e2"]) == {"hidden": [100]}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_the_help_names_every_setting_and_its_default(method):
+    parameters = settings_of(learner_of(method))
+    text = SETTINGS[method]
+    assert [entry.split("=")[0] for entry in re.findall(r"(?:^|, )(\w+=)", text)] == list(parameters)
+    for name, parameter in parameters.items():
+        default = parameter.default
+        shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
+        assert default is None or f"{name}={shown}" in text
+
+
+def test_the_help_shows_the_settings(identify):
+    status, out, _ = identify("--help")
+    assert status == 0
+    for text in ("label_dt=0.001", "diffusion_degree=0", "estimator=martingale", "another format"):
+        assert text in out
 
 
 @pytest.mark.parametrize(

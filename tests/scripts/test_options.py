@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from safe_envs import ConfigurationError
@@ -43,3 +45,21 @@ def test_texts_become_numbers():
 def test_texts_of_another_form_are_named(read, message):
     with pytest.raises(ConfigurationError, match=message):
         read()
+
+
+def test_outputs_are_files_of_their_own(tmp_path):
+    out, json, plot = tmp_path / "a.npz", tmp_path / "a.json", tmp_path / "a.png"
+    options.require_outputs(json, plot, out=out, inputs=[("--data", tmp_path / "data.npz")])
+    options.require_outputs(None, None)
+    (tmp_path / "link.npz").symlink_to(out)
+    for json_file, inputs in ((out, []), (tmp_path / "." / "a.npz", []), (tmp_path / "link.npz", []), (json, [("--data", json)])):
+        with pytest.raises(ConfigurationError, match="would overwrite the file of --"):
+            options.require_outputs(json_file, plot, out=out, inputs=inputs)
+
+
+def test_the_files_that_a_simulation_reads():
+    filters = ["scbf", "ddscbf:file=a+b.npz:margin=1+cbf:alpha=1", "bayesian-scbf:file=c.npz+cbf"]
+    found = list(options.inputs_of("ppo.zip", filters, [Path("d.npz")]))
+    assert {("--policy", Path("ppo.zip")), ("--learned", Path("d.npz"))} < set(found)
+    assert {Path("a+b.npz"), Path("c.npz")} <= {path for option, path in found if option == "--filter"}
+    assert not list(options.inputs_of("nominal", ["none", "hocbf:p=1,2"]))

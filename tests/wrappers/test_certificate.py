@@ -44,14 +44,15 @@ def best_rows(problem, posterior, simultaneous, x):
     """The most over the inputs of the box of the least that A h may be, at states of a disk, without the filter or its rows."""
     share = 0.5 * (1.0 - simultaneous)
     levels = posterior.diffusion.sigma_intervals(share)[:, 1]
-    z = math.sqrt(stats.chi2.ppf(1.0 - share, 2 * posterior.mean.shape[1]))
+    widest = levels**2 * posterior.diffusion.count / posterior.diffusion.squares
+    factors = stats.chi2.ppf(1.0 - share, 2 * posterior.mean.shape[1]) * widest
     phi, slopes = posterior.features.matrix(x), -2.0 * x
 
     def row(u):
         design = np.hstack((phi, posterior.input_scale[0] * u[:, None] * phi))
         mean = (slopes * (design @ posterior.mean.T)).sum(axis=1) - (levels**2).sum()
-        variance = sum(slopes[:, i] ** 2 * ((design @ posterior.covariance[i]) * design).sum(axis=1) for i in range(2))
-        return mean - z * np.sqrt(variance)
+        variance = sum(factors[i] * slopes[:, i] ** 2 * ((design @ posterior.covariance[i]) * design).sum(axis=1) for i in range(2))
+        return mean - np.sqrt(variance)
 
     # The row is concave in the input, so that the best one is a step from the best that was tried.
     low, high = (np.full(len(x), end) for end in problem.box[0])
@@ -149,7 +150,7 @@ def test_what_is_certified_happens(cubic, monkeypatch):
     monkeypatch.setattr("wrappers.search._ROUNDS", (30, 10))
     envs, horizon, promised = 100, 0.5, []
     for seed in range(6):
-        condition = BayesianSCBF(identify(cubic, starts=300, repetitions=50, degree=3, seed=seed), simultaneous=0.9)
+        condition = BayesianSCBF(identify(cubic, starts=800, repetitions=50, degree=3, seed=seed), simultaneous=0.9)
         (bound,) = certificate(cubic, [condition]).at(np.array([START]), horizon)
         env = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/CubicSDEDisk-v0", num_envs=envs, start=START, horizon=horizon), condition)
         env.reset(seed=seed)

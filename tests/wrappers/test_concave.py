@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -190,6 +192,17 @@ def test_a_row_of_nearly_no_slope_that_is_met_everywhere_does_not_forbid_the_res
     rows = [1e-170, 1.0], [1.0, -0.5]
     assert interval.project_floats(*rows, 0.0, -1.0, 1.0, [1.0] * 2)[3]
     assert project_floats(*rows, [NOTHING] * 2, 0.0, -1.0, 1.0, [1.0] * 2)[3]
+
+
+@pytest.mark.parametrize("q2", [1e-300, 1e-170, 1e-20])
+def test_a_form_that_hardly_bends_has_a_maximiser_in_both_flavours(q2):
+    for a in (0.0, 0.5 * math.sqrt(q2), 2.0 * math.sqrt(q2)):
+        row = [a], [-1.0], [(1.0, 0.0, q2)]
+        u, margin, active, feasible = project_floats(*row, 0.5, LOW, HIGH, [1.0])
+        found = project_arrays(*row, np.array([0.5]), LOW, HIGH, [1.0])
+        assert LOW <= u <= HIGH
+        assert (u, margin, active, feasible) == (found[0][0], found[1][:, 0].tolist(), found[2][:, 0].tolist(), found[3][0])
+        assert not feasible
 
 
 def test_rows_that_meet_in_one_point_are_feasible_whatever_their_scale():

@@ -230,11 +230,11 @@ def curvatures_of(learned, barrier, x):
 
 
 def robust_row(learned, law, barrier, x, u, z):
-    """mean - z deviation of L_f h + L_g h u, for weights of a Gaussian law."""
+    """mean - deviation of L_f h + L_g h u, that of each state times z, for weights of a Gaussian law."""
     design, slopes = linear_form(learned, x, u), slopes_of(learned, barrier, x)
     mean = (slopes * (design @ law.mean.T)).sum(axis=1)
     spread = np.stack([((design @ c) * design).sum(axis=1) for c in law.covariance], axis=1)
-    return mean - z * np.sqrt((slopes**2 * spread).sum(axis=1))
+    return mean - np.sqrt((slopes**2 * spread * np.square(z)).sum(axis=1))
 
 
 def least_ito(learned, barrier, x, intervals):
@@ -247,18 +247,20 @@ def least_ito(learned, barrier, x, intervals):
 def test_the_robust_row_is_mean_less_deviations(cubic, posterior, which):
     problem = cubic if which == "disk" else replace(cubic, barriers=(curved_barrier(cubic),))
     barrier, (x, u) = problem.barriers[0], situations(problem, 700)
-    everything, kept = Gaussian(posterior.mean, posterior.covariance), posterior.weights
+    law, noise = Gaussian(posterior.mean, posterior.covariance), posterior.diffusion
     all_sure = math.sqrt(stats.chi2.ppf(0.95, 2 * posterior.mean.shape[1]))
     intervals, fixed = posterior.diffusion.sigma_intervals(0.05), np.column_stack([posterior.diffusion.sigma] * 2)
     assert (intervals[:, 0] < fixed[:, 0]).all()
     assert (intervals[:, 1] > fixed[:, 1]).all()
+    # The weights are as unsure as the noise is large, which may be as large as its interval allows.
+    widest = intervals[:, 1] / np.sqrt(noise.squares / noise.count)
     cases = [
-        (BayesianSCBF(posterior, confidence=0.97), kept, stats.norm.ppf(0.97), fixed),
-        (BayesianSCBF(posterior, simultaneous=0.9, sampling_margin=0.1), everything, all_sure, intervals),
-        (BayesianSCBF(posterior, simultaneous=0.9), everything, all_sure, intervals),
-        (BayesianSCBF(posterior, confidence=0.3), kept, 0.0, fixed),
+        (BayesianSCBF(posterior, confidence=0.97), stats.t.ppf(0.97, noise.count), fixed),
+        (BayesianSCBF(posterior, simultaneous=0.9, sampling_margin=0.1), all_sure * widest, intervals),
+        (BayesianSCBF(posterior, simultaneous=0.9), all_sure * widest, intervals),
+        (BayesianSCBF(posterior, confidence=0.3), 0.0, fixed),
     ]
-    for condition, law, z, levels in cases if which == "disk" else cases[:2]:
+    for condition, z, levels in cases if which == "disk" else cases[:2]:
         found = SafetyFilter.for_problem(problem, condition).filter(x, u)
         rest = least_ito(posterior, barrier, x, levels) - (0.1 if condition.sampling_margin == 0.1 else 0.0)
         expected = robust_row(posterior, law, barrier, x, found.action, z) + rest
@@ -288,7 +290,11 @@ def test_mean_and_deviation_are_those_of_draws_of_the_weights(cubic, posterior):
     mean, deviation = np.mean(drawn, axis=1), np.std(drawn, axis=1)
     # Five standard errors, of a mean and of a deviation.
     assert (abs(a * v + b - ito - mean) < 5 * deviation / math.sqrt(draws) + 1e-9).all()
-    np.testing.assert_allclose(np.sqrt(q_0 + 2 * q_1 * v + q_2 * v * v), condition.quantile(2) * deviation, rtol=5 / math.sqrt(2 * draws))
+    # The noise of both states is as large, and with it the factor of both.
+    factor = condition.variance_factors(np.array([True, True]))
+    assert factor[0] == pytest.approx(factor[1], rel=0.02)
+    expected = np.sqrt(factor.mean()) * deviation
+    np.testing.assert_allclose(np.sqrt(q_0 + 2 * q_1 * v + q_2 * v * v), expected, rtol=0.02 + 5 / math.sqrt(2 * draws))
 
 
 def test_the_simultaneous_form_holds_for_its_share_of_the_weights(cubic, posterior):
@@ -306,8 +312,9 @@ def test_the_simultaneous_form_holds_for_its_share_of_the_weights(cubic, posteri
         truth = (slopes * (design @ weights.T)).sum(axis=1) + 0.5 * curvatures @ levels**2
         below += bool((truth < found.margin[:, 0]).any())
     assert below <= 0.5 * times
-    assert condition.quantile(2) < BayesianSCBF(posterior, simultaneous=0.99).quantile(2)
-    assert condition.quantile(1) < condition.quantile(2)
+    both, one = np.array([True, True]), np.array([True, False])
+    assert (condition.variance_factors(both) < BayesianSCBF(posterior, simultaneous=0.99).variance_factors(both)).all()
+    assert (condition.variance_factors(one) < condition.variance_factors(both)).all()
     assert (condition.delta_theta, condition.delta_sigma) == (0.25, 0.25)
 
 
@@ -651,6 +658,30 @@ def test_what_a_learned_condition_cannot_take_is_refused(disk, residual):
             parse_conditions(text, disk, learned)
     with pytest.raises(LearnedFileError, match="does not exist"):
         parse_conditions("learned-hocbf:file=/nowhere", disk)
+
+
+def test_what_was_learned_of_another_system_is_refused(disk, top, gap, cubic, residual, network, posterior):
+    believed = problem_of("safe_envs/DubinsDisk-v0", model={"v": 0.4})
+    moved = replace(disk, barriers=(Barrier(disk.barriers[0].expression - 1, "smaller"),))
+    for problem, condition, message in (
+        (believed, LearnedHOCBF(residual, p=(1.0, 2.0)), "model"),
+        (moved, LearnedHOCBF(residual, p=(1.0, 2.0)), "learned for the barriers"),
+        (gap, DDSCBF(network), "Pendulum"),
+        (top, BayesianSCBF(posterior), "CubicSDEDisk"),
+        (cubic, DDSCBF(posterior), "ddscbf learns; given is bayesian"),
+        (cubic, BayesianSCBF("posterior.npz"), "bayesian learns; given is 'posterior.npz'"),
+    ):
+        with pytest.raises(ConfigurationError, match=message):
+            SafetyFilter.for_problem(problem, condition)
+
+
+def test_what_corrects_the_model_starts_from_it_whatever_is_known(disk, residual, cubic, posterior):
+    condition = LearnedHOCBF(residual, p=(1.0, 2.0))
+    known = [SafetyFilter.for_problem(disk, condition, knowledge) for knowledge in ("model", "plant")]
+    assert_same_decisions(disk, *known, tolerance=1e-12)
+    both = replace(disk, barriers=disk.barriers * 2)
+    with pytest.raises(ConfigurationError, match=r"learned-hocbf corrects the model.*knowledge='model'"):
+        SafetyFilter.for_problem(both, (condition, HOCBF((1.0, 2.0))), "plant")
 
 
 def test_files_of_something_else_are_refused(tmp_path, disk, top, gap, cubic, residual, network, diffusion, posterior):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -44,6 +44,7 @@ __all__ = [
     "parse_condition",
     "parse_conditions",
     "power",
+    "require_readable",
     "spec_of",
 ]
 
@@ -66,29 +67,37 @@ def parse_conditions(text: str, problem: SafetyProblem, learned: Learned | None 
     Raises:
         ConfigurationError: as `parse_condition`, or there are neither one nor as many texts as barriers.
     """
+    return _parsed(text, problem, lambda condition, path: _learned_for(text, condition, path, problem, learned or {}))
+
+
+def require_readable(text: str, problem: SafetyProblem) -> None:
+    """Raise ConfigurationError where `parse_conditions` would, but for what was learned, which may not be there yet."""
+    _parsed(text, problem, lambda condition, path: None)
+
+
+def _parsed(text: str, problem: SafetyProblem, learned_for: Callable[[Any, str | None], Any]) -> tuple[Condition, ...]:
     texts = _BETWEEN.split(text)
     count = len(problem.barriers)
     if len(texts) not in (1, count):
         allowed = "one" if count == 1 else f"one for all {count} barriers, or one for each"
         raise ConfigurationError(f"filter {text!r} has {len(texts)} conditions; {problem.name} takes {allowed}")
-    texts = texts * count if len(texts) == 1 else texts
-    return tuple(
-        _parse_learned(part, problem, problem.gains_of(i), learned or {})
-        if part.split(":")[0] in LEARNED
-        else parse_condition(part, problem.gains_of(i))
-        for i, part in enumerate(texts)
-    )
+    found: list[Condition] = []
+    for i, part in enumerate(texts * count if len(texts) == 1 else texts):
+        if part.split(":")[0] in LEARNED:
+            condition, settings = _settings(part)
+            found.append(condition.from_learned(learned_for(condition, settings.pop("file", None)), problem.gains_of(i), **settings))
+        else:
+            found.append(parse_condition(part, problem.gains_of(i)))
+    return tuple(found)
 
 
-def _parse_learned(text: str, problem: SafetyProblem, gains: Sequence[float], learned: Learned) -> Condition:
-    condition, settings = _settings(text)
-    path = settings.pop("file", None)
+def _learned_for(text: str, condition: Any, path: str | None, problem: SafetyProblem, learned: Learned) -> LearnedModel:
     model = learned.get(condition.method) if path is None else load_learned(path, problem, condition.method)
     if model is None:
         raise ConfigurationError(
             f"filter {text!r} rests on something learned: learn it by `safe-envs identify`, and name the file as {condition.name}:file=FILE"
         )
-    return condition.from_learned(model, gains, **settings)
+    return model
 
 
 def spec_of(conditions: Sequence[Condition]) -> str:
@@ -126,10 +135,18 @@ def _settings(text: str) -> tuple[Any, dict[str, Any]]:
     for setting in settings:
         key, _, value = setting.partition("=")
         if key not in names or key in given:
-            reason = f"{text!r} names {key!r} twice" if key in given else f"{name} has no parameter {key!r}; {nearest(key, names)}"
+            reason = f"{text!r} names {key!r} twice" if key in given else f"{name} has no parameter {key!r}; {_hint(key, names, given)}"
             raise ConfigurationError(f"filter {reason}")
         given[key] = value if key == "file" else _value(text, key, value, _takes_one(name, allowed[key].default))
     return condition, given
+
+
+def _hint(key: str, names: Sequence[str], given: Mapping[str, Any]) -> str:
+    if key == "sha256":
+        return "it stands for something learned that is in no file: save it, and name that as file=FILE"
+    if "file" in given:
+        return f"{nearest(key, names)}; a file whose name holds a colon is given by --learned, or read by load_learned"
+    return nearest(key, names)
 
 
 def _takes_one(name: str, default: Any) -> bool:

@@ -6,7 +6,8 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar, Protocol
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import sympy as sp
 
@@ -16,6 +17,9 @@ from safe_envs.codegen import Components
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, SystemDefinitionError
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.class_k import ClassK, Rate, applied
+
+if TYPE_CHECKING:
+    from safe_envs.problem import SafetyProblem
 
 FIRST_ORDER = "first-order"
 
@@ -83,6 +87,7 @@ class Condition(ABC):
     Attributes:
         name: by which `parse_condition` and the command line know it.
         stochastic: whether it takes the noise into account.
+        corrects_model: whether it corrects what the model gets wrong, so that it is of no use to a filter that knows the plant.
         sampling_margin: "none", "first-order", or a number >= 0 in the units of the row.
 
     Raises:
@@ -91,6 +96,7 @@ class Condition(ABC):
 
     name: ClassVar[str]
     stochastic: ClassVar[bool] = False
+    corrects_model: ClassVar[bool] = False
 
     sampling_margin: str | float = field(default="none", kw_only=True)
 
@@ -106,6 +112,9 @@ class Condition(ABC):
         """D of the chain: the Lie derivative, or the Ito generator."""
         return generator if self.stochastic else drift_derivative
 
+    def require_fit(self, problem: SafetyProblem) -> None:  # noqa: B027  (most conditions fit every problem)
+        """Raise ConfigurationError where the condition is made for another problem."""
+
     def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint for a model and a barrier, in the model's symbols.
 
@@ -113,15 +122,7 @@ class Condition(ABC):
             RelativeDegreeError: the condition does not suit the barrier's relative degree.
             SystemDefinitionError: a class-K function cannot be differentiated as often as the chain needs.
         """
-        model = self.believed(model)
-        found = self.derived(model, barrier)
-        if self.sampling_margin == FIRST_ORDER:
-            row = sum(a * u for a, u in zip(found.coefficient, model.inputs, strict=True)) + found.offset - (found.demand or 0)
-            by_input = (input_derivative(model, row) * sp.Matrix(model.inputs))[0, 0]
-            return replace(found, change=resolved(self.derivative(model, row) + by_input, barrier))
-        if self.sampling_margin != "none":
-            return replace(found, offset=found.offset - sp.Float(self.sampling_margin, 17))
-        return found
+        return _constraint(self, model, barrier)
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
         """The system that the condition differentiates along: the model, unless it has learned another."""
@@ -154,6 +155,20 @@ class Condition(ABC):
 
 def _text(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+@lru_cache(maxsize=64)
+def _constraint(condition: Condition, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
+    """Remembered, for the bounds of a filter need the rows that it has, and derivatives of long expressions take their time."""
+    model = condition.believed(model)
+    found = condition.derived(model, barrier)
+    if condition.sampling_margin == FIRST_ORDER:
+        row = sum(a * u for a, u in zip(found.coefficient, model.inputs, strict=True)) + found.offset - (found.demand or 0)
+        by_input = (input_derivative(model, row) * sp.Matrix(model.inputs))[0, 0]
+        return replace(found, change=resolved(condition.derivative(model, row) + by_input, barrier))
+    if condition.sampling_margin != "none":
+        return replace(found, offset=found.offset - sp.Float(condition.sampling_margin, 17))
+    return found
 
 
 def chain_of(

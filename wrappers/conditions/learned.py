@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import sympy as sp
 
 from safe_envs.barrier import Barrier
@@ -19,6 +20,7 @@ from wrappers.conditions.cbf import gains_of_poles
 from wrappers.conditions.class_k import positive_rates
 
 if TYPE_CHECKING:
+    from safe_envs.problem import SafetyProblem
     from wrappers.learning.base import LearnedModel
     from wrappers.learning.generator import GeneratorModel
     from wrappers.learning.posterior import Posterior
@@ -31,10 +33,21 @@ class LearnedCondition(Condition):
 
     Attributes:
         learned: what it rests on.
+        method: by which that is learned.
     """
 
     learned: LearnedModel
     method: ClassVar[str]
+    corrects_model = True
+
+    def require_fit(self, problem: SafetyProblem) -> None:
+        """Raise ConfigurationError where what it rests on was learned by another method, or of another problem."""
+        method = getattr(self.learned, "method", None)
+        if method != self.method:
+            raise ConfigurationError(f"{self.name} rests on what the method {self.method} learns; given is {method or repr(self.learned)}")
+        # There may be further barriers; each row looks its own one up.
+        barriers = tuple(str(problem.model.numeric(b.expression)) for b in problem.barriers)
+        type(self.learned).check(replace(self.learned.signature, barriers=barriers), problem)
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> Condition:
@@ -194,9 +207,10 @@ class BayesianSCBF(LearnedCondition):
     """A^r h >= 0 for the identified system: for its most probable one, or for those that the data leave possible.
 
     With theta Gaussian, A h = a + b u has a mean and a variance v(x, u), and the robust form asks for mean - z sqrt(v) >= 0.
-    With `confidence` z is the quantile of a normal distribution, for each (x, u) by itself. With `simultaneous` the ellipsoid of
-    theta and the intervals of sigma hold together with that probability, hence for all (x, u) at once: then
-    `wrappers.certificate` has a bound for it.
+    With `confidence` z is the quantile of Student's distribution, for each (x, u) by itself, and sigma the most probable. With
+    `simultaneous` the ellipsoid of theta and the intervals of sigma hold together with that probability, hence for all (x, u) at
+    once: then `wrappers.certificate` has a bound for it. Correlated noise makes v at most its largest eigenvalue larger.
+    Both hold as far as the features and a constant sigma fit the data; what does not is in the warnings of the record.
 
     Attributes:
         learned: the posterior.
@@ -214,6 +228,7 @@ class BayesianSCBF(LearnedCondition):
     simultaneous: float | None = None
     name = "bayesian-scbf"
     method = "bayesian"
+    corrects_model = False
     stochastic = True
 
     def __post_init__(self) -> None:
@@ -254,16 +269,14 @@ class BayesianSCBF(LearnedCondition):
             )
         if self.sampling_margin == FIRST_ORDER:
             raise ConfigurationError("the robust form has no sampling margin of first order; give a number")
-        # What is pruned may yet differ from 0 a little: a statement about all systems that the data allow has to keep it.
-        mean, covariance = (
-            (model, self.learned.weights.covariance) if self.simultaneous is None else (self.learned.mean_system, self.learned.covariance)
-        )
+        # What the most probable system prunes may yet differ from 0 a little, and a large input makes that much.
+        mean = self.learned.mean_system
         slopes: Any = gradient(mean, barrier.expression)
         a: Any = input_derivative(mean, barrier.expression)
-        z = self.quantile(sum(1 for entry in slopes if entry != 0))
+        factors = self.variance_factors(np.array([entry != 0 for entry in slopes])).tolist()
         total: Any = sp.zeros(mean.m + 1)
-        for slope, form in zip(slopes, self.learned.variance_expressions(covariance), strict=True):
-            total = total + z * z * slope**2 * form
+        for slope, factor, form in zip(slopes, factors, self.learned.variance_expressions, strict=True):
+            total = total + sp.Float(factor, 17) * slope**2 * form
         return AffineConstraint(
             tuple(a[0, j] for j in range(mean.m)),
             drift_derivative(mean, barrier.expression) + self._least_ito_term(mean, barrier),
@@ -271,13 +284,23 @@ class BayesianSCBF(LearnedCondition):
             uncertainty=tuple(total[i, j] for i in range(mean.m + 1) for j in range(i, mean.m + 1)),
         )
 
-    def quantile(self, outputs: int) -> float:
-        """The z of the robust form, for a barrier that depends on a number of states."""
+    def variance_factors(self, outputs: np.ndarray) -> np.ndarray:
+        """By what the variance of each f_i + g_i u is multiplied, z^2 among others, shape (n,).
+
+        Args:
+            outputs: whether the barrier depends on each state, (n,).
+        """
         from scipy import stats
 
+        noise = self.learned.diffusion
         if self.confidence is not None:
-            return float(max(stats.norm.ppf(self.confidence), 0.0))
-        return math.sqrt(stats.chi2.ppf(1.0 - self.delta_theta, outputs * self.learned.mean.shape[1]))
+            z = max(stats.t.ppf(self.confidence, noise.count), 0.0)
+            correlated = np.linalg.eigvalsh(noise.correlation[np.ix_(outputs, outputs)])[-1]
+            return np.full(len(outputs), z**2 * correlated)
+        # The variance of the weights is that of the noise, which may be as large as its interval allows.
+        largest, estimated = noise.sigma_intervals(self.delta_sigma)[:, 1] ** 2, noise.squares / noise.count
+        allowed = np.divide(largest, estimated, out=np.ones(len(largest)), where=estimated > 0)
+        return stats.chi2.ppf(1.0 - self.delta_theta, outputs.sum() * self.learned.mean.shape[1]) * np.maximum(allowed, 1.0)
 
     @property
     def delta_theta(self) -> float:

@@ -10,7 +10,8 @@ from typing import Any
 from safe_envs.errors import nearest
 from safe_envs.problem import SafetyProblem
 from wrappers.learning.base import LearnedModel, Progress, Record
-from wrappers.learning.files import LearnedFileError, load
+from wrappers.learning.checks import require_problem
+from wrappers.learning.files import DATA, LearnedFileError, load
 
 __all__ = ["METHODS", "LearnedFileError", "LearnedModel", "Progress", "Record", "learner_of", "load_learned"]
 
@@ -40,9 +41,14 @@ def load_learned(path: Path | str, problem: SafetyProblem, method: str | None = 
         method: which it has to be of; None for any.
 
     Raises:
-        LearnedFileError: the file is damaged, of another method, or of another system.
+        LearnedFileError: the path is empty, or the file is damaged, holds data, or is of another method or system.
     """
+    if not str(path):
+        raise LearnedFileError("the path of a learned model is empty; name a file that `safe-envs identify` wrote")
+    require_problem(problem)
     content = load(Path(path))
+    if content.kind == DATA:
+        raise LearnedFileError(f"{path} holds transitions (data), no model; `safe-envs identify --data {path}` learns from it")
     if method is not None and content.kind != method:
         raise LearnedFileError(f"{path} holds {content.kind}; {method} is needed here")
     model: LearnedModel = getattr(_module(content.kind), METHODS[content.kind][1]).from_content(content, problem)

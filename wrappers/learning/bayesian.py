@@ -14,7 +14,9 @@ from scipy.stats import f as fisher
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem import SafetyProblem
 from wrappers.learning.base import Progress, Record
+from wrappers.learning.checks import Purpose, random_stream, require_kind, require_problem
 from wrappers.learning.collect import Step, collect
+from wrappers.learning.estimators import region_warnings
 from wrappers.learning.features import Features
 from wrappers.learning.identifiability import IdentifiabilityWarning, misfits, weaknesses
 from wrappers.learning.posterior import Diffusion, Posterior
@@ -76,8 +78,8 @@ class Fit:
 def fit(rows: Rows, design: np.ndarray, features: Features | None, prior: Prior) -> Fit:
     """Regress the rates on the design, with the noise that the data show.
 
-    Where the rows scatter about the best fit by more than the noise explains, that much is taken for the variance: what the
-    features miss makes the weights less sure.
+    Where the rows scatter about the best fit by more than the noise explains, that much is taken for their variance; and what
+    the features miss is no noise, that more rows would average out: its mean square is the least variance of the constant term.
 
     Args:
         rows: of data.
@@ -100,9 +102,10 @@ def fit(rows: Rows, design: np.ndarray, features: Features | None, prior: Prior)
         error = rows.rate - design @ learned.mean.T
         excess = (error**2 / variance).sum(axis=0) / left
         beyond = excess > fisher.ppf(_SURE, left, count)
-        variance = variance * np.where(beyond, excess, 1.0)
-        learned = posterior(design, rows.rate, variance, prior.weights)
-        misfit = np.where(beyond, np.sqrt((error**2).mean(axis=0) / (size + _SMALLEST)), 0.0)
+        missed = np.where(beyond, np.maximum((error**2 - variance).mean(axis=0), 0.0), 0.0)
+        learned = posterior(design, rows.rate, variance * np.where(beyond, excess, 1.0), prior.weights)
+        learned.covariance[:, 0, 0] += missed
+        misfit = np.sqrt(missed / (size + _SMALLEST))
     return Fit(learned, noise, misfit, np.zeros(len(size)) if features else _variation(rows, residual, noise))
 
 
@@ -220,14 +223,18 @@ def identify(
     print leaves open. The print identifies f under u = 0 and g under u = .1; here both come from inputs of both signs.
     """
     began = time.perf_counter()
+    require_problem(problem)
+    _require_prior(prior, alpha, beta)
+    collected = data is None
     if data is None:
         collecting = None if progress is None else lambda part: progress(_COLLECTING * part)
         data = collect(problem, starts, repetitions, steps=steps, seed=seed, step=step, progress=collecting)
-    data.signature.require(problem)
+    require_kind("data", data, Transitions, "collect, Transitions.from_log or Transitions.load")
+    data.require(problem)
     rows = Rows.of(data)
     chosen = _degree(problem, len(rows.x)) if degree is None else degree
     features = Features.of(problem, chosen)
-    varying = Features.of(problem, diffusion_degree) if diffusion_degree else None
+    varying = Features.of(problem, diffusion_degree, "diffusion_degree") if diffusion_degree else None
     half = 0.5 * np.ptp(problem.exploration.region, axis=1)
     largest = abs(rows.u).max(axis=0)
     scale = 1.0 / np.where(largest > 0, largest, 1.0)
@@ -246,11 +253,12 @@ def identify(
             prior,
         ),
         *misfits(features, found.misfit, found.variation),
+        *region_warnings(problem, data),
     )
     for text in told:
         warnings.warn(text, IdentifiabilityWarning, stacklevel=2)
     settings = {
-        "points": data.points,
+        **({"starts": starts, "steps": steps} if collected else {"points": data.points}),
         "repetitions": data.repetitions,
         "degree": chosen,
         "diffusion_degree": diffusion_degree,
@@ -262,7 +270,18 @@ def identify(
         progress(1.0)
     record = Record(data.count, data.observed, time.perf_counter() - began, data.seed, errors, settings, told)
     learned, dt = found.learned, float(data.dt.mean())
-    return Posterior(data.signature, record, features, problem.plant.inputs, scale, learned.mean, learned.covariance, found.diffusion, dt)
+    weights = learned.mean, learned.covariance
+    return Posterior(
+        data.signature, record, features, problem.plant.inputs, scale, *weights, found.diffusion, dt, found.misfit, found.variation
+    )
+
+
+def _require_prior(prior: float, alpha: float, beta: float) -> None:
+    if not 0 < prior < math.inf:
+        raise ConfigurationError(f"prior = {prior!r}; the variance of the weights is positive and finite")
+    for name, value in (("alpha", alpha), ("beta", beta)):
+        if not 0 <= value < math.inf:
+            raise ConfigurationError(f"{name} = {value!r}; the prior of sigma needs a finite number from 0")
 
 
 def _degree(problem: SafetyProblem, rows: int) -> int:
@@ -282,7 +301,7 @@ def _held_out(data: Transitions, features: Features, scale: np.ndarray, varying:
     """
     if len(np.unique(data.x, axis=0)) < _FEWEST_HELD_OUT:
         return {}
-    kept, held = (Rows.of(part) for part in data.split(_HELD_OUT, np.random.default_rng(data.seed)))
+    kept, held = (Rows.of(part) for part in data.split(_HELD_OUT, random_stream(data.seed or 0, Purpose.HELD_OUT)))
     found = fit(kept, kept.design(features, scale), varying, prior)
     design = held.design(features, scale)
     error = held.rate - design @ found.learned.mean.T

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +15,7 @@ from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import finite_number
 from wrappers.learning.base import Progress
+from wrappers.learning.checks import Purpose, random_stream, require_problem, require_room
 from wrappers.learning.files import Signature
 from wrappers.learning.transitions import Transitions, numbers
 
@@ -26,8 +28,6 @@ _AT_ONCE = 1 << 17
 _TRIES_AT_ONCE = 1024
 _TRIES_BEFORE_DESPAIR = 1 << 20
 _SMALLEST_SHARE = 1e-4
-_OF_DATA, _OF_PATHS = 0, 1
-"""Second entries of seeds: data and paths of the same seed share no randomness."""
 
 
 def plant_step(problem: SafetyProblem, dt: float | None = None) -> Step:
@@ -97,9 +97,11 @@ def draw_states(problem: SafetyProblem, count: int, rng: np.random.Generator) ->
         States, shape (count, n).
 
     Raises:
-        ConfigurationError: the count is no whole number from 1, or the barriers leave next to nothing of the region.
+        ConfigurationError: the count is no whole number from 1, or too large for the memory, or the barriers leave next to
+            nothing of the region.
     """
     require_whole("count", count, 1)
+    require_room(float(count) * len(problem.states), f"{count} states of {problem.name}", "their number")
     low, high = np.array(problem.exploration.region).T
     found, accepted, tried = [], 0, 0
     while accepted < count:
@@ -147,17 +149,27 @@ def collect(
         so on; and for each state its inputs in order.
 
     Raises:
-        ConfigurationError: an argument is not allowed, an input is outside the box, or no states are found.
+        ConfigurationError: an argument is not allowed, an input is outside the box, the data would take more than 2 GB, or no
+            states are found.
         InvalidInputError: the inputs are no numbers, or the step returns an array of the wrong shape, or data that
             `Transitions` refuses.
         NumericalError: a successor is not finite.
     """
+    require_problem(problem)
     for name, value in (("points", points), ("repetitions", repetitions), ("steps", steps)):
         require_whole(name, value, 1)
     tried, period = _allowed(problem, problem.exploration.inputs if inputs is None else inputs), _period(problem, dt)
-    drawing, noise = _generators(seed, _OF_DATA)
-    step = plant_step(problem, period) if step is None else step
     n, rows = len(problem.states), points * len(tried)
+    require_room(
+        float(steps) * rows * ((repetitions + 1) * n + len(problem.inputs) + 1),
+        f"data of {steps} steps from {points} points under {len(tried)} inputs, {repetitions} times each,",
+        "points, repetitions, inputs or steps",
+    )
+    # Two generators: the states that are drawn do not depend on how often a step is repeated.
+    drawing, noise = random_stream(seed, Purpose.DATA).spawn(2)
+    # The step of somebody else may be that of any plant.
+    signature = Signature.of(problem) if step is None else replace(Signature.of(problem), plant=())
+    step = plant_step(problem, period) if step is None else step
     x, successors = np.empty((steps, rows, n)), np.empty((steps, rows, repetitions, n))
     u = np.tile(tried, (points, 1))
     tell = (lambda _: None) if progress is None else progress
@@ -167,7 +179,7 @@ def collect(
         _repeat(step, x[k], u, noise, successors[k], lambda part, k=k: tell((k + part) / steps))
     every = steps * rows
     return Transitions(
-        Signature.of(problem),
+        signature,
         x.reshape(every, n),
         np.tile(u, (steps, 1)),
         successors.reshape(every, repetitions, n),
@@ -199,6 +211,7 @@ def collect_paths(
             step returns an array of the wrong shape.
         NumericalError: a state that is reached is not finite.
     """
+    require_problem(problem)
     require_whole("steps", steps, 1)
     held, period = _allowed(problem, inputs), _period(problem, dt)
     begin = numbers("states", states)
@@ -206,19 +219,14 @@ def collect_paths(
         raise InvalidInputError(
             f"states have the shape {begin.shape}; give ({len(held)}, {len(problem.states)}) finite numbers, a row for each of the inputs"
         )
-    _, noise = _generators(seed, _OF_PATHS)
+    require_room(float(begin.size) * (steps + 1), f"{len(begin)} paths of {steps} steps", "their number or their steps")
+    noise = random_stream(seed, Purpose.PATHS)
     step = plant_step(problem, period) if step is None else step
     paths = np.empty((len(begin), steps + 1, begin.shape[1]))
     paths[:, 0] = begin
     for k in range(steps):
         paths[:, k + 1] = _stepped(step, paths[:, k], held, noise)
     return paths
-
-
-def _generators(seed: int, purpose: int) -> list[np.random.Generator]:
-    """Two generators, so that the states that are drawn do not depend on how often a step is repeated."""
-    require_whole("seed", seed, 0)
-    return np.random.default_rng([seed, purpose]).spawn(2)
 
 
 def _period(problem: SafetyProblem, dt: float | None) -> float:

@@ -12,12 +12,14 @@ import sympy as sp
 
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
+from wrappers.learning.checks import Purpose, random_stream
 from wrappers.learning.estimators import by_parts, rounding
 from wrappers.learning.features import Features
 from wrappers.learning.transitions import Transitions
 
 _DEGREES = (0, 1, 2)
 _HELD_OUT = 0.2
+_FEWEST_STARTS = 5
 _SINGULAR = 1e-12
 """Least eigenvalue of a constant covariance, as part of the largest one: what is below cannot be told from rounding."""
 
@@ -57,23 +59,27 @@ class LearnedDiffusion:
     entries: tuple[Entry, ...]
 
     @classmethod
-    def learn(cls, problem: SafetyProblem, data: Transitions, rate: np.ndarray) -> tuple[LearnedDiffusion, dict[str, float]]:
+    def learn(
+        cls, problem: SafetyProblem, data: Transitions, rate: np.ndarray, allowed: np.ndarray | float = 0.0
+    ) -> tuple[LearnedDiffusion, dict[str, float]]:
         """Regress the covariances at the points, by least squares, with the degree that the information criterion BIC prefers.
 
         Args:
             problem: over whose region the features are scaled.
             data: transitions under any inputs; one from each point is enough where there are many points.
-            rate: f(x) + g(x) u at each point, shape (P, n); see `wrappers.learning.estimators.rates`.
+            rate: f(x) + g(x) u at each point, or its mean over the steps, shape (P, n); see `wrappers.learning.estimators`.
+            allowed: residual of each state, shape (n,), that is no noise where data do not repeat; see `slack` there.
 
         Returns:
             What was learned from all points; and by name, for each entry that is not zero, the root mean square error of a
-            regression on 80 % of the points at the others, without which there are less than five points. It contains the error
-            of the covariances there, sqrt(2/K) of a diagonal entry.
+            regression on 80 % of the start states at the others, empty where there are less than five. It contains the error
+            of the covariances there, sqrt(2/(K - 1)) of a diagonal entry.
 
         Source: thesis Sec. 5.3 learns from the same data a term of a single barrier's generator.
         """
         found = covariances(data, rate)
-        noisy = found.diagonal(axis1=1, axis2=2).max(axis=0) > rounding(data, rate) ** 2 / data.dt.min()
+        small = rounding(data, rate) + (allowed if data.repetitions == 1 else 0.0)
+        noisy = found.diagonal(axis1=1, axis2=2).max(axis=0) > small**2 / data.dt.min()
         pairs = [(i, j) for i in range(len(noisy)) for j in range(i, len(noisy)) if noisy[i] and noisy[j]]
         designs = _designs(problem, data.x)
         fits = {(i, j): _fit(designs, found[:, i, j], may_vanish=i != j) for i, j in pairs}
@@ -135,22 +141,26 @@ class LearnedDiffusion:
 
 
 def covariances(data: Transitions, rate: np.ndarray) -> np.ndarray:
-    """mean(r r')/dt over the residuals r = x' - x - (f + g u) dt at each point, an estimate of sigma sigma'.
+    """Estimates of sigma sigma' at each point, free of bias for Euler-Maruyama steps.
 
-    Of Euler-Maruyama steps it is free of bias. An error e of the known drift adds e e' dt.
+    With repetitions they are the covariances of the sample, over dt: whatever the drift is, and however a step without noise
+    was integrated, is not taken for noise. A single successor leaves r r'/dt with the residual r = x' - x - (f + g u) dt, to
+    which an error e of the known drift adds e e' dt.
 
     Args:
         data: transitions under any inputs.
-        rate: f(x) + g(x) u at each point, shape (P, n).
+        rate: f(x) + g(x) u at each point, or its mean over the steps, shape (P, n).
 
     Returns:
         Shape (P, n, n), in units of the states' products per s.
     """
     expected = (data.x + rate * data.dt[:, None]).T
     found = np.empty((data.points, len(expected), len(expected)))
+    more = data.repetitions - 1
     for part, successors in by_parts(data):
-        residuals = [after - before[part, None] for after, before in zip(successors, expected, strict=True)]
-        scale = data.dt[part] * data.repetitions
+        means = [after.mean(axis=1) for after in successors] if more else expected[:, part]
+        residuals = [after - mean[:, None] for after, mean in zip(successors, means, strict=True)]
+        scale = data.dt[part] * max(more, 1)
         for i, first in enumerate(residuals):
             for j, second in enumerate(residuals[: i + 1]):
                 found[part, i, j] = found[part, j, i] = np.einsum("pk,pk->p", first, second) / scale
@@ -159,7 +169,7 @@ def covariances(data: Transitions, rate: np.ndarray) -> np.ndarray:
 
 def _designs(problem: SafetyProblem, x: np.ndarray) -> list[tuple[Features, np.ndarray]]:
     """The features of each degree at states (P, n), as far as there are two points for each feature."""
-    candidates = [Features.of(problem, degree) for degree in _DEGREES]
+    candidates = [Features.of(problem, degree) for degree in _DEGREES if Features.allowed(problem, degree)]
     return [(f, f.matrix(x)) for f in candidates if f.degree == 0 or 2 * f.count <= len(x)]
 
 
@@ -182,10 +192,10 @@ def _fit(designs: Sequence[tuple[Features, np.ndarray]], values: np.ndarray, may
 
 def _held_out_errors(problem: SafetyProblem, data: Transitions, found: np.ndarray, entries: Sequence[Entry]) -> dict[str, float]:
     """See `LearnedDiffusion.learn`."""
-    rows = np.random.default_rng(0).permutation(data.points)
-    held, kept = np.split(rows, [int(_HELD_OUT * len(rows))])
-    if not len(held):
+    if len(np.unique(data.x, axis=0)) < _FEWEST_STARTS:
         return {}
+    held = data.held_out(_HELD_OUT, random_stream(data.seed or 0, Purpose.HELD_OUT))
+    kept = ~held
     designs, errors = _designs(problem, data.x[kept]), {}
     for entry in entries:
         fit = _fit(designs, found[kept, entry.row, entry.column], may_vanish=entry.row != entry.column)

@@ -11,6 +11,7 @@ import sympy as sp
 
 from safe_envs.codegen import Components, compile_function, filled, stacked
 from safe_envs.errors import ConfigurationError
+from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
 from wrappers.learning.network import Network
 from wrappers.learning.transitions import Transitions
@@ -36,6 +37,12 @@ _BLOCK = 64
 _SUSPECT = 1.5
 """Score of a drift, in standard errors, from which it does not fit the data."""
 
+_SURE = 5.0
+"""Standard errors from which a log does not fit a drift."""
+
+_MATERIAL = 0.05
+"""Part of a state's steps, or of all states, from which something is told."""
+
 _ROUNDING = 64 * np.finfo(float).eps
 """Part of the size of a state up to which a residual is taken for a rounding error."""
 
@@ -55,9 +62,40 @@ class Estimate:
 
 def rates(model: ControlAffineSDE, data: Transitions) -> np.ndarray:
     """f(x) + g(x) u of a model at each point under its input, in units of the states per s, shape (P, n)."""
+    return _rate_of(model, data)(data.x)
+
+
+def mean_rates(model: ControlAffineSDE, data: Transitions, rate: np.ndarray) -> np.ndarray:
+    """Mean of f + g u of a model over each step, as the data were integrated, shape (P, n).
+
+    An Euler step takes the rate at its beginning, an exact one differs from that by an order of dt, and one of several Euler
+    steps is between them. Which it was is one number, told by least squares over all data; for noise it must not be taken.
+
+    Args:
+        model: that is known.
+        data: transitions under any inputs.
+        rate: f(x) + g(x) u at each point, shape (P, n); see `rates`.
+    """
+    dt = data.dt[:, None]
+    read = _rate_of(model, data)
+    with np.errstate(all="ignore"):
+        second = read(data.x + 0.5 * dt * rate)
+        third = read(data.x + 0.5 * dt * second)
+        curved = (rate + 2.0 * (second + third) + read(data.x + dt * third)) / 6.0 - rate
+        curved[~np.isfinite(curved).all(axis=1)] = 0.0
+    residual = (data.successors.mean(axis=1) - data.x) / dt - rate
+    size = np.mean(residual**2, axis=0)
+    weight = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    total = float((weight * curved**2).sum())
+    share = float((weight * curved * residual).sum()) / total if total > 0 else 0.0
+    return rate + min(max(share, 0.0), 1.0) * curved
+
+
+def _rate_of(model: ControlAffineSDE, data: Transitions) -> Callable[[np.ndarray], np.ndarray]:
+    """The function f + g u of a model, of states (P, n) under the inputs of the points."""
     rate = model.numeric(model.drift + model.input_matrix * sp.Matrix(model.inputs))
-    compiled = compile_function((*model.states, *model.inputs), tuple(rate), "arrays")
-    return stacked(compiled(*np.ascontiguousarray(data.x.T), *np.ascontiguousarray(data.u.T)), data.points)
+    compiled, u = compile_function((*model.states, *model.inputs), tuple(rate), "arrays"), np.ascontiguousarray(data.u.T)
+    return lambda x: stacked(compiled(*np.ascontiguousarray(x.T), *u), len(x))
 
 
 def by_parts(data: Transitions) -> Iterator[tuple[slice, list[np.ndarray]]]:
@@ -73,34 +111,80 @@ def rounding(data: Transitions, rate: np.ndarray) -> np.ndarray:
     return _ROUNDING * (np.abs(data.x) + np.abs(rate) * data.dt[:, None]).max(axis=0)
 
 
-def drift_score(data: Transitions, rate: np.ndarray) -> float:
+def slack(data: Transitions, rate: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """The largest residual of each state that another way of integrating may make, shape (n,); arguments as for `drift_warnings`."""
+    return _MATERIAL * (np.abs(mean - rate) * data.dt[:, None]).max(axis=0)
+
+
+def drift_score(data: Transitions, rate: np.ndarray, allowed: np.ndarray | float = 0.0) -> float:
     """How far the mean steps are from a drift's, in standard errors: root mean square over points and states; 1 if it is right.
 
     Steps without repetitions say nothing about it and score 1, and so do residuals within the rounding.
 
     Args:
         data: transitions under any inputs.
-        rate: f(x) + g(x) u at each point, shape (P, n).
+        rate: f(x) + g(x) u at each point, or its mean over the steps, shape (P, n).
+        allowed: part of the mean residual of each state that does not count, shape (n,); see `slack`.
     """
     expected, small = (data.x + rate * data.dt[:, None]).T, rounding(data, rate)
+    ignored = np.broadcast_to(allowed, small.shape)
     scores = np.ones((data.points, len(expected)))
     for part, successors in by_parts(data):
         for i, after in enumerate(successors):
             residual = after - expected[i, part, None]
-            mean, square = residual.mean(axis=1), np.einsum("pk,pk->p", residual, residual) / data.repetitions
+            mean = np.maximum(np.abs(residual.mean(axis=1)) - ignored[i], 0.0)
+            square = np.einsum("pk,pk->p", residual, residual) / data.repetitions
             np.divide(mean**2 * data.repetitions, square, out=scores[part, i], where=square > small[i] ** 2)
     return float(np.sqrt(scores.mean()))
 
 
-def drift_warnings(data: Transitions, rate: np.ndarray) -> tuple[str, ...]:
-    """What a user has to know where a drift does not fit the data; arguments as for `drift_score`."""
-    score = drift_score(data, rate)
-    if score < _SUSPECT:
+def drift_warnings(data: Transitions, rate: np.ndarray, mean: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
+    """What a user has to know where a drift does not fit the data.
+
+    Args:
+        data: transitions under any inputs.
+        rate: f(x) + g(x) u at each point, shape (P, n).
+        mean: what it is over the steps; see `mean_rates`.
+        names: of the states.
+    """
+    score = drift_score(data, mean, slack(data, rate, mean))
+    if score >= _SUSPECT:
+        return (
+            f"the mean steps are {score:.1f} standard errors away from those of the model's f and g, where 1 is expected: the method takes "
+            "both for known, and what is learned of the noise contains their error. A wrong dt looks the same",
+        )
+    return _factor_warnings(data, mean, names)
+
+
+def _factor_warnings(data: Transitions, mean: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
+    """The same where the score sees nothing: of a log without repetitions, by regression of the steps on those of the drift."""
+    moved = mean * data.dt[:, None]
+    product = (data.successors.mean(axis=1) - data.x - moved) * moved
+    size, total, spread = (moved**2).sum(axis=0), product.sum(axis=0), np.sqrt((product**2).sum(axis=0))
+    excess = np.divide(total, size, out=np.zeros_like(size), where=size > 0)
+    bad = (np.abs(total) > _SURE * spread) & (np.abs(excess) > _MATERIAL)
+    if not bad.any():
         return ()
+    factors = ", ".join(f"{name} {1.0 + excess[i]:.2g}" for i, name in enumerate(names) if bad[i])
     return (
-        f"the mean steps are {score:.1f} standard errors away from those of the model's f and g, where 1 is expected: the method takes "
-        "both for known, and what is learned of the noise contains their error",
+        f"the steps in the data are not those of the model's f and g over dt, but times: {factors}. A wrong dt, columns in another order "
+        "or a wrong model does this; the method takes all three for right, and what is learned of the noise contains their error",
     )
+
+
+def region_warnings(problem: SafetyProblem, data: Transitions) -> tuple[str, ...]:
+    """Which states of the data are to a material part outside the region in which a problem is explored."""
+    found = []
+    for variable, (low, high), column in zip(problem.states, problem.exploration.region, data.x.T, strict=True):
+        # Of an unbounded angle any turn will do.
+        bounded = np.isfinite(variable.low) or np.isfinite(variable.high)
+        share = np.mean((column < low) | (column > high))
+        if bounded and share > _MATERIAL:
+            found.append(
+                f"{share:.0%} of the data have {variable.symbol} outside the explored region, [{low:g}, {high:g}]: it is from "
+                f"{column.min():g} to {column.max():g}. Learn from data of the region, where what is learned will be used"
+            )
+    return tuple(found)
 
 
 def in_bulk(network: Network, inputs: Sequence[np.ndarray]) -> np.ndarray:

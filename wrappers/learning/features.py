@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,6 +15,9 @@ import sympy as sp
 from safe_envs.codegen import compile_function, stacked
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.problem import SafetyProblem
+
+_MOST = 300
+"""Features; a regression holds the square of some multiple of their number, and their symbols take minutes to write out."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,7 @@ class Features:
         angles: names of the states that are angles.
 
     Raises:
-        ConfigurationError: the degree is no whole number from 0.
+        ConfigurationError: the degree is no whole number from 0, or makes more than 300 features.
     """
 
     states: tuple[sp.Symbol, ...]
@@ -42,12 +46,29 @@ class Features:
         unknown = set(self.angles) - {s.name for s in self.states}
         if unknown or len(self.region) != len(self.states):
             raise ConfigurationError(f"features of {self.states} with the ranges {self.region} and the angles {self.angles} do not fit")
+        if self.count > _MOST:
+            names = ", ".join(s.name for s in self.states)
+            raise ConfigurationError(f"degree = {self.degree} makes {self.count} features of {names}; give one with at most {_MOST}")
 
     @classmethod
-    def of(cls, problem: SafetyProblem, degree: int) -> Features:
-        """Features over the region in which a problem is explored; its unbounded states are the angles."""
-        angles = tuple(s.symbol.name for s in problem.states if np.isinf(s.low) and np.isinf(s.high))
-        return cls(problem.plant.states, problem.exploration.region, degree, angles)
+    def of(cls, problem: SafetyProblem, degree: int, name: str = "degree") -> Features:
+        """Features over the region in which a problem is explored; its unbounded states are the angles.
+
+        Args:
+            problem: whose region and states are taken.
+            degree: total degree, from 0.
+            name: by which the user knows the degree, for the messages.
+
+        Raises:
+            ConfigurationError: the degree is not allowed.
+        """
+        require_whole(name, degree, 0)
+        return cls(problem.plant.states, problem.exploration.region, degree, _angles(problem))
+
+    @classmethod
+    def allowed(cls, problem: SafetyProblem, degree: int) -> bool:
+        """Whether `of` takes a degree from 0: whether there are not too many features."""
+        return _count(len(problem.states), len(_angles(problem)), degree) <= _MOST
 
     @cached_property
     def expressions(self) -> tuple[Any, ...]:
@@ -67,7 +88,7 @@ class Features:
     @property
     def count(self) -> int:
         """M, the number of features."""
-        return len(self.expressions)
+        return _count(len(self.states), len(self.angles), self.degree)
 
     @cached_property
     def _compiled(self) -> Any:
@@ -81,3 +102,12 @@ class Features:
         """The function with these M weights, multiplied out."""
         terms = [sp.Float(float(w), 17) * e for w, e in zip(weights, self.expressions, strict=True)]
         return sp.expand(sp.Add(*terms))
+
+
+def _angles(problem: SafetyProblem) -> tuple[str, ...]:
+    return tuple(s.symbol.name for s in problem.states if np.isinf(s.low) and np.isinf(s.high))
+
+
+def _count(states: int, angles: int, degree: int) -> int:
+    """Number of features: monomials in as many coordinates as there are states, each times some of the sines."""
+    return sum(math.comb(angles, k) * math.comb(states + degree - k, states) for k in range(min(angles, degree) + 1))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -17,8 +18,12 @@ import numpy as np
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
+from safe_envs.sde import ControlAffineSDE
 
-_FORMAT = 1
+DATA = "transitions"
+"""Kind of a file that holds data, where others hold what was learned."""
+
+_FORMAT = 2
 _HEADER = "header"
 _PACKAGES = ("safe-envs", "numpy", "sympy", "torch")
 
@@ -55,6 +60,7 @@ class Signature:
         dt: control period in s.
         barriers: expressions of the barriers.
         model: parameters that the designer believed.
+        plant: parameters of the plant that was stepped; empty where they are not known, as for a log.
     """
 
     system: str
@@ -65,6 +71,7 @@ class Signature:
     dt: float
     barriers: tuple[str, ...] = ()
     model: tuple[tuple[str, float], ...] = ()
+    plant: tuple[tuple[str, float], ...] = ()
 
     @classmethod
     def of(cls, problem: SafetyProblem) -> Signature:
@@ -77,7 +84,8 @@ class Signature:
             tuple(i.unit for i in problem.inputs),
             problem.dt,
             tuple(str(problem.model.numeric(b.expression)) for b in problem.barriers),
-            tuple(sorted((p.name, v) for p, v in problem.model.parameters.items())),
+            _parameters(problem.model),
+            _parameters(problem.plant),
         )
 
     def require(self, problem: SafetyProblem, *also: str) -> None:
@@ -87,14 +95,25 @@ class Signature:
             problem: for which it is to be used.
             *also: further attributes that must be the same: "barriers", "model", "dt".
         """
+        difference = self.difference(problem, *also)
+        if difference:
+            raise LearnedFileError(f"what was learned is of another problem: {difference}; learn again, by `safe-envs identify`")
+
+    def difference(self, problem: SafetyProblem, *also: str) -> str:
+        """In what this is not of a problem's system, in words; empty if it is. Arguments as for `require`."""
         wanted = Signature.of(problem)
         for name in ("system", "states", "state_units", "inputs", "input_units", *also):
             mine, other = getattr(self, name), getattr(wanted, name)
             if mine != other:
-                raise LearnedFileError(
-                    f"what was learned is of another problem: its {name.replace('_', ' ')}: {mine}, that of {problem.name}: {other}; "
-                    "learn again, by `safe-envs identify`"
-                )
+                return f"its {name.replace('_', ' ')}: {mine}, that of {problem.name}: {other}"
+        return ""
+
+    def differences(self, problem: SafetyProblem) -> tuple[str, ...]:
+        """Parameters of the plant that are not those of a problem's, such as "v = 0.8 (here 1)"; none if they are not known."""
+        here = dict(_parameters(problem.plant))
+        return tuple(
+            f"{name} = {value:.12g} (here {here.get(name, math.nan):.12g})" for name, value in self.plant if here.get(name) != value
+        )
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Signature:
@@ -102,10 +121,15 @@ class Signature:
         found = dict(data)
         for name in ("states", "state_units", "inputs", "input_units", "barriers"):
             found[name] = tuple(found[name])
-        found["model"] = tuple((name, float(value)) for name, value in found["model"])
+        for name in ("model", "plant"):
+            found[name] = tuple((parameter, float(value)) for parameter, value in found[name])
         if set(found) != {f.name for f in fields(cls)}:
             raise KeyError("signature")
         return cls(**found)
+
+
+def _parameters(system: ControlAffineSDE) -> tuple[tuple[str, float], ...]:
+    return tuple(sorted((p.name, value) for p, value in system.parameters.items()))
 
 
 @dataclass(frozen=True)
@@ -129,7 +153,7 @@ class Content:
 
 def checksum(kind: str, signature: Signature, details: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
     """SHA-256 of everything that is saved, as hexadecimal digits."""
-    digest = hashlib.sha256(json.dumps([kind, asdict(signature), details], sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps([kind, asdict(signature), details], sort_keys=True, default=_plain).encode())
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
         digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
@@ -158,7 +182,7 @@ def save(path: Path, kind: str, signature: Signature, details: Mapping[str, Any]
         "versions": {package: version(package) for package in _PACKAGES},
         "sha256": checksum(kind, signature, details, arrays),
     }
-    encoded = np.frombuffer(json.dumps(header, allow_nan=False).encode(), dtype=np.uint8)
+    encoded = np.frombuffer(json.dumps(header, allow_nan=False, default=_plain).encode(), dtype=np.uint8)
 
     def write(part: Path) -> None:
         with part.open("wb") as stream:
@@ -171,12 +195,21 @@ def _savez(stream: BinaryIO, arrays: Mapping[str, np.ndarray]) -> None:
     np.savez(stream, allow_pickle=False, **{name: np.asarray(array) for name, array in arrays.items()})  # pyright: ignore[reportArgumentType]
 
 
+def _plain(value: Any) -> Any:
+    """A number of NumPy, which settings and seeds may be, as one of Python."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{value!r} is no JSON")
+
+
 def load(path: Path) -> Content:
     """Read a file.
 
     Raises:
-        LearnedFileError: it is missing, no such file, truncated or altered.
+        LearnedFileError: it is missing, a folder, no such file, truncated or altered.
     """
+    if path.is_dir():
+        raise LearnedFileError(f"{path} is a folder; name a file in it that `safe-envs identify` wrote")
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}
@@ -190,7 +223,9 @@ def load(path: Path) -> Content:
     except _DAMAGED as error:
         if isinstance(error, LearnedFileError):
             raise
-        raise LearnedFileError(f"{path} is no file of `safe-envs identify`, or it is truncated ({type(error).__name__})") from error
+        raise LearnedFileError(
+            f"{path} is no file of `safe-envs identify`, or it is truncated or altered ({type(error).__name__})"
+        ) from error
     if content.sha256 != checksum(content.kind, signature, content.details, arrays):
         raise LearnedFileError(f"{path} was altered: its content does not match its checksum. Learn again")
     return content

@@ -18,9 +18,20 @@ from safe_envs.codegen import Components, compile_function, filled, stacked
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem import SafetyProblem
 from wrappers.learning.base import LearnedModel, Progress, Record
+from wrappers.learning.checks import require_kind, require_problem
 from wrappers.learning.collect import Step, collect
 from wrappers.learning.diffusion import LearnedDiffusion
-from wrappers.learning.estimators import Estimator, drift_warnings, in_bulk, ito_part, rates, require_estimator
+from wrappers.learning.estimators import (
+    Estimator,
+    drift_warnings,
+    in_bulk,
+    ito_part,
+    mean_rates,
+    rates,
+    region_warnings,
+    require_estimator,
+    slack,
+)
 from wrappers.learning.files import LearnedFileError, Signature
 from wrappers.learning.network import Network
 from wrappers.learning.training import train
@@ -216,6 +227,7 @@ def learn_generator(
 
     Source: thesis Algorithm 2, Sec. 5.3. Its estimator is "printed", 200 points, 50000 transitions from each.
     """
+    require_problem(problem)
     require_estimator(estimator)
     if way not in (None, *get_args(Way)):
         raise ConfigurationError(f"way = {way!r}; allowed: {', '.join(get_args(Way))}")
@@ -224,26 +236,33 @@ def learn_generator(
     if data is None:
         at_rest = [min(max(0.0, low), high) for low, high in problem.box]
         data = collect(problem, points, repetitions, [at_rest], seed=seed, step=step, progress=lambda part: told(0.5 * part))
-    data.signature.require(problem)
+    require_kind("data", data, Transitions, "collect, Transitions.from_log or Transitions.load")
+    data.require(problem)
     way = way or ("network" if max(degrees) == 1 and data.repetitions > 1 else "direct")
     settings: dict[str, Any] = {"way": way, "points": data.points, "repetitions": data.repetitions}
-    rate, errors, generators, diffusion = rates(problem.model, data), {}, [], None
+    rate = rates(problem.model, data)
+    mean = mean_rates(problem.model, data, rate)
+    warnings = (*drift_warnings(data, rate, mean, [s.name for s in problem.model.states]), *region_warnings(problem, data))
+    errors, generators, diffusion = {}, [], None
     if way == "direct":
-        diffusion, errors = LearnedDiffusion.learn(problem, data, rate)
+        diffusion, errors = LearnedDiffusion.learn(problem, data, mean, slack(data, rate, mean))
+        warnings += () if diffusion.entries else ("the data show no noise, and none was learned",)
     else:
         settings |= {"estimator": estimator, "training_seed": seed, **_TRAINING}
         done, every = 0, sum(degrees)
+        # The printed estimator has the bias that it was printed with.
+        taken = rate if estimator == "printed" else mean
         for barrier, degree in zip(problem.barriers, degrees, strict=True):
             found = LearnedGenerator(problem.plant.states, problem.exploration.coordinates, ())
             for _ in range(degree):
                 how = {"seed": seed, "progress": lambda part, k=done: told(0.5 + 0.5 * (k + part) / every)}
-                found, new = _next_order(problem, barrier, found, data, rate, estimator, **how)
+                found, new = _next_order(problem, barrier, found, data, taken, estimator, **how)
                 errors |= new
                 done += 1
             generators.append(found)
     told(1.0)
-    record = Record(data.count, data.observed, time.perf_counter() - begin, data.seed, errors, settings, drift_warnings(data, rate))
-    signature = replace(Signature.of(problem), **({"barriers": ()} if diffusion else {}))
+    record = Record(data.count, data.observed, time.perf_counter() - begin, data.seed, errors, settings, warnings)
+    signature = replace(Signature.of(problem), plant=data.signature.plant, **({"barriers": ()} if diffusion else {}))
     return GeneratorModel(signature, record, tuple(generators), diffusion)
 
 

@@ -75,12 +75,12 @@ def misfits(features: Features, misfit: np.ndarray, variation: np.ndarray) -> tu
         variation: part by which the variance of its noise varies although it is taken for constant, (n,).
     """
     missed = [
-        f"{state}: features of degree {features.degree} miss {100 * part:.2g} % of its rate; give a higher degree"
+        f"{state}: features of degree {features.degree} miss {100 * part:.3g} % of its rate; give a higher degree"
         for state, part in zip(features.states, misfit, strict=True)
         if part > _MATERIAL
     ]
     varied = [
-        f"{state}: the variance of its noise varies by {100 * part:.2g} % over the states; give a diffusion degree"
+        f"{state}: the variance of its noise varies by {100 * part:.3g} % over the states; give a diffusion degree"
         for state, part in zip(features.states, variation, strict=True)
         if part > _MATERIAL
     ]
@@ -103,8 +103,8 @@ def _steady(features: Features, inputs: Sequence[str], x: np.ndarray, u: np.ndar
     for name, values in zip(inputs, u.T, strict=True):
         if np.ptp(values) <= _STEADY * abs(values).max():
             found.append(
-                f"the input {name} stays within [{values.min():g}, {values.max():g}]: its effect cannot be told from the drift; "
-                "try values of both signs"
+                f"the input {name} stays within [{values.min() + 0.0:g}, {values.max() + 0.0:g}]: its effect cannot be told from the "
+                "drift; try values of both signs"
             )
     return found
 

@@ -18,7 +18,7 @@ from safe_envs.sde import ControlAffineSDE
 from wrappers.learning.base import LearnedModel, Record
 from wrappers.learning.features import Features
 from wrappers.learning.files import Signature
-from wrappers.learning.regression import Gaussian, sigma_map, sigma_quantile, sigma_samples
+from wrappers.learning.regression import Gaussian, sigma_map, sigma_samples
 
 _SIGNIFICANT = 0.999
 _POINTS = 256
@@ -60,6 +60,8 @@ class Diffusion:
     def sigma_intervals(self, delta: float) -> np.ndarray:
         """Intervals that hold all sigma_i of constant, independent noise but for a probability delta, shape (n, 2).
 
+        They are those of S/sigma^2 ~ chi^2_N: a prior of sigma, whose scale is a guess, would move them off the truth.
+
         Raises:
             ConfigurationError: the noise varies with the state, or is correlated.
         """
@@ -69,7 +71,7 @@ class Diffusion:
             )
         tail = 0.5 * delta / len(self.squares)
         levels = np.array([tail, 1.0 - tail])
-        return np.array([sigma_quantile(levels, s, self.count, self.alpha, self.beta) if s > 0 else np.zeros(2) for s in self.squares])
+        return np.sqrt(self.squares[:, None] / chi2.isf(levels, self.count))
 
     def variances(self, x: np.ndarray) -> np.ndarray:
         """Estimated variances per s at states (B, n), without the prior of sigma, shape (B, n)."""
@@ -104,8 +106,8 @@ class Diffusion:
 class Posterior(LearnedModel):
     """What Bayesian identification knows of f, g and sigma.
 
-    f_i = Phi w_i0 and g_ij = s_j Phi w_ij, with the features Phi and Gaussian weights (w_i0, .., w_im), independent from state
-    to state. That they are not where the noise of the states is correlated is neglected.
+    f_i = Phi w_i0 and g_ij = s_j Phi w_ij, with the features Phi and Gaussian weights (w_i0, .., w_im), drawn independently from
+    state to state. Where the noise of the states is correlated, the weights are as well: see `BayesianSCBF`.
 
     Attributes:
         signature: of which system.
@@ -117,6 +119,8 @@ class Posterior(LearnedModel):
         covariance: of the weights, (n, D, D).
         diffusion: the noise.
         dt: mean length of the steps in the data, in s.
+        misfit: part of each state's rate that the features miss beyond the noise, (n,); 0 where that may be chance.
+        variation: part by which the variance of its noise varies although it was taken for constant, (n,), likewise.
 
     Source: thesis Sec. 6.2, with f and g in one regression on both inputs instead of the pairs of Eq. (6.5): the same posterior,
     with the right variances.
@@ -132,6 +136,8 @@ class Posterior(LearnedModel):
     covariance: np.ndarray
     diffusion: Diffusion
     dt: float
+    misfit: np.ndarray
+    variation: np.ndarray
 
     @cached_property
     def pruned(self) -> np.ndarray:
@@ -212,24 +218,22 @@ class Posterior(LearnedModel):
         """Shape (n, 1 + m, 1 + m, M)."""
         return (len(self.mean), 1 + len(self.inputs), 1 + len(self.inputs), self.features.count)
 
-    def _scaled(self, covariance: np.ndarray) -> np.ndarray:
-        """A covariance of the weights with the scales of the inputs in it, axes (n, 1 + m, 1 + m, M, M)."""
+    @cached_property
+    def _split_covariance(self) -> np.ndarray:
+        """The covariance of the weights with the scales of the inputs in it, axes (n, 1 + m, 1 + m, M, M)."""
         n, parts, _, count = self._blocks
         scale = np.array([1.0, *self.input_scale])
-        split = covariance.reshape(n, parts, count, parts, count).transpose(0, 1, 3, 2, 4)
+        split = self.covariance.reshape(n, parts, count, parts, count).transpose(0, 1, 3, 2, 4)
         return split * np.outer(scale, scale)[:, :, None, None]
 
     @cached_property
     def _stretched(self) -> np.ndarray:
         """The same as one matrix (M, n (1 + m)^2 M), so that a batch costs one product of matrices."""
-        return np.ascontiguousarray(np.moveaxis(self._scaled(self.covariance), 3, 0).reshape(self.features.count, -1))
+        return np.ascontiguousarray(np.moveaxis(self._split_covariance, 3, 0).reshape(self.features.count, -1))
 
-    def variance_expressions(self, covariance: np.ndarray) -> tuple[sp.ImmutableMatrix, ...]:
-        """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m) of expressions, multiplied out.
-
-        Args:
-            covariance: of the weights, (n, D, D): `covariance` or, given what is pruned, `weights.covariance`.
-        """
+    @property
+    def variance_expressions(self) -> tuple[sp.ImmutableMatrix, ...]:
+        """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m) of expressions, multiplied out."""
         first, second = np.triu_indices(self.features.count)
         phi = self.features.expressions
         products = [sp.expand(phi[k] * phi[j]) for k, j in zip(first, second, strict=True)]
@@ -239,12 +243,12 @@ class Posterior(LearnedModel):
             weights = (block + block.T)[first, second] * twice
             return sp.expand(sp.Add(*[sp.Float(w, 17) * p for w, p in zip(weights.tolist(), products, strict=True)]))
 
-        return tuple(sp.ImmutableMatrix([[entry(block) for block in row] for row in state]) for state in self._scaled(covariance))
+        return tuple(sp.ImmutableMatrix([[entry(block) for block in row] for row in state]) for state in self._split_covariance)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """See `LearnedModel.arrays`."""
         noise = self.diffusion
-        named = {name: getattr(self, name) for name in ("input_scale", "mean", "covariance")}
+        named = {name: getattr(self, name) for name in ("input_scale", "mean", "covariance", "misfit", "variation")}
         named |= {"squares": noise.squares, "correlation": noise.correlation}
         if noise.variance is not None:
             named |= {"variance_mean": noise.variance.mean, "variance_covariance": noise.variance.covariance}
@@ -289,6 +293,8 @@ class Posterior(LearnedModel):
             arrays["covariance"],
             noise,
             details["dt"],
+            arrays["misfit"],
+            arrays["variation"],
         )
 
     @classmethod

@@ -1,10 +1,15 @@
-"""What the model gets wrong in the derivatives of a barrier, learned from short paths of the plant under held inputs."""
+"""What the model gets wrong in the derivatives of a barrier, learned from short paths of the plant under held inputs.
+
+A network says something everywhere, but it has seen states of the explored region only. Outside it extrapolates, and the
+errors at held-out states, all of which are from that region, mean nothing there.
+"""
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -14,12 +19,21 @@ from safe_envs.calculus import derivatives, drift_derivative, input_derivative, 
 from safe_envs.codegen import Components, compile_function, stacked
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.problem import SafetyProblem
-from safe_envs.sde import ControlAffineSDE
+from safe_envs.sde import ControlAffineSDE, finite_number
 from wrappers.learning.base import LearnedModel, Progress, Record
+from wrappers.learning.checks import Purpose, random_stream, require_problem
 from wrappers.learning.collect import Step, collect_paths, draw_states
 from wrappers.learning.files import Signature
 from wrappers.learning.network import Network
-from wrappers.learning.training import LEAST_ROWS, train
+from wrappers.learning.training import LEAST_ROWS, hidden_widths, train
+
+_ROUNDING = 1e-12
+
+_HELD_OUT = 0.15
+"""Share of the states that `train` measures the network with."""
+
+_SHORTEST, _LONGEST = 1e-4, 100.0
+"""Label steps in control periods. Of shorter ones the rounding of h takes over, over longer ones the derivatives change."""
 
 _MOST_DISAGREEMENT = 1e-3
 """Of derivatives below the relative degree between inputs, relative to their size: they are labels of the same numbers."""
@@ -35,7 +49,7 @@ class LearnedResidual:
         degree: r, the relative degree of the model.
         network: from the coordinates to Delta_1, ..., Delta_r in units of h per s^j, and Sigma_1, ..., Sigma_m in units of h
             per s^r and unit of the input.
-        heldout: absolute errors (N_h, r + m) of the network at states that it was not trained on.
+        heldout: absolute errors (N_h, r + m) of the network at states of the explored region that it was not trained on.
         symbols: r + m symbols that stand for its outputs in a row.
 
     Source: thesis Eq. (3.18).
@@ -66,15 +80,24 @@ class LearnedResidual:
         return self.network.arrays(tuple(stacked(self._arrays(*x), len(x[0])).T))
 
     def eps(self, level: float) -> np.ndarray:
-        """The error (r + m,) that a share of the held-out states does not exceed, for each residual by itself.
+        """The errors (r + m,) that a fresh state exceeds with a probability of at most 1 - level, each residual by itself.
+
+        The error of rank ceil(level (n + 1)) among the n at held-out states. It holds for states that are drawn as those were,
+        on average over what is learned; outside the explored region it means nothing, for the network extrapolates there.
 
         Raises:
-            ConfigurationError: the level is not in [0, 1].
+            ConfigurationError: the level is not in [0, 1], or higher than this many held-out states can tell.
+
+        Source: split conformal prediction, Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005.
         """
         if not 0 <= level <= 1:
             raise ConfigurationError(f"level = {level!r}; give a share from 0 to 1")
-        # An error that occurred, not one interpolated below it.
-        return np.quantile(self.heldout, level, axis=0, method="higher")
+        n = len(self.heldout)
+        # A level such as .95 is no binary number: 20 times it has to count as 19.
+        rank = max(1, math.ceil(level * (n + 1) - _ROUNDING * n))
+        if rank > n:
+            raise ConfigurationError(f"level = {level!r} is more than {n} held-out states can tell; {_remedy(level, n)}")
+        return np.sort(self.heldout, axis=0)[rank - 1]
 
 
 @dataclass(eq=False)
@@ -173,26 +196,30 @@ def learn_residual(
     Source: thesis Sec. 3.4, Alg. 1, with the differences that `residual_labels` names.
     """
     began = time.perf_counter()
+    require_problem(problem)
     require_whole("states", states, LEAST_ROWS)
-    require_whole("seed", seed, 0)
+    widths = hidden_widths(hidden)
+    _require_label_dt(label_dt, problem.dt)
     if step is None and any(entry != 0 for entry in problem.plant.numeric(problem.plant.diffusion)):
         raise ConfigurationError(
             f"the plant of {problem.name} is noisy, and the derivatives of a noisy path do not exist; learn with noise=0, or use "
             "ddscbf or bayesian-scbf, which are for noise"
         )
-    x = draw_states(problem, states, np.random.default_rng(seed))
+    x = draw_states(problem, states, random_stream(seed, Purpose.STATES))
     labels, transitions = residual_labels(problem, x, label_dt, seed, step)
     coordinates = problem.exploration.coordinates
     inputs = stacked(compile_function(problem.plant.states, coordinates, "arrays")(*np.ascontiguousarray(x.T)), states)
     parts, errors = [], {}
     for i, (barrier, (targets, sizes)) in enumerate(zip(problem.barriers, labels, strict=True)):
-        trained = train(inputs, targets, hidden=hidden, epochs=epochs, seed=seed, sizes=sizes, progress=_share(progress, i, len(labels)))
+        trained = train(inputs, targets, hidden=widths, epochs=epochs, seed=seed, sizes=sizes, progress=_share(progress, i, len(labels)))
         degree = targets.shape[1] - problem.plant.m
         parts.append(LearnedResidual(problem.plant.states, coordinates, degree, trained.network, trained.heldout))
         errors |= _summary(barrier.name, _names(degree, [u.symbol.name for u in problem.inputs]), parts[-1])
-    settings = {"states": states, "label_dt": label_dt, "hidden": list(hidden), "epochs": epochs}
+    settings = {"states": states, "label_dt": label_dt, "hidden": list(widths), "epochs": epochs}
     record = Record(transitions, transitions * label_dt, time.perf_counter() - began, seed, errors, settings)
-    return ResidualModel(Signature.of(problem), record, tuple(parts))
+    # The step of somebody else may be that of any plant.
+    signature = Signature.of(problem) if step is None else replace(Signature.of(problem), plant=())
+    return ResidualModel(signature, record, tuple(parts))
 
 
 def residual_labels(
@@ -239,6 +266,16 @@ def residual_labels(
     return found, len(x) * len(tried) * steps
 
 
+def _require_label_dt(label_dt: float, dt: float) -> None:
+    """Raise ConfigurationError unless a step of the labels suits control periods of dt s."""
+    low, high = _SHORTEST * dt, _LONGEST * dt
+    if not low <= finite_number("label_dt", label_dt) <= high:
+        raise ConfigurationError(
+            f"label_dt = {label_dt} s; give a step from {low:g} to {high:g} s, {_SHORTEST:g} to {_LONGEST:g} control periods: over shorter "
+            "ones the differences of h are rounding, over longer ones its derivatives change"
+        )
+
+
 def _split_by_input(problem: SafetyProblem, tried: np.ndarray) -> np.ndarray:
     """The matrix (1 + m, J) that takes values c + a u at J inputs to (c, a) by least squares; raises as `residual_labels`."""
     # Centred and scaled, for inputs may be large and far from 0.
@@ -282,6 +319,15 @@ def _lie_derivatives(system: ControlAffineSDE, h: sp.Expr, degree: int) -> Calla
     return lambda x: stacked(compiled(*np.ascontiguousarray(x.T)), len(x))
 
 
+def _remedy(level: float, heldout: int) -> str:
+    """How to get errors of a level that some held-out states are too few for."""
+    highest = f"give a level up to {math.floor(1000 * heldout / (heldout + 1)) / 1000}"
+    if level == 1:
+        return f"{highest}: no number of states tells the largest error"
+    more = math.ceil(level / (1 - level) - _ROUNDING * heldout) - heldout
+    return f"learn with about {math.ceil(more / _HELD_OUT)} more states, of which {more} are held out, or {highest}"
+
+
 def _names(degree: int, inputs: Sequence[str]) -> list[str]:
     return [*(f"Delta_{j}" for j in range(1, degree + 1)), *(f"Sigma_{name}" for name in inputs)]
 
@@ -293,7 +339,8 @@ def _share(progress: Progress | None, part: int, parts: int) -> Progress | None:
 
 def _summary(name: str, outputs: Sequence[str], part: LearnedResidual) -> dict[str, float]:
     """Held-out errors by name: root mean square and 95 % quantile of each residual."""
-    rms, q95 = np.sqrt((part.heldout**2).mean(axis=0)), part.eps(0.95)
+    # The quantile describes these errors; that of fresh ones, `eps`, exists for 19 held-out states or more only.
+    rms, q95 = np.sqrt((part.heldout**2).mean(axis=0)), np.quantile(part.heldout, 0.95, axis=0, method="higher")
     return {
         f"{name} {out} {kind}": float(e) for kind, errors in (("rms", rms), ("q95", q95)) for out, e in zip(outputs, errors, strict=True)
     }

@@ -13,6 +13,7 @@ import numpy as np
 
 from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole
 from wrappers.learning.base import Progress
+from wrappers.learning.checks import Purpose, random_stream
 from wrappers.learning.network import Activation, Network, require_activation
 
 LEAST_ROWS = 10
@@ -20,6 +21,9 @@ LEAST_ROWS = 10
 
 _LARGEST = 1e100
 """Largest entry of the data: the sum of its squares is still a number."""
+
+_MOST_PARAMETERS = 10_000_000
+"""Of a network: Adam keeps four numbers for each, and half a thousand epochs take hours."""
 
 _PATIENCE = 60
 _TRAINED, _VALIDATED = 0.7, 0.15
@@ -73,27 +77,53 @@ def train(
 
     Raises:
         InvalidInputError: the arrays have other shapes, fewer than ten rows, or entries that are not finite or above 1e100.
-        ConfigurationError: a setting is out of its range.
+        ConfigurationError: a setting is out of its range, or the network would have more than ten million parameters.
 
     Source: thesis Sec. 3.4.2, whose loss lacks the square and whose update has the wrong sign.
     """
     _check_data(inputs, targets)
-    for name, value in (("epochs", epochs), ("batch", batch), *(("a hidden layer's width", width) for width in hidden)):
+    for name, value in (("epochs", epochs), ("batch", batch)):
         require_whole(name, value, 1)
-    require_whole("seed", seed, 0)
+    widths = (inputs.shape[1], *hidden_widths(hidden), targets.shape[1])
+    _require_size(widths)
+    rows = random_stream(seed, Purpose.TRAINING).permutation(len(inputs))
     require_activation(activation)
     if not 0 < rate < 1:
         raise ConfigurationError(f"rate = {rate!r}; give a number between 0 and 1")
-    rows = np.random.default_rng(seed).permutation(len(inputs))
     fitted, validated = int(_TRAINED * len(rows)), int(_VALIDATED * len(rows))
     parts = np.split(rows, [fitted, fitted + validated])
     ends = (*_standardisation(inputs), *_standardisation(targets, sizes))
     x, y = (inputs - ends[0]) / ends[1], (targets - ends[2]) / ends[3]
     with _single_thread():
-        layers, run, loss = _fit(x, y, parts, (x.shape[1], *hidden, y.shape[1]), activation, epochs, batch, rate, seed, progress)
+        layers, run, loss = _fit(x, y, parts, widths, activation, epochs, batch, rate, int(seed), progress)
     network = Network(tuple(w for w, _ in layers), tuple(b for _, b in layers), activation, *ends)
     predicted = np.stack(network.arrays(tuple(inputs[parts[2]].T)), axis=1)
     return Trained(network, run, loss, np.abs(predicted - targets[parts[2]]))
+
+
+def hidden_widths(hidden: Any) -> tuple[int, ...]:
+    """The widths of hidden layers as Python's numbers.
+
+    Raises:
+        ConfigurationError: they are no whole numbers from 1.
+    """
+    try:
+        widths = tuple(hidden)
+    except TypeError as error:
+        raise ConfigurationError(f"hidden = {hidden!r}; give the width of each hidden layer, such as (100, 30) or (100,)") from error
+    for width in widths:
+        require_whole("the width of a hidden layer", width, 1)
+    return tuple(map(int, widths))
+
+
+def _require_size(widths: Sequence[int]) -> None:
+    """Raise ConfigurationError where layers between these widths have too many parameters."""
+    parameters = sum((into + 1) * out for into, out in pairwise(widths))
+    if parameters > _MOST_PARAMETERS:
+        raise ConfigurationError(
+            f"hidden = {list(widths[1:-1])} makes a network of {parameters:.3g} parameters; at most {_MOST_PARAMETERS} are allowed: "
+            "give narrower hidden layers"
+        )
 
 
 def _check_data(inputs: np.ndarray, targets: np.ndarray) -> None:

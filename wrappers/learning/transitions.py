@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole
 from safe_envs.problem import SafetyProblem
-from wrappers.learning.files import LearnedFileError, Signature, load, save
+from wrappers.learning.checks import require_kind, require_problem
+from wrappers.learning.files import DATA, LearnedFileError, Signature, load, save
 
-_KIND = "transitions"
 _ARRAYS = ("x", "u", "successors", "dt")
 
 
@@ -33,7 +33,7 @@ class Transitions:
     Raises:
         InvalidInputError: there are no data, an array has the wrong shape or is not finite, a dt is not positive, or a row
             occurs twice.
-        ConfigurationError: the seed is no whole number.
+        ConfigurationError: the seed is no whole number, or the signature is none.
     """
 
     signature: Signature
@@ -44,6 +44,7 @@ class Transitions:
     seed: int | None = None
 
     def __post_init__(self) -> None:
+        require_kind("signature", self.signature, Signature, "Signature.of(problem)")
         for name in _ARRAYS:
             object.__setattr__(self, name, numbers(name, getattr(self, name)))
         self._check_shapes()
@@ -87,7 +88,7 @@ class Transitions:
 
     @classmethod
     def from_log(cls, source: SafetyProblem | Signature, x: Any, u: Any, successors: Any, dt: Any) -> Self:
-        """Data that were logged elsewhere, each step once.
+        """Data that were logged elsewhere, each step once. Of which plant is not known: their signature says nothing of it.
 
         Args:
             source: the problem, or its signature, whose states and inputs they are of.
@@ -98,8 +99,11 @@ class Transitions:
 
         Raises:
             InvalidInputError: as for `Transitions`.
+            ConfigurationError: the source is neither a problem nor a signature.
         """
-        signature = Signature.of(source) if isinstance(source, SafetyProblem) else source
+        if not isinstance(source, Signature):
+            require_problem(source)
+        signature = replace(source if isinstance(source, Signature) else Signature.of(source), plant=())
         followed = numbers("successors", successors)
         if followed.ndim != 2:
             raise InvalidInputError(f"the successors of a log have the shape {followed.shape}; give (P, {len(signature.states)})")
@@ -125,6 +129,12 @@ class Transitions:
         """Time that all transitions last together, in s."""
         return float(self.dt.sum()) * self.repetitions
 
+    def require(self, problem: SafetyProblem) -> None:
+        """Raise LearnedFileError unless the data are of a problem's system."""
+        difference = self.signature.difference(problem)
+        if difference:
+            raise LearnedFileError(f"the data are of another problem: {difference}; give data of {problem.name}, or let them be collected")
+
     def split(self, share: float, rng: np.random.Generator) -> tuple[Transitions, Transitions]:
         """Divide the data at random, by start states: rows that start from the same state stay together, in their order.
 
@@ -139,6 +149,11 @@ class Transitions:
             ConfigurationError: the share is not between 0 and 1.
             InvalidInputError: all rows start from the same state.
         """
+        held = self.held_out(share, rng)
+        return self._part(~held), self._part(held)
+
+    def held_out(self, share: float, rng: np.random.Generator) -> np.ndarray:
+        """Which rows `split` holds out, shape (P,); arguments and errors are the same."""
         if not 0 < share < 1:
             raise ConfigurationError(f"share = {share!r}; give the part of the data to be held out, between 0 and 1")
         labels = _labels(self.x)
@@ -147,7 +162,7 @@ class Transitions:
             raise InvalidInputError(f"all {self.points} rows start from the state {self.x[0]}; to hold some out takes two states at least")
         held = np.zeros(states, dtype=bool)
         held[rng.permutation(states)[: min(max(round(share * states), 1), states - 1)]] = True
-        return self._part(~held[labels]), self._part(held[labels])
+        return held[labels]
 
     def _part(self, rows: np.ndarray) -> Transitions:
         return Transitions(self.signature, self.x[rows], self.u[rows], self.successors[rows], self.dt[rows], self.seed)
@@ -158,7 +173,7 @@ class Transitions:
         Raises:
             ConfigurationError: it cannot be written there.
         """
-        save(path, _KIND, self.signature, {"seed": self.seed}, {name: getattr(self, name) for name in _ARRAYS})
+        save(path, DATA, self.signature, {"seed": self.seed}, {name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -168,8 +183,8 @@ class Transitions:
             LearnedFileError: it is missing, damaged, or holds something else.
         """
         content = load(path)
-        if content.kind != _KIND:
-            raise LearnedFileError(f"{path} holds {content.kind!r}, not {_KIND!r}; give a file that `Transitions.save` wrote")
+        if content.kind != DATA:
+            raise LearnedFileError(f"{path} holds {content.kind!r}, not {DATA!r}; give a file that `Transitions.save` wrote")
         try:
             return cls(content.signature, **{name: content.arrays[name] for name in _ARRAYS}, seed=content.details["seed"])
         except (KeyError, TypeError, ValueError) as error:
@@ -177,19 +192,25 @@ class Transitions:
 
 
 def numbers(name: str, given: Any) -> np.ndarray:
-    """What NumPy reads as an array of floats.
+    """What NumPy reads as an array of floats, with nothing left out.
 
     Args:
         name: of what was given, for the message.
         given: anything.
 
     Raises:
-        InvalidInputError: it is none.
+        InvalidInputError: it is none, entries of it are masked, or it is complex.
     """
+    parts = given if isinstance(given, list | tuple) else (given,)
+    if any(np.ma.is_masked(part) for part in parts):
+        raise InvalidInputError(f"{name} has masked entries, whose values mean nothing; drop such rows, as by numpy.ma.compress_rows")
     try:
-        return np.asarray(given, dtype=float)
+        found = np.asarray(given)
+        if not np.iscomplexobj(found):
+            return found.astype(float, copy=False)
     except (TypeError, ValueError) as error:
         raise InvalidInputError(f"{name} is no array of numbers ({error}); give rows of equal length") from error
+    raise InvalidInputError(f"{name} is complex; give real numbers, the parts of a complex state as two states")
 
 
 def _require_finite(name: str, values: np.ndarray) -> None:

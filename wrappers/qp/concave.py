@@ -68,13 +68,16 @@ def _nearest(row: tuple[float, float, Quadratic], interval: tuple[float, float],
 def _maximiser(a: float, q: Quadratic, v: float, low: float, high: float) -> float:
     """Where c is largest: with w = u + q_1/q_2 and s the least sqrt(q/q_2), a = sqrt(q_2) w/sqrt(w^2 + s^2) there, or at an end."""
     q0, q1, q2 = q
-    if a * a == q2 and q0 * q2 <= q1 * q1:
+    end = high if a > 0.0 else low
+    if q2 == 0.0:
+        return v if a == 0.0 else end
+    t = a / math.sqrt(q2)
+    if t * t < 1.0:
+        return -q1 / q2 + t * math.sqrt(max(q0 - q1 * q1 / q2, 0.0) / q2) / math.sqrt(1.0 - t * t)
+    if t * t == 1.0 and q0 * q2 <= q1 * q1:
         # From the kink on nothing changes any more.
-        kink = -q1 / q2 if q2 else v
-        return max(v, kink) if a > 0.0 else min(v, kink)
-    if a * a >= q2:
-        return high if a > 0.0 else low
-    return -q1 / q2 + a * math.sqrt(max(q0 - q1 * q1 / q2, 0.0) / (q2 * (q2 - a * a)))
+        return max(v, -q1 / q2) if a > 0.0 else min(v, -q1 / q2)
+    return end
 
 
 def _margin(a: float, b: float, q: Quadratic, u: float) -> float:
@@ -201,10 +204,11 @@ def _all_nearest(
 def _maximisers(a: np.ndarray, q: np.ndarray, v: np.ndarray, low: float, high: float) -> np.ndarray:
     """`_maximiser` for arrays (k, B), with the same formulas."""
     q0, q1, q2 = q
-    inside = -q1 / q2 + a * np.sqrt(np.maximum(q0 - q1 * q1 / q2, 0.0) / (q2 * (q2 - a * a)))
-    kink = np.where(q2 > 0.0, -q1 / q2, v)
+    t, kink = a / np.sqrt(q2), -q1 / q2
+    inside = kink + t * np.sqrt(np.maximum(q0 - q1 * q1 / q2, 0.0) / q2) / np.sqrt(1.0 - t * t)
     still = np.where(a > 0.0, np.maximum(v, kink), np.minimum(v, kink))
-    return np.select([(a * a == q2) & (q0 * q2 <= q1 * q1), a * a >= q2], [still, np.where(a > 0.0, high, low)], inside)
+    end, level = np.where(a > 0.0, high, low), (t * t == 1.0) & (q0 * q2 <= q1 * q1)
+    return np.select([q2 == 0.0, t * t < 1.0, level], [np.where(a == 0.0, v, end), inside, still], end)
 
 
 def _least_violating(

@@ -176,7 +176,7 @@ def test_the_truth_is_within_what_is_known(cubic: Posterior):
 def test_variances_of_the_drift_are_those_of_draws(gap: Posterior):
     x = draw_states(acc_gap(), 3, np.random.default_rng(0))
     variance = gap.drift_variance(x)
-    expressions = gap.variance_expressions(gap.covariance)
+    expressions = gap.variance_expressions
     for i in range(2):
         symbolic = values(expressions[i], gap.features.states, x).reshape(3, 2, 2)
         assert symbolic == pytest.approx(variance[:, i], rel=1e-6)
@@ -233,7 +233,7 @@ def test_saved_and_loaded(cubic: Posterior, tmp_path: Path):
     content = load(tmp_path / "file")
     again = Posterior.from_content(content, CUBIC)
     assert content.kind == "bayesian"
-    assert again.sha256 == cubic.sha256 == content.sha256
+    assert again.sha256 == cubic.sha256
     assert again.record == cubic.record
     assert again.system == cubic.system
     for name, array in cubic.arrays().items():

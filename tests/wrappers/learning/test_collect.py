@@ -161,6 +161,7 @@ def test_a_step_of_ones_own():
         ({"seed": -1}, "seed = -1"),
         ({"dt": 0.0}, r"dt = 0\.0 s"),
         ({"dt": math.nan}, "dt = nan"),
+        ({"points": 10**9, "repetitions": 100}, r"data of 1 steps from 1000000000 points .* take \d.*GB; at most 2 GB"),
         ({"inputs": [(10.5,)]}, r"\[10\.5\] is outside the box \(\(-10\.0, 10\.0\),\) of u"),
         ({"inputs": [(math.nan,)]}, "outside the box"),
         ({"inputs": [(1.0, 1.0)]}, "vectors of 1 numbers each: u"),
@@ -194,7 +195,7 @@ def test_a_step_that_is_not_finite_names_its_state_and_input():
     region = Exploration(region=((1.0, 1.0 + 1e-15), (-1.0, 1.0)))
     singular = replace(SMOOTH, plant=plant, barriers=(Barrier(sp.Integer(1)),), explored=region)
     with pytest.raises(NumericalError, match="give a smaller dt"):
-        collect(singular, 20)
+        collect(singular, 200)
 
 
 def test_a_step_has_to_return_states():
@@ -287,3 +288,26 @@ class TestEnvStep:
         one, going_on = step(x, u, rng), step(x, u, rng)
         assert not np.isin(one, going_on).any()
         np.testing.assert_array_equal(step(x, u, np.random.default_rng(0)), one)
+
+
+def test_sizes_are_checked_before_anything_is_drawn():
+    with pytest.raises(ConfigurationError, match=r"1000000000000 states of CubicSDEDisk take 1\.6e"):
+        draw_states(DISK, 10**12, np.random.default_rng(0))
+    with pytest.raises(ConfigurationError, match="1 paths of 1000000000000 steps take"):
+        collect_paths(DISK, [[0.1, 0.2]], [[1.0]], 10**12, 0.01)
+
+
+def test_a_step_of_ones_own_may_be_that_of_any_plant():
+    assert collect(DISK, 3).signature.plant == (("a", 0.6), ("sigma_1", 0.2), ("sigma_2", 0.2))
+    assert collect(DISK, 3, step=shifted).signature.plant == ()
+
+
+def test_numbers_of_numpy_are_numbers():
+    data = collect(DISK, np.int64(3), repetitions=np.int32(2), seed=np.int64(1))
+    np.testing.assert_array_equal(data.successors, collect(DISK, 3, repetitions=2, seed=1).successors)
+
+
+@pytest.mark.parametrize("problem", ["safe_envs/Pendulum-v0", None])
+def test_what_is_no_problem_is_refused(problem):
+    with pytest.raises(ConfigurationError, match=r"problem = .* give a SafetyProblem, as load_problem"):
+        collect(problem, 3)

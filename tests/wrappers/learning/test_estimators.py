@@ -13,7 +13,7 @@ from safe_envs.codegen import compile_function
 from safe_envs.errors import ConfigurationError
 from tests.conftest import problem_of
 from wrappers.learning.collect import collect
-from wrappers.learning.estimators import drift_score, drift_warnings, in_bulk, ito_part, rates
+from wrappers.learning.estimators import drift_score, drift_warnings, in_bulk, ito_part, mean_rates, rates, region_warnings
 from wrappers.learning.network import Network
 
 K = 200
@@ -34,6 +34,11 @@ def estimated(problem, data, estimator):
     h = problem.barriers[0].expression
     value, slopes = (compile_function(problem.model.states, e, "arrays") for e in ([h], list(gradient(problem.model, h))))
     return ito_part(data, rates(problem.model, data), lambda x: value(*x)[0], lambda x: slopes(*x), estimator)
+
+
+def warned(model, data):
+    rate = rates(model, data)
+    return drift_warnings(data, rate, mean_rates(model, data, rate), [s.name for s in model.states])
 
 
 def truth(data):
@@ -123,8 +128,8 @@ def test_unknown_estimators_are_refused(pendulum, data):
 def test_a_wrong_drift_is_told(pendulum, data):
     right, wrong = pendulum.model, pendulum.model.with_parameters(l=0.5)
     assert abs(drift_score(data, rates(right, data)) - 1) < 0.1
-    assert not drift_warnings(data, rates(right, data))
-    (warning,) = drift_warnings(data, rates(wrong, data))
+    assert not warned(right, data)
+    (warning,) = warned(wrong, data)
     assert "standard errors away" in warning
 
 
@@ -136,3 +141,48 @@ def test_bulk_evaluation_of_a_network_is_the_network():
     network = Network(weights, biases, "tanh", np.array([3.0, -1.0]), np.array([2.0, 0.5]), np.array([10.0]), np.array([50.0]))
     x = [3 + 2 * rng.normal(size=10_001), -1 + 0.5 * rng.normal(size=10_001)]
     np.testing.assert_allclose(in_bulk(network, x), network.arrays(x)[0], atol=1e-5 * 50)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_mean_rates_follow_the_integrator(noise):
+    problem = problem_of("safe_envs/Pendulum-v0").configured(noise=noise)
+    data = collect(problem, 200, K, seed=5)
+    rate = rates(problem.model, data)
+    mean = mean_rates(problem.model, data, rate)
+    moved = (data.successors.mean(axis=1) - data.x) / data.dt[:, None]
+    if noise:
+        # An Euler step is told from the noise by far less than what the curvature of the path makes.
+        assert np.abs(mean - rate).max() < 0.02 * np.abs(rate).max() * data.dt[0]
+    else:
+        np.testing.assert_allclose(mean, moved, atol=1e-11)
+        assert np.abs(mean - rate).max() > 0.1 * np.abs(rate).max() * data.dt[0]
+
+
+@pytest.mark.parametrize("substeps", [1, 4])
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_no_way_of_integrating_is_taken_for_a_wrong_model(noise, substeps):
+    problem = problem_of("safe_envs/Pendulum-v0").configured(noise=noise, substeps=substeps)
+    for data in (collect(problem, 200, 500, seed=2), collect(problem, 200, 1, seed=2, steps=10)):
+        assert not warned(problem.model, data)
+
+
+def test_a_log_that_does_not_fit_is_told(pendulum):
+    log = collect(pendulum, 200, 1, seed=1, steps=10)
+    (slow,) = warned(pendulum.model, replace(log, dt=10 * log.dt))
+    assert "times: theta 0.097, thetadot 0.1. A wrong dt" in slow
+    swapped = replace(log, x=log.x[:, ::-1], successors=log.successors[:, :, ::-1])
+    assert "columns in another order" in warned(pendulum.model, swapped)[0]
+    for seed in range(10):
+        assert not warned(pendulum.model, collect(pendulum, 30, 1, seed=seed))
+
+
+def test_states_outside_the_explored_region_are_told(pendulum):
+    log = collect(pendulum, 100, 1)
+    assert region_warnings(pendulum, log) == ()
+    x = log.x + 3.0 * (np.arange(len(log.x)) < 20)[:, None] * [1.0, 0.0]
+    (warning,) = region_warnings(pendulum, replace(log, x=x))
+    assert warning.startswith("10% of the data have theta outside the explored region, [-")
+    assert f"to {x[:, 0].max():g}" in warning
+    dubins = problem_of("safe_envs/StochasticDubins-v0")
+    data = collect(dubins, 20, 1)
+    assert region_warnings(dubins, replace(data, x=data.x + np.array([0.0, 0.0, 20.0]))) == ()

@@ -11,6 +11,7 @@ import pytest
 
 from agents.problems import load_problem
 from safe_envs.errors import ConfigurationError
+from wrappers.learning import load_learned
 from wrappers.learning.files import LearnedFileError, Signature, load, save
 
 DISK = load_problem("safe_envs/CubicSDEDisk-v0")
@@ -74,7 +75,7 @@ def test_the_checksum_is_of_everything(path):
 def test_a_truncated_file_is_refused(path, left):
     whole = path.read_bytes()
     path.write_bytes(whole[: int(left * len(whole))])
-    with pytest.raises(LearnedFileError, match="it is truncated"):
+    with pytest.raises(LearnedFileError, match="it is truncated or altered"):
         load(path)
 
 
@@ -114,15 +115,17 @@ def test_a_header_without_a_signature_is_refused(path, signature):
 
 def test_a_later_format_is_refused(path):
     with_header(path, format=99)
-    with pytest.raises(LearnedFileError, match="has the format 99; this version reads 1"):
+    with pytest.raises(LearnedFileError, match="has the format 99; this version reads 2"):
         load(path)
 
 
 def test_a_missing_file_is_an_error(tmp_path):
     with pytest.raises(LearnedFileError, match="does not exist"):
         load(tmp_path / "none.npz")
-    with pytest.raises(LearnedFileError, match="no file of"):
+    with pytest.raises(LearnedFileError, match="is a folder; name a file in it"):
         load(tmp_path)
+    with pytest.raises(LearnedFileError, match="path of a learned model is empty"):
+        load_learned("", DISK)
 
 
 def test_what_is_no_npz_is_refused(tmp_path):
@@ -200,3 +203,28 @@ def test_what_else_has_to_fit():
     SIGNATURE.require(smaller, "model", "dt")
     with pytest.raises(LearnedFileError, match="its barriers"):
         SIGNATURE.require(smaller, "barriers")
+
+
+def test_data_are_no_model(tmp_path):
+    save(tmp_path / "data.npz", "transitions", SIGNATURE, DETAILS, ARRAYS)
+    for method in (None, "bayesian"):
+        with pytest.raises(LearnedFileError, match=r"data\.npz holds transitions \(data\), no model; `safe-envs identify --data"):
+            load_learned(tmp_path / "data.npz", DISK, method)
+
+
+def test_the_plant_is_kept_and_compared_but_not_required(tmp_path):
+    other = load_problem("safe_envs/CubicSDEDisk-v0", {"plant": {"a": 0.8}})
+    signature = Signature.of(other)
+    signature.require(DISK, "model", "barriers", "dt")
+    save(tmp_path / "model.npz", "regression", signature, DETAILS, ARRAYS)
+    kept = load(tmp_path / "model.npz").signature
+    assert kept == signature
+    assert kept.differences(DISK) == ("a = 0.8 (here 0.6)",)
+    assert kept.differences(other) == replace(kept, plant=()).differences(DISK) == ()
+
+
+def test_numbers_of_numpy_are_kept_as_such(path):
+    save(path, "regression", SIGNATURE, {"degree": np.int64(3), "scale": np.float64(0.1)}, ARRAYS)
+    assert load(path).details == {"degree": 3, "scale": 0.1}
+    with pytest.raises(TypeError, match="no JSON"):
+        save(path, "regression", SIGNATURE, {"degree": object()}, ARRAYS)

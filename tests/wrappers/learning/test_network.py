@@ -208,3 +208,11 @@ def test_shapes_that_do_not_fit_are_refused():
 def test_bad_settings_are_refused(setting):
     with pytest.raises(ConfigurationError):
         train(*data(20), **{"epochs": 1, **setting})
+
+
+@pytest.mark.parametrize(
+    ("hidden", "message"), [(100, "hidden = 100; give the width"), ([10**11], "parameters; at most 10000000"), ([0], "width")]
+)
+def test_hidden_layers_that_are_none_or_huge_are_refused(hidden, message):
+    with pytest.raises(ConfigurationError, match=message):
+        train(np.zeros((20, 2)), np.zeros((20, 1)), hidden=hidden)

@@ -56,6 +56,10 @@ def test_sizes_and_time():
         ({"successors": np.empty((3, 0, 2))}, "there are no data"),
         ({"x": [[0.0, 0.1], [0.2]]}, "x is no array of numbers"),
         ({"u": [["fast"], [1.0], [1.0]]}, "u is no array of numbers"),
+        ({"x": np.ma.masked_greater([[0.0, 0.1], [0.2, 0.3], [0.4, 0.5]], 0.45)}, "x has masked entries"),
+        ({"x": list(np.ma.masked_greater([[0.0, 0.1], [0.2, 0.3], [0.4, 0.5]], 0.45))}, "x has masked entries"),
+        ({"u": np.array([[1.0], [1j], [1.0]])}, "u is complex; give real numbers"),
+        ({"u": [[1.0], [1j], [1.0]]}, "u is complex"),
         ({"x": [[0.0, 0.1], [0.2, np.nan], [0.4, 0.5]]}, r"x\[1, 1\] = nan, one of 1 entries"),
         ({"successors": np.full((3, 2, 2), np.inf)}, r"successors\[0, 0, 0\] = inf, one of 12 entries"),
         ({"dt": 0.0}, r"dt\[0\] = 0.0 s; a step needs a positive duration"),
@@ -91,7 +95,9 @@ def test_repetitions_may_agree_without_noise():
 def test_a_log_equals_collected_data():
     data = collect(DISK, 20, seed=3)
     log = Transitions.from_log(DISK, data.x.tolist(), data.u.tolist(), data.successors[:, 0].tolist(), DISK.dt)
-    assert_same(replace(data, seed=None), log)
+    # Of which plant a log is, nobody knows.
+    data = replace(data, seed=None, signature=replace(data.signature, plant=()))
+    assert_same(data, log)
     assert_same(Transitions.from_log(SIGNATURE, data.x, data.u, data.successors[:, 0], data.dt), log)
 
 
@@ -148,3 +154,26 @@ def test_a_saved_file_is_plain_numbers(tmp_path):
     with np.load(tmp_path / "data.npz", allow_pickle=False) as archive:
         assert set(archive.files) == {"header", "x", "u", "successors", "dt"}
         assert json.loads(archive["header"].tobytes())["details"] == {"seed": None}
+
+
+def test_masks_that_hide_nothing_are_let_through():
+    assert logged(u=np.ma.masked_invalid([[1.0], [-1.0], [1.0]])).points == 3
+
+
+def test_what_data_are_of_is_a_problem_or_a_signature(tmp_path):
+    for source in ("safe_envs/CubicSDEDisk-v0", None):
+        with pytest.raises(ConfigurationError, match="give a SafetyProblem"):
+            Transitions.from_log(source, logged().x, logged().u, logged().x, 0.01)
+    with pytest.raises(ConfigurationError, match=r"signature = .* give a Signature"):
+        Transitions("CubicSDEDisk", logged().x, logged().u, logged().successors, 0.01)
+
+
+def test_data_of_another_problem_are_told_from_models():
+    logged().require(DISK)
+    with pytest.raises(LearnedFileError, match="the data are of another problem: its system: CubicSDEDisk, that of Scalar"):
+        logged().require(load_problem("safe_envs/Scalar-v0"))
+
+
+def test_a_seed_of_numpy_is_kept(tmp_path):
+    logged(seed=np.int64(5)).save(tmp_path / "data.npz")
+    assert Transitions.load(tmp_path / "data.npz").seed == 5
