@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import sympy as sp
@@ -133,15 +134,20 @@ class ControlAffineSDE:
 
     def numeric(self, expression: Any) -> Any:
         """Return an expression or matrix with the parameters' values in place of their symbols."""
-        found = expression.subs({p: sp.Float(v, 17) if v != int(v) else sp.Integer(int(v)) for p, v in self.parameters.items()})
-        if found.has(sp.zoo, sp.nan, sp.oo, -sp.oo):
-            values = ", ".join(f"{p} = {v:g}" for p, v in self.parameters.items())
-            raise ConfigurationError(f"the system has no finite value for its parameters ({values}); look for a division by 0")
-        return found
+        return _numeric(expression, tuple(self.parameters.items()))
 
     def exact(self, expression: Any) -> Any:
         """Like `numeric`, with the decimal value of each parameter as a rational, so that terms cancel exactly."""
         return expression.subs({p: sp.Rational(repr(v)) for p, v in self.parameters.items()})
+
+
+@lru_cache(maxsize=1024)
+def _numeric(expression: Any, parameters: tuple[tuple[sp.Symbol, float], ...]) -> Any:
+    found = expression.subs({p: sp.Float(v, 17) if v != int(v) else sp.Integer(int(v)) for p, v in parameters})
+    if found.has(sp.zoo, sp.nan, sp.oo, -sp.oo):
+        values = ", ".join(f"{p} = {v:g}" for p, v in parameters)
+        raise ConfigurationError(f"the system has no finite value for its parameters ({values}); look for a division by 0")
+    return found
 
 
 def _names(symbols: Iterable[Any]) -> str:

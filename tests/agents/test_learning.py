@@ -27,7 +27,7 @@ def posterior():
 @pytest.fixture(scope="module")
 def repeated():
     """Three identifications."""
-    return evaluate(DISK, filters=["none", "scbf", *LEARNED], episodes=60, repeats=3)
+    return evaluate(DISK, filters=["none", "scbf", *LEARNED], episodes=60, repeats=3, bounds=False)
 
 
 def test_what_several_filters_rest_on_is_learned_once():
@@ -83,9 +83,9 @@ def test_what_does_not_fit_is_refused(posterior):
 
 def test_the_filter_from_a_file_gives_the_same_as_from_memory(posterior, tmp_path):
     posterior.save(tmp_path / "disk.npz")
-    names = [*LEARNED, "bayesian-scbf:simultaneous=0.9"]
+    names = ["bayesian-scbf", "bayesian-scbf:simultaneous=0.9"]
     memory, file, learned, named = (
-        evaluate(DISK, filters=filters, episodes=40, learned=given)
+        evaluate(DISK, filters=filters, episodes=40, learned=given, bounds=False)
         for filters, given in (
             (names, [posterior]),
             (names, [tmp_path / "disk.npz"]),
@@ -97,8 +97,8 @@ def test_the_filter_from_a_file_gives_the_same_as_from_memory(posterior, tmp_pat
     for rows in zip(*(each.rows for each in (memory, file, learned, named)), strict=True):
         first, *others = ({k: v for k, v in row.items() if k not in ignored} for row in rows)
         assert all(other == first for other in others)
-    assert [row["learning"]["files"] for row in file.rows] == [[str(tmp_path / "disk.npz")]] * 3
-    assert [row["learning"]["files"] for row in memory.rows] == [[]] * 3
+    assert [row["learning"]["files"] for row in file.rows] == [[str(tmp_path / "disk.npz")]] * 2
+    assert [row["learning"]["files"] for row in memory.rows] == [[]] * 2
     assert file.rows[0]["learning"]["sha256"] == memory.rows[0]["learning"]["sha256"] == [posterior.sha256]
 
 
@@ -126,7 +126,7 @@ def test_the_answer_is_the_same_for_every_num_envs_and_from_a_file(env_id, name,
 
 
 def test_rows_of_repeats_are_sums_means_and_wider_intervals(repeated):
-    once = evaluate(DISK, filters=["none", "scbf", *LEARNED], episodes=60)
+    once = evaluate(DISK, filters=["none", "scbf", *LEARNED], episodes=60, bounds=False)
     for row, single in zip(repeated.rows, once.rows, strict=True):
         if row["learning"] is None:
             assert row == single
@@ -155,10 +155,8 @@ def test_comparisons_of_repeats_have_no_p_value(repeated):
 
 
 def test_it_is_repeatable(repeated):
-    again = evaluate(DISK, filters=[*LEARNED], episodes=60, repeats=3, num_envs=7)
-    known = {row["filter"]: row for row in repeated.rows}
-    for row in again.rows:
-        assert row == known[row["filter"]]
+    again = evaluate(DISK, filters=LEARNED[:1], episodes=60, repeats=3, num_envs=7, bounds=False)
+    assert again.rows[0] in repeated.rows
 
 
 def test_certificates_stand_beside_the_rates():

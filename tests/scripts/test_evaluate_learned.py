@@ -59,15 +59,15 @@ def test_a_file_is_used_in_its_place(evaluate, learned):
 
 def test_repeats_give_the_worst_identification_and_intervals_over_them(evaluate):
     filters = ("--filter", "scbf", "--filter", "bayesian-scbf", "--filter", "bayesian-scbf:simultaneous=0.9")
-    status, out, err = evaluate(*filters, "--repeats", 3, "--json", "out.json")
+    status, out, err = evaluate(*filters, "--repeats", 2, "--json", "out.json")
     assert (status, err) == (0, "")
     document = strictly("out.json")
-    assert document["config"]["repeats"] == 3
+    assert document["config"]["repeats"] == 2
     _, row, robust = document["rows"]
     assert f"{100 * min(row['learning']['rates']):.1f} %" in out
-    assert row["episodes"] == 60
+    assert row["episodes"] == 40
     assert f"≥ {100 * robust['certificate']['probability']:.1f} %" in out
-    for text in ("20 episodes x 3 identifications", "over identifications and episodes", "200,000 transitions each"):
+    for text in ("20 episodes x 2 identifications", "over identifications and episodes", "200,000 transitions each"):
         assert text in out
 
 
