@@ -19,16 +19,6 @@ from wrappers.learning.transitions import Transitions
 
 
 @pytest.fixture(scope="module")
-def top():
-    return problem_of("safe_envs/Pendulum-v0")
-
-
-@pytest.fixture(scope="module")
-def gap():
-    return problem_of("safe_envs/ACCGap-v0")
-
-
-@pytest.fixture(scope="module")
 def first_order(top):
     return learn_generator(top, points=100, repetitions=1000)
 

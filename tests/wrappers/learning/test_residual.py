@@ -33,11 +33,6 @@ def exact_residuals(problem, barrier, degree, x):
 
 
 @pytest.fixture(scope="module")
-def disk():
-    return problem_of("safe_envs/DubinsDisk-v0")
-
-
-@pytest.fixture(scope="module")
 def learned(disk):
     return learn_residual(disk, states=2000, epochs=200)
 
