@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -189,16 +189,7 @@ class SafetyProblem:
     @property
     def outside(self) -> sp.Expr:
         """Positive where the state has left the workspace; -1 if the workspace is unbounded."""
-        bounded = [v for v in self.states if math.isfinite(v.low) or math.isfinite(v.high)]
-        symmetric: dict[float, list[sp.Expr]] = {}
-        excess: list[sp.Expr] = []
-        for v in bounded:
-            if v.low == -v.high:
-                symmetric.setdefault(v.high, []).append(sp.Abs(v.symbol))
-            else:
-                excess += [v.symbol - v.high] * math.isfinite(v.high) + [v.low - v.symbol] * math.isfinite(v.low)
-        excess += [sp.Max(*sizes) - half for half, sizes in symmetric.items()]
-        return sp.Max(*excess) if excess else sp.Integer(-1)
+        return _excess(tuple((s.symbol, s.low, s.high) for s in self.states))
 
     def configured(
         self,
@@ -284,3 +275,17 @@ def _numbers(given: Any) -> np.ndarray:
         return np.atleast_1d(np.asarray(given, dtype=float))
     except (TypeError, ValueError):
         return np.empty(0)
+
+
+@lru_cache(maxsize=256)
+def _excess(ranges: tuple[tuple[sp.Symbol, float, float], ...]) -> sp.Expr:
+    """By how much the furthest state is outside its range; -1 without a bound. Remembered, for sympy compares all it takes the most of."""
+    symmetric: dict[float, list[sp.Expr]] = {}
+    excess: list[sp.Expr] = []
+    for symbol, low, high in ranges:
+        if low == -high and math.isfinite(high):
+            symmetric.setdefault(high, []).append(sp.Abs(symbol))
+        else:
+            excess += [symbol - high] * math.isfinite(high) + [low - symbol] * math.isfinite(low)
+    excess += [sp.Max(*sizes) - half for half, sizes in symmetric.items()]
+    return sp.Max(*excess) if excess else sp.Integer(-1)
