@@ -1,7 +1,9 @@
 """Who acts, and how well: policies with Stable-Baselines3's `predict`, and the evaluation of filters.
 
-Nothing here imports torch or Stable-Baselines3 before a saved policy is loaded.
+Nothing here imports torch or Stable-Baselines3 before an agent is trained, or a policy of that library is loaded.
 """
+
+from typing import Any
 
 from agents.clf import CLFController
 from agents.evaluation import Evaluation, evaluate
@@ -23,9 +25,18 @@ __all__ = [
     "evaluate",
     "load_problem",
     "make_policy",
+    "make_sb3_env",  # pyright: ignore[reportUnsupportedDunderAll]
     "mcnemar_p",
     "paired_difference_interval",
     "rate_interval",
     "refine",
     "wilson_interval",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "make_sb3_env":
+        from agents.sb3_env import make_sb3_env
+
+        return make_sb3_env
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -17,7 +17,7 @@ import numpy as np
 from agents.comparison import Comparison, Flags, compare_all
 from agents.episodes import Env, Progress, Recorder, Row, Totals, run_episodes
 from agents.learning import Learning, describe, seconds_of
-from agents.policy import POLICIES, Policy, make_policy
+from agents.policy import Policy, make_policy, policy_files
 from agents.problems import full_id, load_problem
 from agents.promised import Promised, together
 from agents.repeats import pooled
@@ -65,7 +65,7 @@ class Evaluation:
         """The whole as JSON-able data."""
         return {
             "config": self.config,
-            "versions": _versions(),
+            "versions": package_versions(),
             "rows": self.rows,
             "comparisons": self.comparisons,
             "timing": self.timing,
@@ -77,6 +77,7 @@ def evaluate(
     policy: Any = "nominal",
     filters: Sequence[str] | None = None,
     *,
+    trust: bool = False,
     options: Mapping[str, Any] | None = None,
     episodes: int = 1000,
     seed: int = 0,
@@ -109,6 +110,7 @@ def evaluate(
         problem: what to simulate, or the id of a registered env.
         policy: a name or a path for `make_policy`, or anything with Stable-Baselines3's `predict`.
         filters: texts for `parse_conditions`, and "none" for the bare env; by default that and the problem's own.
+        trust: load a policy's .zip, which runs code that it contains.
         options: arguments of `gym.make` for an id.
         episodes: number for each filter.
         seed: whole number from 0.
@@ -137,7 +139,7 @@ def evaluate(
     if env_id is None and options:
         raise ConfigurationError("options are the arguments of a registered id; configure the problem itself instead")
     world = problem if isinstance(problem, SafetyProblem) else load_problem(problem, options)
-    actor = make_policy(policy, world) if isinstance(policy, str) else policy
+    actor = make_policy(policy, world, trust) if isinstance(policy, str) else policy
     names = list(dict.fromkeys((BARE, world.filter) if filters is None else filters))
     specs = [_checked(name, world) for name in names]
     learning = Learning(world, names, learned, repeats, seed)
@@ -254,10 +256,12 @@ def _describe(problem: SafetyProblem) -> dict[str, Any]:
 def _describe_policy(policy: Any) -> dict[str, Any]:
     if not isinstance(policy, str):
         return {"name": type(policy).__name__}
-    if policy in POLICIES:
+    files = policy_files(policy)
+    if not files:
         return {"name": policy}
-    return {"name": policy, "sha256": hashlib.sha256(Path(policy).read_bytes()).hexdigest()}
+    return {"name": policy, "sha256": hashlib.sha256(files[0].read_bytes()).hexdigest()}
 
 
-def _versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
+    """Versions of Python and of the packages on which results depend, by name."""
     return {"python": platform.python_version(), **{package: version(package) for package in _PACKAGES}}

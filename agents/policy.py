@@ -12,7 +12,13 @@ from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.problem import SafetyProblem
 
 POLICIES = ("nominal", "clf", "zero", "random")
-"""Names that `make_policy` knows besides the path of a file."""
+"""Names that `make_policy` knows besides paths."""
+
+TENSORS = "policy.safetensors"
+"""Name of the file with the numbers of a policy that was saved as data; see `agents.weights`."""
+
+DESCRIPTION = "policy.json"
+"""Name of the file beside it that says what the numbers are."""
 
 
 class Policy(ABC):
@@ -52,15 +58,18 @@ class Policy(ABC):
         """
 
 
-def make_policy(name: str, problem: SafetyProblem) -> Policy:
-    """Return a named policy, or load the policy that Stable-Baselines3 saved in a file.
+def make_policy(name: str, problem: SafetyProblem, trust: bool = False) -> Policy:
+    """Return a named policy, or load one that was trained.
 
     Args:
-        name: one of `POLICIES`, or the path of a .zip. Loading one runs code that it contains: trust its source.
+        name: one of `POLICIES`; the folder where `safe-envs train` or `agents.weights.save_policy` put a policy, or one of the
+            two files of the policy in it; or the path of a .zip of Stable-Baselines3.
         problem: which the policy is to act in.
+        trust: load a .zip too, which runs code that it contains.
 
     Raises:
-        ConfigurationError: there is neither such a name nor such a file, or the file does not fit the problem.
+        ConfigurationError: there is neither such a name nor such a file, the file does not fit the problem, or it is a .zip
+            that is not trusted.
     """
     from agents import nominal
     from agents.clf import CLFController
@@ -73,10 +82,38 @@ def make_policy(name: str, problem: SafetyProblem) -> Policy:
     }
     if name in named:
         return named[name](problem)
-    if not Path(name).is_file():
-        raise ConfigurationError(
-            f"unknown policy {name!r}; {nearest(name, POLICIES)}, or the path of a Stable-Baselines3 .zip: there is no such file"
-        )
-    from agents.sb3 import SB3Policy
+    files = policy_files(name)
+    if len(files) > 1:
+        from agents.weights import load_policy
 
-    return SB3Policy(name, problem)
+        return load_policy(name, problem)
+    if not files[0].is_file():
+        raise ConfigurationError(
+            f"unknown policy {name!r}; {nearest(name, POLICIES)}, a folder of `safe-envs train`, or the path of a Stable-Baselines3 "
+            ".zip: there is no such file"
+        )
+    return _make_of_archive(files[0], problem, trust)
+
+
+def _make_of_archive(path: Path, problem: SafetyProblem, trust: bool) -> Policy:
+    from agents.sb3 import SB3Policy, require_archive
+
+    require_archive(path)
+    if not trust:
+        raise ConfigurationError(
+            f"loading {path} runs code that it contains; if you trust its source, pass --trust (in Python: trust=True), "
+            f"or give a folder of `safe-envs train`, whose {TENSORS} and {DESCRIPTION} hold no code"
+        )
+    return SB3Policy(path, problem)
+
+
+def policy_files(name: str) -> list[Path]:
+    """The files that `make_policy` reads, that with the numbers first; none for one of `POLICIES`."""
+    if name in POLICIES:
+        return []
+    path = Path(name)
+    if path.is_dir():
+        return [path / TENSORS, path / DESCRIPTION]
+    if path.name in (TENSORS, DESCRIPTION):
+        return [path.with_name(TENSORS), path.with_name(DESCRIPTION)]
+    return [path]

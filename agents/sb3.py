@@ -12,21 +12,16 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.policy import Policy
+from agents.blocks import BlockPolicy
 from safe_envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem import SafetyProblem
 
-_BLOCK = 128
 
-
-class SB3Policy(Policy):
+class SB3Policy(BlockPolicy):
     """The policy in a .zip of PPO, A2C, SAC, TD3 or DDPG, asked for its deterministic action.
 
     Only the policy is built, not the algorithm around it, so that there is no need to know which one saved it.
-
-    A matrix product rounds a row differently in batches of different sizes. So every network call gets a block of
-    the same number of rows, with an episode always in the same row of its block.
 
     Args:
         path: of the file. Loading it runs code that it contains: trust its source.
@@ -37,32 +32,49 @@ class SB3Policy(Policy):
     """
 
     def __init__(self, path: str | Path, problem: SafetyProblem) -> None:
-        self._offset = 0
+        super().__init__(len(problem.features))
         self._network = _load(Path(path))
-        _require_equal(path, "observation", self._network.observation_space, observation_box(problem))
-        _require_equal(path, "action", self._network.action_space, action_box(problem))
+        require_spaces(f"the policy {path}", self._network, problem)
 
-    def begin(self, episodes: range, seed: int) -> None:
-        """Remember in which row of its block the first episode belongs; see `Policy.begin`."""
-        self._offset = episodes.start % _BLOCK
+    def act(self, block: np.ndarray) -> np.ndarray:
+        """Call the network; see `BlockPolicy.act`."""
+        return self._network.predict(block, deterministic=True)[0]
 
-    def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
-    ) -> tuple[np.ndarray, Any]:
-        """Ask the network for its deterministic action; see `Policy.predict`."""
-        given = np.asarray(observation, dtype=np.float32)
-        rows = np.atleast_2d(given)
-        end = self._offset + len(rows)
-        padded = np.zeros((-(-end // _BLOCK) * _BLOCK, rows.shape[1]), dtype=np.float32)
-        padded[self._offset : end] = rows
-        blocks = [self._network.predict(padded[k : k + _BLOCK], deterministic=True)[0] for k in range(0, len(padded), _BLOCK)]
-        actions = np.concatenate(blocks)[self._offset : end]
-        return actions.reshape(*given.shape[:-1], -1), state
+
+def require_archive(path: Path) -> None:
+    """Raise ConfigurationError unless a file looks like one of Stable-Baselines3; nothing in it is run."""
+    if zipfile.is_zipfile(path):
+        with zipfile.ZipFile(path) as archive:
+            if {"data", "policy.pth"} <= set(archive.namelist()):
+                return
+    raise ConfigurationError(
+        f"{path} is not a policy that Stable-Baselines3 saved; give a .zip of `model.save(...)`, or a folder of `safe-envs train`"
+    )
+
+
+def require_spaces(what: str, network: Any, problem: SafetyProblem) -> None:
+    """Raise ConfigurationError unless a network takes a problem's observations and gives its actions.
+
+    Args:
+        what: the network is, to begin the message with.
+        network: a policy of Stable-Baselines3.
+        problem: which it is to act in.
+    """
+    spaces = (("observation", network.observation_space, observation_box(problem)), ("action", network.action_space, action_box(problem)))
+    for kind, trained, wanted in spaces:
+        if trained != wanted:
+            raise ConfigurationError(f"{what} was trained for another {kind} space, {_difference(trained, wanted)}")
+
+
+def _difference(trained: gym.Space[Any], wanted: gym.spaces.Box) -> str:
+    if not isinstance(trained, gym.spaces.Box) or trained.shape != wanted.shape:
+        return f"{trained}; the env's is {wanted}"
+    theirs, ours = [f"between {space.low.tolist()} and {space.high.tolist()}" for space in (trained, wanted)]
+    return f"{theirs}; the env's is {ours}"
 
 
 def _load(path: Path) -> Any:
-    if not _is_archive(path):
-        raise ConfigurationError(f"{path} is not a policy that Stable-Baselines3 saved; give the .zip that `model.save(...)` writes")
+    require_archive(path)
     import torch
     from stable_baselines3.common.save_util import load_from_zip_file
 
@@ -85,23 +97,5 @@ def _load(path: Path) -> Any:
     return network.to("cpu")
 
 
-def _is_archive(path: Path) -> bool:
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return {"data", "policy.pth"} <= set(archive.namelist())
-
-
 def _no_learning(_: float) -> float:
     return 0.0
-
-
-def _require_equal(path: str | Path, what: str, saved: gym.Space[Any], wanted: gym.spaces.Box) -> None:
-    if saved == wanted:
-        return
-    if not isinstance(saved, gym.spaces.Box) or saved.shape != wanted.shape:
-        difference = f"{saved}; the env's is {wanted}"
-    else:
-        theirs, ours = [f"between {space.low.tolist()} and {space.high.tolist()}" for space in (saved, wanted)]
-        difference = f"{theirs}; the env's is {ours}"
-    raise ConfigurationError(f"the policy {path} was trained for another {what} space, {difference}")

@@ -115,7 +115,7 @@ def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...],
     arrays = _ArrayPrinter(_PRINTER_SETTINGS)
     function = sp.lambdify(
         arguments,
-        tuple(sp.Float(e, 17) if e.is_number else e for e in expressions),
+        tuple(sp.Float(sp.N(e, 17), 17) if e.is_number else e for e in expressions),
         modules=[_ARRAY_FUNCTIONS, np] if flavour == "arrays" else [math],
         printer=arrays if flavour == "arrays" else PythonCodePrinter(_PRINTER_SETTINGS),
         cse=_shared_subexpressions,  # pyright: ignore[reportArgumentType]  (annotated as bool, documented as callable)

@@ -100,6 +100,7 @@ def measure() -> Figures:
         "vector env, filtered, million steps a second": 1.0 / times["vector env, filtered"],
         "speed of the filtered vector env / fused loop": times["hand-fused loop"] / times["vector env, filtered"],
         **seconds,
+        **_vec_envs(),
     }
 
 
@@ -188,6 +189,17 @@ def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
         cases[f"{name}, 1 state"] = Case(lambda f=safety_filter, x=x[acting], u=u[acting]: f.filter(x, u))
         cases[f"{name}, {_NUM_ENVS} states"] = Case(lambda f=safety_filter, x=x, u=u: f.filter(x, u), _NUM_ENVS)
     return cases
+
+
+def _vec_envs() -> Figures:
+    """The VecEnv over the native vector env, as a multiple of the speed of DummyVecEnv over 64 scalar envs."""
+    from agents.sb3_speed import speeds
+
+    found = {}
+    for name, text in (("bare", None), ("filtered", "scbf")):
+        measured = speeds(_ID, filter=text)
+        found[f"SB3 VecEnv of 64 / DummyVecEnv, {name}"] = measured["SafeVecEnv"] / measured["DummyVecEnv"]
+    return found
 
 
 def _scalar_steps() -> dict[str, Case]:

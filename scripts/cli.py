@@ -10,6 +10,8 @@ import typer
 from scripts.console import run
 from scripts.evaluate import evaluate
 from scripts.identify import identify
+from scripts.leaderboard import leaderboard
+from scripts.train import train
 from scripts.verify import verify
 
 app = typer.Typer(
@@ -21,6 +23,8 @@ app = typer.Typer(
 )
 app.command("evaluate")(evaluate)
 app.command("identify")(identify)
+app.command("train")(train)
+app.command("leaderboard")(leaderboard)
 app.command("verify")(verify)
 
 

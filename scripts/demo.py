@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from agents.evaluation import evaluate
-from agents.problems import make_env
+from agents.problems import load_problem, make_env
+from agents.weights import save_policy
 from safe_envs import SafeEnv
 from safe_envs.errors import ConfigurationError
 from scripts.console import progress_bar, stdout
@@ -37,12 +38,12 @@ def demo(folder: Path, episodes: int = 1000) -> None:
     except OSError as error:
         raise ConfigurationError(f"--folder {folder} cannot be made: {error.strerror}; give another one") from error
     console = stdout()
-    policy = folder / "ppo.zip"
+    policy = folder / "ppo"
     console.print(f"Training PPO on {ENV_ID}, {_STEPS} steps without any filter ...", highlight=False)
     begun = time.perf_counter()
     with progress_bar("Training PPO") as tell:
         train(policy, tell)
-    console.print(f"Trained in {time.perf_counter() - begun:.0f} s and saved as {policy}\n", highlight=False, markup=False)
+    console.print(f"Trained in {time.perf_counter() - begun:.0f} s and saved in {policy}\n", highlight=False, markup=False)
     for actor in ("nominal", str(policy)):
         with progress_bar("Evaluating") as tell:
             answer = evaluate(ENV_ID, actor, FILTERS, episodes=episodes, progress=tell, record=True)
@@ -52,11 +53,11 @@ def demo(folder: Path, episodes: int = 1000) -> None:
         console.print(f"Picture: {picture}\n", highlight=False, markup=False)
 
 
-def train(path: Path, tell: Callable[[float], None] | None = None, steps: int = _STEPS, seed: int = 0) -> None:
+def train(folder: Path, tell: Callable[[float], None] | None = None, steps: int = _STEPS, seed: int = 0) -> None:
     """Train PPO on the unfiltered env, and save it.
 
     Args:
-        path: of the .zip.
+        folder: where the policy goes, as data and as `model.zip` of Stable-Baselines3.
         tell: told the part of the training that is done, from 0 to 1.
         steps: control periods, over all copies of the env.
         seed: of the training.
@@ -87,7 +88,8 @@ def train(path: Path, tell: Callable[[float], None] | None = None, steps: int = 
         return True  # anything else would end the training
 
     model.learn(steps, callback=note)
-    model.save(path)
+    save_policy(model, folder, load_problem(ENV_ID))
+    model.save(folder / "model.zip")
     envs.close()
 
 

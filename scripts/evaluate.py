@@ -33,10 +33,11 @@ def evaluate(
     policy: Annotated[
         str,
         typer.Option(
-            metavar="NAME|FILE",
-            help="nominal, clf, zero, random, or a .zip of Stable-Baselines3. Loading a file runs code that it contains: trust its source.",
+            metavar="NAME|FOLDER|FILE",
+            help="nominal, clf, zero, random, a folder of `safe-envs train`, or with --trust a .zip of Stable-Baselines3.",
         ),
     ] = "nominal",
+    trust: options.Trust = False,
     episodes: Annotated[int, typer.Option(help="Episodes for each filter.")] = 1000,
     seed: options.Seed = 0,
     noise: options.Noise = None,
@@ -88,6 +89,7 @@ def evaluate(
             env_id,
             policy,
             filters=names,
+            trust=trust,
             options=arguments,
             episodes=episodes,
             seed=seed,

@@ -25,6 +25,9 @@ Substeps = Annotated[int | None, typer.Option(help="Integration steps in a contr
 Horizon = Annotated[float | None, typer.Option(help="Length of an episode in s.")]
 Box = Annotated[list[str] | None, typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each.")]
 StartAt = Annotated[str | None, typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution.")]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Load the .zip of --policy. That runs code that it contains: only for files whose source you trust.")
+]
 Seed = Annotated[int, typer.Option(help="Seed of all randomness.")]
 FORMATS = ".png, .pdf, .svg, or another format of matplotlib."
 
@@ -100,10 +103,10 @@ def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = 
 
 def inputs_of(policy: str, filters: Iterable[str], learned: Iterable[Path] = ()) -> Iterator[tuple[str, Path]]:
     """Options and the files that a simulation may read: of a policy, of filters with file=FILE, and of --learned."""
-    from agents.policy import POLICIES
+    from agents.policy import policy_files
 
-    if policy not in POLICIES:
-        yield "--policy", Path(policy)
+    for path in policy_files(policy):
+        yield "--policy", path
     for path in learned:
         yield "--learned", path
     for name in filters:

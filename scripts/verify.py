@@ -30,7 +30,8 @@ def verify(
     horizon: options.Horizon = None,
     box: options.Box = None,
     start: options.StartAt = None,
-    policy: Annotated[str, typer.Option(metavar="NAME|FILE", help="Who acts in the simulation, as for evaluate.")] = "nominal",
+    policy: Annotated[str, typer.Option(metavar="NAME|FOLDER|FILE", help="Who acts in the simulation, as for evaluate.")] = "nominal",
+    trust: options.Trust = False,
     episodes: Annotated[int, typer.Option(help="Episodes of the simulation, from each start.")] = 500,
     seed: options.Seed = 0,
     simulate: Annotated[bool, typer.Option("--simulate/--no-simulate", help="Measure the safety, and hold it against the bounds.")] = True,
@@ -58,14 +59,14 @@ def verify(
         noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
     )
     problem = load_problem(env_id, arguments)
-    make_policy(policy, problem)  # An unknown one is to show before the search, and without a simulation too.
+    actor = make_policy(policy, problem, trust)  # An unknown one is to show before the search, and without a simulation too.
     found = find(problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed)
     starts = starts_of(problem, seed)
     bounds = promise(found, starts, problem.horizon)
     measurements = []
     if simulate:
         with progress_bar("Simulating") as tell:
-            measurements = measure(found, policy, episodes=episodes, seed=seed, progress=tell)
+            measurements = measure(found, actor, episodes=episodes, seed=seed, progress=tell)
     print_report(stdout(), full_id(env_id), found, starts, bounds, policy, measurements)
     if json is not None:
         config = {

@@ -90,7 +90,7 @@ class SafetyFilter:
         self.rows = tuple(rows)
         self._clf = clf
         self.constraints = tuple(condition.constraint(model, barrier) for barrier, condition in self.rows)
-        program = Program(
+        self.program = Program(
             model,
             self.constraints,
             *_bounds(model, box),
@@ -99,8 +99,8 @@ class SafetyFilter:
             dt=_period(self.constraints, dt),
             clf=clf,
         )
-        self._floats, self._arrays = Solver(program, "floats"), Solver(program, "arrays")
-        self._single = len(self.rows) == 1 and program.plain
+        self._floats, self._arrays = Solver(self.program, "floats"), Solver(self.program, "arrays")
+        self._single = len(self.rows) == 1 and self.program.plain
 
     @classmethod
     def for_problem(

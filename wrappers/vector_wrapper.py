@@ -106,6 +106,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         """Put what is reported at reset in place of a decision, for the envs that were reset in this step."""
         self._forget(envs)
         for key, value in self._rest.items():
+            # The env itself may hold the array of a single input.
+            added[key] = added[key].copy()
             added[key][envs] = value
 
     def _forget(self, envs: np.ndarray) -> None:

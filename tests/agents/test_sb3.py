@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
-from agents import evaluate, load_problem, make_policy
+from agents import evaluate, load_problem, make_policy, refine
 from safe_envs import ConfigurationError
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
@@ -67,7 +68,7 @@ def assert_predicts_like(model, policy):
 @pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_loaded_policy_predicts_like_the_model(trained, name):
     model, path = trained[name]
-    assert_predicts_like(model, make_policy(path, load_problem(ENV_ID)))
+    assert_predicts_like(model, make_policy(path, load_problem(ENV_ID), trust=True))
 
 
 @pytest.mark.parametrize(
@@ -82,21 +83,22 @@ def test_loaded_policy_predicts_like_the_model(trained, name):
 )
 def test_every_algorithm_with_continuous_actions_is_loaded(tmp_path, algorithm, arguments):
     model, path = saved(tmp_path, algorithm, gym.make(ENV_ID), **arguments)
-    assert_predicts_like(model, make_policy(path, load_problem(ENV_ID)))
+    assert_predicts_like(model, make_policy(path, load_problem(ENV_ID), trust=True))
 
 
 @pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_evaluation_is_the_same_for_every_num_envs(trained, name):
     _, path = trained[name]
     answers = [
-        evaluate(ENV_ID, path, ["none", "scbf"], options=OPTIONS, episodes=140, seed=2, num_envs=n, record=True) for n in (1000, 9, 130)
+        evaluate(ENV_ID, path, ["none", "scbf"], trust=True, options=OPTIONS, episodes=140, seed=2, num_envs=n, record=True)
+        for n in (1000, 9, 130)
     ]
     for other in answers[1:]:
         assert other.rows == answers[0].rows
         assert other.config == answers[0].config
         for filter_name, recorder in answers[0].recorders.items():
             assert recorder.states.tobytes() == other.recorders[filter_name].states.tobytes()
-    few = [evaluate(ENV_ID, path, ["none"], options=OPTIONS, episodes=12, seed=2, num_envs=n).rows for n in (1, 12)]
+    few = [evaluate(ENV_ID, path, ["none"], trust=True, options=OPTIONS, episodes=12, seed=2, num_envs=n).rows for n in (1, 12)]
     assert few[0] == few[1]
 
 
@@ -108,7 +110,7 @@ def test_an_episode_keeps_its_row_of_a_network_call(trained):
             return np.linspace(-1.0, 1.0, len(rows), dtype=np.float32)[:, None] + 0.0 * rows[:, :1], None
 
     sizes = set()
-    policy = make_policy(trained["ppo"][1], load_problem(ENV_ID))
+    policy = make_policy(trained["ppo"][1], load_problem(ENV_ID), trust=True)
     policy._network = Coarse()
     rows = [evaluate(ENV_ID, policy, ["none"], options={"horizon": 0.1}, episodes=200, num_envs=n).rows for n in (200, 1, 7, 128, 130)]
     assert all(other == rows[0] for other in rows)
@@ -117,13 +119,42 @@ def test_an_episode_keeps_its_row_of_a_network_call(trained):
 
 def test_evaluation_of_a_file_and_of_the_model_agree(trained):
     model, path = trained["ppo"]
-    by_file, by_model = (evaluate(ENV_ID, policy, options=OPTIONS, episodes=20) for policy in (path, model))
+    by_file, by_model = (evaluate(ENV_ID, policy, trust=True, options=OPTIONS, episodes=20) for policy in (path, model))
     for a, b in zip(by_file.rows, by_model.rows, strict=True):
         assert (a["policy"], b["policy"]) == (path, "PPO")
         assert (a["safe"], a["episodes"]) == (b["safe"], b["episodes"])
         assert a["return_mean"] == pytest.approx(b["return_mean"], rel=1e-4)
     assert len(by_file.config["policy"]["sha256"]) == 64
-    assert evaluate(ENV_ID, path, options=OPTIONS, episodes=1).config["policy"] == by_file.config["policy"]
+    assert evaluate(ENV_ID, path, trust=True, options=OPTIONS, episodes=1).config["policy"] == by_file.config["policy"]
+
+
+class Bomb:
+    """Runs code where it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_a_file_is_loaded_only_where_it_is_trusted(trained, tmp_path):
+    problem, _, path = load_problem(ENV_ID), *trained["ppo"]
+    model = PPO.load(path, device="cpu")
+    model.bomb = Bomb(tmp_path / "exploded")
+    model.save(tmp_path / "bomb.zip")
+    for ask in (
+        lambda: make_policy(str(tmp_path / "bomb.zip"), problem),
+        lambda: evaluate(ENV_ID, str(tmp_path / "bomb.zip"), episodes=1),
+        lambda: refine(ENV_ID, str(tmp_path / "bomb.zip"), episodes=1),
+    ):
+        with pytest.raises(ConfigurationError, match=r"bomb\.zip runs code that it contains; if you trust its source, pass --trust"):
+            ask()
+    assert not (tmp_path / "exploded").exists()
+    make_policy(str(tmp_path / "bomb.zip"), problem, trust=True)
+    assert (tmp_path / "exploded").exists()
+    refined = refine(ENV_ID, path, trust=True, filters=["none"], options={"horizon": 0.1}, episodes=1)
+    assert len(refined.evaluations) == 3
 
 
 def test_missing_files_and_files_of_another_kind_are_errors(tmp_path):
@@ -160,17 +191,17 @@ def test_damaged_archives_are_errors(trained, tmp_path, changed):
             if content is not None:
                 archive.writestr(name, content)
     with pytest.raises(ConfigurationError, match=r"damaged\.zip"):
-        make_policy(str(path), load_problem(ENV_ID))
+        make_policy(str(path), load_problem(ENV_ID), trust=True)
 
 
 def test_policies_for_other_spaces_are_errors(trained, tmp_path):
     _, path = trained["ppo"]
     with pytest.raises(ConfigurationError, match="another observation space"):
-        make_policy(path, load_problem("safe_envs/ACCGap-v0"))
+        make_policy(path, load_problem("safe_envs/ACCGap-v0"), trust=True)
     with pytest.raises(ConfigurationError, match="another observation space, between"):
-        make_policy(path, load_problem(ENV_ID, {"barrier": {"radius": 5.0}}))
+        make_policy(path, load_problem(ENV_ID, {"barrier": {"radius": 5.0}}), trust=True)
     with pytest.raises(ConfigurationError, match="another observation space"):
-        evaluate("safe_envs/Scalar-v0", path, episodes=1)
+        evaluate("safe_envs/Scalar-v0", path, trust=True, episodes=1)
 
 
 @pytest.mark.parametrize("space", [gym.spaces.Box(-2.0, 2.0, (1,)), gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Discrete(3)])
@@ -179,4 +210,4 @@ def test_policies_for_other_actions_are_errors(tmp_path, space):
     env.action_space = space
     _, path = saved(tmp_path, PPO, env)
     with pytest.raises(ConfigurationError, match="another action space"):
-        make_policy(path, load_problem(ENV_ID))
+        make_policy(path, load_problem(ENV_ID), trust=True)

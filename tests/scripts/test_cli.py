@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 import safe_envs
-from agents import evaluate
+from agents import evaluate, load_problem
 from scripts import cli
 from scripts.table import print_evaluation
 from tests.scripts.conftest import strictly
@@ -293,6 +293,8 @@ USER_ERRORS = (
     ([DUBINS, "--policy", "nominl"], ["unknown policy 'nominl'", "did you mean 'nominal'"]),
     ([DUBINS, "--policy", "missing.zip"], ["'missing.zip'", "there is no such file"]),
     ([DUBINS, "--policy", __file__], ["not a policy that Stable-Baselines3 saved"]),
+    ([DUBINS, "--policy", __file__, "--trust"], ["not a policy that Stable-Baselines3 saved"]),
+    ([DUBINS, "--policy", "."], ["policy.safetensors cannot be read: No such file", "`safe-envs train`"]),
     ([DUBINS, "--plant", "vv=1"], ["unknown parameter 'vv'", "did you mean 'v'"]),
     ([DUBINS, "--plant", "v=fast"], ["--plant 'v=fast'", "not a number"]),
     ([DUBINS, "--plant", "v"], ["NAME=VALUE"]),
@@ -330,6 +332,7 @@ USER_ERRORS = (
     ([DUBINS, "--json", "x.npz", "--learned", "x.npz"], ["would overwrite the file of --learned x.npz"]),
     ([DUBINS, "--json", "x.npz", "--filter", "ddscbf:file=x.npz"], ["would overwrite the file of --filter x.npz"]),
     ([DUBINS, "--json", "ppo.zip", "--policy", "ppo.zip"], ["would overwrite the file of --policy ppo.zip"]),
+    ([DUBINS, "--json", "policy.json", "--policy", "."], ["would overwrite the file of --policy policy.json"]),
     ([DUBINS, "--plot", "nowhere/out.png"], ["cannot write nowhere/out.png"]),
     ([DUBINS, "--plot", "out.pong"], ["unknown format 'pong'", "did you mean 'png'"]),
     ([DUBINS, "--plot", "out"], ["unknown format ''"]),
@@ -349,6 +352,31 @@ def test_errors_of_the_user_end_with_status_2_and_say_why(safe_envs_command, arg
     for message in messages:
         assert message in err
     assert list(Path().iterdir()) == []
+
+
+@pytest.fixture
+def ppo(tmp_path):
+    """A folder as `safe-envs train` writes it, with the .zip of an untrained model."""
+    import gymnasium as gym
+    from stable_baselines3 import PPO
+
+    from agents.weights import save_policy
+
+    model = PPO("MlpPolicy", gym.make(DUBINS), policy_kwargs={"net_arch": [8]}, device="cpu")
+    save_policy(model, tmp_path / "ppo", load_problem(DUBINS))
+    model.save(tmp_path / "ppo" / "model.zip")
+
+
+def test_a_trained_policy_needs_trust_only_as_a_zip(safe_envs_command, ppo):
+    evaluation, verification = ("evaluate", DUBINS, *QUICK, "--filter", "none"), ("verify", "Scalar-v0", "--no-simulate")
+    assert safe_envs_command(*evaluation, "--policy", "ppo")[0] == 0
+    assert safe_envs_command(*evaluation, "--policy", "ppo/model.zip", "--trust")[0] == 0
+    for command in (evaluation, verification):
+        status, out, err = safe_envs_command(*command, "--policy", "ppo/model.zip")
+        assert (status, out) == (2, "")
+        assert "loading ppo/model.zip runs code that it contains; if you trust its source, pass --trust" in " ".join(err.split())
+    status, _, err = safe_envs_command(*verification, "--policy", "ppo/model.zip", "--trust")
+    assert (status, "another observation space" in " ".join(err.split())) == (2, True)
 
 
 @pytest.mark.parametrize(

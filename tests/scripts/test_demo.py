@@ -12,9 +12,9 @@ from scripts import demo
 
 
 def test_training_writes_a_policy_that_can_be_evaluated(tmp_path):
-    path, told = tmp_path / "ppo.zip", []
+    path, told = tmp_path / "ppo", []
     demo.train(path, told.append, steps=1024)
-    assert PPO.load(path, device="cpu").num_timesteps == 1024
+    assert PPO.load(path / "model.zip", device="cpu").num_timesteps == 1024
     assert told == sorted(told)
     assert 0 < told[0] < 0.1
     assert told[-1] == 1.0
@@ -26,8 +26,8 @@ def test_training_writes_a_policy_that_can_be_evaluated(tmp_path):
 def test_being_told_does_not_change_the_training(tmp_path):
     policies = []
     for i, tell in enumerate((None, lambda _: None)):
-        demo.train(tmp_path / f"{i}.zip", tell, steps=1024)
-        policies.append(make_policy(str(tmp_path / f"{i}.zip"), load_problem(demo.ENV_ID)))
+        demo.train(tmp_path / str(i), tell, steps=1024)
+        policies.append(make_policy(str(tmp_path / str(i)), load_problem(demo.ENV_ID)))
     observations = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 4)).astype(np.float32)
     first, second = (policy.predict(observations)[0] for policy in policies)
     np.testing.assert_array_equal(first, second)
@@ -38,10 +38,11 @@ def test_demo_prints_two_tables_and_leaves_a_policy_and_two_pictures(tmp_path, m
     folder = tmp_path / "new" / "results"
     demo.demo(folder, episodes=10)
     out = capsys.readouterr().out
-    assert sorted(p.name for p in folder.iterdir()) == ["nominal.png", "ppo.png", "ppo.zip"]
+    assert sorted(p.name for p in folder.iterdir()) == ["nominal.png", "ppo", "ppo.png"]
+    assert sorted(p.name for p in (folder / "ppo").iterdir()) == ["model.zip", "policy.json", "policy.safetensors"]
     for path in folder.iterdir():
         assert str(path) in out
-        assert path.stat().st_size > 5000
+        assert path.is_dir() or path.stat().st_size > 5000
     assert out.count("safe [95 % interval]") == 2
     assert "policy nominal" in out
     for name in demo.FILTERS:

@@ -99,6 +99,18 @@ def test_vector_filter_sees_the_model_and_never_the_plant():
     assert first("plant") == first("plant", model={"v": 0.6}) != first("plant", plant={"v": 0.6})
 
 
+def test_what_is_reported_at_a_reset_does_not_change_what_was_executed():
+    envs = SafetyFilterVectorWrapper(
+        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.1, autoreset_mode="SameStep"), "scbf"
+    )
+    envs.reset(seed=0)
+    for _ in range(2):
+        _, _, _, truncated, info = envs.step(np.full((3, 1), 0.9, dtype=np.float32))
+    assert truncated.all()
+    assert (info["final_info"]["safe_action"] != 0).all()
+    np.testing.assert_array_equal(envs.unwrapped.executed[0], info["final_info"]["safe_action"][:, 0])
+
+
 def test_filter_draws_no_random_numbers():
     bare, filtered = gym.make("safe_envs/StochasticDubins-v0"), SafetyFilterWrapper(gym.make("safe_envs/StochasticDubins-v0"), "scbf")
     bare.reset(seed=4)

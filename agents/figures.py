@@ -1,0 +1,103 @@
+"""What happens while an agent is trained, for Stable-Baselines3's logger: safety of episodes, interventions, infeasible steps."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter
+
+_EPISODES = 100
+
+
+class SafetyFigures(BaseCallback):
+    """Counts what the infos of a `SafeVecEnv` say, and records it under `safety/` whenever a rollout ends.
+
+    | key | meaning |
+    |---|---|
+    | `rate` | share of the last 100 episodes without a violation |
+    | `episode_cost` | their mean number of unsafe steps |
+    | `h_min` | their mean smallest barrier value |
+    | `violations` | unsafe steps in the training so far |
+    | `interventions`, `infeasible` | shares of all steps so far, with a filter |
+
+    Attributes:
+        counts: JSON-able, all that has to be kept to go on later.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: dict[str, Any] = {"steps": 0, "violations": 0, "interventions": 0, "infeasible": 0, "episodes": []}
+
+    def _on_step(self) -> bool:
+        batch = self.training_env.unwrapped.batch_info  # pyright: ignore[reportAttributeAccessIssue]
+        counts, done = self.counts, np.flatnonzero(self.locals["dones"])
+        counts["steps"] += len(batch["violation"])
+        counts["violations"] += int(batch["violation"].sum())
+        if "intervention" in batch:
+            counts["interventions"] += int(batch["intervention"].sum())
+            counts["infeasible"] += int((~batch["feasible"]).sum())
+        if done.size:
+            ended = zip(batch["episode_cost"][done].tolist(), batch["h_min"][done].tolist(), strict=True)
+            counts["episodes"] = list(deque([*counts["episodes"], *map(list, ended)], _EPISODES))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        for name, value in self.figures().items():
+            self.logger.record(f"safety/{name}", value)
+
+    def figures(self) -> dict[str, float]:
+        """The figures by name; those of episodes from the first one on that ended."""
+        counts = self.counts
+        found = {"violations": float(counts["violations"])}
+        if counts["steps"]:
+            found |= {name: counts[name] / counts["steps"] for name in ("interventions", "infeasible")}
+        if counts["episodes"]:
+            cost, h_min = np.array(counts["episodes"]).T
+            found |= {"rate": float(np.mean(cost == 0)), "episode_cost": float(cost.mean()), "h_min": float(h_min.mean())}
+        return found
+
+
+class ProgressLog(KVWriter):
+    """Everything that is logged, as a line of JSON for each dump, in a file that a resumed training goes on with.
+
+    Args:
+        path: of the file.
+        until: lines of later steps are dropped: they were written after the checkpoint from which a training goes on.
+    """
+
+    def __init__(self, path: Path, until: int) -> None:
+        self._path = path
+        kept = [line for line in _lines(path) if json.loads(line)["step"] <= until]
+        path.write_text("".join(f"{line}\n" for line in kept))
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Append a line; numbers that are not finite are null."""
+        numbers = {key: _number(value) for key, value in sorted(key_values.items()) if isinstance(value, int | float | np.number)}
+        with self._path.open("a") as stream:
+            stream.write(json.dumps({"step": step, **numbers}, allow_nan=False) + "\n")
+
+    def close(self) -> None:
+        """There is nothing to close: each line is written at once."""
+
+
+def read_progress(path: Path) -> list[Mapping[str, Any]]:
+    """The lines of a `ProgressLog`."""
+    return [json.loads(line) for line in _lines(path)]
+
+
+def _lines(path: Path) -> list[str]:
+    # The last line of a training that was killed may be half a line.
+    text = path.read_text() if path.exists() else ""
+    return text.split("\n")[:-1]
+
+
+def _number(value: Any) -> float | int | None:
+    number = value.item() if isinstance(value, np.number) else value
+    return number if math.isfinite(number) else None

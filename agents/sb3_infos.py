@@ -1,0 +1,87 @@
+"""The info of one env of a batch, made from the batch's arrays only as far as it is read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import wraps
+from typing import Any
+
+import numpy as np
+
+_get = dict.get
+
+
+class LazyInfo(dict[str, Any]):
+    """A dict like the scalar env's info, whose entries are made when they are first read.
+
+    Reading a key makes its entry, with the type that the scalar env reports; whatever looks at all keys (iteration,
+    `items`, `==`, ...) makes all. A `copy()` stays lazy and keeps `batch` and `index`; a pickle or a deep copy is a
+    plain dict of this env's entries.
+
+    Attributes:
+        batch: arrays by key, with the batch in front; the infos of a step share them, so read only.
+        index: of the env in the batch.
+
+    Args:
+        batch: see above; arrays that nobody changes any more.
+        index: see above.
+    """
+
+    __slots__ = ("_left", "batch", "index")
+
+    def __init__(self, batch: Mapping[str, np.ndarray], index: int) -> None:
+        self.batch = self._left = batch
+        self.index = index
+
+    def __missing__(self, key: str) -> Any:
+        values = self._left[key]
+        if values.ndim == 1:
+            # It is quicker to make a number again than to keep it, which learners read once.
+            return values.item(self.index)
+        row = self[key] = values[self.index].copy()
+        return row
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._left or dict.__contains__(self, key)
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Return an entry, or the default if there is none."""
+        return self[key] if key in self._left else _get(self, key, default)
+
+    def copy(self) -> LazyInfo:
+        """Return an info with the same entries, as lazy as this one."""
+        # VecMonitor copies the info of each env that is done: a callback should find `batch` there as well.
+        twin = LazyInfo(self.batch, self.index)
+        twin._left = self._left
+        # What is made already and no more, unlike `twin.update(self)`.
+        twin.update(dict.items(self))
+        return twin
+
+    __copy__ = copy
+
+    def __reduce__(self) -> tuple[type[dict[str, Any]], tuple[dict[str, Any]]]:
+        return dict, (dict(self),)
+
+    def make_all(self) -> None:
+        """Make the entries that were not read yet."""
+        for key in self._left:
+            self[key] = self[key]
+        # What is deleted from now on stays away.
+        self._left = {}
+
+
+def _after_making_all(name: str) -> Callable[..., Any]:
+    of_dict = getattr(dict, name)
+
+    @wraps(of_dict)
+    def method(self: LazyInfo, *arguments: Any) -> Any:
+        self.make_all()
+        return of_dict(self, *arguments)
+
+    return method
+
+
+_OF_ALL_KEYS = ("keys", "values", "items", "pop", "popitem", "setdefault", "clear")
+_OF_ALL_KEYS += ("__iter__", "__reversed__", "__len__", "__eq__", "__ne__", "__or__", "__ror__", "__repr__", "__delitem__")
+for _name in _OF_ALL_KEYS:
+    setattr(LazyInfo, _name, _after_making_all(_name))

@@ -1,0 +1,130 @@
+"""`safe-envs leaderboard`: agents on every env, bare and filtered, with what they cost."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.table import Table
+
+from safe_envs import ENV_IDS
+from safe_envs.errors import ConfigurationError
+from scripts.console import progress_bar, run, stdout
+
+_RESULTS = "results.json"
+_QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 50}
+_QUICK_EPISODES = 100
+
+Row = dict[str, Any]
+
+
+def leaderboard(
+    env_ids: Annotated[list[str] | None, typer.Argument(metavar="[ENV_ID]...", help="Envs; by default all.")] = None,
+    algo: Annotated[str, typer.Option(metavar="NAME", help="ppo, a2c, sac or td3.")] = "ppo",
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where agents and results go. What is in it already is not done again.")] = Path(
+        "leaderboard"
+    ),
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each evaluation.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
+    quick: Annotated[bool, typer.Option("--quick", help="Train for moments only: to see that it works, not how good agents get.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown.")] = False,
+) -> None:
+    """Train an agent on each env, without a filter and with the env's own in the loop, and compare it with the nominal controller.
+
+    Each policy is evaluated bare and behind the filter, the agent that was trained behind it only there. The table has the safety
+    rates with their 95 % intervals, the returns, and how long the training took.
+    """
+    from agents.problems import full_id
+
+    ids = [full_id(env_id) for env_id in (env_ids or ENV_IDS)]
+    out.mkdir(parents=True, exist_ok=True)
+    settings: dict[str, Any] = _QUICK if quick else {}
+    known = {"algo": algo, "seed": seed, "quick": quick, "episodes": _QUICK_EPISODES if quick else episodes}
+    rows = _read(out / _RESULTS, known)
+    with progress_bar("Leaderboard") as bar:
+        tell = bar or (lambda _: None)
+        for k, env_id in enumerate(ids):
+            if not any(row["env_id"] == env_id for row in rows):
+                rows += _of_env(env_id, known, settings, out, lambda part, k=k: tell((k + part) / len(ids)))
+                _write(out / _RESULTS, known, rows)
+            tell((k + 1) / len(ids))
+    found = [row for env_id in ids for row in rows if row["env_id"] == env_id]
+    if markdown:
+        stdout().print("\n".join(_markdown(found)), highlight=False, markup=False, soft_wrap=True)
+    else:
+        stdout().print(_table(found))
+
+
+def _of_env(env_id: str, known: dict[str, Any], settings: dict[str, Any], out: Path, tell: Any) -> list[Row]:
+    """The rows of one env: the nominal controller, an agent trained bare, and one trained behind the filter."""
+    from agents.problems import load_problem
+    from agents.training import Training, train
+
+    natural = load_problem(env_id).filter
+    rows = _evaluated(env_id, "nominal", "nominal", ["none", natural], known, None)
+    for i, (name, in_loop, filters) in enumerate(
+        ((known["algo"], None, ["none", natural]), (f"{known['algo']}, filter in the loop", natural, [natural]))
+    ):
+        folder = out / f"{env_id.split('/')[-1]}-{known['algo']}-{'bare' if in_loop is None else 'filtered'}"
+        began = time.perf_counter()
+        training = Training(env_id, known["algo"], filter=in_loop, seed=known["seed"], **settings)
+        train(training, folder, resume=(folder / "config.json").exists(), tell=lambda part, i=i: tell((i + part) / 2))
+        rows += _evaluated(env_id, name, str(folder), filters, known, time.perf_counter() - began)
+    return rows
+
+
+def _evaluated(env_id: str, name: str, policy: str, filters: Sequence[str], known: dict[str, Any], seconds: float | None) -> list[Row]:
+    from agents import evaluate
+
+    found = evaluate(env_id, policy, filters, episodes=known["episodes"], seed=known["seed"], bounds=False)
+    keys = ("filter", "safety_rate", "ci_low", "ci_high", "return_mean", "intervention_rate")
+    return [{"env_id": env_id, "policy": name, **{key: row[key] for key in keys}, "trained_in": seconds} for row in found.rows]
+
+
+def _read(path: Path, known: dict[str, Any]) -> list[Row]:
+    """The rows that are there already, of the same settings."""
+    if not path.exists():
+        return []
+    document = json.loads(path.read_text())
+    if document["settings"] != known:
+        raise ConfigurationError(f"{path} has the settings {document['settings']}, not {known}; give another --out")
+    return document["rows"]
+
+
+def _write(path: Path, known: dict[str, Any], rows: Sequence[Row]) -> None:
+    from agents.evaluation import package_versions
+    from agents.training import write_json
+
+    write_json(path, {"settings": known, "versions": package_versions(), "rows": list(rows)})
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    rate = f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]"
+    trained = "-" if row["trained_in"] is None else f"{row['trained_in']:.0f} s"
+    return row["env_id"].removeprefix("safe_envs/"), row["policy"], row["filter"], rate, f"{row['return_mean']:.4g}", trained
+
+
+_TITLES = ("env", "policy", "filter", "safe [95 % interval]", "return", "trained in")
+
+
+def _table(rows: Sequence[Row]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for title in _TITLES:
+        table.add_column(title, justify="right" if title in _TITLES[3:] else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*_cells(row))
+    return table
+
+
+def _markdown(rows: Sequence[Row]) -> list[str]:
+    lines = [_TITLES, ("---",) * 3 + ("---:",) * 3, *map(_cells, rows)]
+    return [f"| {' | '.join(cells)} |" for cells in lines]
+
+
+if __name__ == "__main__":
+    run(lambda: typer.run(leaderboard))

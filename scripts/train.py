@@ -1,0 +1,124 @@
+"""`safe-envs train`: an agent of Stable-Baselines3, with a filter in the loop or without one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich import box
+from rich.table import Table
+
+from safe_envs.errors import ConfigurationError
+from safe_envs.files import require_writable
+from scripts import options
+from scripts.console import progress_bar, run, stdout
+
+
+def train(
+    env_id: options.EnvId,
+    algo: Annotated[str, typer.Option(metavar="NAME", help="ppo, a2c, sac or td3.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="New folder for the policy, its evaluations and the checkpoint.")],
+    filter_: Annotated[
+        str | None, typer.Option("--filter", metavar="NAME", help="Filter in the loop, as for evaluate; none by default.")
+    ] = None,
+    n_timesteps: Annotated[
+        int | None, typer.Option(help="Control periods over all copies; by default that of the hyperparameters.")
+    ] = None,
+    num_envs: Annotated[int | None, typer.Option(help="Copies of the env; by default that of the hyperparameters.")] = None,
+    seed: options.Seed = 0,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Hyperparameter in place of the file's, such as learning_rate=3e-4. Repeatable."),
+    ] = None,
+    action: Annotated[
+        str, typer.Option(metavar="executed|proposed|both", help="On which action an off-policy algorithm learns behind a filter.")
+    ] = "executed",
+    intervention_penalty: Annotated[
+        float, typer.Option(metavar="X", help="Taken from the reward for each unit by which the filter moves the action.")
+    ] = 0.0,
+    noise: options.Noise = None,
+    plant: options.Plant = None,
+    model: options.Model = None,
+    barrier: options.BarrierArguments = None,
+    knowledge: options.Knowledge = "model",
+    dt: options.Dt = None,
+    substeps: options.Substeps = None,
+    horizon: options.Horizon = None,
+    box_: options.Box = None,
+    start: options.StartAt = None,
+    eval_freq: Annotated[
+        int | None, typer.Option(help="Steps between evaluations and checkpoints; by default a tenth of the training.")
+    ] = None,
+    eval_episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 200,
+    threads: Annotated[int, typer.Option(help="Threads of torch.")] = 1,
+    tensorboard: Annotated[Path | None, typer.Option(metavar="DIR", help="Write logs for tensorboard.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the training in --out after its last checkpoint.")] = False,
+) -> None:
+    """Train an agent, evaluate it on the way, and keep the last and the best policy.
+
+    The hyperparameters are those of agents/hyperparams, in the RL Zoo's format. What is logged goes to progress.jsonl and, if
+    asked for, to tensorboard: the safety rate of the last episodes, their cost and smallest h, and violations, interventions and
+    infeasible steps in the training so far. The folder is what `safe-envs evaluate --policy DIR` reads.
+    """
+    from agents.training import Training
+    from agents.training import train as train_agent
+
+    arguments = options.of_env(
+        noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box_, start=start
+    )
+    training = Training(
+        env_id=env_id,
+        algorithm=algo,
+        filter=filter_,
+        options=arguments,
+        knowledge=knowledge,
+        n_timesteps=n_timesteps,
+        num_envs=num_envs,
+        settings=_settings(settings or []),
+        seed=seed,
+        action=action,
+        intervention_penalty=intervention_penalty,
+        eval_freq=eval_freq,
+        eval_episodes=eval_episodes,
+        threads=threads,
+    )
+    require_writable(out.absolute().parent / f".{out.name}")
+    with progress_bar("Training") as tell:
+        train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)
+    _report(training.env_id, out, training.filter or "none")
+
+
+def _settings(texts: list[str]) -> dict[str, Any]:
+    """NAME=VALUE entries, the values read as YAML."""
+    import yaml
+
+    found = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise ConfigurationError(f"--set {text}: give NAME=VALUE, such as learning_rate=0.001")
+        try:
+            found[name] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigurationError(f"--set {text}: {value!r} is no YAML") from error
+    return found
+
+
+def _report(env_id: str, out: Path, filter_name: str) -> None:
+    """Print how safe and how good the agent was in each evaluation."""
+    console = stdout()
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for title in ("steps", "safe [95 % interval]", "return", "violations in training"):
+        table.add_column(title, justify="right")
+    for row in json.loads((out / "evaluations.json").read_text()):
+        rate = f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]"
+        table.add_row(f"{row['timesteps']:,}", rate, f"{row['return_mean']:.4g}", f"{row['training']['violations']:.0f}")
+    console.print(f"Evaluations with the filter {filter_name}:", highlight=False, markup=False)
+    console.print(table)
+    console.print(f"\nTo evaluate the policy: safe-envs evaluate {env_id} --policy {out}", highlight=False, markup=False)
+
+
+if __name__ == "__main__":
+    run(lambda: typer.run(train))

@@ -1,0 +1,76 @@
+"""`safe-envs train` and `safe-envs leaderboard` as a person types them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.scripts.conftest import strictly
+
+DUBINS = "safe_envs/StochasticDubins-v0"
+QUICK = ("--n-timesteps", 512, "--num-envs", 4, "--eval-freq", 256, "--eval-episodes", 8, "--horizon", 0.5)
+
+
+def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_path):
+    arguments = ("train", DUBINS, "--algo", "ppo", "--filter", "scbf", *QUICK, "--set", "learning_rate=lin_1e-3", "--out", "run")
+    status, out, err = safe_envs_command(*arguments, "--tensorboard", "logs")
+    assert (status, err) == (0, "")
+    assert "violations in training" in out
+    assert f"safe-envs evaluate {DUBINS} --policy run" in out
+    assert list((tmp_path / "logs").iterdir())
+    config = json.loads((tmp_path / "run" / "config.json").read_text())["training"]
+    assert config["settings"] == {"learning_rate": "lin_1e-3"}
+    status, out, err = safe_envs_command("evaluate", DUBINS, "--policy", "run", "--filter", "none", "--filter", "scbf", "--episodes", 20)
+    assert (status, err) == (0, "")
+    assert "policy run" in out
+    status, _, err = safe_envs_command(*arguments)
+    assert status == 2
+    assert "not empty" in err
+    assert safe_envs_command(*arguments, "--resume")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--algo", "dqn"), "dqn"),
+        (("--algo", "ppo", "--filter", "sbf"), "sbf"),
+        (("--algo", "ppo", "--set", "gamma"), "NAME=VALUE"),
+        (("--algo", "ppo", "--set", "gamma=[1"), "no YAML"),
+        (("--algo", "ppo", "--set", "speed=3"), "does not take"),
+        (("--algo", "ppo", "--n-timesteps", 0), "n_timesteps = 0"),
+        (("--algo", "ppo", "--intervention-penalty", 1), "penalty"),
+        (("--algo", "sac", "--action", "best"), "action = 'best'"),
+        (("--algo", "ppo", "--resume"), "holds no training"),
+    ],
+)
+def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(safe_envs_command, tmp_path, arguments, message):
+    status, _, err = safe_envs_command("train", DUBINS, "--horizon", 0.5, "--num-envs", 2, *arguments, "--out", "run")
+    assert status == 2
+    assert "Traceback" not in err
+    assert message in " ".join(err.split())
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command, monkeypatch):
+    monkeypatch.setattr("scripts.leaderboard._QUICK", {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4})
+    monkeypatch.setattr("scripts.leaderboard._QUICK_EPISODES", 8)
+    arguments = ("leaderboard", "Scalar-v0", "--quick", "--out", "board")
+    status, out, err = safe_envs_command(*arguments)
+    assert (status, err) == (0, "")
+    rows = strictly("board/results.json")["rows"]
+    assert [(row["policy"], row["filter"]) for row in rows] == [
+        ("nominal", "none"),
+        ("nominal", "scbf"),
+        ("ppo", "none"),
+        ("ppo", "scbf"),
+        ("ppo, filter in the loop", "scbf"),
+    ]
+    assert "Scalar-v0" in out
+    again = safe_envs_command(*arguments, "--markdown")
+    assert again[0] == 0
+    assert again[1].startswith("| env | policy | filter |")
+    assert strictly("board/results.json")["rows"] == rows
+    status, _, err = safe_envs_command(*arguments, "--seed", 1)
+    assert status == 2
+    assert "give another --out" in err
