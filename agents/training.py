@@ -21,7 +21,7 @@ from agents.evaluation import BARE, evaluate, package_versions
 from agents.hyperparameters import hyperparameters, scheduled
 from agents.problems import full_id, load_problem
 from safe_envs.errors import ConfigurationError, nearest, require_whole
-from safe_envs.files import write_atomically
+from safe_envs.files import write_atomically, write_json
 
 PARTS = 10
 """Into how many parts a training is cut unless it is said otherwise."""
@@ -86,8 +86,10 @@ class Training:
             object.__setattr__(self, "eval_freq", max(1, (self.n_timesteps or 0) // PARTS))
         for name, least in (("n_timesteps", 1), ("num_envs", 1), ("seed", 0), ("eval_freq", 1), ("eval_episodes", 1), ("threads", 1)):
             require_whole(name, getattr(self, name), least)
-        if self.action not in ("executed", "proposed", "both"):
-            raise ConfigurationError(f"action = {self.action!r}; {nearest(self.action, ('executed', 'proposed', 'both'))}")
+        from agents.replay import ACTIONS
+
+        if self.action not in ACTIONS:
+            raise ConfigurationError(f"action = {self.action!r}; {nearest(self.action, ACTIONS)}")
 
     @property
     def hyperparameters(self) -> dict[str, Any]:
@@ -299,12 +301,6 @@ class _Session:
         for key in ("safety_rate", "ci_low", "ci_high", "return_mean"):
             model.logger.record(f"eval/{key}", row[key])
         model.logger.dump(model.num_timesteps)
-
-
-def write_json(path: Path, data: Any) -> None:
-    """Write strict JSON, whole or not at all."""
-    text = json.dumps(data, indent=2, allow_nan=False)
-    write_atomically(path, lambda part: part.write_text(text + "\n"))
 
 
 def _read_list(path: Path) -> list[Any]:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from safe_envs.errors import ConfigurationError
 
@@ -47,3 +49,14 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write strict JSON, whole or not at all; errors as for `write_atomically`.
+
+    Args:
+        path: where the file is to be.
+        data: JSON-able, without NaN or infinities.
+    """
+    text = json.dumps(data, indent=2, allow_nan=False)
+    write_atomically(path, lambda part: part.write_text(text + "\n"))

@@ -134,7 +134,9 @@ class ControlAffineSDE:
 
     def numeric(self, expression: Any) -> Any:
         """Return an expression or matrix with the parameters' values in place of their symbols."""
-        return _numeric(expression, tuple(self.parameters.items()))
+        # What is remembered must not change: a matrix is frozen first.
+        given: Any = sp.ImmutableMatrix(expression) if isinstance(expression, sp.MatrixBase) else expression
+        return _numeric(given, tuple(self.parameters.items()))
 
     def exact(self, expression: Any) -> Any:
         """Like `numeric`, with the decimal value of each parameter as a rational, so that terms cancel exactly."""

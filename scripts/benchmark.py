@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 import timeit
@@ -19,7 +18,7 @@ from rich.table import Table
 import safe_envs
 from agents.problems import load_problem
 from safe_envs import Barrier, ControlAffineSDE
-from safe_envs.files import require_writable, write_atomically
+from safe_envs.files import require_writable, write_json
 from scripts.console import stdout
 from wrappers import (
     CBF,
@@ -85,7 +84,7 @@ def benchmark(json_file: Path | None = None) -> None:
     console.print(f"{_ID} with scbf, safe-envs {safe_envs.__version__}, on one of {os.cpu_count()} cores\n", highlight=False)
     console.print(_table(figures))
     if json_file is not None:
-        write_atomically(json_file, lambda path: path.write_text(json.dumps(figures, indent=2) + "\n"))
+        write_json(json_file, figures)
 
 
 def measure() -> Figures:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from safe_envs.files import write_json
 from scripts import options
 from scripts.console import progress_bar, run, stdout
 
@@ -76,7 +77,7 @@ def evaluate(
     are Wilson's (Clopper and Pearson's where all or no episodes are safe), and Newcombe's for differences.
     """
     from agents import evaluation, refinement
-    from scripts.table import print_evaluation, print_refinement, write_json
+    from scripts.table import print_evaluation, print_refinement
 
     options.require_outputs(json, plot, inputs=options.inputs_of(policy, filters or (), learned or ()))
     arguments = options.of_env(
@@ -107,7 +108,7 @@ def evaluate(
     if refine:
         print_refinement(stdout(), answer)
     if json is not None:
-        write_json(json, answer)
+        write_json(json, answer.document())
     if plot is not None:
         from scripts.figure import draw
 

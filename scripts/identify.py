@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from safe_envs.errors import ConfigurationError, nearest, require_whole
+from safe_envs.files import write_json
 from scripts import options
 from scripts.console import progress_bar, run, stdout
 
@@ -69,7 +70,7 @@ def identify(
     the plant, with its --noise.
     """
     from agents.problems import full_id, load_problem
-    from scripts.identify_report import Identification, Source, compare, print_report, write_json
+    from scripts.identify_report import Identification, Source, compare, document, print_report
     from wrappers.learning import learner_of
     from wrappers.learning.identifiability import IdentifiabilityWarning
 
@@ -112,7 +113,7 @@ def identify(
     )
     print_report(stdout(), found)
     if json is not None:
-        write_json(json, found)
+        write_json(json, document(found))
     if plot is not None:
         from scripts.identify_figure import draw
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
-import platform
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +16,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from agents.evaluation import package_versions
 from safe_envs.errors import ConfigurationError
-from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
 from scripts.table import describe_plant, describe_system
 from wrappers.learning import LearnedModel
@@ -46,7 +43,6 @@ _ERRORS = {
 """What the held-out errors of each method are, or of its way."""
 
 _ROUNDING = 1e-8
-_PACKAGES = ("safe-envs", "numpy", "scipy", "sympy", "torch")
 _NAMED = re.compile(r"(f|g|covariance|C)[\[(](\w+)(?:, (\w+))?[\])]")
 
 
@@ -231,12 +227,6 @@ def _say_vanishing(console: Console, found: Identification) -> None:
         _say(console, f"\n0 in truth and estimate: {', '.join(names[:_MOST_NAMED])}{f' and {more} more' if more > 0 else ''}")
 
 
-def write_json(path: Path, found: Identification) -> None:
-    """Write it as strict JSON, whole or not at all."""
-    text = json.dumps(document(found), indent=2, allow_nan=False)
-    write_atomically(path, lambda part: part.write_text(text + "\n"))
-
-
 def document(found: Identification) -> dict[str, Any]:
     """The whole as JSON-able data; what is not finite is null."""
     functions = () if isinstance(found.functions, str) else found.functions
@@ -248,7 +238,7 @@ def document(found: Identification) -> dict[str, Any]:
             "seed": found.seed,
             "data": None if found.source is None else str(found.source.path),
         },
-        "versions": {"python": platform.python_version(), **{package: version(package) for package in _PACKAGES}},
+        "versions": package_versions(),
         "file": str(found.out),
         "sha256": found.learned.sha256,
         "record": {**asdict(found.learned.record), "warnings": list(found.learned.record.warnings)},

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from safe_envs import ENV_IDS
 from safe_envs.errors import ConfigurationError
+from safe_envs.files import write_json
 from scripts.console import progress_bar, run, stdout
 
 _RESULTS = "results.json"
@@ -100,7 +101,6 @@ def _read(path: Path, known: dict[str, Any]) -> list[Row]:
 
 def _write(path: Path, known: dict[str, Any], rows: Sequence[Row]) -> None:
     from agents.evaluation import package_versions
-    from agents.training import write_json
 
     write_json(path, {"settings": known, "versions": package_versions(), "rows": list(rows)})
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -14,7 +11,6 @@ from agents.comparison import Comparison
 from agents.episodes import Row
 from agents.evaluation import BARE, Evaluation
 from agents.refinement import TOLERANCE, Refinement
-from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
 from scripts.learned_columns import learned_columns, learned_notes
 
@@ -75,12 +71,6 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
         _say(console, f"  {row['filter']}: {_VERDICTS[row['verdict']].format(change)}")
     reach = f"{100 * TOLERANCE:g} points"
     _say(console, f"Converged: the {interval} of the change from dt/2 to dt/4 reaches no further than {reach} either way.")
-
-
-def write_json(path: Path, answer: Evaluation | Refinement) -> None:
-    """Write an answer as strict JSON, whole or not at all."""
-    text = json.dumps(answer.document(), indent=2, allow_nan=False)
-    write_atomically(path, lambda part: part.write_text(text + "\n"))
 
 
 def heading(evaluation: Evaluation) -> Text:

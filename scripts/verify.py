@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json as jsonlib
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.files import write_atomically
+from safe_envs.files import write_json
 from scripts import options
 from scripts.console import progress_bar, run, stdout
 
@@ -75,8 +74,7 @@ def verify(
             "policy": policy,
             "seed": seed,
         }
-        text = jsonlib.dumps(document(config, found, bounds, measurements), indent=2, allow_nan=False)
-        write_atomically(json, lambda part: part.write_text(text + "\n"))
+        write_json(json, document(config, found, bounds, measurements))
     if plot is not None:
         from scripts.verify_figure import draw
 

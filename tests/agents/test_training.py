@@ -162,8 +162,8 @@ def test_there_are_hyperparameters_for_every_id():
             assert settings["n_envs"] >= 1
 
 
-def test_the_zoo_reads_the_hyperparameters():
-    """By what its ExperimentManager does: the file is YAML with ids for keys, and texts are evaluated, so that there are none."""
+def test_the_files_have_the_form_that_the_zoo_reads():
+    """Its ExperimentManager takes YAML with ids for keys, and evaluates texts for arguments, so that there are none here."""
     from importlib.resources import files
 
     for algorithm in ALGORITHMS:

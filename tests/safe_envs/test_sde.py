@@ -66,6 +66,15 @@ def test_with_parameters_returns_another_system_and_knows_its_names():
         system.with_parameters(kk=1.0)
 
 
+def test_numbers_take_the_place_of_parameters_in_a_matrix_that_may_change_later():
+    a, x = sp.symbols("a x", real=True)
+    system = ControlAffineSDE((x,), (sp.Symbol("u", real=True),), [a * x], [1], [0], {a: 2.0})
+    matrix = sp.Matrix([a, x])
+    assert system.numeric(matrix) == sp.Matrix([2, x])
+    matrix[0] = 3 * a
+    assert system.numeric(matrix) == sp.Matrix([6, x])
+
+
 def test_functions_by_pieces_compile():
     x = sp.Symbol("x", real=True)
     pieces = sp.Piecewise((1 - x**2, x > 0), ((1 + x) ** 3, True))

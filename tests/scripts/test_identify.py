@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from agents.evaluation import package_versions
 from agents.problems import load_problem
 from scripts.identify import SETTINGS, read_settings, settings_of
 from scripts.identify_report import Function, Source, percent, unit_of
@@ -95,7 +96,7 @@ def test_json_holds_all_of_it(identify):
         "seed": 0,
         "data": None,
     }
-    assert set(document["versions"]) == {"python", "safe-envs", "numpy", "scipy", "sympy", "torch"}
+    assert document["versions"] == package_versions()
     assert document["record"]["settings"]["repetitions"] == 10
     functions = {entry["name"]: entry for entry in document["functions"]}
     assert functions["covariance[x_2, x_2]"]["size"] == pytest.approx(0.09)
