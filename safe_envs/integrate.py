@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.codegen import Components, Flavour, compile_function
+from safe_envs.codegen import Components, Flavour, compile_function, constants
 from safe_envs.sde import ControlAffineSDE
 
 
@@ -25,7 +25,9 @@ class Integrator:
 
     def __init__(self, system: ControlAffineSDE, dt: float, substeps: int, flavour: Flavour) -> None:
         self._substeps = substeps
-        self._h = dt / substeps
+        h = dt / substeps
+        factors = (0.5 * h, h, h / 6.0, 2.0)
+        self._factors: Sequence[Any] = constants(factors) if flavour == "arrays" else factors
         diffusion = system.numeric(system.diffusion)
         live = [j for j in range(diffusion.cols) if any(e != 0 for e in diffusion[:, j])]
         self._wiener = len(live)
@@ -33,8 +35,8 @@ class Integrator:
         rate = system.numeric(system.drift + system.input_matrix * sp.Matrix(system.inputs))
         if live:
             draws = sp.symbols(f"_w:{len(live)}", real=True)
-            noise = diffusion[:, live] * sp.Matrix(draws) * sp.Float(math.sqrt(self._h), 17)
-            moved = sp.Matrix(system.states) + rate * sp.Float(self._h, 17) + noise
+            noise = diffusion[:, live] * sp.Matrix(draws) * sp.Float(math.sqrt(h), 17)
+            moved = sp.Matrix(system.states) + rate * sp.Float(h, 17) + noise
             self._euler = compile_function((*system.states, *system.inputs, *draws), tuple(moved), flavour)
         else:
             self._rate = compile_function((*system.states, *system.inputs), tuple(rate), flavour)
@@ -56,11 +58,10 @@ class Integrator:
         return x
 
     def _runge_kutta(self, x: Components, u: Sequence[Any]) -> Components:
-        h, rate = self._h, self._rate
-        half = 0.5 * h
+        rate = self._rate
+        half, h, sixth, two = self._factors
         k1 = rate(*x, *u)
         k2 = rate(*[a + half * b for a, b in zip(x, k1, strict=True)], *u)
         k3 = rate(*[a + half * b for a, b in zip(x, k2, strict=True)], *u)
         k4 = rate(*[a + h * b for a, b in zip(x, k3, strict=True)], *u)
-        sixth = h / 6.0
-        return tuple(a + sixth * (b1 + 2.0 * (b2 + b3) + b4) for a, b1, b2, b3, b4 in zip(x, k1, k2, k3, k4, strict=True))
+        return tuple(a + sixth * (b1 + two * (b2 + b3) + b4) for a, b1, b2, b3, b4 in zip(x, k1, k2, k3, k4, strict=True))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.codegen import Components, Flavour, compile_function, filled
+from safe_envs.codegen import Components, Flavour, compile_function
 from safe_envs.errors import ConfigurationError
 from safe_envs.integrate import Integrator
 from safe_envs.problem import TIME, SafetyProblem
@@ -38,10 +38,11 @@ class Simulation:
         start = problem.starts[problem.start]
         self._uniforms = len(start.uniforms)
         self._tries = 1 if start.condition is None else _TRIES_AT_ONCE
-        self._start = compile_function(start.uniforms, start.state, flavour)
+        # Few envs start together, and each from numbers of its own: plain floats are the quickest way.
+        self._start = compile_function(start.uniforms, start.state, "floats")
         if start.condition is not None:
             condition = problem.model.numeric(start.condition)
-            self._accept = compile_function(problem.plant.states, (condition,), flavour)
+            self._accept = compile_function(problem.plant.states, (condition,), "floats")
         else:
             self._accept = None
 
@@ -62,38 +63,20 @@ class Simulation:
         return values[:f], values[f:b], values[b], values[b + 1], values[b + 2]
 
     def draw_start(self, rng: np.random.Generator) -> Components:
-        """Draw an initial state by rejection. For flavour "floats"."""
+        """Draw an initial state, by rejection: a plain float for each state."""
         for _ in range(_MOST_TRIES // self._tries):
             for uniforms in rng.random((self._tries, self._uniforms)).tolist():
                 x = self._start(*uniforms)
                 if self._accept is None or self._accept(*x)[0] > 0:
                     return x
-        raise self._hopeless()
-
-    def draw_starts(self, rngs: Sequence[np.random.Generator]) -> list[np.ndarray]:
-        """Draw an initial state from each generator; components of shape (len(rngs),). For flavour "arrays"."""
-        states = [np.empty(len(rngs)) for _ in self.problem.states]
-        missing = np.arange(len(rngs))
-        for _ in range(_MOST_TRIES // self._tries):
-            uniforms = np.empty((missing.size, self._tries, self._uniforms))
-            for i, row in zip(missing.tolist(), uniforms, strict=True):
-                rngs[i].random(out=row)
-            shape = (self._tries, missing.size)
-            tries = [filled(c, shape) for c in self._start(*np.ascontiguousarray(uniforms.T))]
-            accepted = filled(True if self._accept is None else self._accept(*tries)[0] > 0, shape)
-            first, found = accepted.argmax(axis=0), accepted.any(axis=0)
-            for state, component in zip(states, tries, strict=True):
-                state[missing] = component[first, np.arange(missing.size)]
-            missing = missing[~found]
-            if not missing.size:
-                return states
-        raise self._hopeless()
-
-    def _hopeless(self) -> ConfigurationError:
-        return ConfigurationError(
+        raise ConfigurationError(
             f"no start of {self.problem.name!r} met the condition of the distribution {self.problem.start!r} in "
             f"{_MOST_TRIES} tries; give a fixed start or another distribution"
         )
+
+    def draw_starts(self, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        """Draw an initial state from each generator; shape (n, len(rngs))."""
+        return np.array([self.draw_start(rng) for rng in rngs], dtype=float).T.copy()
 
 
 class NoiseStream:

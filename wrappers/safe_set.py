@@ -111,7 +111,7 @@ def repeats(expression: Any, s: sp.Symbol) -> bool:
 def draw_starts(problem: SafetyProblem, count: int, seed: int = 0) -> np.ndarray:
     """Draw initial states of a problem, shape (count, n)."""
     rngs: list[Any] = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)]
-    return np.stack([np.broadcast_to(c, (count,)) for c in Simulation(problem, "arrays").draw_starts(rngs)], axis=1)
+    return Simulation(problem, "floats").draw_starts(rngs).T
 
 
 @dataclass(frozen=True)
