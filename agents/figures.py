@@ -33,7 +33,7 @@ class SafetyFigures(BaseCallback):
 
     def __init__(self) -> None:
         super().__init__()
-        self.counts: dict[str, Any] = {"steps": 0, "violations": 0, "interventions": 0, "infeasible": 0, "episodes": []}
+        self.counts: dict[str, Any] = {"steps": 0, "violations": 0, "episodes": []}
 
     def _on_step(self) -> bool:
         batch = self.training_env.unwrapped.batch_info  # pyright: ignore[reportAttributeAccessIssue]
@@ -41,8 +41,8 @@ class SafetyFigures(BaseCallback):
         counts["steps"] += len(batch["violation"])
         counts["violations"] += int(batch["violation"].sum())
         if "intervention" in batch:
-            counts["interventions"] += int(batch["intervention"].sum())
-            counts["infeasible"] += int((~batch["feasible"]).sum())
+            counts["interventions"] = counts.get("interventions", 0) + int(batch["intervention"].sum())
+            counts["infeasible"] = counts.get("infeasible", 0) + int((~batch["feasible"]).sum())
         if done.size:
             ended = zip(batch["episode_cost"][done].tolist(), batch["h_min"][done].tolist(), strict=True)
             counts["episodes"] = list(deque([*counts["episodes"], *map(list, ended)], _EPISODES))
@@ -56,8 +56,7 @@ class SafetyFigures(BaseCallback):
         """The figures by name; those of episodes from the first one on that ended."""
         counts = self.counts
         found = {"violations": float(counts["violations"])}
-        if counts["steps"]:
-            found |= {name: counts[name] / counts["steps"] for name in ("interventions", "infeasible")}
+        found |= {name: counts[name] / counts["steps"] for name in ("interventions", "infeasible") if name in counts}
         if counts["episodes"]:
             cost, h_min = np.array(counts["episodes"]).T
             found |= {"rate": float(np.mean(cost == 0)), "episode_cost": float(cost.mean()), "h_min": float(h_min.mean())}

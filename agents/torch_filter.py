@@ -44,11 +44,13 @@ class TorchResult(NamedTuple):
         action: executed input, shape (..., m), in the box; only this one has a gradient.
         feasible: whether some action in the box meets every row, shape (...).
         active: rows that bind or cannot be met, shape (..., k).
+        differentiable: whether the gradient is that of the action, shape (...); where not, it is zero.
     """
 
     action: torch.Tensor
     feasible: torch.Tensor
     active: torch.Tensor
+    differentiable: torch.Tensor
 
 
 class TorchFilter(torch.nn.Module):
@@ -56,7 +58,8 @@ class TorchFilter(torch.nn.Module):
 
     Where the rows cannot all be met, the action is the least-violating one, and its gradient is that of this action: zero
     along the inputs that stay in a corner of the box, and with several rows that of their weighted compromise. From three inputs
-    on, a solver may return a compromise that is not the nearest one to the proposal: there the gradient is zero.
+    on, a solver may return a compromise that is not the nearest one to the proposal: there the gradient is zero, and the result
+    says so.
 
     It runs on the CPU and in double precision, whatever the tensors are.
 
@@ -109,24 +112,26 @@ class TorchFilter(torch.nn.Module):
             raise InvalidInputError(f"state {x.dtype} and input {u.dtype}; give real floating-point tensors, such as x.double()")
         given = [part.detach().to("cpu", torch.float64).numpy() for part in (x, u)]
         found = self.safety_filter.filter(*given)
-        action = torch.from_numpy(found.action)
+        action, differentiable = torch.from_numpy(found.action), torch.ones(found.action.shape[:-1], dtype=torch.bool)
         if torch.is_grad_enabled() and (x.requires_grad or u.requires_grad):
             states, inputs = [part.to("cpu", torch.float64).reshape(-1, part.shape[-1]) for part in (x, u)]
-            formula = self._formula(states, inputs, found).reshape(action.shape)
+            formula, agrees = self._formula(states, inputs, found)
+            formula, differentiable = formula.reshape(action.shape), agrees.reshape(differentiable.shape)
             action = action + (formula - formula.detach())
         action = action.to(u.device, u.dtype)
-        flags = [torch.as_tensor(part, device=u.device) for part in (found.feasible, found.active)]
+        flags = [torch.as_tensor(part, device=u.device) for part in (found.feasible, found.active, differentiable)]
         return TorchResult(action, *flags) if return_result else action
 
-    def _formula(self, states: torch.Tensor, inputs: torch.Tensor, found: Any) -> torch.Tensor:
-        """The actions (B, m) as functions of states (B, n) and inputs (B, m), true near these."""
+    def _formula(self, states: torch.Tensor, inputs: torch.Tensor, found: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """The actions (B, m) as functions of states (B, n) and inputs (B, m), true near these, and where that holds (B,)."""
         m, k = len(self._low), len(self._priorities)
         action, active, slack = found.action.reshape(-1, m), found.active.reshape(-1, k), found.slack.reshape(-1, k)
         # Where no row acts, the state's gradient is zero, and not missing.
         result = inputs.clamp(torch.from_numpy(self._low), torch.from_numpy(self._high)) + 0.0 * states[:, :1]
+        everywhere = torch.ones(len(states), dtype=torch.bool)
         acting = np.flatnonzero(active.any(axis=1))
         if not acting.size:
-            return result
+            return result, everywhere
         places = torch.from_numpy(acting)
         a, b = self._rows(states[places])
         held, missed, binding = self._active_sets(
@@ -139,8 +144,9 @@ class TorchFilter(torch.nn.Module):
         rows = torch.where(torch.from_numpy(held)[:, None, :], 0.0, a / roots)
         weights = missed * np.sqrt(self._priorities)
         solution = start + _nearest(rows, gaps, weights, binding) / roots
-        agrees = (solution - decided).abs() <= torch.from_numpy(_AGREED * (self._high - self._low))
-        return result.index_copy(0, places, torch.where(agrees.all(dim=1, keepdim=True), solution, decided))
+        agrees = ((solution - decided).abs() <= torch.from_numpy(_AGREED * (self._high - self._low))).all(dim=1)
+        formula = torch.where(agrees[:, None], solution, decided)
+        return result.index_copy(0, places, formula), everywhere.index_copy(0, places, agrees)
 
     def _active_sets(
         self, a: np.ndarray, v: np.ndarray, u: np.ndarray, active: np.ndarray, slack: np.ndarray

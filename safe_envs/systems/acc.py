@@ -25,6 +25,7 @@ _CAR = {f_0: 0.1, f_1: 5.0, f_2: 0.25, M: 1650.0}
 _MOST_FORCE = 0.3 * 1650.0 * 9.81
 _DESIRED_SPEED = 22
 _LEAD_SPEED = 20.0
+_LONG_GAP = 50
 
 
 def own_acceleration(speed: sp.Symbol) -> sp.Expr:
@@ -33,6 +34,11 @@ def own_acceleration(speed: sp.Symbol) -> sp.Expr:
     Source: thesis Sec. 4.3.1.
     """
     return -(f_0 + f_1 * speed + f_2 * speed**2) / M
+
+
+def near_desired_speed(speed: sp.Symbol) -> sp.Expr:
+    """exp(-((v - 22)/4)^2): 1 at the desired speed."""
+    return sp.exp(-(((speed - _DESIRED_SPEED) / 4) ** 2))
 
 
 def headway_system() -> ControlAffineSDE:
@@ -66,15 +72,13 @@ def gap_system() -> ControlAffineSDE:
 
 
 def _cruise(name: str, *, system: ControlAffineSDE, speed: sp.Symbol, rate: float, slack_weight: float, **rest: Any) -> SafetyProblem:
-    """What both problems have in common: the force's box, and the task of driving at the desired speed."""
-    error = speed - _DESIRED_SPEED
-    clf = CLF(error**2, rate, input_weight=2 / M**2, slack_weight=positive("slack_weight", slack_weight))
+    """What both problems have in common: the force's box, and the goal of driving at the desired speed."""
+    clf = CLF((speed - _DESIRED_SPEED) ** 2, rate, input_weight=2 / M**2, slack_weight=positive("slack_weight", slack_weight))
     return SafetyProblem(
         name=name,
         plant=system,
         model=system,
         inputs=(Variable(u, -_MOST_FORCE, _MOST_FORCE, "N"),),
-        reward=sp.exp(-((error / 4) ** 2)),
         nominal=clf.min_norm(system),
         clf=clf,
         filter="scbf",
@@ -98,6 +102,7 @@ def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> S
         speed=x_1,
         rate=rate,
         slack_weight=slack_weight,
+        reward=near_desired_speed(x_1),
         barriers=(Barrier(x_3 - positive("tau", tau) * x_1),),
         states=(Variable(x_1, 0.0, 50.0, "m/s"), Variable(x_2, 0.0, 50.0, "m/s"), Variable(x_3, 0.0, 1000.0, "m")),
         starts={"thesis": Start.at((15.0, _LEAD_SPEED, 150.0))},
@@ -132,6 +137,7 @@ def acc_gap(*, distance: float = 10.0, power: int = 5, rate: float = 1.0, slack_
         speed=v,
         rate=rate,
         slack_weight=slack_weight,
+        reward=near_desired_speed(v) * sp.exp(-z / _LONG_GAP),
         barriers=(Barrier((z - positive("distance", distance)) ** power),),
         states=(Variable(v, 0.0, 50.0, "m/s"), Variable(z, 0.0, 500.0, "m")),
         starts={"thesis": Start.at((10.0, 15.0))},
@@ -243,7 +249,8 @@ class ACCGap(SystemEnv):
     None.
 
     ## Reward
-    exp(-((v - 22)/4)^2) a step, in (0, 1].
+    exp(-((v - 22)/4)^2) exp(-z/50) a step, in (0, 1]: others cut into a long gap. Without the second factor nothing would pull an
+    agent towards the edge, since in the long run it drives as fast as the lead at any gap.
 
     ## Nominal controller
     Min-norm CLF law of V = (v - 22)^2: AV + V <= d, at the cost 2 u^2/M^2 + 2 d^2. The weights are chosen by us, so that the
