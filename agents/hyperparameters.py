@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -32,7 +32,7 @@ def hyperparameters(algorithm: str, env_id: str) -> dict[str, Any]:
     return dict(table.get(env_id, table["default"]))
 
 
-def scheduled(settings: dict[str, Any]) -> dict[str, Any]:
+def scheduled(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings with the Zoo's texts such as lin_3e-4 as functions of the part of the training that is left."""
     return {k: _linear(k, v) if k in _SCHEDULED and isinstance(v, str) else v for k, v in settings.items()}
 
@@ -44,4 +44,5 @@ def _linear(name: str, text: str) -> Callable[[float], float]:
         first = float(text.removeprefix(_LINEAR))
     except ValueError as error:
         raise ConfigurationError(f"{name} = {text!r}; give a number, or {_LINEAR}NUMBER for one that falls to 0") from error
-    return lambda left: left * first
+    # Whole rollouts may lead beyond the end of the training, where less than nothing is left.
+    return lambda left: max(left, 0.0) * first

@@ -8,6 +8,11 @@ With the proposals Q is that of the filtered env instead, constant along all act
 executed actions alone Q is extrapolated at actions that the filter never lets through; "both" also fills those in,
 consistently, as the filter passes its own answer on unchanged.
 
+A penalty on interventions (`SafeVecEnv`) is a function of the proposal: r - c |u - a| belongs to (s, a). Stored with u it would be
+noise, as the same u follows from many a. So the rewards go as with Krasowski et al.: the penalised r to (s, a), the env's own r to
+(s, u), which the buffers get by adding the infos' "intervention_penalty" back (up to the rounding of rewards to single precision),
+also in n-step returns. A penalty thus has no effect with "executed"; `Training` refuses that.
+
 On-policy (PPO, A2C) the proposal has to stay, and no buffer for it is offered. The loss weights a sample by
 pi_new(a | s) / pi_old(a | s) with the stored log-probability of the a that was sampled. With u in its place the ratio is not
 1 before the first update, and u has no density under pi that could be stored: all proposals beyond a barrier row are
@@ -31,11 +36,9 @@ import numpy as np
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.algorithms import ACTIONS
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.problem import SafetyProblem
-
-ACTIONS = ("executed", "proposed", "both")
-"""What may be stored."""
 
 _ROUNDING = 1e-6
 """How far beyond [-1, 1] rounding may put an action of the box."""
@@ -47,6 +50,7 @@ class FilteredReplayBuffer(ReplayBuffer):
     It takes `info["safe_action"]`, which is physical, to [-1, 1] in double precision. An env that reports none has no filter: its
     proposal is stored, as Stable-Baselines3 does. With "both" each step fills two rows, so that the buffer holds half as many steps;
     also where the two actions are equal, as one row holds a step of all envs: so each step has the same weight for any number of envs.
+    A row of the executed action has the env's own reward, to which `info["intervention_penalty"]`, if there is one, is added back.
 
     Args:
         args: those of `ReplayBuffer`.
@@ -77,7 +81,7 @@ class FilteredReplayBuffer(ReplayBuffer):
             obs: shape (n_envs, features).
             next_obs: shape (n_envs, features), the terminal one where an episode ended.
             action: proposals in [-1, 1], shape (n_envs, m).
-            reward: shape (n_envs,).
+            reward: less the penalty on interventions, if there is one, shape (n_envs,).
             done: whether the episode ended, shape (n_envs,).
             infos: of the step just taken, not of the reset after it.
 
@@ -85,16 +89,15 @@ class FilteredReplayBuffer(ReplayBuffer):
             ConfigurationError: an executed action is not in the box.
         """
         if self.action != "proposed":
-            super().add(obs, next_obs, self._executed(action, infos), reward, done, infos)
+            super().add(obs, next_obs, self._executed(action, infos), _own_reward(reward, infos), done, infos)
         if self.action != "executed":
             super().add(obs, next_obs, action, reward, done, infos)
 
     def _executed(self, proposed: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """The executed actions in [-1, 1], shape (n_envs, m); the proposals of envs without a filter."""
-        physical = _in_one_batch(infos)
-        if physical is not None:
-            return self._normalized(physical)
-        each = [info.get("safe_action") for info in infos]
+        each = _of_each(infos, "safe_action")
+        if isinstance(each, np.ndarray):
+            return self._normalized(each)
         filtered = [i for i, u in enumerate(each) if u is not None]
         if not filtered:
             return proposed
@@ -152,15 +155,23 @@ def replay_options(
     return {"replay_buffer_class": FilteredNStepReplayBuffer, "replay_buffer_kwargs": settings, "gamma": gamma}
 
 
-def _in_one_batch(infos: Sequence[Any]) -> np.ndarray | None:
-    """The executed physical actions, shape (n_envs, m), of infos that are views of one batch, or None if they are not.
+def _own_reward(reward: np.ndarray, infos: Sequence[Any]) -> np.ndarray:
+    """The envs' rewards before a penalty on interventions, shape (n_envs,)."""
+    penalties = _of_each(infos, "intervention_penalty")
+    if isinstance(penalties, list):
+        penalties = np.array([penalty or 0.0 for penalty in penalties])
+    return reward + penalties
+
+
+def _of_each(infos: Sequence[Any], key: str) -> np.ndarray | list[Any]:
+    """An entry of every info: an array over the envs if they are views of one batch that has it; else a list, None where it is missing.
 
     An info may have `batch`, a dict of arrays over the envs, and `index`, its row in them.
     """
     batch = getattr(infos[0], "batch", None)
-    if batch is None or "safe_action" not in batch or any(getattr(info, "batch", None) is not batch for info in infos):
-        return None
-    return batch["safe_action"][[info.index for info in infos]]
+    if batch is None or key not in batch or any(getattr(info, "batch", None) is not batch for info in infos):
+        return [info.get(key) for info in infos]
+    return batch[key][[info.index for info in infos]]
 
 
 def _center_and_half_width(box: Sequence[Sequence[float]], inputs: int) -> tuple[np.ndarray, np.ndarray]:

@@ -17,18 +17,23 @@ from safe_envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem import SafetyProblem
 
+_STATISTICS = ("normalization.pkl", "vecnormalize.pkl", "*/vecnormalize.pkl")
+"""Where a VecNormalize lies beside a .zip: that of `safe-envs train`, one of RL Zoo, and the place where RL Zoo itself puts it."""
+
 
 class SB3Policy(BlockPolicy):
     """The policy in a .zip of PPO, A2C, SAC, TD3 or DDPG, asked for its deterministic action.
 
-    Only the policy is built, not the algorithm around it, so that there is no need to know which one saved it.
+    Only the policy is built, not the algorithm around it, so that there is no need to know which one saved it. The file does not
+    say for which inputs its actions stand: that is left to the problem's box.
 
     Args:
         path: of the file. Loading it runs code that it contains: trust its source.
         problem: which the policy is to act in.
 
     Raises:
-        ConfigurationError: the file is no archive of Stable-Baselines3, or its spaces are not those of the problem.
+        ConfigurationError: the file is no archive of Stable-Baselines3, or its spaces are not those of the problem; or beside it
+            lies the VecNormalize of its training, whose observations are not the problem's.
     """
 
     def __init__(self, path: str | Path, problem: SafetyProblem) -> None:
@@ -42,14 +47,25 @@ class SB3Policy(BlockPolicy):
 
 
 def require_archive(path: Path) -> None:
-    """Raise ConfigurationError unless a file looks like one of Stable-Baselines3; nothing in it is run."""
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            if {"data", "policy.pth"} <= set(archive.namelist()):
-                return
-    raise ConfigurationError(
-        f"{path} is not a policy that Stable-Baselines3 saved; give a .zip of `model.save(...)`, or a folder of `safe-envs train`"
-    )
+    """Raise ConfigurationError unless a file looks like a whole policy of Stable-Baselines3; nothing in it is run."""
+    if not _is_archive(path):
+        raise ConfigurationError(
+            f"{path} is not a policy that Stable-Baselines3 saved; give a .zip of `model.save(...)`, or a folder of `safe-envs train`"
+        )
+    statistics = next((found for name in _STATISTICS for found in sorted(path.parent.glob(name))), None)
+    if statistics is not None:
+        raise ConfigurationError(
+            f"{path} is not the whole policy: it was trained on normalised observations, and how these are normalised stands in "
+            f"{statistics}, not in the .zip. Give the folder of `safe-envs train`, or write the policy with its normalisation by "
+            "agents.weights.save_policy(model, folder, problem, normalization) and give that folder"
+        )
+
+
+def _is_archive(path: Path) -> bool:
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return {"data", "policy.pth"} <= set(archive.namelist())
 
 
 def require_spaces(what: str, network: Any, problem: SafetyProblem) -> None:

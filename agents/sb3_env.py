@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import numbers
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -28,6 +28,7 @@ from wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 from wrappers.conditions import Condition
 
 _TRUNCATED = "TimeLimit.truncated"
+_TAKEN_OFF = "intervention_penalty"
 _OF_ONE_ENV = {"observation_space": "single_observation_space", "action_space": "single_action_space"}
 _TUPLES_OF_ENVS = ("np_random", "np_random_seed")
 _OF_THE_BATCH = ("reset", "step", "step_physical", "close")
@@ -86,7 +87,9 @@ class SafeVecEnv(VecEnv):
 
     The algorithms learn on the action that the policy proposed, and on-policy ones have to: they see a filter only
     through the transition, in which all proposals that it corrects to the same action look alike. So nothing draws
-    the policy away from proposals that need correction, unless a penalty does.
+    the policy away from proposals that need correction, unless a penalty does. What it takes off a reward is in the infos
+    as "intervention_penalty", float64 of shape (num_envs,) in `batch_info`; zeros at reset, and no such key if c is 0.
+    `agents.replay` stores executed actions with the reward before the penalty.
 
     Attributes:
         env: the native vector env, filtered or bare.
@@ -127,7 +130,7 @@ class SafeVecEnv(VecEnv):
         observation, info = self.env.reset(seed=self._seeds)
         self._reset_seeds()
         self._reset_options()
-        self.batch_info = _arrays(info)
+        self.batch_info = self._at_rest(info)
         self.reset_infos = self._infos(self.batch_info)
         return observation
 
@@ -154,14 +157,24 @@ class SafeVecEnv(VecEnv):
         batch[_TRUNCATED] = truncated & ~terminated
         self.batch_info = batch
         if self._penalty:
-            reward = reward - self._penalty * np.linalg.norm((batch["safe_action"] - batch["nominal_action"]) / self._half, axis=1)
+            distance = np.linalg.norm((batch["safe_action"] - batch["nominal_action"]) / self._half, axis=1)
+            batch[_TAKEN_OFF] = self._penalty * distance
+            reward = reward - batch[_TAKEN_OFF]
         infos = self._infos(batch)
         if ended:
-            restarted = _arrays(info)
+            restarted = self._at_rest(info)
             for i in ended:
                 infos[i]["terminal_observation"] = info["final_obs"][i].copy()
                 self.reset_infos[i] = LazyInfo(restarted, i)
         return observation, reward.astype(np.float32), dones, infos
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Where each episode stands; see `SafeVectorEnv.snapshot`."""
+        return self.env.snapshot()  # pyright: ignore[reportAttributeAccessIssue]
+
+    def restore(self, snapshot: Mapping[str, np.ndarray], seed: int) -> None:
+        """Put each episode where a snapshot has it; see `SafeVectorEnv.restore`."""
+        self.env.restore(snapshot, seed)  # pyright: ignore[reportAttributeAccessIssue]
 
     def close(self) -> None:
         """Close the native env."""
@@ -178,8 +191,8 @@ class SafeVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the filter's wrapper or else of the native env, for each env.
 
-        Each env gets its row of an array with the batch in front, like `state`, and its own spaces and generator; of
-        anything else, all get the same object.
+        Each env gets its row of an array with the batch in front, like `state`, or of each array in a tuple or list of
+        them, like `executed`, and its own spaces and generator; of anything else, all get the same object.
 
         Raises:
             AttributeError: neither has it.
@@ -210,6 +223,11 @@ class SafeVecEnv(VecEnv):
             AttributeError: neither has it.
             ConfigurationError: the method moves the envs on, which is for this class to do.
         """
+        # Gymnasium has these two for single envs only.
+        if method_name == "get_wrapper_attr":
+            return self.get_attr(*method_args, indices=indices)
+        if method_name == "has_wrapper_attr":
+            return [self.has_attr(*method_args) for _ in self._get_indices(indices)]
         if method_name in _OF_THE_BATCH:
             raise ConfigurationError(f"env_method does not call {method_name!r}, which acts on all envs at once; call that of the VecEnv")
         return self._for_each(self._find(method_name)(*method_args, **method_kwargs), indices)
@@ -219,6 +237,13 @@ class SafeVecEnv(VecEnv):
         wanted = SafetyFilterVectorWrapper if wrapper_class is SafetyFilterWrapper else wrapper_class
         wrapped = any(isinstance(layer, wanted) for layer in self._layers())
         return [wrapped for _ in self._get_indices(indices)]
+
+    def _at_rest(self, info: Info) -> Info:
+        """What the envs report at reset, where nothing was taken off a reward yet."""
+        batch = _arrays(info)
+        if self._penalty:
+            batch[_TAKEN_OFF] = np.zeros(self.num_envs)
+        return batch
 
     def _infos(self, batch: Info) -> list[dict[str, Any]]:
         return [LazyInfo(batch, i) for i in range(self.num_envs)]
@@ -239,8 +264,16 @@ class SafeVecEnv(VecEnv):
         raise AttributeError(f"neither {self.env} nor what it wraps has an attribute {name!r}")
 
     def _for_each(self, value: Any, indices: VecEnvIndices) -> list[Any]:
-        batched = isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
-        return [value[i].copy() if batched else value for i in self._get_indices(indices)]
+        envs = self._get_indices(indices)
+        if self._batched(value):
+            return [value[i].copy() for i in envs]
+        if isinstance(value, tuple | list) and value and all(map(self._batched, value)):
+            kind = tuple if isinstance(value, tuple) else list
+            return [kind([v[i].copy() if v.ndim > 1 else v.item(i) for v in value]) for i in envs]
+        return [value for _ in envs]
+
+    def _batched(self, value: Any) -> bool:
+        return isinstance(value, np.ndarray) and value.shape[:1] == (self.num_envs,)
 
 
 def _require_penalty(penalty: Any, filtered: bool) -> None:

@@ -16,7 +16,9 @@ class LazyInfo(dict[str, Any]):
 
     Reading a key makes its entry, with the type that the scalar env reports; whatever looks at all keys (iteration,
     `items`, `==`, ...) makes all. A `copy()` stays lazy and keeps `batch` and `index`; a pickle or a deep copy is a
-    plain dict of this env's entries.
+    plain dict of this env's entries. Two are equal if their entries are, and arrays if all their elements are.
+
+    Give `json.dumps` a `dict(info)`: its C code takes an info of which no array was read yet for empty, and writes "{}".
 
     Attributes:
         batch: arrays by key, with the batch in front; the infos of a step share them, so read only.
@@ -62,12 +64,26 @@ class LazyInfo(dict[str, Any]):
     def __reduce__(self) -> tuple[type[dict[str, Any]], tuple[dict[str, Any]]]:
         return dict, (dict(self),)
 
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, dict):
+            return NotImplemented
+        mine, theirs = dict(self), dict(other)
+        return mine.keys() == theirs.keys() and all(_same(value, theirs[key]) for key, value in mine.items())
+
+    def __ne__(self, other: object) -> bool:
+        equal = self == other
+        return not equal
+
     def make_all(self) -> None:
         """Make the entries that were not read yet."""
         for key in self._left:
             self[key] = self[key]
         # What is deleted from now on stays away.
         self._left = {}
+
+
+def _same(a: Any, b: Any) -> bool:
+    return np.array_equal(a, b) if isinstance(a, np.ndarray) or isinstance(b, np.ndarray) else a is b or a == b
 
 
 def _after_making_all(name: str) -> Callable[..., Any]:
@@ -82,6 +98,6 @@ def _after_making_all(name: str) -> Callable[..., Any]:
 
 
 _OF_ALL_KEYS = ("keys", "values", "items", "pop", "popitem", "setdefault", "clear")
-_OF_ALL_KEYS += ("__iter__", "__reversed__", "__len__", "__eq__", "__ne__", "__or__", "__ror__", "__repr__", "__delitem__")
+_OF_ALL_KEYS += ("__iter__", "__reversed__", "__len__", "__or__", "__ror__", "__repr__", "__delitem__")
 for _name in _OF_ALL_KEYS:
     setattr(LazyInfo, _name, _after_making_all(_name))

@@ -44,7 +44,8 @@ class TorchResult(NamedTuple):
         action: executed input, shape (..., m), in the box; only this one has a gradient.
         feasible: whether some action in the box meets every row, shape (...).
         active: rows that bind or cannot be met, shape (..., k).
-        differentiable: whether the gradient is that of the action, shape (...); where not, it is zero.
+        differentiable: whether the gradient is that of the action, shape (...); where not, it is zero. It says so whether or not
+            a gradient was asked for.
     """
 
     action: torch.Tensor
@@ -86,7 +87,7 @@ class TorchFilter(torch.nn.Module):
     def for_problem(
         cls,
         problem: SafetyProblem,
-        conditions: Condition | Sequence[Condition],
+        conditions: Condition | Sequence[Condition] | str,
         knowledge: str = "model",
         priorities: Sequence[float] | None = None,
     ) -> TorchFilter:
@@ -113,7 +114,7 @@ class TorchFilter(torch.nn.Module):
         given = [part.detach().to("cpu", torch.float64).numpy() for part in (x, u)]
         found = self.safety_filter.filter(*given)
         action, differentiable = torch.from_numpy(found.action), torch.ones(found.action.shape[:-1], dtype=torch.bool)
-        if torch.is_grad_enabled() and (x.requires_grad or u.requires_grad):
+        if return_result or (torch.is_grad_enabled() and (x.requires_grad or u.requires_grad)):
             states, inputs = [part.to("cpu", torch.float64).reshape(-1, part.shape[-1]) for part in (x, u)]
             formula, agrees = self._formula(states, inputs, found)
             formula, differentiable = formula.reshape(action.shape), agrees.reshape(differentiable.shape)

@@ -18,12 +18,12 @@ from safetensors.numpy import save as save_tensors
 from agents.blocks import BlockPolicy
 from agents.policy import DESCRIPTION, TENSORS, policy_files
 from agents.sb3 import require_spaces
-from safe_envs.env import action_box, observation_box
+from safe_envs.env import observation_box
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
 
-_FORMAT = 1
+_FORMAT = 2
 _PACKAGES = ("safe-envs", "numpy", "stable-baselines3", "torch", "safetensors")
 
 _ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -94,6 +94,7 @@ class NetworkPolicy(BlockPolicy):
         activation: after every layer but the last, by its name in `policy.json`.
         output: after the last one, "tanh" or "clip".
         normalization: before the first one, if any.
+        boxes: physical boxes of the training and of the env, each (m, 2), where they differ.
 
     Raises:
         ConfigurationError: an activation is unknown, or a number is not finite.
@@ -106,6 +107,7 @@ class NetworkPolicy(BlockPolicy):
         activation: str,
         output: str,
         normalization: Normalization | None = None,
+        boxes: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
         super().__init__(weights[0].shape[1])
         for what, name, allowed in (("activation", activation, _ACTIVATIONS), ("output", output, _OUTPUTS)):
@@ -115,6 +117,7 @@ class NetworkPolicy(BlockPolicy):
         self._layers = [(np.ascontiguousarray(w.T, dtype=float), b.astype(float)) for w, b in zip(weights, biases, strict=True)]
         self._activation, self._output = _ACTIVATIONS[activation], _OUTPUTS[output]
         self._normalization = normalization
+        self._boxes = boxes
 
     def act(self, block: np.ndarray) -> np.ndarray:
         """Evaluate the layers; see `BlockPolicy.act`."""
@@ -124,7 +127,10 @@ class NetworkPolicy(BlockPolicy):
         for weights, bias in self._layers[:-1]:
             x = self._activation(x @ weights + bias)
         weights, bias = self._layers[-1]
-        return self._output(x @ weights + bias).astype(np.float32)
+        actions = self._output(x @ weights + bias)
+        if self._boxes is not None:
+            actions = _in_another_box(actions, *self._boxes)
+        return actions.astype(np.float32)
 
 
 def save_policy(model: Any, folder: str | Path, problem: SafetyProblem, normalization: Any = None) -> None:
@@ -155,6 +161,7 @@ def save_policy(model: Any, folder: str | Path, problem: SafetyProblem, normaliz
         "normalization": None if scaling is None else asdict(scaling),
         "problem": _identity(problem),
         "dt": problem.dt,
+        "box": _box(problem).tolist(),
         "versions": {package: version(package) for package in _PACKAGES},
     }
     arrays = {**_numbered("weight", weights), **_numbered("bias", biases)}
@@ -166,6 +173,9 @@ def save_policy(model: Any, folder: str | Path, problem: SafetyProblem, normaliz
 
 def load_policy(folder: str | Path, problem: SafetyProblem) -> NetworkPolicy:
     """Read what `save_policy` wrote; no code is run.
+
+    An action stands for an input in physical units. In an env with another box than that of the training the policy gives the
+    same inputs, and where that box does not hold one, the nearest one that it holds.
 
     Args:
         folder: or one of the two files in it.
@@ -183,7 +193,7 @@ def load_policy(folder: str | Path, problem: SafetyProblem) -> NetworkPolicy:
         _require_format(files[1], description)
         _require_untouched(files, content, description)
         _require_problem(files[1].parent, description["problem"], problem)
-        return _policy(load_tensors(content), description)
+        return _policy(load_tensors(content), description, problem)
     except _DAMAGED as error:
         if isinstance(error, ConfigurationError):
             raise
@@ -192,9 +202,9 @@ def load_policy(folder: str | Path, problem: SafetyProblem) -> NetworkPolicy:
         ) from error
 
 
-def _policy(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> NetworkPolicy:
-    sizes, problem, scaling = description["layers"], description["problem"], description["normalization"]
-    depth, ends = len(sizes) - 1, problem["observation"]["shape"] + problem["action"]["shape"]
+def _policy(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any], problem: SafetyProblem) -> NetworkPolicy:
+    sizes, scaling = description["layers"], description["normalization"]
+    depth, ends = len(sizes) - 1, [len(problem.features), len(problem.inputs)]
     shapes = {f"weight_{k}": (sizes[k + 1], sizes[k]) for k in range(depth)} | {f"bias_{k}": (sizes[k + 1],) for k in range(depth)}
     fits = [sizes[0], sizes[-1]] == ends and {name: a.shape for name, a in arrays.items()} == shapes
     if not fits or any(a.dtype != np.float32 for a in arrays.values()):
@@ -202,8 +212,12 @@ def _policy(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) ->
     normalization = None if scaling is None else Normalization.from_json(scaling)
     if normalization is not None and {len(normalization.mean), len(normalization.var)} != {sizes[0]}:
         raise ValueError("the normalisation is not that of the observations")
+    trained, given = np.array(description["box"], dtype=float), _box(problem)
+    if trained.shape != given.shape or not np.isfinite(trained).all() or (trained[:, 0] >= trained[:, 1]).any():
+        raise ValueError("the box is not one of the inputs")
+    boxes = None if np.array_equal(trained, given) else (trained, given)
     weights, biases = ([arrays[f"{name}_{k}"] for k in range(depth)] for name in ("weight", "bias"))
-    return NetworkPolicy(weights, biases, description["activation"], description["output"], normalization)
+    return NetworkPolicy(weights, biases, description["activation"], description["output"], normalization, boxes)
 
 
 def _numbered(name: str, arrays: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
@@ -215,15 +229,26 @@ def _require_finite(arrays: Sequence[np.ndarray]) -> None:
         raise ConfigurationError("the weights of the policy are not all finite: its training diverged; train with a smaller learning rate")
 
 
+def _box(problem: SafetyProblem) -> np.ndarray:
+    """The physical box of a problem's inputs, (m, 2)."""
+    return np.array(problem.box, dtype=float)
+
+
+def _in_another_box(actions: np.ndarray, trained: np.ndarray, given: np.ndarray) -> np.ndarray:
+    """Actions (B, m) that stand for the same inputs in the given box as others in the trained one, or for the nearest ones."""
+    (center, half), (new_center, new_half) = ((box.mean(axis=1), 0.5 * np.ptp(box, axis=1)) for box in (trained, given))
+    return np.clip((center + half * actions - new_center) / new_half, -1.0, 1.0)
+
+
 def _identity(problem: SafetyProblem) -> dict[str, Any]:
-    """What must be the same where a policy is used: dt and parameters may differ, to see what comes of that."""
-    spaces = {"observation": observation_box(problem), "action": action_box(problem)}
+    """What must be the same where a policy is used: dt and parameters may differ, to see what comes of that, and the box."""
+    box = observation_box(problem)
     return {
         "system": problem.name,
         "states": [s.symbol.name for s in problem.states],
         "features": [f.name for f in problem.features],
         "inputs": [i.symbol.name for i in problem.inputs],
-        **{name: {"shape": list(box.shape), "low": box.low.tolist(), "high": box.high.tolist()} for name, box in spaces.items()},
+        "observation": {"shape": list(box.shape), "low": box.low.tolist(), "high": box.high.tolist()},
     }
 
 
@@ -259,6 +284,11 @@ def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
+        if (path.parent / "config.json").exists():
+            raise ConfigurationError(
+                f"the training in {path.parent} is not finished: go on with it by `safe-envs train ... --resume`, or give the best policy "
+                f"so far, {path.parent / 'best'}, which is there after the first evaluation"
+            ) from error
         raise ConfigurationError(
             f"{path} cannot be read: {error.strerror}; give a folder with {TENSORS} and {DESCRIPTION}, as `safe-envs train` writes it"
         ) from error

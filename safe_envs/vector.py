@@ -20,6 +20,8 @@ from safe_envs.simulation import NoiseStreams, Simulation, center_and_half_width
 
 _LOWEST, _HIGHEST = constants((-1.0, 1.0))
 
+_OF_EPISODES = ("steps", "h_min", "episode_cost", "ended")
+
 VectorStep = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]
 
 
@@ -147,6 +149,28 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._restart(np.flatnonzero(mask))
         observation, _, _, _, info = self._observe(tuple(self._center), counted=mask)
         return observation, with_masks(info, mask)
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Where each episode stands: arrays with the batch in front, from which `restore` goes on."""
+        return {"state": self.state, **{name: getattr(self, f"_{name}").copy() for name in _OF_EPISODES}}
+
+    def restore(self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None) -> None:
+        """Put each episode where a snapshot has it.
+
+        Args:
+            snapshot: of an env of the same problem and size.
+            seed: of the noise and of the starts from then on; see `reset`. The generators are no part of a snapshot.
+
+        Raises:
+            InvalidInputError: the snapshot is of an env of another size or problem.
+        """
+        shape = np.shape(snapshot["state"])
+        if shape != (self.num_envs, self.problem.plant.n):
+            raise InvalidInputError(f"the snapshot has states of shape {shape}; these envs have {(self.num_envs, self.problem.plant.n)}")
+        self._seed(self._one_seed_each(seed))
+        self._x = tuple(np.array(snapshot["state"], dtype=float).T.copy())
+        for name in _OF_EPISODES:
+            setattr(self, f"_{name}", np.array(snapshot[name]))
 
     def step(self, actions: Any) -> VectorStep:
         """Hold an action in each env for one control period.

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 from agents.evaluation import evaluate
-from agents.training import Training, train
+from agents.trainer import train
+from agents.training import Training
 from safe_envs.errors import ConfigurationError
 from scripts.console import progress_bar, stdout
 from scripts.figure import draw
@@ -22,7 +22,7 @@ def demo(folder: Path, episodes: int = 1000, steps: int = _STEPS) -> None:
     """Train PPO without a filter, and print and draw the safety of the nominal controller and of PPO.
 
     Args:
-        folder: where the policy and the pictures go; it is made if need be. A policy that is there already is not trained again.
+        folder: where the policy and the pictures go; it is made if need be. A training that is in it is gone on with.
         episodes: for each policy and filter.
         steps: control periods of the training.
 
@@ -35,7 +35,7 @@ def demo(folder: Path, episodes: int = 1000, steps: int = _STEPS) -> None:
         raise ConfigurationError(f"--folder {folder} cannot be made: {error.strerror}; give another one") from error
     console = stdout()
     policy = folder / "ppo"
-    train_once(policy, steps)
+    _train(policy, steps)
     for actor in ("nominal", str(policy)):
         with progress_bar("Evaluating") as tell:
             answer = evaluate(ENV_ID, actor, FILTERS, episodes=episodes, progress=tell, record=True)
@@ -45,14 +45,10 @@ def demo(folder: Path, episodes: int = 1000, steps: int = _STEPS) -> None:
         console.print(f"Picture: {picture}\n", highlight=False, markup=False)
 
 
-def train_once(policy: Path, steps: int) -> None:
-    """Train the policy, or finish its training, unless that was done before."""
-    console, training = stdout(), Training(ENV_ID, "ppo", n_timesteps=steps, eval_freq=steps)
-    if (policy / "policy.json").exists():
-        console.print(f"The policy in {policy} is not trained again.\n", highlight=False, markup=False)
-        return
+def _train(policy: Path, steps: int) -> None:
+    """Train the policy, or finish its training."""
+    console = stdout()
     console.print(f"Training PPO on {ENV_ID}, {steps} steps without any filter ...", highlight=False)
-    begun = time.perf_counter()
     with progress_bar("Training PPO") as tell:
-        train(training, policy, resume=(policy / "config.json").exists(), tell=tell)
-    console.print(f"Trained in {time.perf_counter() - begun:.0f} s and saved in {policy}\n", highlight=False, markup=False)
+        seconds = train(Training.of(ENV_ID, "ppo", n_timesteps=steps, eval_freq=steps), policy, resume=policy.exists(), tell=tell)
+    console.print(f"Trained in {seconds:.0f} s and saved in {policy}\n", highlight=False, markup=False)

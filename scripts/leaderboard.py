@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +18,7 @@ from scripts.console import progress_bar, run, stdout
 
 _RESULTS = "results.json"
 _QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 50}
-_QUICK_EPISODES = 100
+_QUICK_EPISODES, _EPISODES = 100, 1000
 _KNOWLEDGE = "plant"
 """Of the filters: with a wrong model they are to be learned first, which is another comparison."""
 
@@ -32,7 +31,7 @@ def leaderboard(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where agents and results go. What is in it already is not done again.")] = Path(
         "leaderboard"
     ),
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each evaluation.")] = 1000,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each evaluation; by default 1000, or 100 with --quick.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
     quick: Annotated[bool, typer.Option("--quick", help="Train for moments only: to see that it works, not how good agents get.")] = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown.")] = False,
@@ -40,14 +39,24 @@ def leaderboard(
     """Train an agent on each env, without a filter and with the env's own in the loop, and compare it with the nominal controller.
 
     Each policy is evaluated bare and behind the filter, which knows the plant; the agent that was trained behind it only there.
-    The table has the safety rates with their 95 % intervals, the returns, and how long the training took.
+    The table has the safety rates with their 95 % intervals, the returns, and how long the training took. The intervals are of the
+    episodes: there is one training of each kind, and another seed gives another agent.
     """
     from agents.problems import full_id
 
-    ids = [full_id(env_id) for env_id in (env_ids or ENV_IDS)]
-    out.mkdir(parents=True, exist_ok=True)
+    ids = list(dict.fromkeys(full_id(env_id) for env_id in (env_ids or ENV_IDS)))
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"--out {out} cannot be made: {error.strerror}; give another folder") from error
     settings: dict[str, Any] = _QUICK if quick else {}
-    known = {"algo": algo, "seed": seed, "quick": quick, "episodes": _QUICK_EPISODES if quick else episodes}
+    known = {
+        "algo": algo,
+        "seed": seed,
+        "quick": quick,
+        "episodes": episodes or (_QUICK_EPISODES if quick else _EPISODES),
+        "knowledge": _KNOWLEDGE,
+    }
     rows = _read(out / _RESULTS, known)
     with progress_bar("Leaderboard") as bar:
         tell = bar or (lambda _: None)
@@ -66,7 +75,8 @@ def leaderboard(
 def _of_env(env_id: str, known: dict[str, Any], settings: dict[str, Any], out: Path, tell: Any) -> list[Row]:
     """The rows of one env: the nominal controller, an agent trained bare, and one trained behind the filter."""
     from agents.problems import load_problem
-    from agents.training import Training, train
+    from agents.trainer import train
+    from agents.training import Training
 
     natural = load_problem(env_id).filter
     rows = _evaluated(env_id, "nominal", "nominal", ["none", natural], known, None)
@@ -74,10 +84,9 @@ def _of_env(env_id: str, known: dict[str, Any], settings: dict[str, Any], out: P
         ((known["algo"], None, ["none", natural]), (f"{known['algo']}, filter in the loop", natural, [natural]))
     ):
         folder = out / f"{env_id.split('/')[-1]}-{known['algo']}-{'bare' if in_loop is None else 'filtered'}"
-        began = time.perf_counter()
-        training = Training(env_id, known["algo"], filter=in_loop, knowledge=_KNOWLEDGE, seed=known["seed"], **settings)
-        train(training, folder, resume=(folder / "config.json").exists(), tell=lambda part, i=i: tell((i + part) / 2))
-        rows += _evaluated(env_id, name, str(folder), filters, known, time.perf_counter() - began)
+        training = Training.of(env_id, known["algo"], filter=in_loop, knowledge=_KNOWLEDGE, seed=known["seed"], **settings)
+        seconds = train(training, folder, resume=(folder / "config.json").exists(), tell=lambda part, i=i: tell((i + part) / 2))
+        rows += _evaluated(env_id, name, str(folder), filters, known, seconds)
     return rows
 
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import shlex
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich import box
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.files import require_writable
 from scripts import options
 from scripts.console import progress_bar, run, stdout
 
@@ -20,11 +22,15 @@ def train(
     env_id: options.EnvId,
     algo: Annotated[str, typer.Option(metavar="NAME", help="ppo, a2c, sac or td3.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="New folder for the policy, its evaluations and the checkpoint.")],
-    filter_: Annotated[
-        str | None, typer.Option("--filter", metavar="NAME", help="Filter in the loop, as for evaluate; none by default.")
+    filters: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--filter", metavar="NAME", help="Filter in the loop; none by default. A learned one with its file: ddscbf:file=FILE."
+        ),
     ] = None,
     n_timesteps: Annotated[
-        int | None, typer.Option(help="Control periods over all copies; by default that of the hyperparameters.")
+        int | None,
+        typer.Option(help="Control periods over all copies, rounded up to whole rollouts; by default that of the hyperparameters."),
     ] = None,
     num_envs: Annotated[int | None, typer.Option(help="Copies of the env; by default that of the hyperparameters.")] = None,
     seed: options.Seed = 0,
@@ -46,7 +52,7 @@ def train(
     dt: options.Dt = None,
     substeps: options.Substeps = None,
     horizon: options.Horizon = None,
-    box_: options.Box = None,
+    box: options.Box = None,
     start: options.StartAt = None,
     eval_freq: Annotated[
         int | None, typer.Option(help="Steps between evaluations and checkpoints; by default a tenth of the training.")
@@ -54,7 +60,9 @@ def train(
     eval_episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 200,
     threads: Annotated[int, typer.Option(help="Threads of torch.")] = 1,
     tensorboard: Annotated[Path | None, typer.Option(metavar="DIR", help="Write logs for tensorboard.")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the training in --out after its last checkpoint.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the unfinished training in --out after its last checkpoint.")
+    ] = False,
 ) -> None:
     """Train an agent, evaluate it on the way, and keep the last and the best policy.
 
@@ -62,16 +70,18 @@ def train(
     asked for, to tensorboard: the safety rate of the last episodes, their cost and smallest h, and violations, interventions and
     infeasible steps in the training so far. The folder is what `safe-envs evaluate --policy DIR` reads.
     """
+    from agents.trainer import train as train_agent
     from agents.training import Training
-    from agents.training import train as train_agent
 
+    if len(filters or []) > 1:
+        raise ConfigurationError(f"--filter was given {len(filters or [])} times; a training has one filter in the loop")
     arguments = options.of_env(
-        noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box_, start=start
+        noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
     )
-    training = Training(
-        env_id=env_id,
-        algorithm=algo,
-        filter=filter_,
+    training = Training.of(
+        env_id,
+        algo,
+        filter=filters[0] if filters else None,
         options=arguments,
         knowledge=knowledge,
         n_timesteps=n_timesteps,
@@ -84,10 +94,15 @@ def train(
         eval_episodes=eval_episodes,
         threads=threads,
     )
-    require_writable(out.absolute().parent / f".{out.name}")
     with progress_bar("Training") as tell:
-        train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)
-    _report(training.env_id, out, training.filter or "none")
+        try:
+            train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)
+        except KeyboardInterrupt:
+            print(f"Stopped. The same command with --resume goes on after the last checkpoint in {out}.", file=sys.stderr)
+            raise
+    given = {"noise": noise, "plant": plant, "model": model, "barrier": barrier, "knowledge": knowledge if knowledge != "model" else None}
+    given |= {"dt": dt, "substeps": substeps, "horizon": horizon, "box": box, "start": start}
+    _report(training.env_id, out, training.filter or "none", given)
 
 
 def _settings(texts: list[str]) -> dict[str, Any]:
@@ -100,16 +115,24 @@ def _settings(texts: list[str]) -> dict[str, Any]:
         if not equals or not name:
             raise ConfigurationError(f"--set {text}: give NAME=VALUE, such as learning_rate=0.001")
         try:
-            found[name] = yaml.safe_load(value)
+            found[name] = _number(yaml.safe_load(value))
         except yaml.YAMLError as error:
             raise ConfigurationError(f"--set {text}: {value!r} is no YAML") from error
     return found
 
 
-def _report(env_id: str, out: Path, filter_name: str) -> None:
+def _number(value: Any) -> Any:
+    """What YAML takes for a text although it is a number, such as 3e-4."""
+    try:
+        return float(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
+def _report(env_id: str, out: Path, filter_name: str, given: Mapping[str, Any]) -> None:
     """Print how safe and how good the agent was in each evaluation."""
     console = stdout()
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for title in ("steps", "safe [95 % interval]", "return", "violations in training"):
         table.add_column(title, justify="right")
     for row in json.loads((out / "evaluations.json").read_text()):
@@ -117,7 +140,10 @@ def _report(env_id: str, out: Path, filter_name: str) -> None:
         table.add_row(f"{row['timesteps']:,}", rate, f"{row['return_mean']:.4g}", f"{row['training']['violations']:.0f}")
     console.print(f"Evaluations with the filter {filter_name}:", highlight=False, markup=False)
     console.print(table)
-    console.print(f"\nTo evaluate the policy: safe-envs evaluate {env_id} --policy {out}", highlight=False, markup=False)
+    command = ["safe-envs", "evaluate", env_id, "--policy", str(out), "--filter", filter_name]
+    for name, values in given.items():
+        command += [f"--{name}={value}" for value in (values if isinstance(values, list) else [values]) if value is not None]
+    console.print(f"\nTo evaluate the policy: {shlex.join(command)}", highlight=False, markup=False)
 
 
 if __name__ == "__main__":

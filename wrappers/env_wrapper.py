@@ -13,7 +13,7 @@ from safe_envs.env import SafeEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info, filter_info
 from safe_envs.problem import SafetyProblem
-from wrappers.conditions import Condition, parse_conditions, spec_of
+from wrappers.conditions import Condition, spec_of
 from wrappers.safety_filter import SafetyFilter
 
 
@@ -117,12 +117,8 @@ def build_filter(
     priorities: Sequence[float] | None,
 ) -> tuple[str, SafetyFilter]:
     """Return the filter of one or several conditions for a problem, and the text that names them."""
-    if isinstance(condition, str):
-        condition = parse_conditions(condition, problem)
-    each = (condition,) * len(problem.barriers) if isinstance(condition, Condition) else condition
-    if not isinstance(each, Sequence) or not all(isinstance(c, Condition) for c in each):
-        raise ConfigurationError(f"condition = {condition!r}; give a Condition, one for each barrier, or their text, like 'scbf'")
-    return spec_of(each), SafetyFilter.for_problem(problem, each, knowledge, objective, priorities)
+    safety_filter = SafetyFilter.for_problem(problem, condition, knowledge, objective, priorities)
+    return spec_of([condition for _, condition in safety_filter.rows]), safety_filter
 
 
 def resting_action(problem: SafetyProblem) -> np.ndarray:

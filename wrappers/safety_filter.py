@@ -15,7 +15,7 @@ from safe_envs.codegen import Components, Flavour, compile_function, stacked
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, SystemDefinitionError, nearest
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
-from wrappers.conditions import AffineConstraint, Condition
+from wrappers.conditions import AffineConstraint, Condition, parse_conditions
 from wrappers.program import Decision, Program, Solver, UndefinedRowError
 
 
@@ -106,7 +106,7 @@ class SafetyFilter:
     def for_problem(
         cls,
         problem: SafetyProblem,
-        conditions: Condition | Sequence[Condition],
+        conditions: Condition | Sequence[Condition] | str,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
@@ -115,7 +115,7 @@ class SafetyFilter:
 
         Args:
             problem: whose model, barriers and box are taken.
-            conditions: one for every barrier, or one for all.
+            conditions: one for every barrier, one for all, or their text; see `SafetyFilterWrapper`.
             knowledge: "model" for what the designer believes, "plant" for the true system. Conditions that correct the model start
                 from it in any case.
             objective: "nearest" to the proposed action, or "clf" for the joint program with the problem's goal.
@@ -130,8 +130,10 @@ class SafetyFilter:
                 raise ConfigurationError(f"{name} = {given!r}; {nearest(str(given), allowed)}")
         if objective == "clf" and problem.clf is None:
             raise ConfigurationError(f"objective = 'clf', but {problem.name} has no control Lyapunov function; use 'nearest'")
-        count = len(problem.barriers)
-        each = (conditions,) * count if isinstance(conditions, Condition) else tuple(conditions)
+        count, given = len(problem.barriers), parse_conditions(conditions, problem) if isinstance(conditions, str) else conditions
+        each = (given,) * count if isinstance(given, Condition) else given
+        if not isinstance(each, Sequence) or not all(isinstance(condition, Condition) for condition in each):
+            raise ConfigurationError(f"condition = {conditions!r}; give a Condition, one for each barrier, or their text, like 'scbf'")
         if len(each) != count:
             raise ConfigurationError(f"{len(each)} conditions for the {count} barriers of {problem.name}; give one for each")
         for condition in each:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -55,6 +55,17 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         self._forget(present)
         at_rest = {key: np.full((self.num_envs, *np.shape(value)), value) for key, value in self._rest.items()}
         return observation, {**info, **with_masks(at_rest, present)}
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """That of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
+        counts = {"interventions": self._interventions.copy(), "infeasible": self._infeasible.copy()}
+        return {**self._inner.snapshot(), **counts}
+
+    def restore(self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None) -> None:
+        """Put each episode where a snapshot of a filtered env has it; see `SafeVectorEnv.restore`."""
+        self._inner.restore(snapshot, seed)
+        self._interventions, self._infeasible = (np.array(snapshot[name]) for name in ("interventions", "infeasible"))
+        self._ended = np.array(snapshot["ended"])
 
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""

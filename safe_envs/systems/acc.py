@@ -11,7 +11,7 @@ from safe_envs.clf import CLF
 from safe_envs.env import SystemEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.exploration import Exploration
-from safe_envs.problem import SafetyProblem, Start, Variable
+from safe_envs.problem import Feature, SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
 from safe_envs.systems._common import positive
 from safe_envs.vector import SystemVectorEnv
@@ -25,7 +25,7 @@ _CAR = {f_0: 0.1, f_1: 5.0, f_2: 0.25, M: 1650.0}
 _MOST_FORCE = 0.3 * 1650.0 * 9.81
 _DESIRED_SPEED = 22
 _LEAD_SPEED = 20.0
-_LONG_GAP = 50
+_CLOSENESS = sp.exp(-z / 50)
 
 
 def own_acceleration(speed: sp.Symbol) -> sp.Expr:
@@ -37,8 +37,8 @@ def own_acceleration(speed: sp.Symbol) -> sp.Expr:
 
 
 def near_desired_speed(speed: sp.Symbol) -> sp.Expr:
-    """exp(-((v - 22)/4)^2): 1 at the desired speed."""
-    return sp.exp(-(((speed - _DESIRED_SPEED) / 4) ** 2))
+    """1/(1 + ((v - 22)/4)^2): 1 at the desired speed, with a slope that is felt from far away."""
+    return 1 / (1 + ((speed - _DESIRED_SPEED) / 4) ** 2)
 
 
 def headway_system() -> ControlAffineSDE:
@@ -137,9 +137,10 @@ def acc_gap(*, distance: float = 10.0, power: int = 5, rate: float = 1.0, slack_
         speed=v,
         rate=rate,
         slack_weight=slack_weight,
-        reward=near_desired_speed(v) * sp.exp(-z / _LONG_GAP),
+        reward=near_desired_speed(v) * _CLOSENESS,
         barriers=(Barrier((z - positive("distance", distance)) ** power),),
         states=(Variable(v, 0.0, 50.0, "m/s"), Variable(z, 0.0, 500.0, "m")),
+        features=(Feature("v", v, 0.0, 50.0), Feature("z", z, 0.0, 500.0), Feature("closeness", _CLOSENESS, 0.0, 1.0)),
         starts={"thesis": Start.at((10.0, 15.0))},
         dt=0.01,
         horizon=30.0,
@@ -187,7 +188,7 @@ class ACC(SystemEnv):
     None.
 
     ## Reward
-    exp(-((x_1 - 22)/4)^2) a step, in (0, 1].
+    1/(1 + ((x_1 - 22)/4)^2) a step, in (0, 1].
 
     ## Nominal controller
     Min-norm CLF law of V = (x_1 - 22)^2: AV + 5 V <= d, at the cost 2 u^2/M^2 + .02 d^2. With the weights and the
@@ -236,7 +237,7 @@ class ACCGap(SystemEnv):
     | `u` | force at the wheels | N | [-.3 M g, .3 M g] = [-4855.95, 4855.95] |
 
     ## Observation
-    The states.
+    The states, and the closeness exp(-z/50), which tells small gaps apart when long ones are about.
 
     ## Barrier
     h = (z - D)^5 with D = 10 m, of relative degree 2 and unbounded above. Its derivatives vanish at the edge, and with them
@@ -249,7 +250,7 @@ class ACCGap(SystemEnv):
     None.
 
     ## Reward
-    exp(-((v - 22)/4)^2) exp(-z/50) a step, in (0, 1]: others cut into a long gap. Without the second factor nothing would pull an
+    exp(-z/50)/(1 + ((v - 22)/4)^2) a step, in (0, 1]: others cut into a long gap. Without the second factor nothing would pull an
     agent towards the edge, since in the long run it drives as fast as the lead at any gap.
 
     ## Nominal controller

@@ -161,11 +161,35 @@ def test_attributes_are_set_for_all_envs():
 def test_methods_are_called_once_for_the_batch():
     env = make_sb3_env(DUBINS, 2, "scbf", seed=0)
     env.reset()
+    assert env.env_method("get_wrapper_attr", "problem", indices=[0]) == [env.get_attr("problem")[0]]
+    assert [env.env_method("has_wrapper_attr", name) for name in ("problem", "nothing")] == [[True, True], [False, False]]
     rows = env.env_method("normalized_action", [np.array([5.0, -10.0])])
     np.testing.assert_array_equal(rows, [[0.5], [-1.0]])
     np.testing.assert_array_equal(env.env_method("normalized_action", [np.array([5.0, -10.0])], indices=1), [[-1.0]])
     with pytest.raises(ConfigurationError, match="'reset', which acts on all envs"):
         env.env_method("reset", indices=[0])
+
+
+def test_components_are_handed_out_by_env():
+    env_id = "safe_envs/QuadrotorLimits-v0"
+    ours, theirs = pair(env_id, "hocbf", noise=0.05)
+    (action,) = drawn_actions(ours, 1)
+    for env in (ours, theirs):
+        env.reset()
+        env.step(action)
+    for name in ("executed", "components"):
+        values = ours.get_attr(name)
+        np.testing.assert_allclose(values, [getattr(env.unwrapped, name) for env in theirs.envs], rtol=1e-6)
+        assert all(type(u) is float for value in values for u in value)
+        assert ours.get_attr(name, [2]) == [values[2]]
+    wanted = [env.unwrapped.physical_action(a) for env, a in zip(theirs.envs, action, strict=True)]
+    np.testing.assert_allclose(ours.env_method("physical_action", action), wanted, rtol=1e-6)
+    ours.set_attr("of_matrices", [np.arange(6.0).reshape(NUM_ENVS, 2)])
+    ((row,),) = ours.get_attr("of_matrices", 1)
+    np.testing.assert_array_equal(row, [2.0, 3.0])
+    for shared in ((), [], (np.zeros(NUM_ENVS), 1.0), (np.zeros(NUM_ENVS + 1),)):
+        ours.set_attr("shared", shared)
+        assert all(value is shared for value in ours.get_attr("shared"))
 
 
 def test_wrappers_are_found():
@@ -211,13 +235,32 @@ def test_penalty_is_the_distance_in_units_of_the_box():
     half = np.diff(np.array(envs[0].get_attr("problem")[0].box))[:, 0] / 2.0
     reduced = 0
     for action in drawn_actions(envs[0], 24):
-        (_, plain, dones, infos), (_, rewards, _, _) = (env.step(action) for env in envs)
+        (_, plain, dones, infos), (_, rewards, _, penalised) = (env.step(action) for env in envs)
         distances = np.array([np.linalg.norm((info["safe_action"] - info["nominal_action"]) / half) for info in infos])
         np.testing.assert_allclose(rewards, plain - c * distances, rtol=1e-5, atol=1e-6)
         assert rewards.dtype == np.float32
         reduced += (distances[dones] > 0.0).sum()
         assert all((d > 0.0) == info["intervention"] for d, info in zip(distances, infos, strict=True))
+        np.testing.assert_allclose([info["intervention_penalty"] for info in penalised], c * distances, rtol=1e-12)
     assert reduced, "an episode should end with an intervention"
+
+
+def test_penalty_is_in_all_infos_if_there_is_one():
+    free, penalised = (make_sb3_env(DUBINS, 2, "scbf", seed=3, intervention_penalty=c, max_episode_steps=3) for c in (0.0, 0.5))
+    for env in (free, penalised):
+        env.reset()
+        assert all(("intervention_penalty" in info) == (env is penalised) for info in env.reset_infos)
+    for action in drawn_actions(penalised, 3):
+        infos = penalised.step(action)[3]
+        assert all("intervention_penalty" not in info for info in free.step(action)[3])
+        values = penalised.batch_info["intervention_penalty"]
+        assert (values.dtype, values.shape) == (np.float64, (2,))
+        for info, at_rest in zip(infos, penalised.reset_infos, strict=True):
+            assert type(info["intervention_penalty"]) is float
+            assert set(info) - set(at_rest) <= {"TimeLimit.truncated", "terminal_observation"}
+            assert set(at_rest) <= set(info)
+            assert at_rest["intervention_penalty"] == 0.0
+    assert "terminal_observation" in infos[0]
 
 
 @pytest.mark.parametrize("given", [None, "none", "scbf", SCBF(), [SCBF()]], ids=str)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import pickle
 
 import numpy as np
@@ -70,17 +71,44 @@ def test_every_way_to_read_an_info_gives_all_of_it(reading):
         np.testing.assert_allclose(read[key], value, rtol=1e-7, err_msg=key)
 
 
+def test_infos_are_equal_if_their_entries_are():
+    # An array of several barriers has no truth value of its own.
+    envs = [make_sb3_env("safe_envs/QuadrotorLimits-v0", 2, "hocbf", seed=0) for _ in range(2)]
+    for env in envs:
+        env.reset()
+    info, twin = (env.step(np.ones((2, 4), dtype=np.float32))[3][1] for env in envs)
+    changed = [info.copy() for _ in range(4)]
+    changed[0]["cost"] = 7.0
+    changed[1]["barrier"][1] += 1.0
+    changed[2]["another"] = 1
+    del changed[3]["cost"]
+    # A copy of a lazy one is lazy, so that no comparison can rely on an earlier one.
+    for other, same in ((twin, True), (info, True), (dict(twin.copy()), True), *((other, False) for other in changed)):
+        for a, b in ((info.copy(), other), (other, info.copy()), (info.copy(), other.copy()), (other.copy(), info.copy())):
+            assert ((a == b), (a != b)) == (same, not same)
+    assert info.copy() != 3
+
+
+def test_a_dict_of_an_info_is_written_as_json():
+    env = make_sb3_env(DUBINS, 2, seed=0)
+    env.reset()
+    info = env.reset_infos[1]
+    assert set(json.loads(json.dumps(dict(info), default=list))) == set(env.batch_info)
+
+
 def test_infos_can_be_changed_without_changing_the_batch():
     env = make_sb3_env(DUBINS, 2, seed=0)
     env.reset()
     info, other = env.reset_infos
+    unchanged = info.copy()
     info["cost"] = 7.0
     info["barrier"][:] = 7.0
     del info["h_min"]
     assert info.get("cost") == info["cost"] == 7.0
     assert "h_min" not in info
     assert info.get("h_min") is None
-    assert info != other
+    assert info != unchanged
+    assert unchanged == {key: values[0] for key, values in env.batch_info.items()}
     assert (len(info), len(other)) == (4, 5)
     assert other["cost"] == 0.0
     assert env.batch_info["barrier"][0] != 7.0

@@ -157,6 +157,21 @@ def test_contradicting_rows_on_many_inputs_have_a_finite_slope_or_a_flag():
     assert 0 < torch.count_nonzero(result.differentiable) < 400
 
 
+def test_the_flag_of_gradients_does_not_hang_on_whether_one_was_asked_for():
+    module = TorchFilter(planar(4, 2, contradicting=True, seed=3))
+    rng = np.random.default_rng(0)
+    x, u = (torch.tensor(rng.normal(size=(400, size))) for size in (2, 4))
+    wanted = module(x, u.clone().requires_grad_(), return_result=True)
+    plain = module(x, u, return_result=True)
+    with torch.no_grad():
+        unasked = module(x, u.clone().requires_grad_(), return_result=True)
+    assert not wanted.differentiable.all()
+    for found in (plain, unasked):
+        assert torch.equal(found.differentiable, wanted.differentiable)
+        assert torch.equal(found.action, wanted.action)
+        assert not found.action.requires_grad
+
+
 def test_second_derivatives():
     module = TorchFilter(planar(2, 3, seed=2))
     rng = np.random.default_rng(0)
@@ -169,7 +184,7 @@ def test_second_derivatives():
 
 def test_floats_of_less_precision_are_computed_in_double():
     problem = load_problem("safe_envs/StochasticDubins-v0")
-    module = TorchFilter.for_problem(problem, parse_conditions("scbf", problem))
+    module = TorchFilter.for_problem(problem, "scbf")
     x = torch.tensor([0.5, 2.5, 1.2])
     u = torch.tensor([-1.0], requires_grad=True)
     action = module(x, u)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,13 @@ import yaml
 
 import safe_envs
 from agents import evaluate
-from agents.figures import ProgressLog, read_progress
-from agents.hyperparameters import ALGORITHMS, hyperparameters, scheduled
-from agents.training import Training, train
+from agents.algorithms import whole_batches
+from agents.figures import ProgressLog, SafetyFigures, read_progress
+from agents.hyperparameters import ALGORITHMS, scheduled
+from agents.problems import load_problem
+from agents.sb3_env import make_sb3_env
+from agents.trainer import _Session, train
+from agents.training import Training
 from safe_envs import ConfigurationError
 
 DUBINS = "safe_envs/StochasticDubins-v0"
@@ -21,9 +26,10 @@ SMALL = {"num_envs": 4, "eval_episodes": 8, "options": {"horizon": 0.5}}
 
 
 def training(algorithm="ppo", steps=768, every=256, **changes):
-    settings = {"learning_starts": 100, "buffer_size": 2000} if algorithm in ("sac", "td3") else {}
-    given = {"filter": "scbf", "n_timesteps": steps, "eval_freq": every, "settings": settings, **SMALL, **changes}
-    return Training(DUBINS, algorithm, **given)
+    settings = {"learning_starts": 100} if algorithm in ("sac", "td3") else {}
+    given = {"filter": "scbf", "n_timesteps": steps, "eval_freq": every, **SMALL, **changes}
+    given["settings"] = settings | given.get("settings", {})
+    return Training.of(DUBINS, algorithm, **given)
 
 
 def logged(folder):
@@ -64,9 +70,10 @@ def test_the_folder_holds_all_that_is_needed(finished):
 
 def test_its_figures_are_those_of_the_evaluation(finished):
     _, folder = finished
+    assert len({row["seed"] for row in evaluations(folder)}) == 1
     last, best = evaluations(folder)[-1], max(evaluations(folder), key=lambda row: row["return_mean"])
     for path, row in ((folder, last), (folder / "best", best)):
-        (found,) = evaluate(DUBINS, str(path), ["scbf"], episodes=8, bounds=False, options=SMALL["options"]).rows
+        (found,) = evaluate(DUBINS, str(path), ["scbf"], episodes=8, seed=row["seed"], bounds=False, options=SMALL["options"]).rows
         assert {key: found[key] for key in ("safe", "return_mean", "violations")} == {
             key: row[key] for key in ("safe", "return_mean", "violations")
         }
@@ -100,6 +107,9 @@ def test_a_training_that_was_interrupted_goes_on_as_if_it_had_not_been(finished,
     with pytest.raises(KeyboardInterrupt):
         train(training(algorithm), interrupted, tell=stop)
     assert evaluations(interrupted)[-1]["timesteps"] < 768
+    with pytest.raises(ConfigurationError, match="not finished"):
+        evaluate(DUBINS, str(interrupted), ["none"], episodes=1)
+    evaluate(DUBINS, str(interrupted / "best"), ["none"], episodes=1)
     train(training(algorithm), interrupted, resume=True)
     assert logged(interrupted) == logged(folder)
     assert evaluations(interrupted) == evaluations(folder)
@@ -120,8 +130,11 @@ def test_a_checkpoint_without_its_evaluation_gets_it(finished, tmp_path):
 def test_normalised_observations_are_part_of_the_policy(tmp_path):
     train(training(steps=512, settings={"normalize": True}), tmp_path / "run")
     rows = evaluations(tmp_path / "run")
-    (found,) = evaluate(DUBINS, str(tmp_path / "run"), ["scbf"], episodes=8, bounds=False, options=SMALL["options"]).rows
+    given = {"episodes": 8, "seed": rows[-1]["seed"], "bounds": False, "options": SMALL["options"]}
+    (found,) = evaluate(DUBINS, str(tmp_path / "run"), ["scbf"], **given).rows
     assert found["return_mean"] == rows[-1]["return_mean"]
+    assert (tmp_path / "run" / "normalization.pkl").exists()
+    assert (tmp_path / "run" / "best" / "normalization.pkl").exists()
     assert "normalization" in (tmp_path / "run" / "policy.json").read_text()
 
 
@@ -137,15 +150,19 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
         ({"n_timesteps": 0}, "n_timesteps"),
         ({"num_envs": 2.5}, "num_envs"),
         ({"action": "both "}, "action"),
+        ({"action": "both"}, "leave it out"),
+        ({"algorithm": "sac", "intervention_penalty": 1.0}, "intervention penalty"),
+        ({"options": {"noise": np.ones(2)}}, "JSON"),
+        ({"seed": 2**32}, "seed"),
+        ({"settings": {"batch_size": 100}}, "batch_size"),
+        ({"settings": {"n_timesteps": "many"}, "n_timesteps": None}, "n_timesteps"),
     ):
         with pytest.raises(ConfigurationError, match=message):
             training(**changes)
-    with pytest.raises(ConfigurationError, match=r"ppo does not take these hyperparameters.*speed"):
-        train(training(settings={"speed": 3}), tmp_path / "speed")
     with pytest.raises(ConfigurationError, match="--algo dqn"):
         training("dqn")
     with pytest.raises(ConfigurationError, match="unknown env"):
-        Training("Nowhere-v0", "ppo")
+        Training.of("Nowhere-v0", "ppo")
     with pytest.raises(ConfigurationError, match="not empty"):
         train(training(), folder)
     with pytest.raises(ConfigurationError, match="holds no training"):
@@ -154,12 +171,92 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
         train(training(json.loads((folder / "config.json").read_text())["training"]["algorithm"], seed=1), folder, resume=True)
 
 
-def test_there_are_hyperparameters_for_every_id():
-    for algorithm in ALGORITHMS:
-        for env_id in safe_envs.ENV_IDS:
-            settings = hyperparameters(algorithm, env_id)
-            assert settings["policy"] == "MlpPolicy"
-            assert settings["n_envs"] >= 1
+@pytest.mark.parametrize(
+    ("algorithm", "settings", "message"),
+    [
+        ("ppo", {"speed": 3}, r"ppo does not take these hyperparameters.*speed"),
+        ("ppo", {"normalize": "no thanks"}, "normalize|does not take"),
+        ("ppo", {"normalize": {"bogus": 1}}, "bogus"),
+        ("sac", {"noise_type": "pink", "noise_std": 0.1}, "noise_type"),
+        ("sac", {"noise_type": "normal"}, "needs noise_std"),
+        ("sac", {"noise_std": 0.1}, "noise_type"),
+        ("sac", {"replay_buffer_kwargs": {}}, "replay buffer"),
+        ("sac", {"use_sde": True}, "saved"),
+        ("sac", {"learning_starts": "soon"}, "failed after"),
+        ("ppo", {"learning_rate": 1e12}, "diverged|not all finite"),
+    ],
+)
+def test_hyperparameters_that_do_not_work_are_refused_and_leave_the_folder_to_others(algorithm, settings, message, tmp_path):
+    with pytest.raises(ConfigurationError, match=message):
+        train(training(algorithm, settings=settings), tmp_path / "run")
+    train(training("a2c", steps=64, every=64), tmp_path / "run")
+
+
+def test_the_zoo_s_texts_and_lists_are_understood(tmp_path):
+    session = _Session(training(settings={"normalize": "{'norm_obs': False, 'norm_reward': True}", "gamma": 0.9}), tmp_path)
+    scales = session._model.get_env()
+    assert (scales.norm_obs, scales.norm_reward, scales.gamma) == (False, True, 0.9)
+    session = _Session(
+        training("sac", settings={"train_freq": [2, "step"], "noise_type": "ornstein-uhlenbeck", "noise_std": 0.2}), tmp_path
+    )
+    assert session._model.train_freq.frequency == 2
+    assert "OrnsteinUhlenbeck" in str(session._model.action_noise)
+
+
+def test_a_rollout_is_cut_into_whole_batches():
+    assert [whole_batches(512, rollout, False) for rollout in (2048, 625, 448, 37, 1021)] == [512, 125, 448, 37, 1021]
+    assert whole_batches(64, 256, True) == 64
+    with pytest.raises(ConfigurationError, match="give 64"):
+        whole_batches(100, 256, True)
+    wrong: Any
+    for wrong in (1, 2.0, "512", True):
+        with pytest.raises(ConfigurationError, match="batch_size"):
+            whole_batches(wrong, 256, False)
+
+
+def test_the_filter_in_the_loop_knows_what_it_is_to_know(tmp_path):
+    problem = load_problem("safe_envs/QuadrotorAltitude-v0")
+    for knowledge, system in (("model", problem.model), ("plant", problem.plant)):
+        session = _Session(Training.of("QuadrotorAltitude-v0", "ppo", filter="hocbf", knowledge=knowledge), tmp_path)
+        assert session._model.get_env().unwrapped.env.safety_filter.model.parameters == system.parameters
+    assert problem.model.parameters != problem.plant.parameters
+
+
+def test_episodes_go_on_from_one_part_to_the_next(tmp_path):
+    """Their 10 steps are longer than a part, which are 4 of each env."""
+    train(training("a2c", steps=160, every=16, settings={"n_steps": 4}, filter=None), tmp_path / "run")
+    last = {key: value for line in logged(tmp_path / "run") for key, value in line.items()}
+    assert last["rollout/ep_len_mean"] == 10
+    assert len(evaluations(tmp_path / "run")) == 10
+    assert last["safety/rate"] >= 0
+
+
+def test_the_learning_rate_falls_over_the_whole_training_and_never_below_zero(tmp_path):
+    train(training(steps=700, settings={"learning_rate": "lin_1e-3", "n_steps": 64}), tmp_path / "run")
+    found = {line["step"]: line["train/learning_rate"] for line in logged(tmp_path / "run") if "train/learning_rate" in line}
+    assert max(found) > 700
+    assert found == pytest.approx({step: 1e-3 * max(0.0, 1 - step / 700) for step in found})
+
+
+def test_the_figures_are_those_of_the_infos():
+    envs, figures = make_sb3_env(DUBINS, 3, "scbf", seed=0, horizon=0.5, noise=1.0), SafetyFigures()
+    figures.init_callback(type("Model", (), {"get_env": lambda self: envs, "logger": None, "num_timesteps": 0})())  # pyright: ignore
+    envs.reset()
+    rng, seen, ended = np.random.default_rng(0), [], []
+    for _ in range(60):
+        _, _, dones, infos = envs.step(rng.uniform(-1.0, 1.0, (3, 1)))
+        figures.locals = {"dones": dones}
+        figures._on_step()
+        seen += [dict(info) for info in infos]
+        ended += [dict(info) for info, done in zip(infos, dones, strict=True) if done]
+    found = figures.figures()
+    assert found["violations"] == sum(info["violation"] for info in seen) > 0
+    assert found["interventions"] == np.mean([info["intervention"] for info in seen])
+    assert found["infeasible"] == np.mean([not info["feasible"] for info in seen])
+    assert 0 < found["infeasible"] < found["interventions"] < 1
+    assert found["rate"] == np.mean([info["episode_cost"] == 0 for info in ended])
+    assert found["episode_cost"] == np.mean([info["episode_cost"] for info in ended])
+    assert found["h_min"] == pytest.approx(np.mean([info["h_min"] for info in ended]))
 
 
 def test_the_files_have_the_form_that_the_zoo_reads():
@@ -171,11 +268,12 @@ def test_the_files_have_the_form_that_the_zoo_reads():
         assert set(safe_envs.ENV_IDS) <= set(table)
         for settings in table.values():
             assert not isinstance(settings["policy_kwargs"], str)
+            assert settings["policy"] == "MlpPolicy"
 
 
 def test_schedules_fall_to_nothing():
     settings = scheduled({"learning_rate": "lin_2e-3", "gamma": 0.9})
-    assert [settings["learning_rate"](left) for left in (1.0, 0.5, 0.0)] == pytest.approx([2e-3, 1e-3, 0.0])
+    assert [settings["learning_rate"](left) for left in (1.0, 0.5, 0.0, -1.0)] == pytest.approx([2e-3, 1e-3, 0.0, 0.0])
     for text in ("exp_3", "lin_x"):
         with pytest.raises(ConfigurationError, match="learning_rate"):
             scheduled({"learning_rate": text})

@@ -151,7 +151,7 @@ def test_every_path_of_a_policy_is_the_policy(saved, problem):
 def test_the_folder_holds_two_files_and_what_they_are(saved, problem):
     assert sorted(path.name for path in saved.iterdir()) == ["policy.json", "policy.safetensors"]
     found = json.loads((saved / "policy.json").read_text())
-    assert (found["format"], found["layers"], found["activation"]) == (1, [4, 8, 8, 1], "tanh")
+    assert (found["format"], found["layers"], found["activation"]) == (2, [4, 8, 8, 1], "tanh")
     assert found["problem"]["features"] == ["x", "y", "cos_theta", "sin_theta"]
     assert (found["problem"]["observation"]["low"], found["dt"]) == ([-6.0, -6.0, -1.0, -1.0], problem.dt)
     content = (saved / "policy.safetensors").read_bytes()
@@ -273,7 +273,7 @@ def unchanged(description):
         ("policy.safetensors", lambda data: b"", "altered or truncated"),
         ("policy.json", lambda data: data.replace(b'"clip"', b'"tanh"'), r"policy\.json was altered"),
         ("policy.json", lambda data: data.replace(b'"activation": "tanh"', b'"activation": "relu"'), r"policy\.json was altered"),
-        ("policy.json", lambda data: data.replace(b'"format": 1', b'"format": 2'), "has the format 2; this version reads 1"),
+        ("policy.json", lambda data: data.replace(b'"format": 2', b'"format": 1'), "has the format 1; this version reads 2"),
         ("policy.json", lambda data: data[:-40], "JSONDecodeError"),
         ("policy.json", lambda data: b"[]", "TypeError"),
         ("policy.json", lambda data: b"{}", "KeyError"),
@@ -303,6 +303,10 @@ def test_damaged_files_are_errors(copy, problem, name, damage, message):
         ({"normalization": {"mean": 4 * [0.0], "var": 4 * [-1.0], "clip": 1.0, "epsilon": 1e-8}}, "the normalisation"),
         ({"normalization": {"mean": 4 * [0.0], "var": 4 * [1.0], "clip": float("nan"), "epsilon": 1e-8}}, "the normalisation"),
         ({"normalization": {"mean": 4 * ["a"], "var": 4 * [1.0], "clip": 1.0, "epsilon": 1e-8}}, "ValueError"),
+        ({"box": [[-10.0, 10.0], [-10.0, 10.0]]}, "damaged or altered"),
+        ({"box": [[10.0, -10.0]]}, "damaged or altered"),
+        ({"box": [[-10.0, float("inf")]]}, "damaged or altered"),
+        ({"box": 1.0}, "damaged or altered"),
         ({"problem": {}}, "KeyError"),
         ({"problem": None}, "TypeError"),
     ],

@@ -18,11 +18,3 @@ def test_demo_prints_two_tables_and_leaves_a_policy_and_two_pictures(tmp_path, c
     assert "policy nominal" in out
     for name in demo.FILTERS:
         assert sum(line.startswith(name) for line in out.splitlines()) == 2
-
-
-def test_a_policy_that_is_there_is_not_trained_again(tmp_path, capsys):
-    for _ in range(2):
-        demo.train_once(tmp_path / "ppo", 1)
-    trained, kept = capsys.readouterr().out.split("Trained in")
-    assert "Training PPO" in trained
-    assert "is not trained again" in kept

@@ -13,14 +13,29 @@ QUICK = ("--n-timesteps", 512, "--num-envs", 4, "--eval-freq", 256, "--eval-epis
 
 
 def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_path):
-    arguments = ("train", DUBINS, "--algo", "ppo", "--filter", "scbf", *QUICK, "--set", "learning_rate=lin_1e-3", "--out", "run")
+    arguments = (
+        "train",
+        DUBINS,
+        "--algo",
+        "ppo",
+        "--filter",
+        "scbf",
+        *QUICK,
+        "--set",
+        "learning_rate=lin_1e-3",
+        "--set",
+        "ent_coef=1e-3",
+        "--out",
+        "run",
+    )
     status, out, err = safe_envs_command(*arguments, "--tensorboard", "logs")
     assert (status, err) == (0, "")
     assert "violations in training" in out
-    assert f"safe-envs evaluate {DUBINS} --policy run" in out
+    assert f"safe-envs evaluate {DUBINS} --policy run --filter scbf --horizon=0.5" in out
     assert list((tmp_path / "logs").iterdir())
     config = json.loads((tmp_path / "run" / "config.json").read_text())["training"]
-    assert config["settings"] == {"learning_rate": "lin_1e-3"}
+    assert config["hyperparameters"]["learning_rate"] == "lin_1e-3"
+    assert config["hyperparameters"]["ent_coef"] == 1e-3
     status, out, err = safe_envs_command("evaluate", DUBINS, "--policy", "run", "--filter", "none", "--filter", "scbf", "--episodes", 20)
     assert (status, err) == (0, "")
     assert "policy run" in out
@@ -35,6 +50,7 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
     [
         (("--algo", "dqn"), "dqn"),
         (("--algo", "ppo", "--filter", "sbf"), "sbf"),
+        (("--algo", "ppo", "--filter", "scbf", "--filter", "hocbf"), "one filter"),
         (("--algo", "ppo", "--set", "gamma"), "NAME=VALUE"),
         (("--algo", "ppo", "--set", "gamma=[1"), "no YAML"),
         (("--algo", "ppo", "--set", "speed=3"), "does not take"),
@@ -54,8 +70,7 @@ def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(safe_envs_com
 
 def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command, monkeypatch):
     monkeypatch.setattr("scripts.leaderboard._QUICK", {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4})
-    monkeypatch.setattr("scripts.leaderboard._QUICK_EPISODES", 8)
-    arguments = ("leaderboard", "Scalar-v0", "--quick", "--out", "board")
+    arguments = ("leaderboard", "Scalar-v0", "safe_envs/Scalar-v0", "--quick", "--episodes", 8, "--out", "board")
     status, out, err = safe_envs_command(*arguments)
     assert (status, err) == (0, "")
     rows = strictly("board/results.json")["rows"]

@@ -1,0 +1,258 @@
+"""Training Stable-Baselines3's agents with a filter in the loop: in parts that can be gone on with, each of them evaluated.
+
+Each part begins with randomness of its own, which hangs on nothing but the seed and the number of steps until then; the episodes
+go on from one part to the next. So a training that was interrupted goes on after its last whole part exactly as it would have.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from agents.algorithms import OFF_POLICY, new_model
+from agents.checkpoints import (
+    copy_policy,
+    drop_replay_buffer,
+    keep_checkpoint,
+    last_checkpoint,
+    read_state,
+    restored_model,
+    resume_episodes,
+)
+from agents.evaluation import BARE, evaluate, package_versions
+from agents.problems import load_problem
+from agents.training import Training
+from safe_envs.errors import ConfigurationError, SafeEnvsError
+from safe_envs.files import write_json
+
+_OF_EVALUATIONS = 2**32 - 1
+"""Key of their seeds, which no number of steps is."""
+
+_CONFIG, _EVALUATIONS, _PROGRESS, _BEST = "config.json", "evaluations.json", "progress.jsonl", "best"
+
+Told = Callable[[float], None]
+"""Told the part of the training that is done, from 0 to 1."""
+
+
+def train(training: Training, folder: Path, *, resume: bool = False, tensorboard: Path | None = None, tell: Told | None = None) -> float:
+    """Train an agent, and leave in a folder all that is needed to use it and to know how it came about.
+
+    The folder holds `config.json` with the versions, `progress.jsonl` with all that was logged, `evaluations.json`, the policy as
+    `policy.safetensors` with `policy.json` and as Stable-Baselines3's `model.zip` (beside it `normalization.pkl`, if observations
+    are normalised), in `best` those with the highest return in an evaluation, whatever their safety, and the last checkpoint.
+    Evaluations have episodes of their own, so that none of them is among those of `safe-envs evaluate`.
+
+    Args:
+        training: what to do.
+        folder: a new one, or with `resume` that of an interrupted training, whose checkpoint is a pickle: resume only your own.
+        resume: go on after the last checkpoint.
+        tensorboard: folder of logs for tensorboard, in which this training gets one by the name of its own.
+        tell: told how far the training is.
+
+    Returns:
+        The seconds that the learning took, in all its runs, evaluations left out.
+
+    Raises:
+        ConfigurationError: the folder holds something else, or the training is not the one that is resumed.
+    """
+    import torch
+
+    torch.set_num_threads(training.threads)
+    folder = Path(folder)
+    if tensorboard is not None and find_spec("tensorboard") is None:
+        raise ConfigurationError("--tensorboard: tensorboard is not installed; install it with pip install safe-envs[tensorboard]")
+    _require_folder(folder, training, resume)
+    session = _Session(training, folder)
+    for wanted in (folder, *([] if tensorboard is None else [tensorboard])):
+        try:
+            wanted.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigurationError(f"the folder {wanted} cannot be made: {error.strerror}; give another one") from error
+    if not resume:
+        for name in (_EVALUATIONS, _PROGRESS):
+            (folder / name).unlink(missing_ok=True)
+        write_json(folder / _CONFIG, {"training": asdict(training), "versions": package_versions()})
+    session.log(tensorboard)
+    session.run(tell or (lambda _: None))
+    return session.seconds
+
+
+def _require_folder(folder: Path, training: Training, resume: bool) -> None:
+    """Raise ConfigurationError unless the folder is new, or that of the same training."""
+    if not resume:
+        # A training that did not reach its first checkpoint leaves nothing that could be lost.
+        if folder.is_dir() and {path.name for path in folder.iterdir()} <= {_CONFIG, _EVALUATIONS, _PROGRESS}:
+            return
+        if folder.exists():
+            what = "is not empty" if folder.is_dir() else "is a file"
+            raise ConfigurationError(f"--out {folder} {what}; give a new folder, or go on with the training in one by --resume")
+        return
+    path = folder / _CONFIG
+    if not path.is_file():
+        raise ConfigurationError(f"--resume: {folder} holds no training; start it without --resume")
+    try:
+        known = _flat(json.loads(path.read_text())["training"])
+    except (LookupError, TypeError, ValueError) as error:
+        raise ConfigurationError(
+            f"--resume: {path} cannot be read ({error}); it is damaged or altered: start anew in another folder"
+        ) from error
+    wanted = _flat(json.loads(json.dumps(asdict(training))))
+    for name in sorted({*known, *wanted}):
+        if known.get(name) != wanted.get(name):
+            raise ConfigurationError(
+                f"--resume: the training in {folder} has {name} = {known.get(name)!r}, not {wanted.get(name)!r}; give the same arguments"
+            )
+
+
+def _flat(document: Mapping[str, Any]) -> dict[str, Any]:
+    """A training's attributes, the hyperparameters among them."""
+    return {**document, **document["hyperparameters"], "hyperparameters": None}
+
+
+class _Session:
+    """One run of a training, from its beginning or from a checkpoint."""
+
+    def __init__(self, training: Training, folder: Path) -> None:
+        from stable_baselines3.common.vec_env import VecMonitor
+
+        from agents.figures import SafetyFigures
+        from agents.sb3_env import make_sb3_env
+
+        self.seconds = 0.0
+        self._training, self._folder = training, folder
+        self._problem = load_problem(training.env_id, training.options)
+        self._figures = SafetyFigures()
+        envs = VecMonitor(
+            make_sb3_env(
+                training.env_id,
+                training.num_envs,
+                training.filter,
+                knowledge=training.knowledge,
+                intervention_penalty=training.intervention_penalty,
+                **training.options,
+            )
+        )
+        checkpoint = last_checkpoint(folder)
+        if checkpoint is None:
+            action = training.action if training.learns_on_executed else None
+            self._model: Any = new_model(training.algorithm, envs, self._problem, training.hyperparameters, action, training.seed)
+        else:
+            self._model = restored_model(checkpoint, training.algorithm, envs)
+            state = read_state(checkpoint)
+            self._figures.counts, self.seconds = state["counts"], state["seconds"]
+        self._evaluations = [e for e in _read_list(folder / _EVALUATIONS) if e["timesteps"] <= self._model.num_timesteps]
+
+    def log(self, tensorboard: Path | None) -> None:
+        """Log to the folder, and to another one for tensorboard."""
+        from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+
+        from agents.figures import ProgressLog
+
+        folder, done = self._folder, self._model.num_timesteps
+        outputs: list[Any] = [ProgressLog(folder / _PROGRESS, done)]
+        if tensorboard is not None:
+            from torch.utils.tensorboard.writer import SummaryWriter
+
+            of_run = TensorBoardOutputFormat(str(tensorboard / folder.resolve().name))
+            of_run.writer.close()
+            # What was logged after the checkpoint is logged anew.
+            of_run.writer = SummaryWriter(of_run.writer.log_dir, purge_step=done + 1 if done else None)
+            outputs.append(of_run)
+        self._model.set_logger(Logger(str(folder), outputs))
+
+    def run(self, tell: Told) -> None:
+        """Train part by part, from where the model is, and leave the finished policy."""
+        training, model, folder = self._training, self._model, self._folder
+        checkpoint = last_checkpoint(folder)
+        if checkpoint is not None and model.num_timesteps > max((e["timesteps"] for e in self._evaluations), default=0):
+            self._evaluate(checkpoint)
+        while model.num_timesteps < training.n_timesteps:
+            end = (model.num_timesteps // training.eval_freq + 1) * training.eval_freq
+            self._train_part(checkpoint, min(end, training.n_timesteps), tell)
+            state = {"timesteps": model.num_timesteps, "counts": self._figures.counts, "seconds": self.seconds}
+            checkpoint = keep_checkpoint(folder, model, self._problem, state)
+            self._evaluate(checkpoint)
+        if checkpoint is not None:
+            copy_policy(checkpoint, folder)
+            drop_replay_buffer(checkpoint)
+        model.get_env().close()
+
+    def _train_part(self, checkpoint: Path | None, end: int, tell: Told) -> None:
+        from stable_baselines3.common.callbacks import CallbackList, ConvertCallback
+        from stable_baselines3.common.utils import set_random_seed
+
+        training, model = self._training, self._model
+        seed = _child_seed(training.seed, model.num_timesteps)
+        set_random_seed(seed)
+        model.action_space.seed(seed)
+        if checkpoint is None:
+            model.get_env().seed(seed)
+        else:
+            resume_episodes(checkpoint, model, seed)
+
+        def note(_: dict[str, Any], __: dict[str, Any]) -> bool:
+            tell(min(model.num_timesteps / training.n_timesteps, 1.0))
+            return True  # anything else would end the training
+
+        # Schedules are of the whole training, not of its part.
+        of_part = model._update_current_progress_remaining
+        model._update_current_progress_remaining = lambda done, _: of_part(done, training.n_timesteps)
+        began = time.perf_counter()
+        try:
+            model.learn(
+                end - model.num_timesteps,
+                CallbackList([self._figures, ConvertCallback(note)]),
+                log_interval=4 if training.algorithm in OFF_POLICY else 1,
+                reset_num_timesteps=False,
+            )
+        except (AssertionError, LookupError, RuntimeError, TypeError, ValueError) as error:
+            if isinstance(error, SafeEnvsError):
+                raise
+            raise ConfigurationError(
+                f"the training failed after {model.num_timesteps} steps ({type(error).__name__}: {error}): "
+                f"it diverged, or a hyperparameter is not allowed; they are {training.hyperparameters}"
+            ) from error
+        finally:
+            del model._update_current_progress_remaining
+        self.seconds += time.perf_counter() - began
+        # What the last updates recorded would be lost if the training was interrupted now.
+        model.logger.dump(model.num_timesteps)
+
+    def _evaluate(self, checkpoint: Path) -> None:
+        """Evaluate the checkpoint as `safe-envs evaluate` would, and keep it if its return is the best so far."""
+        training, model = self._training, self._model
+        seed = _child_seed(training.seed, _OF_EVALUATIONS)
+        found = evaluate(
+            training.env_id,
+            str(checkpoint),
+            [training.filter or BARE],
+            options=training.options,
+            episodes=training.eval_episodes,
+            seed=seed,
+            knowledge=training.knowledge,
+            bounds=False,
+        )
+        row = {k: v for k, v in found.rows[0].items() if k not in ("curve", "policy")}
+        best = max((e["return_mean"] for e in self._evaluations), default=-np.inf)
+        self._evaluations.append({"timesteps": model.num_timesteps, "seed": seed, **row, "training": self._figures.figures()})
+        if row["return_mean"] > best:
+            copy_policy(checkpoint, self._folder / _BEST)
+        for key in ("safety_rate", "ci_low", "ci_high", "return_mean"):
+            model.logger.record(f"eval/{key}", row[key])
+        model.logger.dump(model.num_timesteps)
+        write_json(self._folder / _EVALUATIONS, self._evaluations)
+
+
+def _child_seed(seed: int, *key: int) -> int:
+    return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0])
+
+
+def _read_list(path: Path) -> list[Any]:
+    return json.loads(path.read_text()) if path.exists() else []
