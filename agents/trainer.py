@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from agents.algorithms import OFF_POLICY, new_model
 from agents.checkpoints import (
@@ -80,7 +81,8 @@ def train(training: Training, folder: Path, *, resume: bool = False, tensorboard
             (folder / name).unlink(missing_ok=True)
         write_json(folder / _CONFIG, {"training": asdict(training), "versions": package_versions()})
     session.log(tensorboard)
-    session.run(tell or (lambda _: None))
+    with threadpool_limits(training.threads, "blas"):
+        session.run(tell or (lambda _: None))
     return session.seconds
 
 
