@@ -54,7 +54,7 @@ def read(folder: Path, artefact: Artefact, sample: Sample) -> tuple[Outcome, flo
 def keep(folder: Path, artefact: Artefact, sample: Sample, outcome: Outcome, seconds: float) -> None:
     """Draw the outcome, and write it; the JSON comes last, so that it stands for all."""
     if artefact.draw is not None:
-        with mpl.rc_context(STYLE):
+        with mpl.rc_context({**STYLE, "svg.hashsalt": artefact.name}):
             figure = Figure(figsize=artefact.size)
             artefact.draw(figure, outcome)
             for suffix in _SUFFIXES:

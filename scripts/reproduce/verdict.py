@@ -44,6 +44,16 @@ class Judgement:
     wrong_formula: bool
     reasons: tuple[str, ...]
 
+    @property
+    def text(self) -> str:
+        """The verdict in words."""
+        return f"{self.verdict}; {Verdict.WRONG_FORMULA}" if self.wrong_formula else str(self.verdict)
+
+    @property
+    def mood(self) -> str:
+        """How good that is: "good", "middle" or "bad"."""
+        return {Verdict.REPRODUCED: "good", Verdict.NOT: "bad"}.get(self.verdict, "middle")
+
 
 def judge(artefact: Artefact, outcome: Outcome) -> Judgement:
     """Apply `RULES` to what came out."""
