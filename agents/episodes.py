@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from agents.comparison import Flags
 from agents.policy import Policy
@@ -174,15 +175,17 @@ def run_episodes(
     """
     world: SafeVectorEnv = env.unwrapped  # pyright: ignore[reportAssignmentType]
     totals = Totals(world.problem)
-    for first in range(0, episodes, env.num_envs):
-        count = min(env.num_envs, episodes - first)
-        rows = range(first, first + env.num_envs)
-        if isinstance(policy, Policy):
-            policy.begin(rows, seed)
-        started = env.reset(seed=[episode_seed(seed, i) for i in rows])
-        if on_start:
-            on_start(world.components, count)
-        totals.add(_play(env, policy, started, first, count, progress, recorder), count)
+    # Threads of BLAS gain nothing on small networks, and on a busy machine they wait for each other for most of the time.
+    with threadpool_limits(1, "blas"):
+        for first in range(0, episodes, env.num_envs):
+            count = min(env.num_envs, episodes - first)
+            rows = range(first, first + env.num_envs)
+            if isinstance(policy, Policy):
+                policy.begin(rows, seed)
+            started = env.reset(seed=[episode_seed(seed, i) for i in rows])
+            if on_start:
+                on_start(world.components, count)
+            totals.add(_play(env, policy, started, first, count, progress, recorder), count)
     return totals
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from agents.algorithms import OFF_POLICY, new_model
 from agents.checkpoints import (
@@ -57,7 +58,7 @@ def train(training: Training, folder: Path, *, resume: bool = False, tensorboard
         tell: told how far the training is.
 
     Returns:
-        The seconds that the learning took, in all its runs, evaluations left out.
+        The processor's seconds that the learning took, in all its runs, evaluations left out.
 
     Raises:
         ConfigurationError: the folder holds something else, or the training is not the one that is resumed.
@@ -80,7 +81,8 @@ def train(training: Training, folder: Path, *, resume: bool = False, tensorboard
             (folder / name).unlink(missing_ok=True)
         write_json(folder / _CONFIG, {"training": asdict(training), "versions": package_versions()})
     session.log(tensorboard)
-    session.run(tell or (lambda _: None))
+    with threadpool_limits(training.threads, "blas"):
+        session.run(tell or (lambda _: None))
     return session.seconds
 
 
@@ -204,7 +206,7 @@ class _Session:
         # Schedules are of the whole training, not of its part.
         of_part = model._update_current_progress_remaining
         model._update_current_progress_remaining = lambda done, _: of_part(done, training.n_timesteps)
-        began = time.perf_counter()
+        began = time.process_time()
         try:
             model.learn(
                 end - model.num_timesteps,
@@ -221,7 +223,7 @@ class _Session:
             ) from error
         finally:
             del model._update_current_progress_remaining
-        self.seconds += time.perf_counter() - began
+        self.seconds += time.process_time() - began
         # What the last updates recorded would be lost if the training was interrupted now.
         model.logger.dump(model.num_timesteps)
 

@@ -37,7 +37,7 @@ class Training:
         intervention_penalty: see `agents.sb3_env.make_sb3_env`.
         eval_freq: steps between evaluations, which are kept as checkpoints too.
         eval_episodes: of each evaluation.
-        threads: of torch. Small networks are many times slower on several threads of a busy machine.
+        threads: of torch and BLAS. Small networks are many times slower on several threads of a busy machine.
 
     Raises:
         ConfigurationError: a value is not allowed.

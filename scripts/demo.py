@@ -51,4 +51,4 @@ def _train(policy: Path, steps: int) -> None:
     console.print(f"Training PPO on {ENV_ID}, {steps} steps without any filter ...", highlight=False)
     with progress_bar("Training PPO") as tell:
         seconds = train(Training.of(ENV_ID, "ppo", n_timesteps=steps, eval_freq=steps), policy, resume=policy.exists(), tell=tell)
-    console.print(f"Trained in {seconds:.0f} s and saved in {policy}\n", highlight=False, markup=False)
+    console.print(f"Trained in {seconds:.0f} s of processor time and saved in {policy}\n", highlight=False, markup=False)

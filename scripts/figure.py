@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from agents.evaluation import BARE, Evaluation
+from agents.policy import DESCRIPTION, TENSORS
 from safe_envs.codegen import compile_function
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.files import write_atomically
@@ -63,9 +64,14 @@ def draw(evaluation: Evaluation, path: Path) -> None:
         if problem.plane:
             _draw_plane(figure.add_subplot(grid[:, 1]), evaluation, colors)
         add_legend(figure, barrier.get_legend_handles_labels()[0])
-        title = f"{config['env_id'] or problem.name}, {Path(config['policy']['name']).stem} policy"
+        title = f"{config['env_id'] or problem.name}, {_policy_name(Path(config['policy']['name']))} policy"
         figure.suptitle(f"{title}\n{describe_system(problem)}", fontsize=11)
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+
+
+def _policy_name(path: Path) -> str:
+    """That of a file or folder; a file of a policy's folder is called as all others are."""
+    return path.parent.name if path.name in (TENSORS, DESCRIPTION) else path.stem
 
 
 def add_legend(figure: Figure, handles: Sequence[Any]) -> None:

@@ -39,7 +39,7 @@ def leaderboard(
     """Train an agent on each env, without a filter and with the env's own in the loop, and compare it with the nominal controller.
 
     Each policy is evaluated bare and behind the filter, which knows the plant; the agent that was trained behind it only there.
-    The table has the safety rates with their 95 % intervals, the returns, and how long the training took. The intervals are of the
+    The table has the safety rates with their 95 % intervals, the returns, and the processor time of the training. The intervals are of the
     episodes: there is one training of each kind, and another seed gives another agent.
     """
     from agents.problems import full_id
@@ -120,7 +120,7 @@ def _cells(row: Row) -> tuple[str, ...]:
     return row["env_id"].removeprefix("safe_envs/"), row["policy"], row["filter"], rate, f"{row['return_mean']:.4g}", trained
 
 
-_TITLES = ("env", "policy", "filter", "safe [95 % interval]", "return", "trained in")
+_TITLES = ("env", "policy", "filter", "safe [95 % interval]", "return", "processor time")
 
 
 def _table(rows: Sequence[Row]) -> Table:

@@ -58,7 +58,7 @@ def train(
         int | None, typer.Option(help="Steps between evaluations and checkpoints; by default a tenth of the training.")
     ] = None,
     eval_episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 200,
-    threads: Annotated[int, typer.Option(help="Threads of torch.")] = 1,
+    threads: Annotated[int, typer.Option(help="Threads of torch and BLAS.")] = 1,
     tensorboard: Annotated[Path | None, typer.Option(metavar="DIR", help="Write logs for tensorboard.")] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the unfinished training in --out after its last checkpoint.")
