@@ -99,7 +99,7 @@ class Outcome:
     Attributes:
         numbers: of the artefact.
         claims: of its figure and of the text about it.
-        elsewhere: the same numbers with other settings, by a name that says which.
+        elsewhere: the same numbers with other settings, by a name that says which; only where the claims hold there too.
         as_printed: the same numbers by the printed formula, where that is wrong.
         data: what the picture shows, lists by name.
         notes: what else a reader should know, computed where it holds numbers.

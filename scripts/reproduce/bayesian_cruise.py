@@ -1,303 +1,57 @@
-"""Chapter 6, the car behind another one: its Bayesian identification and control; with what the cubic system shares of that."""
+"""Chapter 6, the car behind another one: its Bayesian identification, and how safe a controller is that rests on it."""
 
 from __future__ import annotations
 
 import time
-import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
 import numpy as np
-import sympy as sp
 from matplotlib.figure import Figure
 
-from agents.episodes import Totals, run_episodes
-from agents.evaluation import Evaluation, evaluate
-from agents.policy import make_policy
+from agents.evaluation import evaluate
 from agents.problems import load_problem
-from agents.repeats import interval_over
-from agents.statistics import paired_difference_interval, repeated_interval
-from safe_envs.barrier import Barrier
-from safe_envs.errors import RelativeDegreeError
 from safe_envs.problem import SafetyProblem
-from safe_envs.sde import ControlAffineSDE
-from safe_envs.vector import SafeVectorEnv
-from scripts.figure import COLORS, QUIET, add_legend
+from scripts.figure import COLORS, add_legend
 from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
-from wrappers import AffineConstraint, Condition, SafetyFilterVectorWrapper
-from wrappers.learning import LearnedModel
-from wrappers.learning.bayesian import identify
-from wrappers.learning.collect import collect, draw_states
-from wrappers.learning.estimators import rates
+from scripts.reproduce.identifications import (
+    DRAWS,
+    FIT_ERRATA,
+    NOISE_STARTS,
+    NOISE_STEPS,
+    REPETITIONS,
+    SIGMA_ERRATA,
+    STARTS,
+    STEPS,
+    averaged,
+    draw_estimate,
+    draw_levels,
+    estimated_drift,
+    identified,
+    noise_level,
+    noise_levels,
+    seeds,
+    spread,
+    true_drift,
+)
+from scripts.reproduce.learned_controllers import Learned, close, known, printed_totals, rate
+from wrappers.learning.collect import draw_states
 from wrappers.learning.generator import GeneratorModel, learn_generator
-from wrappers.learning.identifiability import IdentifiabilityWarning
-from wrappers.learning.posterior import Posterior
-from wrappers.learning.regression import sigma_map, sigma_samples
-
-STARTS, STEPS, DEGREE = 10, 100, 3
-"""Of the data for the drift: trajectories, states of each, degree of the features."""
-
-REPETITIONS = (10, 30, 100)
-"""K of Table 6.1; controllers, figures of sigma and the car rest on the last."""
-
-AT_REST = ((0.0,),)
-"""Inputs of the data for f alone, and of those for sigma."""
-
-NOISE_STARTS, NOISE_STEPS, DRAWS = 100, 300, 10_000
-CLOSE = 5.0
-"""Points of the safety rate, up to which two controllers count as close."""
-
-PRINTED_EPISODES = 1000
-_LEVELS = (0.025, 0.975)
-_BINS = 50
 
 ENV = "safe_envs/ACCGap-v0"
 _PRIOR = 1e4
 _FRESH, _IDENTIFICATIONS = 100, 10
 _EPISODES, _CONTROLLERS, _FEW_CONTROLLERS, _FEW_EPISODES = 1000, 8, 4, 300
+_QUICK_HORIZON = 2.0
+"""In s, of a quick sample of Table 6.3."""
+
 _POINTS, _GENERATOR_REPETITIONS, _TIMED = 300, 10_000, 5
 _ONE_BY_ONE = 2000
 """Evaluations of a network that are timed one by one."""
 
 _PRINTED = {"SCBF": 83, "DDSCBF": 65, "Bayesian SCBF": 78}
 _PRINTED_SECONDS = {"DDSCBF": 5 * 3600.0, "Bayesian SCBF": 15.0}
-
-
-FIT_ERRATA = (
-    "Sec. 6.2.2: the noise of the data has the variance sigma^2/(K dt), with u1 and u2 besides, not sigma^2/K",
-    "Eq. (6.13): K terms, not K + 1",
-    "Sec. 6.3.1: Phi lacks x1^2 x2 and x1 x2^2; here the full cubic",
-)
-SIGMA_ERRATA = (
-    "Sec. 6.2.4: the likelihood is N(0, sigma^2 dt), with N factors; without dt it estimates sigma sqrt(dt)",
-    "Eq. (6.11) has a closed solution",
-)
-
-
-def identified(
-    problem: SafetyProblem, repetitions: int, seed: int, prior: float, *, starts: int = STARTS, steps: int = STEPS, inputs: Any = None
-) -> Posterior:
-    """Learn f, g and sigma from trajectories, by default under inputs of both signs."""
-    with warnings.catch_warnings():
-        # What data at a single input do not tell is meant.
-        warnings.simplefilter("ignore", IdentifiabilityWarning)
-        data = collect(problem, starts, repetitions, inputs, steps=steps, seed=seed)
-        return identify(problem, data=data, degree=DEGREE, prior=prior)
-
-
-def estimated_drift(learned: Posterior, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The estimate of f and its standard deviation at states (B, n), both (B, n)."""
-    phi = learned.features.matrix(x)
-    return phi @ learned.mean[:, : learned.features.count].T, np.sqrt(learned.drift_variance(x)[:, :, 0, 0])
-
-
-def true_drift(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
-    """The plant's f at states (B, n)."""
-    f = sp.lambdify([problem.plant.states], list(problem.plant.numeric(problem.plant.drift)))
-    return np.array([f(row) for row in x.tolist()], dtype=float)
-
-
-def _level(problem: SafetyProblem, name: str) -> float:
-    """A noise level of the plant."""
-    return {parameter.name: value for parameter, value in problem.plant.parameters.items()}[name]
-
-
-def seeds(sample: Sample, full: int) -> range:
-    """Seeds of identifications, others for each seed of the sample; at least two."""
-    count = max(2, full // 10) if sample.quick else full
-    return range(1000 * sample.seed, 1000 * sample.seed + count)
-
-
-def spread(name: str, values: Any, printed: float | None = None, unit: str = "") -> Number:
-    """The median over identifications, and what holds 95 % of them: a printed number is of a single one."""
-    low, high = np.quantile(values, _LEVELS).tolist()
-    return Number(name, float(np.median(values)), low, high, printed, unit=unit)
-
-
-def averaged(name: str, values: Any, unit: str = "") -> Number:
-    """The mean over identifications, with Student's interval."""
-    mean = float(np.mean(values))
-    low, high = repeated_interval(list(map(float, values)), (mean, mean), 0.95, (0.0, float("inf")))
-    return Number(name, mean, low, high, unit=unit)
-
-
-def noise_levels(problem: SafetyProblem, sample: Sample, prior: float, unit: tuple[str, ...]) -> Outcome:
-    """Sample the posterior of sigma from the residuals of fresh trajectories, with the identified f and g known."""
-    first, second, *_ = seeds(sample, 2)
-    learned = identified(problem, REPETITIONS[-1], first, prior)
-    starts, steps = sample.work(NOISE_STARTS), NOISE_STEPS
-    data = collect(problem, starts, 1, AT_REST, steps=steps, seed=second)
-    left = data.successors[:, 0] - data.x - rates(learned.system, data) * problem.dt
-    squares, count = (left**2).sum(axis=0), len(left)
-    rng = np.random.default_rng([sample.seed, 63])
-    true = [_level(problem, name) for name in ("sigma_1", "sigma_2")]
-    numbers, printed, shown, apart, sharp = [], [], {"truth": true}, [], []
-    for i, (s, at) in enumerate(zip(squares.tolist(), unit, strict=True), start=1):
-        draws = sigma_samples(s / problem.dt, count, 1.0, 1.0, DRAWS, rng)
-        # The print: no dt, and one factor less.
-        wrong = sigma_samples(s, count - 1, 1.0, 1.0, DRAWS, rng)
-        numbers.append(spread(f"sigma_{i}", draws, unit=at))
-        printed.append(spread(f"sigma_{i}", wrong, unit=at))
-        apart.append(abs(draws.mean() - true[i - 1]) / draws.std())
-        sharp.append(draws.std() / draws.mean())
-        for name, values in (("ours", draws), ("printed", wrong)):
-            counts, edges = np.histogram(values, bins=_BINS)
-            shown |= {f"{name} {i} counts": counts.tolist(), f"{name} {i} edges": edges.tolist()}
-    mode = sigma_map(squares / problem.dt, np.full(len(squares), count))
-    evidence = [
-        f"sigma_{i} {n.ours:.4f} [{n.low:.4f}, {n.high:.4f}], most probable {m:.4f}, true {t:g}, {a:.1f} standard deviations apart"
-        for i, (n, m, t, a) in enumerate(zip(numbers, mode, true, apart, strict=True), start=1)
-    ]
-    claim = Claim("The posteriors of sigma_1 and sigma_2 gather at the true values.", bool(max(apart) < 3.0), "; ".join(evidence))
-    note = (
-        f"Relative standard deviation {100 * np.mean(sharp):.2f} %; by the law sqrt(1/(2 N)) {100 / np.sqrt(2 * count):.2f} % with "
-        f"N = {count} residuals."
-    )
-    return Outcome(numbers=numbers, claims=[claim], as_printed=printed, data=shown, notes=[note])
-
-
-def draw_levels(figure: Figure, outcome: Outcome) -> None:
-    """Histograms of the draws, and where the printed likelihood puts them."""
-    data, units = outcome.data, [number.unit for number in outcome.numbers]
-    panels = figure.subplots(1, 3)
-    for i, (letter, axes) in enumerate(zip("ab", panels, strict=False), start=1):
-        _draw_histogram(axes, data, "ours", i, COLORS[i - 1])
-        axes.axvline(data["truth"][i - 1], color="black", linewidth=1.4)
-        axes.set(xlabel=f"$\\sigma_{i}$ ({_pretty(units[i - 1])})", title=f"({letter}) $\\sigma_{i}$")
-        axes.locator_params(axis="x", nbins=4)
-    panels[0].set_ylabel("draws")
-    for i in (1, 2):
-        for name, hatch in (("printed", "////"), ("ours", "")):
-            _draw_histogram(panels[2], data, name, i, COLORS[i - 1], hatch)
-    panels[2].axvline(data["truth"][0], ymax=0.85, color="black", linewidth=1.4, label="true value", zorder=0)
-    panels[2].set(xscale="log", xlabel="$\\sigma$, both", title="(c) both likelihoods")
-    low, high = min(data["printed 1 edges"]), data["truth"][0]
-    panels[2].set_xlim(low / 2, high * 2)
-    ticks = [float(f"{t:.1g}") for t in (low, np.sqrt(low * high), high)]
-    panels[2].set_xticks(ticks, [f"{t:g}" for t in ticks])
-    panels[2].minorticks_off()
-    # Room for the words above the peaks.
-    panels[2].set_ylim(top=1.3 * panels[2].get_ylim()[1])
-    for x, across, text in ((0.03, "left", "likelihood\nas printed"), (0.99, "right", "corrected")):
-        panels[2].text(x, 0.99, text, transform=panels[2].transAxes, ha=across, va="top", color=QUIET, fontsize=9)
-    handles, _ = panels[0].get_legend_handles_labels()
-    add_legend(figure, [*handles, *panels[1].get_legend_handles_labels()[0], panels[2].lines[-1]])
-
-
-def draw_estimate(axes: Any, curve: tuple[Any, Any], across: Any, estimate: Any, deviation: Any, color: str) -> None:
-    """A true curve, and estimates with what the posterior leaves open."""
-    axes.plot(*curve, color="black", linewidth=1.4, label="true value", zorder=3)
-    bars = 1.96 * np.array(deviation)
-    axes.errorbar(
-        across, estimate, bars, fmt="o", color=color, markersize=3.5, elinewidth=1.0, label="estimate, with 95 % of its posterior"
-    )
-
-
-def _draw_histogram(axes: Any, data: dict[str, Any], name: str, i: int, color: str, hatch: str = "") -> None:
-    axes.stairs(
-        data[f"{name} {i} counts"], data[f"{name} {i} edges"], fill=not hatch, hatch=hatch, color=color, alpha=0.6, label=f"$\\sigma_{i}$"
-    )
-
-
-def _pretty(unit: str) -> str:
-    return unit.replace("sqrt(s)", "$\\sqrt{\\mathrm{s}}$")
-
-
-@dataclass(frozen=True)
-class PrintedRow(Condition):
-    """A row as it is printed.
-
-    Attributes:
-        row: an expression of states and inputs, which is to be at least 0.
-    """
-
-    row: Any = 0
-    name = "printed"
-    stochastic = True
-
-    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
-        """The row itself."""
-        slopes = [sp.diff(self.row, u) for u in model.inputs]
-        rest = sp.expand(self.row - sum(a * u for a, u in zip(slopes, model.inputs, strict=True)))
-        return AffineConstraint(tuple(slopes), rest, (barrier.expression,))
-
-    @classmethod
-    def for_gains(cls, gains: Sequence[float]) -> PrintedRow:
-        """It has no rates."""
-        return cls()
-
-
-def printed_totals(problem: SafetyProblem, row: Any, episodes: int, seed: int) -> Totals:
-    """Run the episodes of an evaluation under a printed row."""
-    env = SafetyFilterVectorWrapper(SafeVectorEnv(problem, min(episodes, 1024)), (PrintedRow(row),))
-    return run_episodes(env, make_policy("nominal", problem, False), episodes, seed)
-
-
-def known(problem: SafetyProblem, episodes: int, seed: int, bounds: bool = False) -> Evaluation:
-    """Evaluate the SCBF that knows the model."""
-    return evaluate(problem, filters=["scbf"], episodes=episodes, seed=seed, bounds=bounds)
-
-
-def rate(name: str, found: Evaluation, printed: float | None = None) -> Number:
-    """The rate of an evaluation of one filter."""
-    return Number.rate(name, found.rows[0]["safe"], found.rows[0]["episodes"], printed, PRINTED_EPISODES if printed is not None else None)
-
-
-@dataclass(frozen=True)
-class Learned:
-    """A controller with several identifications, on the episodes of the SCBF that knows the system.
-
-    Attributes:
-        rates: with each identification, from 0 to 1.
-        episodes: of each.
-        difference: mean of the rate less that of the SCBF, in points, with its interval over identifications and episodes.
-    """
-
-    rates: list[float]
-    episodes: int
-    difference: tuple[float, float, float]
-
-    @classmethod
-    def run(cls, problem: SafetyProblem, text: str, models: Sequence[LearnedModel], reference: Evaluation) -> Learned:
-        """Evaluate a learned filter with each model, on the episodes of a reference."""
-        config = reference.config
-        how: dict[str, Any] = {"episodes": config["episodes"], "seed": config["seed"], "bounds": False}
-        found = [_under(problem, text, model, how) for model in models]
-        tables = [next(iter(e.flags.values()))[0].table(reference.flags["scbf"][0]) for e in found]
-        mean = np.mean(tables, axis=0).tolist()
-        differences = [(first - second) / how["episodes"] for _, first, second, _ in tables]
-        ends = repeated_interval(differences, paired_difference_interval(*mean), 0.95, (-1.0, 1.0))
-        middle = float(np.mean(differences))
-        return cls([e.rows[0]["safety_rate"] for e in found], how["episodes"], (100 * middle, 100 * ends[0], 100 * ends[1]))
-
-    def number(self, name: str, printed: float | None = None) -> Number:
-        """The mean rate, with its interval over identifications and episodes."""
-        low, high = interval_over(self.rates, self.episodes, 0.95)
-        trials = PRINTED_EPISODES if printed is not None else None
-        return Number(name, 100 * float(np.mean(self.rates)), 100 * low, 100 * high, printed, trials, "%")
-
-    @property
-    def told(self) -> str:
-        """The difference and the worst identification, in words."""
-        mean, low, high = self.difference
-        return f"{mean:+.1f} points [{low:.1f}, {high:.1f}], worst of {len(self.rates)} identifications {100 * min(self.rates):.1f} %"
-
-
-def _under(problem: SafetyProblem, text: str, model: LearnedModel, how: dict[str, Any]) -> Evaluation:
-    """Evaluate a learned filter; the bare env where the input was identified as without any effect, and there is no filter."""
-    try:
-        return evaluate(problem, filters=[text], learned=[model], **how)
-    except RelativeDegreeError:
-        return evaluate(problem, filters=["none"], **how)
-
-
-def close(name: str, each: dict[str, Learned]) -> Claim:
-    """That a learned controller is about as safe as the SCBF that knows the system."""
-    near = all(abs(learned.difference[0]) <= CLOSE for learned in each.values())
-    evidence = "; ".join(f"{place}: {learned.told}" if place else learned.told for place, learned in each.items())
-    return Claim(f"{name} is about as safe as the SCBF that knows the system, within {CLOSE:g} points.", near, evidence)
 
 
 def _drift_picture(sample: Sample) -> Outcome:
@@ -309,7 +63,7 @@ def _drift_picture(sample: Sample) -> Outcome:
     errors, size = np.sqrt(((means - truth) ** 2).mean(axis=1)), np.sqrt((truth**2).mean(axis=0))
     doubts = np.sqrt((((means - truth) / deviations) ** 2).mean(axis=(1, 2)))
     relative = errors / size
-    sigma, rows = _level(problem, "sigma_1"), 2 * STARTS * STEPS
+    sigma, rows = noise_level(problem, "sigma_1"), 2 * STARTS * STEPS
     law = float(np.sqrt(learned[0].features.count * sigma**2 / (REPETITIONS[-1] * rows * problem.dt)))
     numbers = [
         *(spread(f"rms error of f_{i + 1}", errors[:, i], unit=unit) for i, unit in enumerate(("m/s^2", "m/s"))),
@@ -375,6 +129,8 @@ def printed_second_generator(problem: SafetyProblem) -> Any:
 
 def _rates(sample: Sample) -> Outcome:
     problem, episodes = load_problem(ENV), sample.size(_EPISODES)
+    if sample.quick:
+        problem = replace(problem, horizon=_QUICK_HORIZON)
     scbf = known(problem, episodes, sample.seed)
     reference = scbf if sample.quick else known(problem, sample.size(_FEW_EPISODES), sample.seed)
     chosen = seeds(sample, _CONTROLLERS)
@@ -399,7 +155,9 @@ def _rates(sample: Sample) -> Outcome:
         found.number("Bayesian SCBF", _PRINTED["Bayesian SCBF"]),
     ]
     elsewhere, told = {}, [f"With K = {REPETITIONS[-1]} the rates are {100 * min(found.rates):.0f} to {100 * max(found.rates):.0f} %."]
-    if not sample.quick:
+    if sample.quick:
+        told.append(f"A quick sample, over {problem.horizon:g} s in place of 30 s: too short for a car to get near the other one.")
+    else:
         fewer = bayesian(REPETITIONS[0], _FEW_CONTROLLERS)
         last = fewer.number("Bayesian SCBF", _PRINTED["Bayesian SCBF"])
         elsewhere = {f"K = {REPETITIONS[0]} in the identification": [*numbers[:2], last]}
