@@ -1,0 +1,1 @@
+"""`safe-envs reproduce`: the thesis' tables and figures, ours beside the print."""

@@ -1,0 +1,162 @@
+"""What a table or figure of the thesis is here: what is printed, how ours is computed and drawn, and what came out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from agents.statistics import rate_interval
+from safe_envs.errors import require_whole
+
+
+@dataclass(frozen=True)
+class Sample:
+    """How much is simulated.
+
+    Attributes:
+        episodes: of each rate in place of the thesis' number; None for that.
+        seed: of all randomness.
+        quick: a twentieth of the work, to see that it works.
+    """
+
+    episodes: int | None = None
+    seed: int = 0
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        require_whole("seed", self.seed, 0)
+        if self.episodes is not None:
+            require_whole("episodes", self.episodes, 1)
+
+    def size(self, full: int) -> int:
+        """Episodes, or other repetitions that make the answer more certain, where the full work has so many."""
+        return self.episodes or self.work(full)
+
+    def work(self, full: int) -> int:
+        """Points, epochs or other work that is the same for any number of episodes."""
+        return max(full // 20, min(full, 10)) if self.quick else full
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number of ours, beside the printed one if there is one.
+
+    Attributes:
+        name: what it is of, unique in its artefact.
+        ours: in `unit`.
+        low: lower end of our 95 % interval, if it has one.
+        high: upper end.
+        printed: in `unit`; None where the thesis gives none.
+        printed_trials: sample size of a printed rate.
+        unit: "%" for rates, or that of SI.
+    """
+
+    name: str
+    ours: float
+    low: float | None = None
+    high: float | None = None
+    printed: float | None = None
+    printed_trials: int | None = None
+    unit: str = ""
+
+    @classmethod
+    def rate(cls, name: str, safe: int, trials: int, printed: float | None = None, printed_trials: int | None = None) -> Number:
+        """A safety rate in per cent, with its interval.
+
+        Args:
+            name: see the class.
+            safe: how many of the trials.
+            trials: ours.
+            printed: in per cent.
+            printed_trials: see the class.
+        """
+        low, high = rate_interval(safe, trials)
+        return cls(name, 100 * safe / trials, 100 * low, 100 * high, printed, printed_trials, "%")
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence of the thesis as a check of ours.
+
+    Attributes:
+        sentence: in our words.
+        holds: computed.
+        evidence: the numbers by which.
+    """
+
+    sentence: str
+    holds: bool
+    evidence: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came out. JSON-able.
+
+    Attributes:
+        numbers: of the artefact.
+        claims: of its figure and of the text about it.
+        elsewhere: the same numbers with other settings, by a name that says which; only where the claims hold there too.
+        as_printed: the same numbers by the printed formula, where that is wrong.
+        data: what the picture shows, lists by name.
+        notes: what else a reader should know, computed where it holds numbers.
+    """
+
+    numbers: list[Number] = field(default_factory=list)
+    claims: list[Claim] = field(default_factory=list)
+    elsewhere: dict[str, list[Number]] = field(default_factory=dict)
+    as_printed: list[Number] = field(default_factory=list)
+    data: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def document(self) -> dict[str, Any]:
+        """As JSON holds it."""
+        return asdict(self)
+
+    @classmethod
+    def from_document(cls, document: dict[str, Any]) -> Outcome:
+        """Read what `document` wrote."""
+
+        def numbers(rows: list[dict[str, Any]]) -> list[Number]:
+            return [Number(**row) for row in rows]
+
+        return cls(
+            numbers(document["numbers"]),
+            [Claim(**row) for row in document["claims"]],
+            {name: numbers(rows) for name, rows in document["elsewhere"].items()},
+            numbers(document["as_printed"]),
+            document["data"],
+            document["notes"],
+        )
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """A table or figure of the thesis.
+
+    Attributes:
+        name: "table-4.1", "figure-3.2a", "example-4.2.2".
+        title: what it shows, in our words.
+        compute: does the work, with the project's public API only.
+        setting: how, in one place.
+        chosen: what the print leaves open, and what we take.
+        corrections: errors of the print that are not in ours, with the thesis' equation.
+        orderings: pairs of numbers' names, the first of which is printed as the larger one.
+        argument: why the print cannot be reproduced, for a verdict that says so.
+        draw: fills an empty figure from the outcome; None for a table.
+        size: of the figure, in inches.
+    """
+
+    name: str
+    title: str
+    compute: Callable[[Sample], Outcome]
+    setting: tuple[str, ...]
+    chosen: tuple[str, ...] = ()
+    corrections: tuple[str, ...] = ()
+    orderings: tuple[tuple[str, str], ...] = ()
+    argument: str = ""
+    draw: Callable[[Figure, Outcome], None] | None = None
+    size: tuple[float, float] = (7.0, 4.2)

@@ -1,0 +1,127 @@
+"""`safe-envs reproduce`: the tables and figures of the thesis, ours beside the print, on one page."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from safe_envs.errors import ConfigurationError, nearest
+from scripts import options
+from scripts.console import progress_bar, run, stdout
+
+if TYPE_CHECKING:
+    from scripts.reproduce.artefact import Artefact, Sample
+
+_ALL = "all"
+
+
+def reproduce(
+    names: Annotated[
+        list[str] | None, typer.Argument(metavar="[all | NAME]...", help="Such as table-4.1 or figure-3.3; all by default.")
+    ] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each rate; by default the thesis' numbers.")] = None,
+    seed: options.Seed = 0,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Where results and the page go. What is in it already is not done again.")
+    ] = Path("report"),
+    quick: Annotated[bool, typer.Option("--quick", help="A twentieth of the work: to see that it works, not what comes out.")] = False,
+) -> None:
+    """Compute the tables and figures of the thesis, and hold them against the print.
+
+    Each gets a picture (PNG and SVG) or a table, a JSON file with all numbers, and a verdict from a fixed list by stated rules.
+    DIR/index.html is one page with all that is in DIR, DIR/index.md the same as Markdown. What is computed is kept by its
+    configuration and the version of the code: a run that was stopped goes on.
+    """
+    from scripts.reproduce.artefact import Sample
+    from scripts.reproduce.page import write_page
+    from scripts.reproduce.store import read
+
+    sample = Sample(episodes, seed, quick)
+    chosen = _chosen(names or [_ALL])
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(f"--out {out} cannot be made: {error.strerror}; give another folder") from error
+    missing = [artefact for artefact in chosen if read(out, artefact, sample) is None]
+    with progress_bar(f"{len(missing)} of {len(chosen)} to do") as tell:
+        failures = _compute(missing, sample, out, jobs, tell or (lambda _: None))
+    found = [(artefact, *answer) for artefact in chosen if (answer := read(out, artefact, sample)) is not None]
+    write_page(out, found, sample)
+    _report(found, out)
+    if failures:
+        raise ConfigurationError("; ".join(f"{name} failed: {error}" for name, error in failures.items()))
+
+
+def _chosen(names: Sequence[str]) -> list[Artefact]:
+    from scripts.reproduce.catalogue import ARTEFACTS
+
+    known = {artefact.name: artefact for artefact in ARTEFACTS}
+    for name in names:
+        if name != _ALL and name not in known:
+            raise ConfigurationError(f"unknown artefact {name!r}; {nearest(name, [_ALL, *known])}")
+    return [artefact for name, artefact in known.items() if _ALL in names or name in names]
+
+
+def _compute(missing: Sequence[Artefact], sample: Sample, out: Path, jobs: int, tell: Callable[[float], None]) -> dict[str, str]:
+    """Compute and keep what is missing; return the errors of those that failed, which stop no others."""
+    failures: dict[str, str] = {}
+    with _pool(min(jobs, len(missing))) as pool:
+        left: dict[Any, str] = {pool.submit(compute_one, artefact.name, sample, out): artefact.name for artefact in missing}
+        try:
+            while left:
+                for future in wait(left, return_when=FIRST_COMPLETED).done:
+                    name, error = left.pop(future), future.exception()
+                    if error is not None:
+                        failures[name] = f"{type(error).__name__}: {error}"
+                    tell(1 - len(left) / len(missing))
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return failures
+
+
+def _pool(jobs: int) -> Executor:
+    """Processes; for a single job a thread of this one, which starts at once."""
+    # Not by fork: torch's threads do not survive it.
+    return ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) if jobs > 1 else ThreadPoolExecutor(1)
+
+
+def compute_one(name: str, sample: Sample, out: Path) -> None:
+    """Compute an artefact and keep it; what a process of the pool does."""
+    import torch
+
+    from scripts.reproduce.store import keep
+
+    torch.set_num_threads(1)
+    (artefact,) = _chosen([name])
+    began = time.perf_counter()
+    outcome = artefact.compute(sample)
+    keep(out, artefact, sample, outcome, time.perf_counter() - began)
+
+
+def _report(found: Sequence[tuple[Artefact, Any, float]], out: Path) -> None:
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
+    from scripts.reproduce.verdict import judge
+
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for title in ("artefact", "verdict", "because"):
+        table.add_column(title, no_wrap=title != "because")
+    for artefact, outcome, _ in found:
+        judgement = judge(artefact, outcome)
+        table.add_row(artefact.name, judgement.text, "; ".join(judgement.reasons))
+    console = stdout()
+    console.print(table)
+    console.print(f"\nThe page: {out / 'index.html'}", highlight=False, markup=False)
+
+
+if __name__ == "__main__":
+    run(lambda: typer.run(reproduce))

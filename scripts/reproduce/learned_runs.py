@@ -1,0 +1,134 @@
+"""What the figures of chapter 3 share: models whose derivatives are learned some times, and single trajectories under filters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from agents.evaluation import evaluate
+from agents.problems import load_problem
+from agents.repeats import pooled
+from agents.statistics import repeated_interval
+from safe_envs.problem import SafetyProblem
+from scripts.figure import COLORS
+from scripts.reproduce.artefact import Number, Sample
+from wrappers.learning.residual import ResidualModel, learn_residual
+
+LEARNINGS, QUICK_LEARNINGS = 3, 2  # repetitions of the learning, from other seeds
+STATES, LEAST_STATES = 2000, 400  # to learn from; with fewer than 127 the held-out errors have no 95 % quantile
+EPOCHS, LEAST_EPOCHS = 500, 80  # with fewer the margin is so wide that no input meets the row
+EPISODES = 1000  # from starts around the printed one
+
+LEARNING = (
+    f"{LEARNINGS} learnings from {STATES} states each, network 100-30 ReLU, Adam, up to {EPOCHS} epochs, learned margin at the 95 % level"
+)
+CORRECTED = (
+    "Eq. (3.28), Alg. 1: the central second difference gives half of the input's gain; forward differences under one held input here",
+    "Eq. (3.26) forgets the margin of Eq. (3.20), and the box of the input; both are here",
+    "Sec. 3.4.2: the loss lacks its square, and the update has the wrong sign",
+)
+
+LEARNED_COLOR, TRUE_COLOR, PRINTED_COLOR, NOMINAL_COLOR = COLORS[:4]
+_MOST_POINTS = 400
+
+
+@dataclass(frozen=True)
+class Run:
+    """One trajectory.
+
+    Attributes:
+        states: (K, n), one for each control instant.
+        h: smallest barrier value there, (K,).
+    """
+
+    states: np.ndarray
+    h: np.ndarray
+
+    @property
+    def smallest(self) -> float:
+        """The smallest h."""
+        return float(self.h.min())
+
+    @property
+    def steps(self) -> int:
+        """Control periods."""
+        return len(self.h) - 1
+
+    @property
+    def lengths(self) -> np.ndarray:
+        """Distance covered in each control period, in m."""
+        return np.hypot(*np.diff(self.states[:, :2], axis=0).T)
+
+
+def settings(sample: Sample) -> tuple[int, int]:
+    """States to learn from, and epochs."""
+    return max(LEAST_STATES, sample.work(STATES)), max(LEAST_EPOCHS, sample.work(EPOCHS))
+
+
+def seeds(sample: Sample) -> list[int]:
+    """One for each repetition of the learning."""
+    return np.random.SeedSequence(sample.seed).generate_state(QUICK_LEARNINGS if sample.quick else LEARNINGS).tolist()
+
+
+@lru_cache(maxsize=8)
+def residuals(env_id: str, sample: Sample, **model: float) -> tuple[ResidualModel, ...]:
+    """What is learned of a problem, anew for each repetition; remembered, for two figures show the same."""
+    problem = load_problem(env_id, {"model": model or None})
+    states, epochs = settings(sample)
+    return tuple(learn_residual(problem, states=states, epochs=epochs, seed=seed) for seed in seeds(sample))
+
+
+def runs(
+    problem: SafetyProblem, filters: Sequence[str], model: ResidualModel | None = None, policy: str = "nominal", knowledge: str = "model"
+) -> list[Run]:
+    """The trajectory from a problem's fixed start under each filter."""
+    learned = () if model is None else (model,)
+    found = evaluate(
+        problem, policy, filters, episodes=1, num_envs=1, knowledge=knowledge, bounds=False, learned=learned, record=True
+    ).recorders
+    return [cut(found[name].states[:, 0], found[name].barrier[:, 0]) for name in filters]
+
+
+def cut(states: np.ndarray, h: np.ndarray) -> Run:
+    """The part of a recorded trajectory up to its end."""
+    present = np.isfinite(h)
+    return Run(states[present], h[present])
+
+
+def over_learnings(name: str, values: Sequence[float], unit: str, printed: float | None = None) -> Number:
+    """Mean of a quantity, with its interval over the repetitions of the learning."""
+    mean = math.fsum(values) / len(values)
+    low, high = repeated_interval(values, (mean, mean), 0.95, (-math.inf, math.inf))
+    return Number(name, mean, low, high, printed, unit=unit)
+
+
+def rates_around(problem: SafetyProblem, sample: Sample, models: Sequence[ResidualModel], gains: str) -> list[Number]:
+    """Safety rates from starts around the printed one, the learned one's interval over learnings too."""
+    world, size = problem.configured(start="spread"), sample.size(EPISODES)
+
+    def row(name: str, **rest: Any) -> dict[str, Any]:
+        return evaluate(world, "nominal", [name], episodes=size, seed=sample.seed, bounds=False, **rest).rows[0]
+
+    nominal, true = row(f"hocbf:p={gains}"), row(f"hocbf:p={gains}", knowledge="plant")
+    learned = pooled([row(f"learned-hocbf:p={gains}", learned=(model,)) for model in models], 0.95)
+    return [
+        Number(
+            "safe around the start, learned",
+            100 * learned["safety_rate"],
+            100 * learned["ci_low"],
+            100 * learned["ci_high"],
+            unit="%",
+        ),
+        Number.rate("safe around the start, nominal", nominal["safe"], nominal["episodes"]),
+        Number.rate("safe around the start, true", true["safe"], true["episodes"]),
+    ]
+
+
+def thinned(values: np.ndarray) -> list[float]:
+    """At most 400 of the values, evenly spaced."""
+    return np.asarray(values, dtype=float)[:: math.ceil(len(values) / _MOST_POINTS)].round(5).tolist()

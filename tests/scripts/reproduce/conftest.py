@@ -1,0 +1,40 @@
+"""An artefact that costs nothing."""
+
+from __future__ import annotations
+
+import pytest
+
+from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
+
+
+@pytest.fixture
+def computed():
+    """Names that were computed, in order."""
+    return []
+
+
+@pytest.fixture
+def coin(computed):
+    """A table of a fair coin, with a picture."""
+
+    def compute(sample: Sample) -> Outcome:
+        computed.append("table-0.1")
+        trials = sample.size(1000)
+        return Outcome(
+            [Number.rate("heads", trials // 2, trials, 48.0, 50), Number("edge", 0.25, 0.2, 0.3, unit="s")],
+            [Claim("it lands", True, "1 of 1")],
+            data={"x": [0.0, 1.0]},
+            notes=["a < b"],
+        )
+
+    def draw(figure, outcome):
+        figure.subplots().plot(outcome.data["x"])
+
+    return Artefact("table-0.1", "A coin", compute, ("thrown",), ("the coin",), ("Eq 0.1: a sign",), draw=draw)
+
+
+@pytest.fixture
+def catalogue(coin, monkeypatch):
+    """A catalogue of that alone."""
+    monkeypatch.setattr("scripts.reproduce.catalogue.ARTEFACTS", (coin,))
+    return (coin,)

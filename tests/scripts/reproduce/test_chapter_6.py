@@ -1,0 +1,171 @@
+from __future__ import annotations
+
+import json
+import math
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agents.evaluation import evaluate
+from agents.problems import load_problem
+from safe_envs.calculus import derivatives, generator
+from safe_envs.errors import RelativeDegreeError
+from scripts.reproduce import bayesian_cruise, bayesian_cubic, cubic_drift, identifications
+from scripts.reproduce.artefact import Outcome, Sample
+from scripts.reproduce.learned_controllers import Learned, known, printed_totals
+from scripts.reproduce.store import keep
+from scripts.reproduce.verdict import Verdict, judge
+
+ARTEFACTS = {a.name: a for a in (*bayesian_cubic.ARTEFACTS, *bayesian_cruise.ARTEFACTS)}
+QUICK = Sample(quick=True)
+TIMED = "table-6.4"
+
+
+@cache
+def outcome(name: str) -> Outcome:
+    return ARTEFACTS[name].compute(QUICK)
+
+
+def number(found, name):
+    return next(n for n in found if n.name == name)
+
+
+def test_the_chapter_is_complete():
+    assert sorted(ARTEFACTS) == sorted(f"{kind}-6.{i}" for kind in ("figure", "table") for i in range(1, 5))
+
+
+@pytest.mark.parametrize("name", ARTEFACTS)
+def test_an_outcome_is_json_is_drawn_and_judged(name, tmp_path):
+    found = outcome(name)
+    text = json.dumps(found.document(), allow_nan=False)
+    assert Outcome.from_document(json.loads(text)) == found
+    keep(tmp_path, ARTEFACTS[name], QUICK, found, 1.0)
+    assert (tmp_path / f"{name}.png").exists() == (ARTEFACTS[name].draw is not None) == name.startswith("figure")
+    assert judge(ARTEFACTS[name], found).verdict in Verdict
+    names = [n.name for n in found.numbers]
+    assert len(set(names)) == len(names)
+    for n in [*found.numbers, *found.as_printed]:
+        assert (n.low is None) == (n.high is None)
+        assert n.low is None or n.high is None or n.low <= n.ours <= n.high
+    assert {n for pair in ARTEFACTS[name].orderings for n in pair} <= set(names)
+
+
+@pytest.mark.parametrize("name", [name for name in ARTEFACTS if name.startswith("figure")])
+def test_a_seed_gives_the_same_outcome_and_another_one_another(name):
+    assert ARTEFACTS[name].compute(QUICK) == outcome(name)
+    assert ARTEFACTS[name].compute(Sample(seed=1, quick=True)) != outcome(name)
+
+
+def test_the_error_of_the_drift_is_the_law_for_states_over_the_disk():
+    problem = load_problem(bayesian_cubic.ENV)
+    x = np.random.default_rng(1).uniform(-0.6, 0.6, (400, 2))
+    found = cubic_drift.study(problem, x, 10, range(6), 1000, 1)
+    # Ten features, sigma = .2, K = 10, R = 1000, dt = .01. Near the centre the errors are smaller than on average over the disk.
+    assert 0.3 < found.squares.mean() / (10 * 0.2**2 / (10 * 1000 * 0.01)) < 1.2
+    assert 0.7 < found.doubts.mean() < 1.3
+    assert found.overconfident.mean() == pytest.approx(found.doubts.mean() / math.sqrt(problem.dt), rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["figure-6.1", "table-6.1"])
+def test_errors_fall_and_the_printed_variance_is_overconfident(name):
+    found = outcome(name)
+    assert found.numbers[0].ours > found.numbers[2].ours  # K = 10 and 100
+    (printed,) = found.as_printed
+    assert printed.ours > 5 * number(found.numbers, printed.name).ours
+    assert judge(ARTEFACTS[name], found).wrong_formula
+
+
+@pytest.mark.parametrize(("name", "true"), [("figure-6.2", 0.2), ("figure-6.4", 0.5)])
+def test_levels_gather_at_the_true_ones_and_the_printed_likelihood_ten_times_below(name, true):
+    found = outcome(name)
+    for i in (1, 2):
+        level = number(found.numbers, f"sigma_{i}")
+        assert level.ours == pytest.approx(true, rel=0.12)
+        assert level.low is not None
+        assert level.high is not None
+        assert level.high - level.low < 0.2 * true
+        assert number(found.as_printed, f"sigma_{i}").ours == pytest.approx(true * 0.1, rel=0.2)
+    assert sum(found.data["counts 1"]) == identifications.DRAWS
+
+
+def test_the_drift_of_the_car_is_known_where_it_is_large():
+    found = outcome("figure-6.3")
+    assert number(found.numbers, "relative rms error of f_2").ours < 10 < number(found.numbers, "relative rms error of f_1").ours
+    assert number(found.numbers, "rms error in standard deviations of the posterior").ours < 3
+
+
+def test_the_bounds_of_the_table_and_what_known_noise_makes_of_it():
+    found = outcome("table-6.2")
+    for place, h in (("(-.1, .7)", 50), ("(-.1, .8)", 35)):
+        assert number(found.as_printed, f"Analytical {place}").ours == pytest.approx(h)
+        assert number(found.numbers, f"Analytical {place}").ours == pytest.approx(h - 8, abs=0.1)
+        scbf = number(found.numbers, f"SCBF {place}").ours
+        assert scbf == pytest.approx(number(found.numbers, f"DDSCBF {place}").ours, abs=5)
+        assert scbf > number(found.as_printed, f"SCBF {place}").ours
+
+
+def test_the_printed_generator_of_the_disk_lacks_what_was_found():
+    problem = load_problem(bayesian_cubic.ENV)
+    (x_1, x_2), (u,) = problem.plant.states, problem.plant.inputs
+    printed = bayesian_cubic.printed_generator(problem)
+    _, derived = derivatives(problem.plant, problem.barriers[0].expression, 1, generator)
+    derived = problem.plant.numeric(derived) - 2 * x_2**2 * u
+    at = {x_1: 0.3, x_2: 0.4, u: 2.0}
+    assert float((derived - printed).subs(at)) == pytest.approx(0.12)
+
+
+def test_a_row_by_hand_gives_the_same_episodes_as_the_condition():
+    problem = load_problem(bayesian_cubic.ENV, {"start": "thesis-1"})
+    (x_1, x_2), _ = problem.plant.states, problem.plant.inputs
+    row = bayesian_cubic.printed_generator(problem) + x_1 * x_2
+    by_hand = printed_totals(problem, row, 60, 0)
+    assert by_hand.safe == evaluate(problem, filters=["scbf"], episodes=60, bounds=False).rows[0]["safe"]
+
+
+def test_the_printed_second_generator_of_the_car_is_not_safe():
+    problem = load_problem(bayesian_cruise.ENV)
+    printed = printed_totals(problem, bayesian_cruise.printed_second_generator(problem), 20, 0)
+    assert printed.safe < 4
+    assert known(problem, 20, 0).rows[0]["safe"] > 12
+
+
+def test_a_quick_table_of_the_car_has_all_rows_and_says_that_it_is_short():
+    found = outcome("table-6.3")
+    assert [n.name for n in found.numbers] == list(bayesian_cruise._PRINTED)
+    assert {n.name for n in found.as_printed} == {"SCBF", "DDSCBF"}
+    assert any("quick" in note for note in found.notes)
+
+
+def test_the_recursion_takes_longest():
+    found = outcome(TIMED)
+    assert judge(ARTEFACTS[TIMED], found).verdict in (Verdict.ORDERING, Verdict.NOT)
+    assert number(found.numbers, "DDSCBF").ours > number(found.numbers, "Bayesian SCBF").ours
+
+
+def test_a_controller_is_compared_on_the_episodes_of_the_reference():
+    problem = load_problem(bayesian_cubic.ENV, {"start": "thesis-2"})
+    reference = known(problem, 30, 0)
+    learned = identifications.identified(problem, 100, 0, bayesian_cubic.PRIOR)
+    found = Learned.run(problem, "bayesian-scbf", [learned, learned], reference)
+    assert found.rates[0] == found.rates[1]
+    assert found.difference[0] == pytest.approx(100 * (found.rates[0] - reference.rows[0]["safety_rate"]))
+    assert found.difference[1] <= found.difference[0] <= found.difference[2]
+    assert "worst of 2" in found.told
+
+
+def test_an_identification_without_any_input_is_counted_as_the_bare_env(monkeypatch):
+    problem = load_problem(bayesian_cubic.ENV, {"start": "thesis-2"})
+    reference = known(problem, 20, 0)
+
+    def blind(*args, learned=(), **how):
+        if learned:
+            raise RelativeDegreeError("no input")
+        return evaluate(*args, **how)
+
+    monkeypatch.setattr("scripts.reproduce.learned_controllers.evaluate", blind)
+    blinds: Any = [None, None]
+    found = Learned.run(problem, "bayesian-scbf", blinds, reference)
+    bare = evaluate(problem, filters=["none"], episodes=20, bounds=False).rows[0]["safety_rate"]
+    assert found.rates == [bare, bare]

@@ -1,0 +1,115 @@
+"""`safe-envs reproduce` as a person types it, with an artefact that costs nothing."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from scripts.reproduce.artefact import Outcome, Sample
+from scripts.reproduce.catalogue import ARTEFACTS
+from scripts.reproduce.store import keep, read
+from tests.scripts.conftest import strictly
+
+ALL = [f"figure-{n}" for n in ("3.1", "3.2a", "3.2b", "3.3", "4.1", "4.2", "4.3", "5.1", "5.2", "5.3a", "5.3b", "5.3c", "5.3d")]
+ALL += (
+    [f"figure-6.{n}" for n in range(1, 5)] + [f"table-{n}" for n in ("4.1", "5.1", "5.2", "6.1", "6.2", "6.3", "6.4")] + ["example-4.2.2"]
+)
+
+
+def test_every_artefact_of_the_thesis_is_there():
+    assert sorted(artefact.name for artefact in ARTEFACTS) == sorted(ALL)
+    for artefact in ARTEFACTS:
+        assert artefact.setting
+        assert artefact.draw is not None or artefact.name.startswith("table-")
+
+
+def test_results_are_kept_by_configuration_and_version(tmp_path, coin, monkeypatch):
+    sample = Sample(100)
+    outcome = coin.compute(sample)
+    keep(tmp_path, coin, sample, outcome, 1.5)
+    assert read(tmp_path, coin, sample) == (outcome, 1.5)
+    assert read(tmp_path, coin, Sample(101)) is None
+    with monkeypatch.context() as patch:
+        patch.setattr("scripts.reproduce.store.source_checksum", lambda: "another")
+        assert read(tmp_path, coin, sample) is None
+    (tmp_path / "table-0.1.svg").unlink()
+    assert read(tmp_path, coin, sample) is None
+    keep(tmp_path, coin, sample, outcome, 1.5)
+    (tmp_path / "table-0.1.json").write_text("{")
+    assert read(tmp_path, coin, sample) is None
+
+
+def test_equal_outcomes_make_equal_pictures(tmp_path, coin):
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        keep(tmp_path / name, coin, Sample(100), coin.compute(Sample(100)), 1.0)
+    for suffix in (".png", ".svg"):
+        assert (tmp_path / "a" / f"table-0.1{suffix}").read_bytes() == (tmp_path / "b" / f"table-0.1{suffix}").read_bytes()
+
+
+def test_sizes_follow_what_was_asked_for():
+    assert [Sample().size(1000), Sample(7).size(1000), Sample(quick=True).size(1000)] == [1000, 7, 50]
+    assert [Sample(7).work(200), Sample(7, quick=True).work(200), Sample(quick=True).work(4)] == [200, 10, 4]
+
+
+def test_the_command_leaves_a_page_and_does_nothing_twice(safe_envs_command, catalogue, computed, tmp_path):
+    arguments = ("reproduce", "--episodes", 100, "--jobs", 1, "--out", "report")
+    status, out, err = safe_envs_command(*arguments)
+    assert (status, err) == (0, "")
+    assert "reproduced" in out
+    assert "report/index.html" in out
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert "50.0 %" in page
+    assert "[40.4, 59.6]" in page
+    assert "48 % (of 50)" in page
+    assert "a &lt; b" in page
+    assert "data:image/png;base64," in page
+    assert "http" not in page
+    markdown = (tmp_path / "report" / "index.md").read_text()
+    assert "| heads | 48 % (of 50) | 50.0 % | [40.4, 59.6] |" in markdown
+    assert "a < b" in markdown
+    document = strictly("report/table-0.1.json")
+    assert Outcome.from_document(document["outcome"]).numbers[0].ours == 50.0
+    assert safe_envs_command(*arguments)[0] == 0
+    assert computed == ["table-0.1"]
+    assert safe_envs_command(*arguments, "--seed", 1)[0] == 0
+    assert len(computed) == 2
+
+
+def test_a_run_that_was_stopped_goes_on(safe_envs_command, catalogue, computed, coin, monkeypatch):
+    from dataclasses import replace
+
+    def fail(_):
+        raise ValueError("no luck")
+
+    other = replace(coin, name="table-0.2", compute=fail)
+    monkeypatch.setattr("scripts.reproduce.catalogue.ARTEFACTS", (other, coin))
+    status, out, err = safe_envs_command("reproduce", "all", "--jobs", 1, "--out", "report")
+    assert status == 2
+    assert "table-0.2 failed: ValueError: no luck" in err
+    assert "table-0.1" in out
+    monkeypatch.setattr("scripts.reproduce.catalogue.ARTEFACTS", (replace(coin, name="table-0.2"), coin))
+    assert safe_envs_command("reproduce", "all", "--jobs", 1, "--out", "report")[0] == 0
+    assert len(computed) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(("table-9.9",), "unknown artefact 'table-9.9'"), (("--out", "file"), "cannot be made"), (("--seed", -1), "seed")],
+)
+def test_what_it_cannot_take_ends_with_status_2(safe_envs_command, catalogue, tmp_path, arguments, message):
+    (tmp_path / "file").write_text("")
+    status, _, err = safe_envs_command("reproduce", *arguments)
+    assert status == 2
+    assert message in " ".join(err.split())
+
+
+def test_processes_compute_what_a_single_one_does(safe_envs_command, tmp_path):
+    """Over real artefacts, the quickest ones."""
+    names = ("example-4.2.2", "figure-6.2")
+    for jobs in (1, 2):
+        assert safe_envs_command("reproduce", *names, "--quick", "--jobs", jobs, "--out", f"by-{jobs}")[0] == 0
+    for name in names:
+        first, second = (json.loads((tmp_path / f"by-{jobs}" / f"{name}.json").read_text())["outcome"] for jobs in (1, 2))
+        assert first == second
