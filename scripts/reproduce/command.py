@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
@@ -83,6 +84,7 @@ def _compute(missing: Sequence[Artefact], sample: Sample, out: Path, jobs: int, 
                     tell(1 - len(left) / len(missing))
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
+            print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
             raise
     return failures
 

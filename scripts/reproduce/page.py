@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import base64
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
 
 from agents.evaluation import package_versions
 from safe_envs.files import write_atomically
 from scripts.reproduce.artefact import Artefact, Number, Outcome, Sample
 from scripts.reproduce.verdict import RULES, Judgement, agrees, judge
+
+_COLOURS = 64
+"""Of a picture on the page, which need not be larger than its lines and few areas ask for."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,10 @@ def _picture(folder: Path, artefact: Artefact) -> str:
     """The picture as text for a page without other files."""
     if artefact.draw is None:
         return ""
-    return base64.b64encode((folder / f"{artefact.name}.png").read_bytes()).decode()
+    light = io.BytesIO()
+    with Image.open(folder / f"{artefact.name}.png") as picture:
+        picture.convert("RGB").quantize(_COLOURS).save(light, "png", optimize=True)
+    return base64.b64encode(light.getvalue()).decode()
 
 
 def _value(number: Number) -> str:
