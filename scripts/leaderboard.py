@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich import box
+from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from safe_envs import ENV_IDS
@@ -34,7 +34,7 @@ def leaderboard(
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each evaluation; by default 1000, or 100 with --quick.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
     quick: Annotated[bool, typer.Option("--quick", help="Train for moments only: to see that it works, not how good agents get.")] = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown.")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown, with a row for each env.")] = False,
 ) -> None:
     """Train an agent on each env, without a filter and with the env's own in the loop, and compare it with the nominal controller.
 
@@ -114,27 +114,37 @@ def _write(path: Path, known: dict[str, Any], rows: Sequence[Row]) -> None:
     write_json(path, {"settings": known, "versions": package_versions(), "rows": list(rows)})
 
 
-def _cells(row: Row) -> tuple[str, ...]:
-    rate = f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]"
-    trained = "-" if row["trained_in"] is None else f"{row['trained_in']:.0f} s"
-    return row["env_id"].removeprefix("safe_envs/"), row["policy"], row["filter"], rate, f"{row['return_mean']:.4g}", trained
+def _rate(row: Row) -> str:
+    return f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]"
 
 
-_TITLES = ("env", "policy", "filter", "safe [95 % interval]", "return", "processor time")
+def _time(row: Row) -> str:
+    return "-" if row["trained_in"] is None else f"{row['trained_in']:.0f} s"
 
 
 def _table(rows: Sequence[Row]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in _TITLES:
-        table.add_column(title, justify="right" if title in _TITLES[3:] else "left", no_wrap=True)
+    """A row for each policy and filter."""
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for title in ("env", "policy", "filter", "safe [95 % interval]", "return", "processor time"):
+        table.add_column(title, justify="left" if title in ("env", "policy", "filter") else "right", no_wrap=True)
     for row in rows:
-        table.add_row(*_cells(row))
+        name = row["env_id"].removeprefix("safe_envs/")
+        table.add_row(name, row["policy"], row["filter"], _rate(row), f"{row['return_mean']:.4g}", _time(row))
     return table
 
 
 def _markdown(rows: Sequence[Row]) -> list[str]:
-    lines = [_TITLES, ("---",) * 3 + ("---:",) * 3, *map(_cells, rows)]
-    return [f"| {' | '.join(cells)} |" for cells in lines]
+    """A row for each env: how safe each policy was, and its return."""
+    from agents.evaluation import BARE
+
+    policies = [row["policy"] if row["filter"] == BARE or k == 4 else f"{row['policy']} + filter" for k, row in enumerate(rows[:5])]
+    table = [["env", "filter", *policies, "processor time"], ["---"] * 8]
+    for k in range(0, len(rows), 5):
+        of_env = rows[k : k + 5]
+        cells = [f"{_rate(row)}, {row['return_mean']:.4g}" for row in of_env]
+        name = of_env[0]["env_id"].removeprefix("safe_envs/").removesuffix("-v0")
+        table.append([name, of_env[1]["filter"], *cells, f"{_time(of_env[2])}, {_time(of_env[4])}"])
+    return [f"| {' | '.join(line)} |" for line in table]
 
 
 if __name__ == "__main__":
