@@ -37,8 +37,8 @@ def reproduce(
     """Compute the tables and figures of the thesis, and hold them against the print.
 
     Each gets a picture (PNG and SVG) or a table, a JSON file with all numbers, and a verdict from a fixed list by stated rules.
-    DIR/index.html is one page with all that is in DIR, DIR/index.md the same as Markdown. What is computed is kept by its
-    configuration and the version of the code: a run that was stopped goes on.
+    DIR/index.html is one page with all that is in DIR by the same options, DIR/index.md the same as Markdown. What is computed is
+    kept by its configuration and the version of the code: a run that was stopped goes on.
     """
     from scripts.reproduce.artefact import Sample
     from scripts.reproduce.page import write_page
@@ -53,9 +53,9 @@ def reproduce(
     missing = [artefact for artefact in chosen if read(out, artefact, sample) is None]
     with progress_bar(f"{len(missing)} of {len(chosen)} to do") as tell:
         failures = _compute(missing, sample, out, jobs, tell or (lambda _: None))
-    found = [(artefact, *answer) for artefact in chosen if (answer := read(out, artefact, sample)) is not None]
+    found = [(artefact, *answer) for artefact in _chosen([_ALL]) if (answer := read(out, artefact, sample)) is not None]
     write_page(out, found, sample)
-    _report(found, out)
+    _report([entry for entry in found if entry[0] in chosen], out)
     if failures:
         raise ConfigurationError("; ".join(f"{name} failed: {error}" for name, error in failures.items()))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -90,8 +91,12 @@ def test_a_run_that_was_stopped_goes_on(safe_envs_command, catalogue, computed, 
     assert "table-0.2 failed: ValueError: no luck" in err
     assert "table-0.1" in out
     monkeypatch.setattr("scripts.reproduce.catalogue.ARTEFACTS", (replace(coin, name="table-0.2"), coin))
-    assert safe_envs_command("reproduce", "all", "--jobs", 1, "--out", "report")[0] == 0
+    status, out, _ = safe_envs_command("reproduce", "table-0.2", "--jobs", 1, "--out", "report")
+    assert status == 0
     assert len(computed) == 2
+    assert "table-0.1" not in out
+    page = Path("report/index.html").read_text()
+    assert all(name in page for name in ("table-0.1", "table-0.2"))
 
 
 @pytest.mark.parametrize(
