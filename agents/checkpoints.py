@@ -16,6 +16,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from agents.algorithms import algorithm_class
+from agents.policy import DESCRIPTION, TENSORS
 from agents.weights import save_policy
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import write_atomically, write_json
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 _STATE, _MODEL, _BUFFER, _SCALES, _ENVS = "state.json", "model.zip", "replay_buffer.pkl", "normalization.pkl", "envs.npz"
-_OF_THE_POLICY = (_MODEL, _SCALES, "policy.safetensors", "policy.json")
+_OF_THE_POLICY = (_MODEL, _SCALES, TENSORS, DESCRIPTION)
 _CHECKPOINT = "checkpoint_"
 
 # What zip archives, pickles and those who read them raise on damaged files.
@@ -57,7 +58,7 @@ def keep_checkpoint(folder: Path, model: Any, problem: SafetyProblem, state: Map
     scales = model.get_vec_normalize_env()
     if scales is not None:
         scales.save(str(part / _SCALES))
-    arrays: Any = snapshot(model.get_env())
+    arrays: Any = _snapshot(model.get_env())
     np.savez(part / _ENVS, **arrays)
     save_policy(model, part, problem, scales)
     write_json(part / _STATE, state)
@@ -99,7 +100,7 @@ def resume_episodes(checkpoint: Path, model: Any, seed: int) -> None:
     A training that goes on does this at each of its checkpoints too, so that one which was interrupted does the same.
     """
     with np.load(checkpoint / _ENVS) as arrays:
-        restore(model.get_env(), dict(arrays), seed)
+        _restore(model.get_env(), dict(arrays), seed)
 
 
 def copy_policy(checkpoint: Path, target: Path) -> None:
@@ -115,14 +116,14 @@ def drop_replay_buffer(checkpoint: Path) -> None:
     (checkpoint / _BUFFER).unlink(missing_ok=True)
 
 
-def snapshot(envs: VecEnv) -> dict[str, np.ndarray]:
+def _snapshot(envs: VecEnv) -> dict[str, np.ndarray]:
     """Where the episodes of a `SafeVecEnv` and of the VecMonitor and VecNormalize over it stand, as arrays by name."""
     found = dict(envs.unwrapped.snapshot())  # pyright: ignore[reportAttributeAccessIssue]
     return found | {f"{name}_of_layers": getattr(layer, name) for layer, name in _sums(envs)}
 
 
-def restore(envs: VecEnv, arrays: Mapping[str, np.ndarray], seed: int) -> None:
-    """Go on from a `snapshot`, with the randomness of a seed."""
+def _restore(envs: VecEnv, arrays: Mapping[str, np.ndarray], seed: int) -> None:
+    """Go on from a `_snapshot`, with the randomness of a seed."""
     envs.unwrapped.restore(arrays, seed)  # pyright: ignore[reportAttributeAccessIssue]
     for layer, name in _sums(envs):
         setattr(layer, name, arrays[f"{name}_of_layers"].copy())

@@ -130,7 +130,8 @@ class Training:
         steps, copies = (default if chosen is None else chosen for chosen, default in ((n_timesteps, steps), (num_envs, copies)))
         require_whole("n_timesteps", steps, 1)
         require_whole("num_envs", copies, 1)
-        if "n_epochs" in found:
+        if algorithm == "ppo":
+            require_whole("n_steps", found["n_steps"], 1)
             found["batch_size"] = whole_batches(found["batch_size"], found["n_steps"] * copies, "batch_size" in given)
         if algorithm in OFF_POLICY:
             # The whole training, where Stable-Baselines3 would set aside a million rows.

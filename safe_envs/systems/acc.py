@@ -22,7 +22,9 @@ v, z, v_f = sp.symbols("v z v_f", real=True)
 f_0, f_1, f_2, M, sigma_1, sigma_2 = sp.symbols("f_0 f_1 f_2 M sigma_1 sigma_2", real=True)
 
 _CAR = {f_0: 0.1, f_1: 5.0, f_2: 0.25, M: 1650.0}
-_MOST_FORCE = 0.3 * 1650.0 * 9.81
+WEIGHT = _CAR[M] * 9.81
+"""M g, in N."""
+_MOST_FORCE = 0.3 * WEIGHT
 _DESIRED_SPEED = 22
 _LEAD_SPEED = 20.0
 _CLOSENESS = sp.exp(-z / 50)

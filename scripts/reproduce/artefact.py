@@ -99,7 +99,7 @@ class Outcome:
     Attributes:
         numbers: of the artefact.
         claims: of its figure and of the text about it.
-        elsewhere: the same numbers with other settings, by a name that says which; only where the claims hold there too.
+        elsewhere: the same numbers and claims with other settings, by a name that says which.
         as_printed: the same numbers by the printed formula, where that is wrong.
         data: what the picture shows, lists by name.
         notes: what else a reader should know, computed where it holds numbers.
@@ -107,7 +107,7 @@ class Outcome:
 
     numbers: list[Number] = field(default_factory=list)
     claims: list[Claim] = field(default_factory=list)
-    elsewhere: dict[str, list[Number]] = field(default_factory=dict)
+    elsewhere: dict[str, Outcome] = field(default_factory=dict)
     as_printed: list[Number] = field(default_factory=list)
     data: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -126,7 +126,7 @@ class Outcome:
         return cls(
             numbers(document["numbers"]),
             [Claim(**row) for row in document["claims"]],
-            {name: numbers(rows) for name, rows in document["elsewhere"].items()},
+            {name: cls.from_document(other) for name, other in document["elsewhere"].items()},
             numbers(document["as_printed"]),
             document["data"],
             document["notes"],

@@ -160,7 +160,7 @@ def _rates(sample: Sample) -> Outcome:
     else:
         fewer = bayesian(REPETITIONS[0], _FEW_CONTROLLERS)
         last = fewer.number("Bayesian SCBF", _PRINTED["Bayesian SCBF"])
-        elsewhere = {f"K = {REPETITIONS[0]} in the identification": [*numbers[:2], last]}
+        elsewhere = {f"K = {REPETITIONS[0]} in the identification": Outcome([*numbers[:2], last])}
         told.append(f"With K = {REPETITIONS[0]} the Bayesian SCBF differs from the SCBF by {fewer.told}.")
     return Outcome(
         numbers=numbers,

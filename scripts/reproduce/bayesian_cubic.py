@@ -206,7 +206,7 @@ def _rates(sample: Sample) -> Outcome:
     return Outcome(
         numbers=[number for place in places for number in place.numbers(place.bayesian)],
         claims=_claims(places, world.horizon, _long(sample)),
-        elsewhere={f"K = {REPETITIONS[0]} in the identification": few} if few else {},
+        elsewhere={f"K = {REPETITIONS[0]} in the identification": Outcome(few)} if few else {},
         as_printed=wrong,
         notes=[
             f"The hypothesis fails: no input keeps A h >= 0 near the centre: it is missed by up to {worst.missed:.3f}. What holds is "

@@ -70,7 +70,7 @@ def _table(sample: Sample) -> Outcome:
             *(close(found[k], PRINTED["SCBF"][i], PRINTED["DDSCBF"][i], f" at k = {k:g}") for i, k in enumerate(LEVELS)),
             *(_safer(found[k], f"DDSCBF is safer than the CBF at k = {k:g}") for k in LEVELS),
         ],
-        elsewhere={f"a single start {FIXED}": _numbers(fixed, {"SCBF": "scbf", "CBF": CBF})},
+        elsewhere={f"a single start {FIXED}": Outcome(_numbers(fixed, {"SCBF": "scbf", "CBF": CBF}))},
         as_printed=_numbers(printed, {"DDSCBF": "ddscbf"}),
         data={f"k = {k:g}": {name: curve(found[k].rows[text]) for name, text in _FILTERS.items()} for k in LEVELS},
         notes=[

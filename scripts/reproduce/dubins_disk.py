@@ -52,10 +52,10 @@ def compute_disk(sample: Sample) -> Outcome:
     return Outcome(
         numbers=_disk_numbers(ours[PRINTED_START], printed=3),
         elsewhere={
-            f"start {VALID_START}": _disk_numbers(ours[VALID_START], printed=3),
-            f"start {VALID_START}, |omega| <= pi": _disk_numbers([narrow[VALID_START]], printed=3),
-            "|omega| <= pi": _disk_numbers([narrow[PRINTED_START]], printed=3),
-            "without the margin of Eq. (3.20)": _disk_numbers([without], printed=3),
+            f"start {VALID_START}": Outcome(_disk_numbers(ours[VALID_START], printed=3)),
+            f"start {VALID_START}, |omega| <= pi": Outcome(_disk_numbers([narrow[VALID_START]], printed=3)),
+            "|omega| <= pi": Outcome(_disk_numbers([narrow[PRINTED_START]], printed=3)),
+            "without the margin of Eq. (3.20)": Outcome(_disk_numbers([without], printed=3)),
         },
         as_printed=_disk_numbers(by_print),
         claims=[

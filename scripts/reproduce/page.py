@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -13,7 +13,7 @@ from PIL import Image
 
 from agents.evaluation import package_versions
 from safe_envs.files import write_atomically
-from scripts.reproduce.artefact import Artefact, Number, Outcome, Sample
+from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
 from scripts.reproduce.verdict import RULES, Judgement, agrees, judge
 
 _COLOURS = 64
@@ -33,9 +33,15 @@ class _Entry:
     @property
     def settings(self) -> list[tuple[str, Sequence[Number]]]:
         """The tables of numbers, with their headings."""
-        tables = [("", self.outcome.numbers), *((f"With {name}", numbers) for name, numbers in self.outcome.elsewhere.items())]
+        tables = [("", self.outcome.numbers), *((f"With {name}", found.numbers) for name, found in self.outcome.elsewhere.items())]
         tables.append(("By the printed formula", self.outcome.as_printed))
         return [(heading, numbers) for heading, numbers in tables if numbers]
+
+    @property
+    def claims(self) -> list[Claim]:
+        """The claims, and those with other settings by their names."""
+        others = [replace(c, sentence=f"With {name}: {c.sentence}") for name, found in self.outcome.elsewhere.items() for c in found.claims]
+        return [*self.outcome.claims, *others]
 
 
 def write_page(folder: Path, found: Sequence[tuple[Artefact, Outcome, float]], sample: Sample) -> None:

@@ -244,7 +244,7 @@ def _table(sample: Sample) -> Outcome:
                 f"without it the trajectory is {'safe' if still else 'unsafe'}; with it {unsafe} are unsafe",
             ),
         ],
-        elsewhere={f"setting A: uniform in C, {ALL['horizon']:g} s, CBF with alpha = {ALPHA_ALL:g}": _numbers(there, cbf_all)},
+        elsewhere={f"setting A: uniform in C, {ALL['horizon']:g} s, CBF with alpha = {ALPHA_ALL:g}": Outcome(_numbers(there, cbf_all))},
         as_printed=[literal.number("DDSCBF", "ddscbf", DDSCBF_PRINTED)],
         data={name: {text: curve(row) for text, row in found.rows.items()} for name, found in (("B", here), ("A", there))},
         notes=[

@@ -24,7 +24,8 @@ RULES = {
     Verdict.REPRODUCED: "every claim holds, and every printed number agrees: a rate, if ours is inside the 95 % interval of the printed "
     "one at the printed sample size or the printed one inside ours; another number, if it is inside our 95 % interval",
     Verdict.ORDERING: "some number does not agree, but every claim holds, and so does every printed order of two numbers",
-    Verdict.ELSEWHERE: "neither of the above, but all numbers agree with the settings that are named",
+    Verdict.ELSEWHERE: "neither of the above, but with the settings that are named every printed number agrees, and every "
+    "claim that is looked at there holds",
     Verdict.NOT: "none of the above; the argument stands beside it",
     Verdict.WRONG_FORMULA: "said besides: a number by the printed formula is outside our interval by the corrected one",
 }
@@ -67,7 +68,7 @@ def judge(artefact: Artefact, outcome: Outcome) -> Judgement:
         *(f"does not hold: {sentence}" for sentence in failed),
         *(f"{first} is not above {second}" for first, second in turned),
     ]
-    other = next((name for name, numbers in outcome.elsewhere.items() if all(map(agrees, numbers))), None)
+    other = next((name for name, found in outcome.elsewhere.items() if _reached(found)), None)
     if not apart and not failed:
         verdict = Verdict.REPRODUCED
     elif artefact.orderings and not turned and not failed:
@@ -90,6 +91,12 @@ def agrees(number: Number) -> bool:
         return False
     low, high = rate_interval(round(number.printed_trials * number.printed / 100), number.printed_trials)
     return 100 * low <= number.ours <= 100 * high
+
+
+def _reached(outcome: Outcome) -> bool:
+    """Whether the print comes out, where there is something that could say otherwise."""
+    tested = bool(outcome.claims) or any(number.printed is not None for number in outcome.numbers)
+    return tested and all(map(agrees, outcome.numbers)) and all(claim.holds for claim in outcome.claims)
 
 
 def _same(printed_form: Number, numbers: Sequence[Number]) -> bool:

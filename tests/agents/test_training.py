@@ -13,6 +13,7 @@ import yaml
 import safe_envs
 from agents import evaluate
 from agents.algorithms import whole_batches
+from agents.episodes import episode_seed
 from agents.figures import ProgressLog, SafetyFigures, read_progress
 from agents.hyperparameters import ALGORITHMS, scheduled
 from agents.problems import load_problem
@@ -155,6 +156,7 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
         ({"options": {"noise": np.ones(2)}}, "JSON"),
         ({"seed": 2**32}, "seed"),
         ({"settings": {"batch_size": 100}}, "batch_size"),
+        ({"settings": {"n_steps": "many"}}, "n_steps"),
         ({"settings": {"n_timesteps": "many"}, "n_timesteps": None}, "n_timesteps"),
     ):
         with pytest.raises(ConfigurationError, match=message):
@@ -175,6 +177,7 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
     ("algorithm", "settings", "message"),
     [
         ("ppo", {"speed": 3}, r"ppo does not take these hyperparameters.*speed"),
+        ("a2c", {"n_epochs": 3}, "a2c does not take"),
         ("ppo", {"normalize": "no thanks"}, "normalize|does not take"),
         ("ppo", {"normalize": {"bogus": 1}}, "bogus"),
         ("sac", {"noise_type": "pink", "noise_std": 0.1}, "noise_type"),
@@ -257,6 +260,23 @@ def test_the_figures_are_those_of_the_infos():
     assert found["rate"] == np.mean([info["episode_cost"] == 0 for info in ended])
     assert found["episode_cost"] == np.mean([info["episode_cost"] for info in ended])
     assert found["h_min"] == pytest.approx(np.mean([info["h_min"] for info in ended]))
+
+
+def test_the_figures_are_those_of_the_evaluation_on_the_same_episodes():
+    options, episodes = {"horizon": 0.5, "noise": 1.0}, 32
+    (row,) = evaluate(DUBINS, "zero", ["scbf"], options=options, episodes=episodes, bounds=False).rows
+    envs, figures = make_sb3_env(DUBINS, episodes, "scbf", **options), SafetyFigures()
+    figures.init_callback(type("Model", (), {"get_env": lambda self: envs, "logger": None, "num_timesteps": 0})())  # pyright: ignore
+    envs._seeds = [episode_seed(0, i) for i in range(episodes)]
+    envs.reset()
+    dones = np.zeros(episodes, dtype=bool)
+    while not dones.any():
+        _, _, dones, _ = envs.step(np.zeros((episodes, 1)))
+        figures.locals = {"dones": dones}
+        figures._on_step()
+    assert dones.all()
+    assert 0 < figures.figures()["rate"] < 1
+    assert figures.figures()["rate"] == row["safety_rate"]
 
 
 def test_the_files_have_the_form_that_the_zoo_reads():

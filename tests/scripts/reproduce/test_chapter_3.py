@@ -60,7 +60,7 @@ def test_names_of_numbers_are_unique_and_printed_forms_have_one_of_ours(name, ou
     assert len(set(names)) == len(names)
     assert {number.name for number in outcome.as_printed} <= set(names)
     for other in outcome.elsewhere.values():
-        assert [number.name for number in other] == names
+        assert [number.name for number in other.numbers] == names
 
 
 @pytest.mark.parametrize("name", ARTEFACTS)

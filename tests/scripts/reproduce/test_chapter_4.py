@@ -113,7 +113,7 @@ def test_force_near_the_edge() -> None:
     """At equal speeds SCBF balances the drag, and SRCBF brakes by M tau sigma^2/h more."""
     h, setting = cruise.DISTANCES, cruise.TAKEN
     drag = 0.1 + 5 * cruise.NEAR + 0.25 * cruise.NEAR**2
-    asked = drag - cruise.MASS / setting.tau * ((setting.tau * cruise.NOISE) ** 2 / h - setting.gamma * h**3)
+    asked = drag - cruise.WEIGHT / 9.81 / setting.tau * ((setting.tau * cruise.NOISE) ** 2 / h - setting.gamma * h**3)
     acting = h < 1.0
     assert np.allclose(cruise.needed("scbf"), drag)
     assert np.allclose(cruise.needed("srcbf")[acting], asked[acting], rtol=1e-6)
@@ -132,7 +132,7 @@ def test_printed_table_is_out_of_reach_of_the_default() -> None:
 def test_saturation_hurts_srcbf() -> None:
     """With the settings that match the table, far more than SCBF."""
     (matching,) = outcome_of("table-4.1").elsewhere.values()
-    rate = {number.name: number.ours for number in matching}
+    rate = {number.name: number.ours for number in matching.numbers}
     assert rate["SRCBF, unbounded"] - rate["SRCBF, bounded"] > rate["SCBF, unbounded"] - rate["SCBF, bounded"] + 10
 
 
@@ -159,7 +159,7 @@ def test_scbf_is_safer_only_in_the_long_run() -> None:
     """From starts with A h > 0 at 5 s; from all starts it is not yet at 3 s without noise."""
     numbers = ours("figure-4.2")
     assert numbers["SCBF, sigma = 0.2"].low > numbers["SZCBF, sigma = 0.2"].high
-    early = {number.name: number.ours for number in outcome_of("figure-4.2").elsewhere["all starts, T = 3 s"]}
+    early = {number.name: number.ours for number in outcome_of("figure-4.2").elsewhere["all starts, T = 3 s"].numbers}
     assert early["SCBF, sigma = 0"] < early["SZCBF, sigma = 0"]
 
 
