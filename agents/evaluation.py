@@ -18,7 +18,7 @@ from agents.comparison import Comparison, Flags, compare_all
 from agents.episodes import Env, Progress, Recorder, Row, Totals, run_episodes
 from agents.learning import Learning, describe, seconds_of
 from agents.policy import Policy, make_policy, policy_files
-from agents.problems import full_id, load_problem
+from agents.problems import full_id, load_problem, title_of
 from agents.promised import Promised, together
 from agents.repeats import pooled
 from agents.statistics import require_confidence
@@ -60,6 +60,12 @@ class Evaluation:
     flags: dict[str, list[Flags]]
     learned: list[LearnedModel]
     repeats: bool
+
+    @property
+    def title(self) -> str:
+        """How results call what was evaluated."""
+        env_id = self.config["env_id"]
+        return self.problem.name if env_id is None else title_of(env_id, self.config["options"])
 
     def document(self) -> dict[str, Any]:
         """The whole as JSON-able data."""

@@ -9,6 +9,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
 from safe_envs import ENV_IDS, SafeEnv, SafetyProblem
+from safe_envs.custom import CUSTOM_ID
 from safe_envs.errors import ConfigurationError, nearest
 
 
@@ -25,6 +26,35 @@ def full_id(env_id: str) -> str:
     raise ConfigurationError(f"unknown env {env_id!r}; {nearest(name, ENV_IDS)}")
 
 
+def which_env(env_id: str | None, system: str | None) -> str:
+    """The id of a registered env, or that of a system of one's own.
+
+    Args:
+        env_id: registered id, if one was given.
+        system: place of a system, if one was given: FILE.py:NAME.
+
+    Raises:
+        ConfigurationError: there is no such id, or not just one of the two was given.
+    """
+    if (env_id is None) == (system is None):
+        what = "neither is there" if env_id is None else f"both are there, {env_id} and {system}"
+        raise ConfigurationError(f"name an env by ENV_ID, or a system of your own by --system FILE.py:NAME; {what}")
+    return CUSTOM_ID if env_id is None else full_id(env_id)
+
+
+def title_of(env_id: str, options: Mapping[str, Any]) -> str:
+    """How results call an env: by its id, or a system of one's own by its place."""
+    return options.get("system") or env_id
+
+
+def require_ours(env_id: str) -> None:
+    """Raise ConfigurationError unless an id is registered, and of this project."""
+    spec = gym.spec(full_id(env_id))
+    creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
+    if not (isinstance(creator, type) and issubclass(creator, SafeEnv)):
+        raise ConfigurationError(f"{env_id} is not one of this project's envs; {nearest(env_id, ENV_IDS)}")
+
+
 def make_env(env_id: str, options: Mapping[str, Any] | None = None) -> SafeEnv:
     """Make the scalar env of an id, without wrappers.
 
@@ -35,12 +65,9 @@ def make_env(env_id: str, options: Mapping[str, Any] | None = None) -> SafeEnv:
     Raises:
         ConfigurationError: the id is unknown or not of this project, or an argument is not allowed.
     """
-    spec = gym.spec(full_id(env_id))
-    creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
-    if not (isinstance(creator, type) and issubclass(creator, SafeEnv)):
-        raise ConfigurationError(f"{env_id} is not one of this project's envs; {nearest(env_id, ENV_IDS)}")
+    require_ours(env_id)
     given = {key: value for key, value in (options or {}).items() if value is not None}
-    return gym.make(spec, disable_env_checker=True, **given).unwrapped  # pyright: ignore[reportReturnType]
+    return gym.make(full_id(env_id), disable_env_checker=True, **given).unwrapped  # pyright: ignore[reportReturnType]
 
 
 def load_problem(env_id: str, options: Mapping[str, Any] | None = None) -> SafetyProblem:

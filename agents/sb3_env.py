@@ -18,7 +18,7 @@ from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
 from agents.evaluation import BARE
-from agents.problems import full_id, make_env
+from agents.problems import full_id, require_ours
 from agents.sb3_infos import LazyInfo
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.info import Info
@@ -68,7 +68,7 @@ def make_sb3_env(
         require_whole("seed", seed, 0)
     given = {key: value for key, value in options.items() if value is not None}
     # This refuses ids of other projects, whose vector envs take other arguments.
-    make_env(env_id)
+    require_ours(env_id)
     env = gym.make_vec(full_id(env_id), int(num_envs), "vector_entry_point", autoreset_mode=AutoresetMode.SAME_STEP.value, **given)
     if filter is not None and filter != BARE:
         env = SafetyFilterVectorWrapper(env, filter, knowledge, objective)

@@ -4,6 +4,7 @@ from importlib.metadata import version
 
 from safe_envs.barrier import Barrier
 from safe_envs.clf import CLF
+from safe_envs.custom import register, register_custom
 from safe_envs.env import SafeEnv
 from safe_envs.errors import (
     ConfigurationError,
@@ -12,9 +13,11 @@ from safe_envs.errors import (
     RelativeDegreeError,
     SafeEnvsError,
     SystemDefinitionError,
+    SystemDefinitionWarning,
 )
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
+from safe_envs.statement import state_problem
 from safe_envs.systems import ENV_IDS, register_all
 from safe_envs.vector import SafeVectorEnv
 
@@ -32,8 +35,12 @@ __all__ = [
     "SafeVectorEnv",
     "SafetyProblem",
     "SystemDefinitionError",
+    "SystemDefinitionWarning",
+    "register",
+    "state_problem",
 ]
 
 __version__ = version("safe-envs")
 
 register_all()
+register_custom()

@@ -13,6 +13,7 @@ import numpy as np
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, nearest
 from safe_envs.info import Info, safety_info
 from safe_envs.problem import SafetyProblem
+from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 from safe_envs.simulation import NoiseStream, Simulation, center_and_half_width, steps_until
 
 
@@ -28,20 +29,27 @@ def action_box(problem: SafetyProblem) -> gym.spaces.Box:
     return gym.spaces.Box(-1.0, 1.0, (len(problem.inputs),), dtype=np.float32)
 
 
-def make_problem(env_class: type[Any], barrier: Mapping[str, Any] | None, options: Mapping[str, Any]) -> SafetyProblem:
-    """Build the problem of a registered env class with the arguments of `gym.make`.
+def make_problem(name: str, factory: Any, barrier: Mapping[str, Any] | None, options: Mapping[str, Any]) -> SafetyProblem:
+    """Build a problem with the arguments of `gym.make`.
 
-    The arguments of the problem's factory may be given in `barrier` or by themselves.
+    Args:
+        name: of the env, for errors.
+        factory: function that states the problem.
+        barrier: its arguments, which may also be given by themselves in `options`.
+        options: arguments of `SafetyProblem.configured`.
+
+    Raises:
+        ConfigurationError: an argument is unknown or out of range.
     """
-    of_factory = inspect.signature(env_class.problem_factory).parameters
+    of_factory = inspect.signature(factory).parameters
     of_problem = [name for name in inspect.signature(SafetyProblem.configured).parameters if name != "self"]
     shape = {**(barrier or {}), **{key: value for key, value in options.items() if key in of_factory}}
     settings = {key: value for key, value in options.items() if key not in of_factory}
-    for name, allowed, given in (("barrier argument", of_factory, shape), ("argument", (*of_problem, *of_factory), settings)):
+    for what, allowed, given in (("barrier argument", of_factory, shape), ("argument", (*of_problem, *of_factory), settings)):
         for key in given:
             if key not in allowed:
-                raise ConfigurationError(f"{env_class.__name__} has no {name} {key!r}; {nearest(key, allowed)}")
-    return env_class.problem_factory(**shape).configured(**settings)
+                raise ConfigurationError(f"{name} has no {what} {key!r}; {nearest(key, allowed)}")
+    return factory(**shape).configured(**settings)
 
 
 class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -60,14 +68,18 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     Args:
         problem: what to simulate.
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
-        render_mode: None; nothing is drawn yet.
+        render_mode: "rgb_array" for pictures by `render()`, "human" for a window that every step is drawn to, or None.
+
+    Raises:
+        ConfigurationError: an argument is out of range.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # pyright: ignore[reportIncompatibleVariableOverride]
+    # The frame rate of an env is that of its own control period.
+    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 20}  # noqa: RUF012  (as in the base class)
 
     def __init__(self, problem: SafetyProblem, max_episode_steps: int | None = None, render_mode: str | None = None) -> None:
-        if render_mode is not None:
-            raise ConfigurationError(f"render_mode = {render_mode!r}; only None is available")
+        self._viewer = open_viewer(problem, render_mode)
+        self.metadata = {**self.metadata, "render_fps": frames_a_second(problem)}
         self.problem = problem
         self.observation_space = self._bounds = observation_box(problem)
         self.action_space = action_box(problem)
@@ -126,6 +138,8 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self._h_min = math.inf
         self._episode_cost = 0.0
         observation, _, _, info = self._observe([c for c, _ in self._scales])
+        if self._viewer is not None:
+            self._viewer.restart([self._x], [0.0], [0])
         return observation, info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Info]:
@@ -146,7 +160,53 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             observation, reward, terminated, info = self._observe(u)
         except (OverflowError, ZeroDivisionError, ValueError) as error:
             raise NumericalError(f"the simulation of {self.problem.name!r} broke down at {self._x}: {error}") from error
+        if self._viewer is not None:
+            self._viewer.advance([self._x], [self._steps * self.problem.dt], [u])
         return observation, reward, terminated, self._steps >= self._limit, info
+
+    def announce(self, nominal: Sequence[float], active: bool, feasible: bool) -> None:
+        """Tell the picture of the next step what a filter decided; without a render mode nobody needs to know.
+
+        Args:
+            nominal: the physical input that was proposed.
+            active: whether a condition of the filter was active.
+            feasible: whether an input met the conditions.
+        """
+        if self._viewer is not None:
+            self._viewer.announce([nominal], [active], [feasible])
+
+    def render(self) -> Any:
+        """Draw the state, with the trail of the episode and what a filter decided.
+
+        Returns:
+            uint8 of shape (height, width, 3) in the mode "rgb_array"; None in the mode "human", which draws to its window.
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: pygame is missing.
+            ResetNeeded: there is no state yet.
+            ConfigurationError: there is no display for a window.
+        """
+        if self._viewer is None:
+            gym.logger.warn('render() draws nothing without a render mode; make the env with render_mode="rgb_array" or "human"')
+            return None
+        if self._x is None:
+            raise gym.error.ResetNeeded("the env has no state yet: call reset() first")
+        return self._viewer.render()
+
+    def close(self) -> None:
+        """Close the window of the mode "human"."""
+        if self._viewer is not None:
+            self._viewer.close()
+
+    @property
+    def caption(self) -> str:
+        """What the pictures say above the scene, the name of a filter say; empty without a render mode."""
+        return "" if self._viewer is None else self._viewer.caption
+
+    @caption.setter
+    def caption(self, text: str) -> None:
+        if self._viewer is not None:
+            self._viewer.caption = text
 
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
         x = self.components
@@ -187,7 +247,7 @@ class SystemEnv(SafeEnv):
         box: physical bounds (low, high) of every input, or one pair for each.
         start: name of an initial distribution, or a fixed initial state.
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
-        render_mode: None; nothing is drawn yet.
+        render_mode: "rgb_array", "human" or None; see `SafeEnv`.
 
     Raises:
         ConfigurationError: an argument names something unknown or is out of range.
@@ -203,4 +263,4 @@ class SystemEnv(SafeEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(make_problem(type(self), barrier, options), max_episode_steps, render_mode)
+        super().__init__(make_problem(type(self).__name__, type(self).problem_factory, barrier, options), max_episode_steps, render_mode)

@@ -16,6 +16,10 @@ class SystemDefinitionError(SafeEnvsError, ValueError):
     """A system, barrier or problem contradicts itself."""
 
 
+class SystemDefinitionWarning(UserWarning):
+    """A system, barrier or problem may not be what its author means."""
+
+
 class RelativeDegreeError(SystemDefinitionError):
     """The input never appears in the derivatives of a barrier, or not where a condition needs it."""
 

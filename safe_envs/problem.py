@@ -92,6 +92,7 @@ class SafetyProblem:
         filter: name of the condition that suits the problem.
         substeps: integration steps in a control period.
         plane: the two states that draw a trajectory, if any.
+        scene: how the problem is drawn, a name of `safe_envs.rendering.scenes`; "" for the drawing that fits every problem.
         clf: the task as a soft goal, if it is one.
         explored: where and how the system is excited to learn from it, as far as the defaults do not suit; see `exploration`.
 
@@ -118,6 +119,7 @@ class SafetyProblem:
     filter: str = "hocbf"
     substeps: int = 1
     plane: tuple[str, str] | None = None
+    scene: str = ""
     clf: CLF | None = None
     explored: Exploration = field(default_factory=Exploration)
     box: tuple[tuple[float, float], ...] = field(init=False)

@@ -83,6 +83,40 @@ class ControlAffineSDE:
             object.__setattr__(self, name, value)
         self._check_symbols()
 
+    @classmethod
+    def from_rate(
+        cls,
+        states: Sequence[sp.Symbol],
+        inputs: Sequence[sp.Symbol],
+        rate: Sequence[Any],
+        diffusion: Any = None,
+        parameters: Mapping[sp.Symbol, float] | None = None,
+    ) -> ControlAffineSDE:
+        """The system dx = rate(x, u) dt + sigma(x) dW, taken apart into f and g.
+
+        Args:
+            states: n symbols x.
+            inputs: m symbols u.
+            rate: n expressions of the states, inputs and parameters.
+            diffusion: sigma, n x d; none by default.
+            parameters: value of every other symbol that occurs.
+
+        Raises:
+            SystemDefinitionError: the rate is not affine in the inputs, or see the class.
+        """
+        column = _matrix("rate", rate, (len(states), 1))
+        used = set(inputs)
+        effect = column.jacobian(list(inputs)).applyfunc(lambda e: sp.simplify(e) if e.free_symbols & used else e)
+        for i, state in enumerate(states):
+            for j, u in enumerate(inputs):
+                if effect[i, j].free_symbols & used:
+                    raise SystemDefinitionError(
+                        f"the rate of {state} is not affine in the input {u}: its derivative is {effect[i, j]}. Take what is not affine "
+                        "for the input, or make the input a state whose rate is the new input"
+                    )
+        drift = column.subs(dict.fromkeys(inputs, 0))
+        return cls(tuple(states), tuple(inputs), drift, effect, [[0]] * len(states) if diffusion is None else diffusion, parameters or {})
+
     def __hash__(self) -> int:
         return hash((self.states, self.inputs, self.drift, self.input_matrix, self.diffusion, tuple(self.parameters.items())))
 

@@ -16,6 +16,7 @@ from safe_envs.env import action_box, make_problem, observation_box
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.info import Info, safety_info, with_masks
 from safe_envs.problem import SafetyProblem
+from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 from safe_envs.simulation import NoiseStreams, Simulation, center_and_half_width, steps_until
 
 _LOWEST, _HIGHEST = constants((-1.0, 1.0))
@@ -42,7 +43,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             of the episode are in `infos["final_obs"]` and `infos["final_info"]`) or "Disabled" (reset by
             `options={"reset_mask": mask}`).
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
-        render_mode: None; nothing is drawn yet.
+        render_mode: "rgb_array" for pictures by `render()`, or None.
 
     Raises:
         ConfigurationError: an argument is out of range.
@@ -58,8 +59,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> None:
         if not isinstance(num_envs, int) or num_envs < 1:
             raise ConfigurationError(f"num_envs = {num_envs!r}; give a whole number from 1")
-        if render_mode is not None:
-            raise ConfigurationError(f"render_mode = {render_mode!r}; only None is available")
+        self._viewer = open_viewer(problem, render_mode, num_envs)
+        self.render_mode = render_mode
         try:
             self._autoreset = AutoresetMode(autoreset_mode)
         except ValueError as error:
@@ -67,7 +68,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ConfigurationError(f"autoreset_mode = {autoreset_mode!r}; allowed: {allowed}") from error
         self.problem = problem
         self.num_envs = num_envs
-        self.metadata = {"render_modes": [], "autoreset_mode": self._autoreset}
+        self.metadata = {"render_modes": [*RENDER_MODES[1:]], "render_fps": frames_a_second(problem), "autoreset_mode": self._autoreset}
         self.single_observation_space = self._bounds = observation_box(problem)
         self.single_action_space = action_box(problem)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -148,6 +149,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
         self._restart(np.flatnonzero(mask))
         observation, _, _, _, info = self._observe(tuple(self._center), counted=mask)
+        if self._viewer is not None:
+            self._viewer.restart(self.state, self._steps * self.problem.dt, np.flatnonzero(mask).tolist())
         return observation, with_masks(info, mask)
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -171,6 +174,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._x = tuple(np.array(snapshot["state"], dtype=float).T.copy())
         for name in _OF_EPISODES:
             setattr(self, f"_{name}", np.array(snapshot[name]))
+        if self._viewer is not None:
+            self._viewer.restart(self.state, self._steps * self.problem.dt, range(self.num_envs))
 
     def step(self, actions: Any) -> VectorStep:
         """Hold an action in each env for one control period.
@@ -205,9 +210,41 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             if np.count_nonzero(ended):
                 last = self._last_of_episode(ended, observation, info)
                 observation, _, _, _, info = self._observe(tuple(self._center), counted=ended)
+            anew = ended
         else:
             self._ended = ended
+        if self._viewer is not None:
+            fresh = [] if anew is None else np.flatnonzero(anew).tolist()
+            self._viewer.advance(self.state, self._steps * self.problem.dt, np.stack(u, axis=-1), fresh)
         return observation, reward, terminated, truncated, {**with_masks(info, self._everywhere.copy()), **last}
+
+    def announce(self, nominal: Sequence[Any], active: np.ndarray, feasible: np.ndarray) -> None:
+        """Tell the pictures of the next step what a filter decided; see `SafeEnv.announce`.
+
+        Args:
+            nominal: components of the physical inputs that were proposed.
+            active: whether a condition was active, shape (num_envs,).
+            feasible: whether an input met the conditions, shape (num_envs,).
+        """
+        if self._viewer is not None:
+            self._viewer.announce(np.stack(nominal, axis=-1), active, feasible)
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Draw every env, with the trail of its episode and what a filter decided.
+
+        Returns:
+            For each env uint8 of shape (height, width, 3); None, with a warning, without a render mode.
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: pygame is missing.
+            ResetNeeded: there is no state yet.
+        """
+        if self._viewer is None:
+            gym.logger.warn('render() draws nothing without a render mode; make the envs with render_mode="rgb_array"')
+            return None
+        if not self._x:
+            raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
+        return self._viewer.frames()
 
     def _last_of_episode(self, ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
         """Keep what the ended envs showed last, and restart them."""
@@ -308,5 +345,5 @@ class SystemVectorEnv(SafeVectorEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        problem = make_problem(self.env_class, barrier, options)
+        problem = make_problem(self.env_class.__name__, self.env_class.problem_factory, barrier, options)
         super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)

@@ -20,7 +20,8 @@ LEARNED_PARAMETERS = (
 
 
 def evaluate(
-    env_id: options.EnvId,
+    env_id: options.EnvId = None,
+    system: options.System = None,
     filters: Annotated[
         list[str] | None,
         typer.Option(
@@ -77,17 +78,27 @@ def evaluate(
     are Wilson's (Clopper and Pearson's where all or no episodes are safe), and Newcombe's for differences.
     """
     from agents import evaluation, refinement
+    from agents.problems import which_env
     from scripts.table import print_evaluation, print_refinement
 
     options.require_outputs(json, plot, inputs=options.inputs_of(policy, filters or (), learned or ()))
     arguments = options.of_env(
-        noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
+        system=system,
+        noise=noise,
+        plant=plant,
+        model=model,
+        barrier=barrier,
+        dt=dt,
+        substeps=substeps,
+        horizon=horizon,
+        box=box,
+        start=start,
     )
     names = list(dict.fromkeys(filters)) if filters else None
     run_all: Callable[..., Any] = refinement.refine if refine else evaluation.evaluate
     with progress_bar("Evaluating") as tell:
         answer = run_all(
-            env_id,
+            which_env(env_id, system),
             policy,
             filters=names,
             trust=trust,

@@ -64,7 +64,7 @@ def draw(evaluation: Evaluation, path: Path) -> None:
         if problem.plane:
             _draw_plane(figure.add_subplot(grid[:, 1]), evaluation, colors)
         add_legend(figure, barrier.get_legend_handles_labels()[0])
-        title = f"{config['env_id'] or problem.name}, {_policy_name(Path(config['policy']['name']))} policy"
+        title = f"{evaluation.title}, {_policy_name(Path(config['policy']['name']))} policy"
         figure.suptitle(f"{title}\n{describe_system(problem)}", fontsize=11)
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
 

@@ -35,7 +35,6 @@ _SETTINGS_HELP = "\n\n".join(("Setting of the method, repeatable; with the defau
 
 
 def identify(
-    env_id: options.EnvId,
     method: Annotated[
         str,
         typer.Option(
@@ -44,6 +43,8 @@ def identify(
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Where what was learned goes: an npz, without pickle.")],
+    env_id: options.EnvId = None,
+    system: options.System = None,
     data: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Learn from these, an npz of Transitions.save, instead of collecting data."),
@@ -69,7 +70,7 @@ def identify(
     refused. The truth, with which the estimates are compared at states drawn anew from where the problem is explored, is that of
     the plant, with its --noise.
     """
-    from agents.problems import full_id, load_problem
+    from agents.problems import load_problem, title_of, which_env
     from scripts.identify_report import Identification, Source, compare, document, print_report
     from wrappers.learning import learner_of
     from wrappers.learning.identifiability import IdentifiabilityWarning
@@ -77,7 +78,7 @@ def identify(
     require_whole("seed", seed, 0)
     options.require_outputs(json, plot, out=out, inputs=[] if data is None else [("--data", data)])
     arguments = options.of_env(
-        noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=None, box=box, start=None
+        system=system, noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=None, box=box, start=None
     )
     learner = learner_of(method)
     chosen = read_settings(method, learner, settings or ())
@@ -85,7 +86,8 @@ def identify(
     if data is not None:
         _refuse_collecting(chosen, {"--dt": dt, "--substeps": substeps, "--box": box})
         source = {"data": _load_data(method, learner, data)}
-    problem = load_problem(env_id, arguments)
+    known = which_env(env_id, system)
+    problem = load_problem(known, arguments)
     with progress_bar("Learning") as tell, warnings.catch_warnings():
         # They are in the record, and printed with the results.
         warnings.simplefilter("ignore", IdentifiabilityWarning)
@@ -101,7 +103,8 @@ def identify(
         "--box": box,
     }
     found = Identification(
-        env_id=full_id(env_id),
+        env_id=known,
+        title=title_of(known, arguments),
         problem=problem,
         learned=learned,
         functions=compare(learned, problem, seed),
@@ -109,7 +112,7 @@ def identify(
         seed=seed,
         source=None if data is None else Source.of(data, source["data"]),
         out=out,
-        use=_use(env_id, method, out, of_env),
+        use=_use(["--system", system] if system else [known], method, out, of_env),
     )
     print_report(stdout(), found)
     if json is not None:
@@ -189,12 +192,12 @@ def _load_data(method: str, learner: Callable[..., Any], path: Path) -> Any:
     return Transitions.load(path)
 
 
-def _use(env_id: str, method: str, out: Path, of_env: Mapping[str, Any]) -> str:
+def _use(env: Sequence[str], method: str, out: Path, of_env: Mapping[str, Any]) -> str:
     """A command that puts what was learned to use on the same problem."""
     from wrappers.conditions import LEARNED
 
     (name,) = [condition.name for condition in LEARNED.values() if condition.method == method]
-    words = ["safe-envs", "evaluate", env_id, "--filter", name, "--learned", str(out)]
+    words = ["safe-envs", "evaluate", *env, "--filter", name, "--learned", str(out)]
     for option, given in of_env.items():
         for value in given if isinstance(given, list) else [given]:
             words += [] if value is None else [option, str(value)]

@@ -67,7 +67,7 @@ def draw(found: Identification, path: Path) -> None:
         if handles:
             add_legend(figure, list(handles))
         left = f", the largest {len(shown)} of {len(rest)} functions" if len(shown) < len(rest) else ""
-        figure.suptitle(f"{found.env_id}, {found.learned.method}{left}\n{found.setup}", fontsize=11)
+        figure.suptitle(f"{found.title}, {found.learned.method}{left}\n{found.setup}", fontsize=11)
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
 
 

@@ -120,6 +120,7 @@ class Identification:
 
     Attributes:
         env_id: of which env.
+        title: how results call it.
         problem: of which problem.
         learned: what was learned.
         functions: truth and estimate of each learned function; or why they cannot be compared.
@@ -131,6 +132,7 @@ class Identification:
     """
 
     env_id: str
+    title: str
     problem: SafetyProblem
     learned: LearnedModel
     functions: tuple[Function, ...] | str
@@ -197,7 +199,7 @@ def unit_of(name: str, units: Mapping[str, str]) -> str:
 def print_report(console: Console, found: Identification) -> None:
     """Print what was learned from what, its errors, and how to use it."""
     record = found.learned.record
-    title = Text(found.env_id, style="bold")
+    title = Text(found.title, style="bold")
     origin = f"seed {found.seed}" if found.source is None else f"data {found.source.path}"
     title.append(f" | method {found.learned.method} | {origin}", style="not bold")
     title.append(f"\n{found.setup}", style="not bold")

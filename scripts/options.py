@@ -12,7 +12,13 @@ import typer
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import require_writable
 
-EnvId = Annotated[str, typer.Argument(metavar="ENV_ID", help="Registered id; `safe-envs list` shows all.")]
+EnvId = Annotated[str | None, typer.Argument(metavar="[ENV_ID]", help="Registered id; `safe-envs list` shows all.", show_default=False)]
+System = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE.py:NAME", help="In place of ENV_ID: a SafetyProblem of your own or a function that returns one. Runs the file."
+    ),
+]
 Noise = Annotated[
     str | None, typer.Option(metavar="X", help="Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.")
 ]
@@ -34,6 +40,7 @@ FORMATS = ".png, .pdf, .svg, or another format of matplotlib."
 
 def of_env(
     *,
+    system: str | None,
     noise: str | None,
     plant: Sequence[str] | None,
     model: Sequence[str] | None,
@@ -50,6 +57,7 @@ def of_env(
         ConfigurationError: a text cannot be read.
     """
     return {
+        **({} if system is None else {"system": system}),
         "noise": read_noise(noise),
         "plant": parameters("--plant", plant or ()),
         "model": parameters("--model", model or ()),

@@ -76,7 +76,7 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
 def heading(evaluation: Evaluation) -> Text:
     """What was evaluated, in two lines."""
     config = evaluation.config
-    title = Text(config["env_id"] or evaluation.problem.name, style="bold")
+    title = Text(evaluation.title, style="bold")
     repeats = max((row["learning"]["repeats"] for row in evaluation.rows if row["learning"]), default=1)
     often = f" x {repeats} identifications" if repeats > 1 else ""
     title.append(f" | policy {config['policy']['name']} | {config['episodes']} episodes{often} | seed {config['seed']}", style="not bold")

@@ -19,9 +19,10 @@ from scripts.console import progress_bar, run, stdout
 
 
 def train(
-    env_id: options.EnvId,
     algo: Annotated[str, typer.Option(metavar="NAME", help="ppo, a2c, sac or td3.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="New folder for the policy, its evaluations and the checkpoint.")],
+    env_id: options.EnvId = None,
+    system: options.System = None,
     filters: Annotated[
         list[str] | None,
         typer.Option(
@@ -70,16 +71,26 @@ def train(
     asked for, to tensorboard: the safety rate of the last episodes, their cost and smallest h, and violations, interventions and
     infeasible steps in the training so far. The folder is what `safe-envs evaluate --policy DIR` reads.
     """
+    from agents.problems import which_env
     from agents.trainer import train as train_agent
     from agents.training import Training
 
     if len(filters or []) > 1:
         raise ConfigurationError(f"--filter was given {len(filters or [])} times; a training has one filter in the loop")
     arguments = options.of_env(
-        noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
+        system=system,
+        noise=noise,
+        plant=plant,
+        model=model,
+        barrier=barrier,
+        dt=dt,
+        substeps=substeps,
+        horizon=horizon,
+        box=box,
+        start=start,
     )
     training = Training.of(
-        env_id,
+        which_env(env_id, system),
         algo,
         filter=filters[0] if filters else None,
         options=arguments,
@@ -102,7 +113,7 @@ def train(
             raise
     given = {"noise": noise, "plant": plant, "model": model, "barrier": barrier, "knowledge": knowledge if knowledge != "model" else None}
     given |= {"dt": dt, "substeps": substeps, "horizon": horizon, "box": box, "start": start}
-    _report(training.env_id, out, training.filter or "none", given)
+    _report(["--system", system] if system else [training.env_id], out, training.filter or "none", given)
 
 
 def _settings(texts: list[str]) -> dict[str, Any]:
@@ -129,7 +140,7 @@ def _number(value: Any) -> Any:
         return value
 
 
-def _report(env_id: str, out: Path, filter_name: str, given: Mapping[str, Any]) -> None:
+def _report(env: list[str], out: Path, filter_name: str, given: Mapping[str, Any]) -> None:
     """Print how safe and how good the agent was in each evaluation."""
     console = stdout()
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
@@ -140,7 +151,7 @@ def _report(env_id: str, out: Path, filter_name: str, given: Mapping[str, Any]) 
         table.add_row(f"{row['timesteps']:,}", rate, f"{row['return_mean']:.4g}", f"{row['training']['violations']:.0f}")
     console.print(f"Evaluations with the filter {filter_name}:", highlight=False, markup=False)
     console.print(table)
-    command = ["safe-envs", "evaluate", env_id, "--policy", str(out), "--filter", filter_name]
+    command = ["safe-envs", "evaluate", *env, "--policy", str(out), "--filter", filter_name]
     for name, values in given.items():
         command += [f"--{name}={value}" for value in (values if isinstance(values, list) else [values]) if value is not None]
     console.print(f"\nTo evaluate the policy: {shlex.join(command)}", highlight=False, markup=False)

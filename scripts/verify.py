@@ -14,7 +14,8 @@ from scripts.console import progress_bar, run, stdout
 
 
 def verify(
-    env_id: options.EnvId,
+    env_id: options.EnvId = None,
+    system: options.System = None,
     filter_name: Annotated[
         str | None,
         typer.Option("--filter", metavar="NAME", help="As for evaluate: scbf, hocbf:p=2,8, ... By default the env's own."),
@@ -45,7 +46,7 @@ def verify(
     conditions, and the suprema on which the bounds rest. Nothing of this depends on the policy; the simulation does.
     """
     from agents.policy import make_policy
-    from agents.problems import full_id, load_problem
+    from agents.problems import load_problem, title_of, which_env
     from agents.verification import measure, starts_of
     from scripts.verify_report import document, print_report
     from wrappers import parse_conditions
@@ -55,9 +56,20 @@ def verify(
     require_whole("episodes", episodes, 1)
     options.require_outputs(json, plot, inputs=options.inputs_of(policy, [filter_name or ""]))
     arguments = options.of_env(
-        noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=horizon, box=box, start=start
+        system=system,
+        noise=noise,
+        plant=plant,
+        model=model,
+        barrier=barrier,
+        dt=dt,
+        substeps=substeps,
+        horizon=horizon,
+        box=box,
+        start=start,
     )
-    problem = load_problem(env_id, arguments)
+    known = which_env(env_id, system)
+    title = title_of(known, arguments)
+    problem = load_problem(known, arguments)
     actor = make_policy(policy, problem, trust)  # An unknown one is to show before the search, and without a simulation too.
     found = find(problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed)
     starts = starts_of(problem, seed)
@@ -66,10 +78,10 @@ def verify(
     if simulate:
         with progress_bar("Simulating") as tell:
             measurements = measure(found, actor, episodes=episodes, seed=seed, progress=tell)
-    print_report(stdout(), full_id(env_id), found, starts, bounds, policy, measurements)
+    print_report(stdout(), title, found, starts, bounds, policy, measurements)
     if json is not None:
         config = {
-            "env_id": full_id(env_id),
+            "env_id": known,
             "options": {k: v for k, v in arguments.items() if v is not None},
             "policy": policy,
             "seed": seed,
@@ -78,7 +90,7 @@ def verify(
     if plot is not None:
         from scripts.verify_figure import draw
 
-        draw(full_id(env_id), found, starts, plot)
+        draw(title, found, starts, plot)
 
 
 if __name__ == "__main__":

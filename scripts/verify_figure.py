@@ -34,13 +34,13 @@ _LEVELS = (0.2, 0.4, 0.6, 0.8)
 Evaluate = Callable[[np.ndarray], np.ndarray]
 
 
-def draw(env_id: str, found: Verification, starts: np.ndarray, path: Path) -> None:
+def draw(title: str, found: Verification, starts: np.ndarray, path: Path) -> None:
     """Draw a verification, and write the picture whole or not at all.
 
     A plane is drawn with the other states as at the worst state and, beside it, with all values of the others at once.
 
     Args:
-        env_id: for the title.
+        title: what the env is called.
         found: what to draw.
         starts: to be marked, shape (B, n).
         path: of the picture; its suffix is the format.
@@ -59,7 +59,7 @@ def draw(env_id: str, found: Verification, starts: np.ndarray, path: Path) -> No
         if several:
             _draw_shares(figure, panels[1], found, worst, starts)
         figure.legend(handles=_legend(found), loc="outside lower center", ncols=6 if several else 3)
-        figure.suptitle(f"{env_id}, {spec_of(formulas.conditions)}\n{describe_system(problem)}", fontsize=11)
+        figure.suptitle(f"{title}, {spec_of(formulas.conditions)}\n{describe_system(problem)}", fontsize=11)
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
 
 

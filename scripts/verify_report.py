@@ -28,7 +28,7 @@ _COLORS = {"proved": "green", "hypothesis fails": "red", "no bound": "yellow", "
 
 def print_report(
     console: Console,
-    env_id: str,
+    name: str,
     found: Verification,
     starts: np.ndarray,
     bounds: Sequence[Bound],
@@ -38,7 +38,7 @@ def print_report(
     """Print the findings, the bounds and the measurements, a section each."""
     formulas = found.formulas
     problem = formulas.problem
-    title = Text(env_id, style="bold")
+    title = Text(name, style="bold")
     title.append(f" | filter {spec_of(formulas.conditions)} | start {problem.start}", style="not bold")
     title.append(f"\n{describe_system(problem)}; the conditions know the {formulas.knowledge}", style="not bold")
     console.print(title, soft_wrap=True, highlight=False)

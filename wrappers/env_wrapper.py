@@ -68,6 +68,8 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         proposed = self._inner.physical_action(action)
         decision = self.safety_filter.decide_floats(self._inner.components, proposed)
         executed, nominal, active = decision.action, decision.proposed, True in decision.active
+        if self._inner.render_mode is not None:
+            self._inner.announce(nominal, active, decision.feasible)
         if self._directly:
             observation, reward, terminated, truncated, info = self._inner.step_physical(executed)
         else:

@@ -72,6 +72,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         proposed = self._inner.physical_action(actions)
         decision = self.safety_filter.decide_arrays(self._inner.components, proposed)
         active = decision.active[0] if len(decision.active) == 1 else np.logical_or.reduce(decision.active)
+        if self._inner.render_mode is not None:
+            self._inner.announce(decision.proposed, active, decision.feasible)
         if self.env is self._inner:
             observation, reward, terminated, truncated, info = self._inner.step_physical(decision.action)
         else:

@@ -1,0 +1,58 @@
+"""The page of the command line, from the commands themselves."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import typer
+
+from scripts.cli import app
+
+_INTRODUCTION = """# Command line
+
+Every command ends with status 0, or with status 2 and one message where the error is the user's. `--help` after a command
+says what stands here.
+"""
+
+
+def commands() -> dict[str, Any]:
+    """All commands by name, as typer has them."""
+    return dict(typer.main.get_command(app).commands)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def options_of(command: Any) -> set[str]:
+    """What may follow a command: `--episodes` and the like."""
+    return {"--help", *(text for p in command.params for text in (*p.opts, *p.secondary_opts) if text.startswith("-"))}
+
+
+def command_line_page() -> str:
+    """Markdown with a section for each command."""
+    return "\n".join([_INTRODUCTION, *(_section(name, command) for name, command in commands().items())])
+
+
+def _section(name: str, command: Any) -> str:
+    arguments = [p for p in command.params if p.param_type_name == "argument"]
+    options = [p for p in command.params if p.param_type_name == "option"]
+    usage = " ".join(["safe-envs", name, *(p.metavar or p.name.upper() for p in arguments), *["[OPTIONS]"] * bool(options)])
+    rows = [f"| `{_code(p.metavar or p.name.upper())}` | {_cell(p.help)} | |" for p in arguments]
+    rows += [f"| `{_code(_written(p))}` | {_cell(p.help)} | {_default(p)} |" for p in options]
+    table = ["| | meaning | default |", "|---|---|---|", *rows] if rows else []
+    return "\n".join([f"## {name}", "", f"```text\n{usage}\n```", "", inspect.cleandoc(command.help or ""), "", *table, ""])
+
+
+def _written(option: Any) -> str:
+    names = ", ".join((*option.opts, *option.secondary_opts))
+    return names if option.is_flag else f"{names} {option.metavar or option.type.name.upper()}"
+
+
+def _default(option: Any) -> str:
+    return "" if option.default is None or option.is_flag or callable(option.default) else f"`{_code(str(option.default))}`"
+
+
+def _cell(text: str | None) -> str:
+    return (text or "").replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
+
+
+def _code(text: str) -> str:
+    return text.replace("|", "\\|")

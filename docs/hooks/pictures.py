@@ -1,0 +1,154 @@
+"""The pictures of the page of concepts. Every curve, set and number in them is computed when the site is built."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import gymnasium as gym
+import matplotlib as mpl
+import numpy as np
+import sympy as sp
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+import safe_envs  # noqa: F401  (registers the ids)
+from agents import evaluate
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
+from safe_envs.codegen import compile_function
+from scripts.figure import COLORS, QUIET, STYLE, UNSAFE
+from wrappers import HOCBF, SafetyFilter, parse_conditions
+from wrappers.promise import promise
+from wrappers.verify import verify
+
+_GRID = 241
+_EPISODES = 2000
+
+
+def pictures() -> dict[str, bytes]:
+    """PNG files by path."""
+    with mpl.rc_context(STYLE):
+        return {
+            "assets/chain.png": _written(_chain()),
+            "assets/program.png": _written(_program()),
+            "assets/promise.png": _written(_promise()),
+        }
+
+
+def _written(figure: Figure) -> bytes:
+    written = io.BytesIO()
+    figure.savefig(written, format="png", dpi=150, facecolor="white")
+    return written.getvalue()
+
+
+def _problem(env_id: str) -> SafetyProblem:
+    env: Any = gym.make(env_id)
+    return env.unwrapped.problem
+
+
+def _chain() -> Figure:
+    """C_0, C_1 and where no action meets the condition, in the plane of a Dubins vehicle that heads to the right."""
+    problem = _problem("safe_envs/StochasticDubins-v0")
+    figure = Figure(figsize=(10, 4.4))
+    for axes, name in zip(figure.subplots(1, 2), ("hocbf", "scbf"), strict=True):
+        safety_filter = SafetyFilter.for_problem(problem, name)
+        x, y = np.meshgrid(*[np.linspace(-3.4, 3.4, _GRID)] * 2)
+        states = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+        h, b_1 = _chain_values(safety_filter, problem, states).reshape(2, *x.shape)
+        result = safety_filter.filter(states, np.zeros((len(states), 1)))
+        missed = np.where((h > 0) & (b_1 > 0), ~result.feasible.reshape(x.shape), False)
+        axes.contourf(x, y, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35)
+        axes.contourf(x, y, np.minimum(h, b_1), levels=[0.0, np.inf], colors=[COLORS[4]], alpha=0.45)
+        axes.contourf(x, y, missed.astype(float), levels=[0.5, 1.5], colors=[COLORS[3]], alpha=0.8)
+        axes.contour(x, y, h, levels=[0.0], colors="black", linewidths=1.3)
+        axes.contour(x, y, b_1, levels=[0.0], colors=COLORS[0], linewidths=1.3)
+        axes.annotate("", (0.6, -2.4), (-0.6, -2.4), arrowprops={"arrowstyle": "->"})
+        axes.text(0.0, -2.3, "heading", ha="center", color=QUIET)
+        axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{name}: {missed.sum() / ((h > 0) & (b_1 > 0)).sum():.0%} infeasible")
+    figure.legend(
+        handles=[
+            mpl.lines.Line2D([], [], color="black", label="h = 0"),
+            mpl.lines.Line2D([], [], color=COLORS[0], label="b₁ = 0"),
+            mpl.patches.Patch(color=UNSAFE, alpha=0.35, label="unsafe"),
+            mpl.patches.Patch(color=COLORS[4], alpha=0.45, label="C₀ ∩ C₁, which is kept"),
+            mpl.patches.Patch(color=COLORS[3], alpha=0.8, label="no action in the box meets the row"),
+        ],
+        loc="outside lower center",
+        ncols=5,
+    )
+    return figure
+
+
+def _chain_values(safety_filter: SafetyFilter, problem: SafetyProblem, states: np.ndarray) -> np.ndarray:
+    """b_0..b_(r-1) at states (B, n), shape (r, B)."""
+    chain = [problem.model.numeric(b) for b in safety_filter.constraints[0].chain]
+    return np.array(compile_function(problem.model.states, chain, "arrays")(*states.T))
+
+
+def _point() -> tuple[ControlAffineSDE, Barrier]:
+    """A point in the plane that is pushed, and a round obstacle."""
+    x, y, v_x, v_y, a_x, a_y = sp.symbols("x y v_x v_y a_x a_y", real=True)
+    gains = [[0, 0], [0, 0], [1, 0], [0, 1]]
+    system = ControlAffineSDE((x, y, v_x, v_y), (a_x, a_y), drift=[v_x, v_y, 0, 0], input_matrix=gains, diffusion=[0, 0, 0, 0])
+    return system, Barrier(x**2 + y**2 - 1)
+
+
+def _program() -> Figure:
+    """The program that a filter solves, in the plane of two inputs: at a state where the row can be met, and where it cannot."""
+    system, barrier = _point()
+    safety_filter = SafetyFilter(system, [(barrier, HOCBF((2.0, 2.0)))], [(-2.0, 2.0)] * 2)
+    row = safety_filter.constraints[0]
+    compiled = compile_function(system.states, [*row.coefficient, row.offset], "floats")
+    nominal = np.array([1.5, -0.3])
+    figure = Figure(figsize=(10, 4.6))
+    for axes, speed in zip(figure.subplots(1, 2), (1.1, 2.2), strict=True):
+        state = np.array([-2.0, 0.4, speed, 0.0])
+        result = safety_filter.filter(state, nominal)
+        _draw_program(axes, np.array(compiled(*state)), nominal, result)
+        verdict = "feasible" if result.feasible else f"infeasible, slack {result.slack[0]:.2f}"
+        axes.set_title(f"towards the obstacle at {speed:g} m/s: {verdict}")
+    figure.axes[0].legend(loc="lower left", frameon=True, framealpha=0.9)
+    return figure
+
+
+def _draw_program(axes: Axes, row: np.ndarray, nominal: np.ndarray, result: Any) -> None:
+    u, v = np.meshgrid(*[np.linspace(-3.2, 3.2, _GRID)] * 2)
+    allowed = row[0] * u + row[1] * v + row[2]
+    axes.contourf(u, v, allowed, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35)
+    axes.contour(u, v, allowed, levels=[0.0], colors="black", linewidths=1.3)
+    axes.add_patch(mpl.patches.Rectangle((-2, -2), 4, 4, fill=False, linestyle="--", edgecolor=QUIET, label="box"))
+    axes.plot(*nominal, "o", color="#D55E00", markersize=8, label="nominal action")
+    axes.plot(*result.action, "s", color=COLORS[0], markersize=8, label="executed action")
+    axes.annotate("", result.action, nominal, arrowprops={"arrowstyle": "->", "color": QUIET})
+    axes.text(0.98, 0.02, "grey: a u + b < 0", transform=axes.transAxes, ha="right", va="bottom", color=QUIET)
+    axes.set(aspect="equal", xlabel="a_x (m/s²)", ylabel="a_y (m/s²)")
+
+
+def _promise() -> Figure:
+    """The measured rate over the horizon beside what is proved, for the thesis' cubic SDE in a disk."""
+    problem = _problem("safe_envs/CubicSDEDisk-v0")
+    evaluation = evaluate(problem, filters=["none", "scbf"], options=None, episodes=_EPISODES, seed=0)
+    verification = verify(problem, parse_conditions("scbf", problem))
+    starts = _starts(problem)
+    figure = Figure(figsize=(7.5, 4.2))
+    axes = figure.subplots()
+    for row, color in zip(evaluation.rows, ("#D55E00", COLORS[0]), strict=True):
+        curve = row["curve"]
+        axes.fill_between(curve["time"], curve["ci_low"], curve["ci_high"], color=color, alpha=0.25, linewidth=0)
+        axes.plot(curve["time"], curve["rate"], color=color, label=f"{row['filter']}: measured, {_EPISODES} episodes, with its 95 % band")
+    times = np.linspace(0.0, problem.horizon, 41)
+    bounds = {bound.name.split(",")[0]: bound for bound in promise(verification, starts, problem.horizon)}
+    for name, color in zip(bounds, (QUIET, COLORS[1]), strict=False):
+        values = [next(b.value for b in promise(verification, starts, t) if b.name.split(",")[0] == name) for t in times]
+        axes.plot(times, values, color=color, linestyle="--", label=f"{name}: {bounds[name].status}")
+    axes.set(xlim=(0.0, problem.horizon), ylim=(0.0, 1.02), xlabel="horizon T (s)", ylabel="probability of no violation")
+    axes.legend(loc="lower left")
+    return figure
+
+
+def _starts(problem: SafetyProblem) -> np.ndarray:
+    from agents.verification import starts_of
+
+    return starts_of(problem)
+
+

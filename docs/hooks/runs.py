@@ -1,0 +1,99 @@
+"""Examples in pages that are run when the site is built, so that what they print is what the program prints.
+
+A fence that begins with ```python run is executed, one after the other in one namespace for each page. In ```console run
+every line that begins with "$ safe-envs" is a command, "\\" at its end goes on with it. What is printed follows in the page.
+Options: `lines=N` shows the first N lines of it only, `fails` says that the command is to end with an error of the user's.
+All runs of a page share a folder of their own, in which `examples` is that of the repository.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import shlex
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+
+_FENCE = re.compile(r"^```(python|console) run([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+_ANY_FENCE = re.compile(r"^```(python|console)[^\n]*\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+_COMMAND = re.compile(r"^\$ (safe-envs(?:[^\n]*\\\n)*[^\n]*)$", re.MULTILINE)
+
+
+def with_output(markdown: str) -> str:
+    """Run the examples of a page, and put what they print behind them.
+
+    Raises:
+        RuntimeError: a command ended otherwise than its fence says.
+    """
+    if not _FENCE.search(markdown):
+        return markdown
+    names: dict[str, Any] = {}
+    with _folder():
+        return _FENCE.sub(lambda found: _shown(*found.groups(), names), markdown)
+
+
+def run_python(markdown: str) -> None:
+    """Execute all Python of a page in order, shown with its output or not; for tests."""
+    names: dict[str, Any] = {}
+    with _folder(), contextlib.redirect_stdout(io.StringIO()):
+        for kind, code in _ANY_FENCE.findall(markdown):
+            if kind == "python":
+                exec(code, names)
+
+
+def commands_in(markdown: str) -> list[list[str]]:
+    """The words of every `$ safe-envs` command of a page."""
+    return [_words(command) for kind, code in _ANY_FENCE.findall(markdown) if kind == "console" for command in _COMMAND.findall(code)]
+
+
+def _words(command: str) -> list[str]:
+    return shlex.split(command.replace("\\\n", " "))
+
+
+@contextlib.contextmanager
+def _folder() -> Iterator[None]:
+    """A folder for what the examples of a page write, with the repository's examples in it."""
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "examples").symlink_to(ROOT / "examples")
+        with contextlib.chdir(folder):
+            yield
+
+
+def _shown(kind: str, options: str, code: str, names: dict[str, Any]) -> str:
+    settings = dict(option.partition("=")[::2] for option in options.split())
+    if kind == "python":
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(code, names)
+        return f"```python\n{code}```\n\n```text\n{_first(printed.getvalue(), settings)}\n```"
+    parts = [f"$ {command}\n{_first(_output(_words(command), 'fails' in settings), settings)}" for command in _COMMAND.findall(code)]
+    return "```console\n" + "\n\n".join(parts) + "\n```"
+
+
+def _first(text: str, settings: dict[str, str]) -> str:
+    lines = [line.rstrip() for line in text.strip("\n").splitlines()]
+    shown = lines[: int(settings.get("lines", len(lines)))]
+    return "\n".join([*shown, *["..."] * (len(shown) < len(lines))])
+
+
+def _output(words: Sequence[str], fails: bool) -> str:
+    """What a command prints, run in this process, since importing everything again takes longer than most commands."""
+    import typer
+
+    from scripts.cli import app
+    from scripts.console import run
+
+    command, out, err, status = typer.main.get_command(app), io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            run(lambda: command.main(list(words[1:]), prog_name="safe-envs", standalone_mode=False))
+        except SystemExit as end:
+            status = int(end.code or 0)
+    if (status != 0) != fails:
+        raise RuntimeError(f"{' '.join(words)} ended with status {status}: {err.getvalue()}")
+    return out.getvalue() + (err.getvalue() if fails else "")

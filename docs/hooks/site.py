@@ -1,0 +1,55 @@
+"""What mkdocs calls: pages made from the program, examples that are run, and mathematics."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from commands import command_line_page
+from contract import info_page
+from environments import env_pages, short_name
+from mathml import with_mathml
+from mkdocs.exceptions import PluginError
+from mkdocs.structure.files import File
+from notebooks import notebook_pages
+from pictures import pictures
+from runs import with_output
+
+from safe_envs import ENV_IDS
+from wrappers import CONDITIONS, LEARNED
+
+_TABLE = "<!-- table of envs -->"
+
+_made: dict[str, str | bytes] = {}
+
+
+def on_config(config: Any) -> Any:
+    """Add a page for each env and each filter to the navigation."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    for section in config.nav:
+        section.get("Environments", []).extend(f"envs/{short_name(env_id)}.md" for env_id in ENV_IDS)
+        section.get("Filters", []).extend(f"filters/{name}.md" for name in (*CONDITIONS, *LEARNED))
+    return config
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the pages and pictures that are made from the program."""
+    _made.update({**env_pages(), **notebook_pages(), **pictures()})
+    _made.update({"reference/command-line.md": command_line_page(), "reference/info.md": info_page()})
+    for path, content in _made.items():
+        if path != "envs/table.md":
+            files.append(File.generated(config, path, content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Run the examples of a page, and put in the table of envs."""
+    try:
+        return with_output(markdown.replace(_TABLE, str(_made["envs/table.md"])))
+    except Exception as error:
+        raise PluginError(f"{page.file.src_uri}: an example does not run: {type(error).__name__}: {error}") from error
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Turn LaTeX into MathML."""
+    return with_mathml(html)

@@ -1,0 +1,176 @@
+"""Anti-aliased lines, shapes and texts on a surface in memory; no display is needed."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pygame
+
+from safe_envs.rendering.style import INK, NORMAL, PAPER, Color
+
+Point = Sequence[float]
+Box = tuple[int, int, int, int]
+
+_FAR = 20_000.0
+"""Points further away are drawn at this distance: the coordinates of a surface are 16-bit numbers."""
+
+
+@lru_cache(maxsize=16)
+def _font(size: int, bold: bool) -> pygame.font.Font:
+    """DejaVu Sans, which has all the letters and comes with matplotlib: the same picture on every machine."""
+    pygame.font.init()
+    spec = importlib.util.find_spec("matplotlib")
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    path = Path(spec.origin or "").parent / "mpl-data" / "fonts" / "ttf" / name if spec else Path()
+    return pygame.font.Font(str(path) if path.is_file() else None, size)
+
+
+@lru_cache(maxsize=1024)
+def _text(text: str, size: int, bold: bool, color: Color, turned: bool) -> pygame.Surface:
+    surface = _font(size, bold).render(text, True, color)
+    return pygame.transform.rotate(surface, 90) if turned else surface
+
+
+class Canvas:
+    """Drawing on a surface, in pixels from its left upper corner.
+
+    Attributes:
+        surface: that is drawn on.
+
+    Args:
+        size: width and height in pixels.
+        clear: begin with nothing, to be laid over something else, in place of paper.
+    """
+
+    def __init__(self, size: tuple[int, int], clear: bool = False) -> None:
+        self.surface = pygame.Surface(size, pygame.SRCALPHA if clear else 0, 32)
+        self.surface.fill((0, 0, 0, 0) if clear else PAPER)
+
+    def lay(self, other: Canvas, at: tuple[int, int] = (0, 0)) -> None:
+        """Lay another canvas over this one."""
+        self.surface.blit(other.surface, at)
+
+    def within(self, box: Box | None) -> None:
+        """Draw only inside a box from now on; None for everywhere."""
+        self.surface.set_clip(box)
+
+    def fill(self, box: Sequence[float], color: Color, rounded: int = 0) -> None:
+        """Fill a rectangle of left, top, width and height."""
+        pygame.draw.rect(self.surface, color, pygame.Rect([round(v) for v in box]), border_radius=rounded)
+
+    def frame(self, box: Sequence[float], color: Color, width: int = 1, rounded: int = 0) -> None:
+        """Draw the outline of a rectangle."""
+        pygame.draw.rect(self.surface, color, pygame.Rect([round(v) for v in box]), width, border_radius=rounded)
+
+    def line(self, start: Point, end: Point, color: Color, width: int = 1) -> None:
+        """Draw a straight line."""
+        if all([-_FAR < v < _FAR for v in (*start, *end)]):
+            pygame.draw.aaline(self.surface, color, start, end, width)
+
+    def path(self, points: np.ndarray, color: Color, width: int = 1) -> None:
+        """Draw lines through points, shape (k, 2)."""
+        if len(points) < 2:
+            return
+        vertices = np.clip(points, -_FAR, _FAR).tolist()
+        if width == 1:
+            pygame.draw.aalines(self.surface, color, False, vertices)
+            return
+        for start, end in zip(vertices, vertices[1:], strict=False):
+            pygame.draw.aaline(self.surface, color, start, end, width)
+
+    def dashes(self, points: np.ndarray, color: Color, width: int = 1, period: float = 12.0) -> None:
+        """Draw a dashed line through points, shape (k, 2)."""
+        if len(points) < 2:
+            return
+        points = np.clip(points, -_FAR, _FAR)
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+        stops = np.arange(0.0, along[-1], period / 2)
+        places = np.stack([np.interp(stops, along, points[:, i]) for i in range(2)], axis=1).tolist()
+        for start, end in zip(places[::2], places[1::2], strict=False):
+            pygame.draw.aaline(self.surface, color, start, end, width)
+
+    def shape(self, points: Any, fill: Color | None, outline: Color | None = None, width: int = 1) -> None:
+        """Draw a polygon with smooth edges."""
+        vertices = np.clip(np.asarray(points, dtype=float), -_FAR, _FAR)
+        if fill is not None:
+            pygame.draw.polygon(self.surface, fill, vertices.tolist())
+        self.path(np.concatenate([vertices, vertices[:1]]), outline or fill or INK, width)
+
+    def disk(self, center: Point, radius: float, fill: Color | None, outline: Color | None = None, width: int = 2) -> None:
+        """Draw a circle, filled or not."""
+        if not all([-_FAR < v < _FAR for v in (*center, radius)]):
+            return
+        if fill is not None:
+            pygame.draw.aacircle(self.surface, fill, center, radius)
+        if outline is not None:
+            pygame.draw.aacircle(self.surface, outline, center, radius, width)
+
+    def diamond(self, center: Point, size: float, fill: Color | None, outline: Color, width: int = 2) -> None:
+        """Draw a square that stands on a corner."""
+        x, y = center
+        self.shape([(x, y - size), (x + size, y), (x, y + size), (x - size, y)], fill, outline, width)
+
+    def cross(self, center: Point, size: float, color: Color, width: int = 3) -> None:
+        """Draw an X."""
+        x, y = center
+        for side in (-size, size):
+            self.line((x - size, y - side), (x + size, y + side), color, width)
+
+    def arrow(self, start: Point, end: Point, color: Color, width: int = 2, head: float = 7.0) -> None:
+        """Draw an arrow."""
+        length = math.dist(start, end)
+        if length < 1.0:
+            return
+        along = (end[0] - start[0]) / length, (end[1] - start[1]) / length
+        base = end[0] - head * along[0], end[1] - head * along[1]
+        self.line(start, base, color, width)
+        sides = [(base[0] + s * along[1], base[1] - s * along[0]) for s in (0.55 * head, -0.55 * head)]
+        self.shape([end, *sides], color)
+
+    def text(
+        self,
+        text: str,
+        at: Point,
+        color: Color = INK,
+        size: int = NORMAL,
+        *,
+        bold: bool = False,
+        align: tuple[float, float] = (0.0, 0.0),
+        turned: bool = False,
+        widest: int | None = None,
+    ) -> int:
+        """Write a line.
+
+        Args:
+            text: to write.
+            at: place of the point of the text that `align` says.
+            color: of the letters.
+            size: of the letters.
+            bold: whether they are bold.
+            align: (0, 0) is the left upper corner of the text, (1, 1) the right lower one.
+            turned: write from below to above.
+            widest: in pixels; a longer text is cut.
+
+        Returns:
+            The width of what was written.
+        """
+        if widest is not None and _font(size, bold).size(text)[0] > widest:
+            while text and _font(size, bold).size(text + "…")[0] > widest:
+                text = text[:-1]
+            text += "…"
+        surface = _text(text, size, bold, color, turned)
+        width, height = surface.get_size()
+        self.surface.blit(surface, (round(at[0] - align[0] * width), round(at[1] - align[1] * height)))
+        return width
+
+    def pixels(self) -> np.ndarray:
+        """What was drawn, uint8 of shape (height, width, 3), in memory of its own."""
+        width, height = self.surface.get_size()
+        flat = np.frombuffer(pygame.image.tobytes(self.surface, "RGB"), dtype=np.uint8)
+        return flat.reshape(height, width, 3).copy()

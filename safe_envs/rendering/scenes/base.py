@@ -1,0 +1,114 @@
+"""What the scenes share: the states that they show, the part of the world that is seen, and the trail."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem import SafetyProblem
+from safe_envs.rendering.axes import Axes, Range
+from safe_envs.rendering.canvas import Canvas
+from safe_envs.rendering.history import Moment
+from safe_envs.rendering.safe_set import Barriers, barriers_in
+from safe_envs.rendering.style import EXECUTED, INFEASIBLE, INK, INTERVENING, PAPER, SKY, VIOLATION, Color, mix
+
+_MOST_POINTS = 500
+_PADDING = 0.3
+
+
+class Scene(ABC):
+    """The left part of a picture.
+
+    Args:
+        problem: that is drawn. All geometry is read from it.
+    """
+
+    def __init__(self, problem: SafetyProblem) -> None:
+        self.problem = problem
+        self.names = [s.symbol.name for s in problem.states]
+
+    @abstractmethod
+    def draw(self, canvas: Canvas, moment: Moment) -> None:
+        """Draw an instant within `style.SCENE`."""
+
+    def index(self, name: str) -> int:
+        """The index of a state.
+
+        Raises:
+            ConfigurationError: the problem has no such state.
+        """
+        if name not in self.names:
+            raise ConfigurationError(
+                f"the scene {self.problem.scene!r} shows a state {name!r}, and {self.problem.name} has {', '.join(self.names)}; "
+                "choose another scene"
+            )
+        return self.names.index(name)
+
+    def unit(self, name: str) -> str:
+        """The unit of a state."""
+        return self.problem.states[self.index(name)].unit
+
+    def range_of(self, i: int) -> Range:
+        """The workspace of a state; where that has no end, the range that is explored."""
+        state = self.problem.states[i]
+        return (state.low, state.high) if np.isfinite([state.low, state.high]).all() else self.problem.exploration.region[i]
+
+    def window(self, i: int, j: int) -> tuple[Range, Range]:
+        """The part of a plane of two states to look at: around the safe set if that is bounded in it, else the workspace."""
+        shown = self.range_of(i), self.range_of(j)
+        chosen = barriers_in(self.problem, (i, j))
+        if not chosen:
+            return shown
+        x, y = (np.linspace(*r, 121) for r in shown)
+        components = [x[:, None] if k == i else y[None, :] if k == j else 0.0 for k in range(len(self.names))]
+        safe = (Barriers(self.problem, chosen)(components) >= 0.0).all(axis=0)
+        if not safe.any():
+            return shown
+        return _around(x[safe.any(axis=1)], shown[0]), _around(y[safe.any(axis=0)], shown[1])
+
+
+def _around(values: np.ndarray, limits: Range) -> Range:
+    pad = _PADDING * max(float(values[-1] - values[0]), 0.05 * (limits[1] - limits[0]))
+    return max(float(values[0]) - pad, limits[0]), min(float(values[-1]) + pad, limits[1])
+
+
+def warning_color(moment: Moment, usual: Color = EXECUTED) -> Color:
+    """Of what moves: a warning while the filter intervenes or has no feasible action."""
+    return INFEASIBLE if moment.infeasible else INTERVENING if moment.intervening else usual
+
+
+def draw_trail(canvas: Canvas, axes: Axes, x: np.ndarray, y: np.ndarray, h: np.ndarray) -> None:
+    """Draw where the state was, the darker the later, and in the warning colour where it was not safe.
+
+    Args:
+        canvas: to draw on.
+        axes: of the scene.
+        x: along the axis to the right, shape (k,).
+        y: along the axis upwards, shape (k,).
+        h: smallest barrier there, shape (k,).
+    """
+    # A power of two: points once drawn stay as the trail grows.
+    stride = 1 << max(0, (len(x) - 1) // _MOST_POINTS).bit_length()
+    kept = np.r_[0 : len(x) : stride, len(x) - 1] if stride > 1 else np.arange(len(x))
+    places, unsafe = axes.places(x[kept], y[kept]), np.minimum.reduceat(h, kept) < 0.0
+    count = len(places)
+    canvas.within(axes.box)
+    for k in range(1, count):
+        age = 1.0 - (count - k) / max(count, 60)
+        color = VIOLATION if unsafe[k] or unsafe[k - 1] else mix(EXECUTED, mix(SKY, PAPER, 0.45), age)
+        canvas.line(places[k - 1], places[k], color, 2)
+    canvas.within(None)
+
+
+def draw_violation(canvas: Canvas, at: tuple[float, float]) -> None:
+    """Mark where the first violation was."""
+    canvas.cross(at, 7, PAPER, 6)
+    canvas.cross(at, 6, VIOLATION, 3)
+
+
+def draw_point(canvas: Canvas, at: tuple[float, float], color: Color) -> None:
+    """Mark the state."""
+    canvas.disk(at, 8, PAPER)
+    canvas.disk(at, 7, color, INK, 1)

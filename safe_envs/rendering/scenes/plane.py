@@ -1,0 +1,97 @@
+"""A plane of two states with the safe set in it, for any problem that has such a plane."""
+
+from __future__ import annotations
+
+from safe_envs.problem import SafetyProblem
+from safe_envs.rendering.axes import Axes, Range, grown
+from safe_envs.rendering.canvas import Box, Canvas
+from safe_envs.rendering.history import Moment
+from safe_envs.rendering.safe_set import Barriers, SafeSet
+from safe_envs.rendering.scenes.base import Scene, draw_point, draw_trail, draw_violation, warning_color
+from safe_envs.rendering.style import label
+
+_BOX = (76, 20, 504, 466)
+
+
+class Plane:
+    """The safe set, the trail and the state in a box of a scene, the other states held at their values now.
+
+    What does not change is drawn once: all of it, unless a barrier depends on states that are not in the plane.
+
+    Args:
+        scene: that it is part of.
+        names: of the states along x and y.
+        box: where.
+        chosen: indices of the barriers that are shown; None for all.
+        equal: the same scale along both axes.
+        shown: the ranges to begin with; by default those of the scene's `window`.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        names: tuple[str, str],
+        box: Box,
+        *,
+        chosen: list[int] | None = None,
+        equal: bool = False,
+        shown: tuple[Range, Range] | None = None,
+    ) -> None:
+        problem = scene.problem
+        self._labels = [label(name, scene.unit(name)) for name in names]
+        self.x, self.y = (scene.index(name) for name in names)
+        self._box, self._equal = box, equal
+        self._shown = shown or scene.window(self.x, self.y)
+        self._barriers = Barriers(problem, chosen)
+        inside = {problem.plant.states[self.x], problem.plant.states[self.y]}
+        self._changes = any(problem.barriers[k].expression.free_symbols - inside for k in self._barriers.chosen)
+        self._views: dict[Axes, tuple[SafeSet | None, Canvas]] = {}
+
+    def background(self, canvas: Canvas, moment: Moment) -> Axes:
+        """Draw the safe set and the axes, which grow where the trail leaves them."""
+        ranges = [grown(r, moment.states[:, i]) for r, i in zip(self._shown, (self.x, self.y), strict=True)]
+        axes = Axes.equal(self._box, *ranges) if self._equal else Axes(self._box, *ranges)
+        if axes not in self._views:
+            self._views[axes] = self._view(axes, moment)
+        safe_set, furniture = self._views[axes]
+        if safe_set is not None and self._changes:
+            safe_set.draw(canvas, moment.state)
+        canvas.lay(furniture)
+        return axes
+
+    def _view(self, axes: Axes, moment: Moment) -> tuple[SafeSet | None, Canvas]:
+        safe_set = SafeSet(self._barriers, axes, (self.x, self.y)) if len(self._barriers.chosen) else None
+        furniture = Canvas((axes.box[0] + axes.box[2] + 12, axes.box[1] + axes.box[3] + 42), clear=True)
+        if safe_set is not None and not self._changes:
+            safe_set.draw(furniture, moment.state)
+        axes.furnish(furniture, *self._labels, grid=False)
+        return safe_set, furniture
+
+    def trail(self, canvas: Canvas, axes: Axes, moment: Moment) -> tuple[float, float]:
+        """Draw the trail and the first violation; returns the pixel of the state."""
+        x, y = moment.states[:, self.x], moment.states[:, self.y]
+        draw_trail(canvas, axes, x, y, moment.h)
+        if moment.violated is not None:
+            draw_violation(canvas, axes.place(moment.violated[self.x], moment.violated[self.y]))
+        return axes.place(float(x[-1]), float(y[-1]))
+
+    def draw(self, canvas: Canvas, moment: Moment) -> None:
+        """Draw all of it, with a point for the state."""
+        axes = self.background(canvas, moment)
+        at = self.trail(canvas, axes, moment)
+        canvas.within(axes.box)
+        draw_point(canvas, at, warning_color(moment))
+        canvas.within(None)
+
+
+class PlaneScene(Scene):
+    """The plane of the problem, for the whole scene; with the same scale along both axes where their units are the same."""
+
+    def __init__(self, problem: SafetyProblem) -> None:
+        super().__init__(problem)
+        names = problem.plane or (self.names[0], self.names[-1])
+        self._plane = Plane(self, names, _BOX, equal=self.unit(names[0]) == self.unit(names[1]))
+
+    def draw(self, canvas: Canvas, moment: Moment) -> None:
+        """Draw the plane."""
+        self._plane.draw(canvas, moment)

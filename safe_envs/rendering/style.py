@@ -1,0 +1,82 @@
+"""Colours, sizes and texts that all pictures share."""
+
+from __future__ import annotations
+
+import math
+
+import sympy as sp
+
+Color = tuple[int, int, int]
+
+# The palette of Okabe and Ito, which colour-blind people tell apart.
+BLUE: Color = (0, 114, 178)
+SKY: Color = (86, 180, 233)
+GREEN: Color = (0, 158, 115)
+ORANGE: Color = (230, 159, 0)
+VERMILLION: Color = (213, 94, 0)
+PURPLE: Color = (204, 121, 167)
+
+INK: Color = (32, 36, 44)
+GREY: Color = (112, 118, 128)
+LINE: Color = (214, 218, 224)
+PANEL: Color = (246, 247, 249)
+PAPER: Color = (255, 255, 255)
+
+EDGE: Color = (0, 106, 78)
+"""Of h = 0."""
+
+UNSAFE: Color = (252, 243, 236)
+"""Where h < 0, between the hatching."""
+
+HATCH: Color = (236, 200, 174)
+
+EXECUTED = BLUE
+INTERVENING = ORANGE
+INFEASIBLE = VERMILLION
+VIOLATION = VERMILLION
+GOAL = PURPLE
+
+SMALL, NORMAL, LARGE = 13, 15, 20
+"""Heights of the letters, in pixels."""
+
+SIZE = (960, 540)
+"""Of a picture, in pixels: even numbers, as video codecs ask for."""
+
+SCENE = (0, 0, 600, 540)
+"""Left, top, width and height of the scene; the panel is to its right."""
+
+_SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def mix(color: Color, background: Color, share: float) -> Color:
+    """A colour laid over another one with an opacity from 0 to 1."""
+    r, g, b = (round(share * c + (1 - share) * under) for c, under in zip(color, background, strict=True))
+    return r, g, b
+
+
+def pretty(name: str) -> str:
+    """A name with Greek letters, dots and indices: theta, zdot and x_1 as θ, ż and x₁."""
+    return sp.pretty(sp.Symbol(name), use_unicode=True)
+
+
+def unit_text(unit: str) -> str:
+    """A unit with raised exponents and a centred dot: rad^2/s^2 as rad²/s², N m as N·m."""
+    head, *powers = unit.replace(" ", "·").split("^")
+    return head + "".join(power[:1].translate(_SUPERSCRIPTS) + power[1:] for power in powers)
+
+
+def label(name: str, unit: str = "") -> str:
+    """A name with its unit, for an axis."""
+    return f"{pretty(name)} [{unit_text(unit)}]" if unit else pretty(name)
+
+
+def number(value: float) -> str:
+    """Three digits that count, with a true minus sign; large numbers in whole ones, in groups of three."""
+    size = abs(value)
+    if size >= 1e7 or 0.0 < size < 1e-3:
+        text = f"{value:.2e}"
+    elif size >= 1000.0:
+        text = f"{value:,.0f}".replace(",", "\u202f")
+    else:
+        text = f"{value:.{max(0, 2 - (math.floor(math.log10(size)) if size >= 1.0 else 0))}f}"
+    return text.replace("-", "\u2212")

@@ -1,0 +1,152 @@
+"""What an env keeps in order to be seen: the history of its episodes, and the picture or the window that shows them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem import SafetyProblem
+from safe_envs.rendering.history import Decision, History
+
+if TYPE_CHECKING:
+    from safe_envs.rendering.picture import Picture
+    from safe_envs.rendering.window import Window
+
+RENDER_MODES = ("human", "rgb_array")
+"""What a scalar env can be made with, besides None; a vector env only with the last."""
+
+
+def frames_a_second(problem: SafetyProblem) -> int:
+    """Frame rate at which a picture of each control period makes a film in real time."""
+    return max(1, round(1 / problem.dt))
+
+
+def open_viewer(problem: SafetyProblem, mode: str | None, num_envs: int | None = None) -> Viewer | None:
+    """Return the viewer of an env, None if it is not to be seen.
+
+    Args:
+        problem: of the env.
+        mode: of rendering.
+        num_envs: size of the batch of a vector env; None for a scalar env.
+
+    Raises:
+        ConfigurationError: there is no such mode, or not for such an env.
+    """
+    allowed = RENDER_MODES if num_envs is None else RENDER_MODES[1:]
+    if mode is None:
+        return None
+    if mode not in allowed:
+        reason = "a window shows one env, so make a scalar one for it; " if mode in RENDER_MODES else ""
+        raise ConfigurationError(f"render_mode = {mode!r}; {reason}allowed: None, {', '.join(map(repr, allowed))}")
+    return Viewer(problem, mode, num_envs or 1)
+
+
+def require_pygame() -> None:
+    """Raise gymnasium.error.DependencyNotInstalled, with what to install, if pygame is missing."""
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        import pygame  # noqa: F401
+    except ImportError as error:
+        raise gym.error.DependencyNotInstalled('drawing needs pygame: pip install "safe-envs[render]"') from error
+
+
+class Viewer:
+    """Records the episodes of a batch of envs and draws them; nothing is drawn before it is asked for.
+
+    Attributes:
+        caption: what the pictures say above the scene, the name of a filter say.
+
+    Args:
+        problem: of the envs.
+        mode: "rgb_array", or "human" to draw each recorded state to a window in real time.
+        num_envs: size of the batch.
+    """
+
+    def __init__(self, problem: SafetyProblem, mode: str, num_envs: int) -> None:
+        self.caption = ""
+        self._problem = problem
+        self._live = mode == "human"
+        self._histories = [History(problem) for _ in range(num_envs)]
+        self._decisions: list[Decision | None] = [None] * num_envs
+        self._picture: Picture | None = None
+        self._window: Window | None = None
+
+    def announce(self, nominal: Sequence[Sequence[float]], active: Sequence[bool], feasible: Sequence[bool]) -> None:
+        """Keep what a filter decided, a row for each env, for the step that comes next."""
+        self._decisions = [Decision(tuple(n), bool(a), bool(f)) for n, a, f in zip(nominal, active, feasible, strict=True)]
+
+    def restart(self, states: Sequence[Sequence[float]], times: Sequence[float], envs: Sequence[int]) -> None:
+        """Begin an episode in some envs.
+
+        Args:
+            states: of all envs.
+            times: since the start of each env's episode, in s.
+            envs: indices of those that begin.
+        """
+        for i in envs:
+            self._histories[i].restart(states[i], float(times[i]))
+        self._decisions = [None] * len(self._histories)
+        self._go_live()
+
+    def advance(
+        self, states: Sequence[Sequence[float]], times: Sequence[float], executed: Sequence[Sequence[float]], anew: Sequence[int] = ()
+    ) -> None:
+        """Record a step of all envs, a row for each, of which those in `anew` begin an episode."""
+        fresh = frozenset(anew)
+        for i, history in enumerate(self._histories):
+            if i in fresh:
+                history.restart(states[i], float(times[i]))
+            else:
+                history.append(states[i], float(times[i]), tuple(executed[i]), self._decisions[i])
+        self._decisions = [None] * len(self._histories)
+        self._go_live()
+
+    def frames(self) -> tuple[np.ndarray, ...]:
+        """A picture of each env now, uint8 of shape (height, width, 3).
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: pygame is missing.
+        """
+        picture = self._drawn()
+        return tuple([picture.frame(history.moment, self.caption) for history in self._histories])
+
+    def render(self) -> Any:
+        """The picture of a single env; in human mode it goes to the window, and None is returned.
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: pygame is missing.
+            ConfigurationError: there is no display for a window.
+        """
+        if self._live:
+            self._go_live()
+            return None
+        return self.frames()[0]
+
+    def close(self) -> None:
+        """Close the window, if there is one; drawing again opens another."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def _drawn(self) -> Picture:
+        if self._picture is None:
+            require_pygame()
+            from safe_envs.rendering.picture import Picture
+
+            self._picture = Picture(self._problem)
+        return self._picture
+
+    def _go_live(self) -> None:
+        if not self._live:
+            return
+        surface = self._drawn().draw(self._histories[0].moment, self.caption)
+        if self._window is None:
+            from safe_envs.rendering.window import Window
+
+            self._window = Window(surface.get_size(), self._problem.name, frames_a_second(self._problem))
+        self._window.show(surface)

@@ -1,0 +1,143 @@
+"""A problem of your own from a system, its barriers and a few numbers; what is left out gets what suits."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import sympy as sp
+
+from safe_envs.barrier import Barrier
+from safe_envs.calculus import generator, relative_degree
+from safe_envs.errors import ConfigurationError, SystemDefinitionError
+from safe_envs.mistakes import require_sound
+from safe_envs.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.sde import ControlAffineSDE, finite_number
+
+_UNBOUNDED = (-sp.oo, sp.oo)
+
+Range = tuple[float, float]
+
+
+def state_problem(
+    system: ControlAffineSDE,
+    barriers: Any,
+    *,
+    box: Sequence[Any],
+    start: Sequence[Any],
+    dt: float,
+    horizon: float,
+    name: str = "",
+    model: ControlAffineSDE | None = None,
+    nominal: Any = 0,
+    reward: Any = 0,
+    workspace: Mapping[sp.Symbol, Range] | None = None,
+    units: Mapping[sp.Symbol, str] | None = None,
+    **rest: Any,
+) -> SafetyProblem:
+    """State a safety problem.
+
+    Args:
+        system: what is simulated.
+        barriers: h, safe where h >= 0: an expression of the states or a `Barrier`, or several of them.
+        box: physical bounds (low, high) of every input, or one such pair for each.
+        start: of each state a number, or (low, high) to draw it from, uniformly, where every barrier is positive.
+        dt: control period in s.
+        horizon: length of an episode in s.
+        name: of the problem, for tables and pictures.
+        model: what filters and the nominal controller believe, with the same states and inputs; `system` itself by default.
+        nominal: the controller that is to be kept safe, an expression of the states and of parameters for each input.
+        reward: of a step, an expression of the state that it reaches, of the input and of `safe_envs.problem.TIME`.
+        workspace: (low, high) of states; an episode ends when one leaves it. The others are unbounded.
+        units: of states and inputs, by symbol. A state in "rad" without bounds is an angle.
+        **rest: other attributes of `SafetyProblem`. By default `noise` are the parameters that occur in the diffusion alone,
+            `gains` ones for every barrier's relative degree, `filter` "szcbf" with noise and "hocbf" without, and
+            `plane` the states if they are two.
+
+    Raises:
+        SystemDefinitionError: the parts do not fit together, or hold a mistake: see `safe_envs.mistakes`.
+        RelativeDegreeError: no input reaches a barrier.
+        ConfigurationError: a number is out of range.
+    """
+    given = list(barriers) if isinstance(barriers, Sequence) else [barriers]
+    several = len(given) > 1
+    named = [b if isinstance(b, Barrier) else Barrier(b, f"h_{i}" if several else "h") for i, b in enumerate(given, 1)]
+    laws = list(nominal) if isinstance(nominal, Sequence) else [nominal] * system.m
+    bounds, unit = dict(workspace or {}), dict(units or {})
+    _require_symbols("workspace", bounds, system.states)
+    _require_symbols("units", unit, (*system.states, *system.inputs))
+    problem = SafetyProblem(
+        name=name or "problem",
+        plant=system,
+        model=system if model is None else model,
+        barriers=tuple(named),
+        states=tuple(Variable(s, *_ends(f"workspace of {s}", bounds.get(s, _UNBOUNDED)), unit.get(s, "")) for s in system.states),
+        inputs=tuple(Variable(u, *ends, unit.get(u, "")) for u, ends in zip(system.inputs, _boxes(system, box), strict=True)),
+        reward=sp.sympify(reward),
+        nominal=tuple(_law(law, system, rest.get("features", ())) for law in laws),
+        starts={"start": _start(system, named, start)},
+        dt=finite_number("dt", dt),
+        horizon=finite_number("horizon", horizon),
+        **{**_suitable(system, named), **rest},
+    )
+    require_sound(problem)
+    return problem
+
+
+def _suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str, Any]:
+    """Noise, gains, filter and plane of a system."""
+    elsewhere = system.drift.free_symbols | system.input_matrix.free_symbols
+    noisy = any(entry != 0 for entry in system.numeric(system.diffusion))
+    degrees = [relative_degree(system, b.expression, *[generator] * noisy) for b in barriers]
+    return {
+        "noise": tuple(p.name for p in system.parameters if p in system.diffusion.free_symbols - elsewhere),
+        "gains": tuple((1.0,) * degree for degree in degrees) if len(set(degrees)) > 1 else (1.0,) * degrees[0],
+        "filter": "szcbf" if noisy else "hocbf",
+        "plane": tuple(s.name for s in system.states) if system.n == 2 else None,
+    }
+
+
+def _law(law: Any, system: ControlAffineSDE, features: Sequence[Feature]) -> sp.Expr:
+    """A law of the states as one of the features, which have symbols of their own; where features are given, it is one already."""
+    expression = sp.sympify(law)
+    return expression if features else expression.subs({s: sp.Symbol(s.name, real=True) for s in system.states})
+
+
+def _start(system: ControlAffineSDE, barriers: Sequence[Barrier], start: Sequence[Any]) -> Start:
+    if isinstance(start, str) or not isinstance(start, Sequence) or len(start) != system.n:
+        names = ", ".join(map(str, system.states))
+        raise SystemDefinitionError(f"start = {start!r}; give a number or (low, high) for each of the {system.n} states: {names}")
+    ends = [_ends(f"start of {s}", v if isinstance(v, Sequence) else (v, v)) for s, v in zip(system.states, start, strict=True)]
+    for s, (low, high) in zip(system.states, ends, strict=True):
+        finite_number(f"start of {s}", low)
+        finite_number(f"start of {s}", high)
+    if all(low == high for low, high in ends):
+        return Start.at([low for low, _ in ends])
+    uniforms = sp.symbols(f"uniform_1:{system.n + 1}", real=True)
+    state = tuple(low + (high - low) * uniform for (low, high), uniform in zip(ends, uniforms, strict=True))
+    return Start(state, uniforms, sp.Min(*[b.expression for b in barriers]))
+
+
+def _boxes(system: ControlAffineSDE, box: Sequence[Any]) -> list[Range]:
+    pairs = list(box) if isinstance(box, Sequence) and box and isinstance(box[0], Sequence) else [box] * system.m
+    if len(pairs) != system.m:
+        raise ConfigurationError(f"box = {box!r}; give (low, high), or one such pair for each of the {system.m} inputs")
+    return [_ends(f"box of {u}", pair) for u, pair in zip(system.inputs, pairs, strict=True)]
+
+
+def _ends(what: str, given: Any) -> Range:
+    """(low, high) as floats, possibly infinite."""
+    try:
+        low, high = (float(v) for v in given)
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError(f"{what} = {given!r}; give (low, high)") from error
+    if not low <= high:
+        raise ConfigurationError(f"{what} = {given!r}; give (low, high) with low <= high")
+    return low, high
+
+
+def _require_symbols(what: str, given: Mapping[Any, Any], allowed: Sequence[sp.Symbol]) -> None:
+    for symbol in given:
+        if symbol not in allowed:
+            names = ", ".join(map(str, allowed))
+            raise SystemDefinitionError(f"{what} names {symbol!r}, which is none of the symbols {names}; give the symbol itself, no text")

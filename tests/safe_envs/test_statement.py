@@ -1,0 +1,129 @@
+"""Problems of one's own: what is left out gets what suits, and mistakes are found before the first step."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs import (
+    Barrier,
+    ConfigurationError,
+    ControlAffineSDE,
+    RelativeDegreeError,
+    SafeEnv,
+    SafeVectorEnv,
+    SystemDefinitionError,
+    SystemDefinitionWarning,
+    state_problem,
+)
+
+x, v, u, w, k, sigma = sp.symbols("x v u w k sigma", real=True)
+SYSTEM = ControlAffineSDE.from_rate((x, v), (u,), [v, k * u - x], diffusion=[0, sigma], parameters={k: 2.0, sigma: 0.1})
+NUMBERS = {"box": (-5.0, 5.0), "start": [(-0.5, 0.5), 0.0], "dt": 0.05, "horizon": 2.0}
+
+
+def stated(system: ControlAffineSDE = SYSTEM, barriers: object = 1 - x**2, **numbers):
+    return state_problem(system, barriers, **{**NUMBERS, **numbers})
+
+
+def test_what_is_left_out_gets_what_suits():
+    problem = stated()
+    assert problem.model == problem.plant == SYSTEM
+    assert problem.noise == ("sigma",)
+    assert problem.gains == (1.0, 1.0)
+    assert problem.filter == "szcbf"
+    assert problem.plane == ("x", "v")
+    assert [(s.low, s.high) for s in problem.states] == [(-math.inf, math.inf)] * 2
+    assert stated(SYSTEM.with_parameters(sigma=0.0)).filter == "hocbf"
+
+
+def test_barriers_of_different_degrees_get_gains_each():
+    problem = stated(barriers=[1 - x**2, Barrier(4 - v**2, "speed")])
+    assert problem.gains == ((1.0, 1.0), (1.0,))
+    assert [b.name for b in problem.barriers] == ["h_1", "speed"]
+
+
+def test_starts_are_drawn_from_the_ranges_where_all_barriers_are_positive():
+    envs = SafeVectorEnv(stated(start=[(-2.0, 2.0), (0.0, 3.0)], barriers=[1 - x**2, 2 - v]), 200)
+    envs.reset(seed=0)
+    position, speed = envs.components
+    assert (abs(position) < 1).all()
+    assert (speed < 2).all()
+    assert position.std() > 0.4
+
+
+def test_scalar_and_vector_envs_agree():
+    problem = stated(nominal=-v, reward=-(x**2), workspace={x: (-2.0, 2.0)})
+    env, envs = SafeEnv(problem), SafeVectorEnv(problem, 3)
+    env.reset(seed=7)
+    envs.reset(seed=7)
+    for _ in range(20):
+        one, many = env.step([0.3]), envs.step(np.full((3, 1), 0.3))
+    assert np.array_equal(one[0], many[0][0])
+    assert one[1] == pytest.approx(many[1][0])
+
+
+def test_from_rate_takes_a_rate_apart():
+    system = ControlAffineSDE.from_rate((x, v), (u, w), [v + w, sp.cos(x) * (u + 3) - (x + u) ** 2 + u**2 + 2 * x * u])
+    assert system.drift.equals(sp.Matrix([v, 3 * sp.cos(x) - x**2]))
+    assert system.input_matrix.equals(sp.Matrix([[0, 1], [sp.cos(x), 0]]))
+    assert not any(system.diffusion)
+
+
+def test_a_nominal_law_may_use_symbols_without_assumptions():
+    y, f = sp.symbols("y f")
+    plain = ControlAffineSDE((y,), (f,), [0], [1], [0])
+    problem = state_problem(plain, 1 - y**2, box=(-1, 1), start=[0.5], dt=0.1, horizon=1.0, nominal=-y)
+    assert problem.nominal[0].free_symbols == {sp.Symbol("y", real=True)}
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "says"),
+    [
+        ({"barriers": x**2 - 1}, SystemDefinitionError, "wrong sign"),
+        ({"start": [2.0, 0.0]}, SystemDefinitionError, "every start is unsafe"),
+        ({"barriers": [1 - x**2, x - 3]}, SystemDefinitionError, "every start is unsafe: h_2"),
+        ({"barriers": sp.Integer(1)}, RelativeDegreeError, "no relative degree"),
+        ({"barriers": 1 - w**2}, SystemDefinitionError, "unknown symbol w"),
+        ({"barriers": 1 - sp.sqrt(x - 5)}, SystemDefinitionError, "no finite value at the start"),
+        ({"nominal": -5000 * (x + 2)}, SystemDefinitionError, "check that both have the unit"),
+        ({"box": (-1e-4, 1e-4), "start": [0.9, 0.9]}, SystemDefinitionError, "the box is too small for h"),
+        ({"workspace": {x: (2.0, 3.0)}}, SystemDefinitionError, "outside the workspace"),
+        ({"workspace": {"x": (-2.0, 3.0)}}, SystemDefinitionError, "give the symbol itself"),
+        ({"start": [0.0]}, SystemDefinitionError, "2 states: x, v"),
+        ({"start": [(0.0, math.inf), 0.0]}, ConfigurationError, "not finite"),
+        ({"box": (1.0, -1.0)}, ConfigurationError, "low <= high"),
+        ({"box": [(-1.0, 1.0), (-1.0, 1.0)]}, ConfigurationError, "each of the 1 inputs"),
+        ({"box": 3.0}, ConfigurationError, "give \\(low, high\\)"),
+        ({"nominal": [u, u]}, SystemDefinitionError, "nominal expression for each of the 1 inputs"),
+    ],
+)
+def test_mistakes_are_found_and_explained(change, error, says):
+    with pytest.raises(error, match=says):
+        stated(**change)
+
+
+def test_an_input_that_does_nothing_is_found():
+    system = ControlAffineSDE((x, v), (u, w), [v, 0], [[0, 0], [1, 0]], [0, 0])
+    with pytest.raises(SystemDefinitionError, match="input w never appears"):
+        stated(system)
+
+
+def test_a_barrier_that_no_input_reaches_is_found():
+    system = ControlAffineSDE((x, v), (u,), [-x, 0], [0, 1], [0, 0])
+    with pytest.raises(RelativeDegreeError, match="no action can keep it positive"):
+        stated(system)
+
+
+@pytest.mark.parametrize("rate", [sp.sin(u), u**2, x * sp.Abs(u), 1 / (u + 2)])
+def test_a_rate_that_is_not_affine_in_the_input_is_found(rate):
+    with pytest.raises(SystemDefinitionError, match="the rate of v is not affine in the input u"):
+        ControlAffineSDE.from_rate((x, v), (u,), [v, rate])
+
+
+def test_a_box_that_throws_the_state_about_is_doubtful():
+    with pytest.warns(SystemDefinitionWarning, match="across its whole workspace"):
+        stated(box=(-500.0, 500.0), workspace={v: (-3.0, 3.0)})
