@@ -16,9 +16,10 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info
 from safe_envs.problem import SafetyProblem
 from safe_envs.vector import SafeVectorEnv
-from wrappers import SafetyFilterVectorWrapper
+from wrappers import SafetyFilterVectorWrapper, SafetyMonitorVector
+from wrappers.vector_wrapper import readable
 
-Env = SafeVectorEnv | SafetyFilterVectorWrapper
+Env = SafeVectorEnv | SafetyMonitorVector | SafetyFilterVectorWrapper
 Progress = Callable[[float], None]
 OnStart = Callable[[Components, int], None]
 Row = dict[str, Any]
@@ -173,7 +174,7 @@ def run_episodes(
         on_start: given the components of the start states of each wave, arrays of shape (num_envs,), and how many
             of them, from the first, are of episodes that count.
     """
-    world: SafeVectorEnv = env.unwrapped  # pyright: ignore[reportAssignmentType]
+    world = readable(env)
     totals = Totals(world.problem)
     # Threads of BLAS gain nothing on small networks, and on a busy machine they wait for each other for most of the time.
     with threadpool_limits(1, "blas"):
@@ -193,7 +194,7 @@ def _play(
     env: Env, policy: Any, started: tuple[np.ndarray, Info], first: int, count: int, progress: Progress | None, recorder: Recorder | None
 ) -> Wave:
     """Simulate a wave that was just reset, and that begins with the episode `first`."""
-    world: SafeVectorEnv = env.unwrapped  # pyright: ignore[reportAssignmentType]
+    world = readable(env)
     steps = world.problem.steps
     observation, info = started
     h = _smallest(info["barrier"])
@@ -223,6 +224,6 @@ def _smallest(barriers: np.ndarray) -> np.ndarray:
     return barriers[:, 0] if barriers.shape[1] == 1 else barriers.min(axis=1)
 
 
-def _executed(world: SafeVectorEnv, actions: np.ndarray, info: Info) -> Components:
+def _executed(world: SafeVectorEnv | SafetyMonitorVector, actions: np.ndarray, info: Info) -> Components:
     """Components of the executed input in physical units."""
     return tuple(info["safe_action"].T) if "safe_action" in info else world.physical_action(actions)

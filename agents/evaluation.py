@@ -17,16 +17,14 @@ import numpy as np
 from agents.comparison import Comparison, Flags, compare_all
 from agents.episodes import Env, Progress, Recorder, Row, Totals, run_episodes
 from agents.learning import Learning, describe, seconds_of
-from agents.policy import Policy, make_policy, policy_files
-from agents.problems import full_id, load_problem, title_of
+from agents.policy import policy_files
 from agents.promised import Promised, together
 from agents.repeats import pooled
 from agents.statistics import require_confidence
+from agents.worlds import world_of
 from safe_envs.errors import ConfigurationError, nearest, require_whole
-from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
-from safe_envs.vector import SafeVectorEnv
-from wrappers import CONDITIONS, LEARNED, Condition, SafetyFilterVectorWrapper, parse_conditions, require_readable, spec_of
+from wrappers import CONDITIONS, LEARNED, Condition, FilterSpec, parse_conditions, require_readable, spec_of
 from wrappers.learning import LearnedModel
 
 BARE = "none"
@@ -64,8 +62,7 @@ class Evaluation:
     @property
     def title(self) -> str:
         """How results call what was evaluated."""
-        env_id = self.config["env_id"]
-        return self.problem.name if env_id is None else title_of(env_id, self.config["options"])
+        return self.config["title"]
 
     def document(self) -> dict[str, Any]:
         """The whole as JSON-able data."""
@@ -92,6 +89,7 @@ def evaluate(
     objective: str = "nearest",
     confidence: float = 0.95,
     bounds: bool = True,
+    spec: FilterSpec | str | None = None,
     learned: Sequence[LearnedModel | Path | str] = (),
     repeats: int = 1,
     progress: Progress | None = None,
@@ -113,7 +111,7 @@ def evaluate(
     for each repeat, and the intervals are over identifications too: see `agents.statistics.repeated_interval`.
 
     Args:
-        problem: what to simulate, or the id of a registered env.
+        problem: what to simulate, or the id of a registered env; with a spec, the id of any env that Gymnasium knows.
         policy: a name or a path for `make_policy`, or anything with Stable-Baselines3's `predict`.
         filters: texts for `parse_conditions`, and "none" for the bare env; by default that and the problem's own.
         trust: load a policy's .zip, which runs code that it contains.
@@ -125,6 +123,8 @@ def evaluate(
         objective: of the filters, "nearest" to the policy's action or "clf": see `SafetyFilter.for_problem`.
         confidence: of all intervals, between 0 and 1.
         bounds: look for proved bounds and certificates, which takes a search of the safe set for each filter.
+        spec: how filters see an env of somebody else, or FILE.py:NAME of that. There `problem` is the model that filters believe, and
+            episodes are simulated one by one.
         learned: models, or files of `safe-envs identify`, to use in place of learning.
         repeats: number of identifications of what is learned, from the seed and from children of it; 1 where nothing is.
         progress: told the part of the work that is done, from 0 to 1.
@@ -141,22 +141,26 @@ def evaluate(
         if value not in allowed:
             raise ConfigurationError(f"{name} = {value!r}; {nearest(value, allowed)}")
     require_confidence(confidence)
-    env_id = full_id(problem) if isinstance(problem, str) else None
-    if env_id is None and options:
-        raise ConfigurationError("options are the arguments of a registered id; configure the problem itself instead")
-    world = problem if isinstance(problem, SafetyProblem) else load_problem(problem, options)
-    actor = make_policy(policy, world, trust) if isinstance(policy, str) else policy
-    names = list(dict.fromkeys((BARE, world.filter) if filters is None else filters))
+    simulated = world_of(problem, options, spec)
+    world = simulated.problem
+    actor = simulated.policy(policy, trust) if isinstance(policy, str) else policy
+    names = list(dict.fromkeys((BARE, simulated.filter) if filters is None else filters))
     specs = [_checked(name, world) for name in names]
     learning = Learning(world, names, learned, repeats, seed)
+    if simulated.spec is not None and learning.missing():
+        raise ConfigurationError("a filter over an env of somebody else takes what was learned from a log: NAME:file=FILE")
     work = _Work(progress, len(learning.missing()) + sum(learning.repeats(name) for name in names))
     for method, repeat in learning.missing():
         learning.learn(method, repeat, work.part())
     filters_of = {name: [_conditions(name, learning, r) for r in range(learning.repeats(name))] for name in names}
-    envs = {name: [_make_env(world, c, knowledge, objective, min(num_envs, episodes)) for c in each] for name, each in filters_of.items()}
+    envs = {
+        name: [_ready(simulated.env(c, knowledge, objective, min(num_envs, episodes))) for c in each] for name, each in filters_of.items()
+    }
     config = {
-        "env_id": env_id,
-        "options": {k: v for k, v in (options or {}).items() if v is not None},
+        "title": simulated.title,
+        "env_id": simulated.env_id,
+        "options": simulated.options,
+        "filter_spec": None if spec is None else spec if isinstance(spec, str) else type(spec).__name__,
         "problem": _describe(world),
         "policy": _describe_policy(policy),
         "filters": [{"name": name, "spec": spec or spec_of(filters_of[name][0])} for name, spec in zip(names, specs, strict=True)],
@@ -167,10 +171,11 @@ def evaluate(
         "repeats": repeats,
         "confidence": confidence,
     }
+    why_not = simulated.why_no_bound or (None if bounds else "it was not asked for")
     rows, speeds, flags = [], [], {}
     recorders = {name: Recorder(world.steps, world.plant.n, episodes) for name in names} if record else {}
     for name in names:
-        promised = [Promised(conditions, world, knowledge, bounds) for conditions in filters_of[name]]
+        promised = [Promised(conditions, world, knowledge, why_not) for conditions in filters_of[name]]
         begun = time.perf_counter()
         totals = [
             run_episodes(env, actor, episodes, seed, work.part(episodes), recorders.get(name) if r == 0 else None, promised[r].add)
@@ -190,7 +195,7 @@ def evaluate(
         flags[name] = [each.flags for each in totals]
     timing = {"num_envs": num_envs, "rows": speeds}
     comparisons = compare_all(flags, confidence)
-    return Evaluation(world, config, rows, comparisons, timing, recorders, flags, learning.models(), _is_deterministic(world, actor))
+    return Evaluation(world, config, rows, comparisons, timing, recorders, flags, learning.models(), simulated.is_deterministic(actor))
 
 
 class _Work:
@@ -230,19 +235,11 @@ def _conditions(name: str, learning: Learning, repeat: int) -> tuple[Condition, 
     return () if name == BARE else learning.conditions(name, repeat)
 
 
-def _make_env(problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int) -> Env:
-    env = SafeVectorEnv(problem, num_envs)
-    filtered: Env = SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
-    # The first step compiles what the filter needs: an error shows before a long run, and the timing is of steps.
-    filtered.reset(seed=0)
-    filtered.step(np.zeros(env.action_space.shape or ()))
-    return filtered
-
-
-def _is_deterministic(problem: SafetyProblem, policy: Any) -> bool:
-    noise = Integrator(problem.plant, problem.dt, problem.substeps, "arrays").channels
-    acts_alike = policy.deterministic if isinstance(policy, Policy) else True
-    return acts_alike and not noise and not problem.starts[problem.start].uniforms
+def _ready(env: Env) -> Env:
+    """The env after a first step, which compiles what the filter needs: an error shows before a long run, and the timing is of steps."""
+    env.reset(seed=0)
+    env.step(np.zeros(env.action_space.shape or (), dtype=np.float32))
+    return env
 
 
 def _describe(problem: SafetyProblem) -> dict[str, Any]:

@@ -6,8 +6,10 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
+from safe_envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.problem import SafetyProblem
 
@@ -19,6 +21,10 @@ TENSORS = "policy.safetensors"
 
 DESCRIPTION = "policy.json"
 """Name of the file beside it that says what the numbers are."""
+
+
+Spaces = tuple[gym.Space[Any], gym.Space[Any]]
+"""Of observations and of actions."""
 
 
 class Policy(ABC):
@@ -58,7 +64,7 @@ class Policy(ABC):
         """
 
 
-def make_policy(name: str, problem: SafetyProblem, trust: bool = False) -> Policy:
+def make_policy(name: str, problem: SafetyProblem, trust: bool = False, spaces: Spaces | None = None) -> Policy:
     """Return a named policy, or load one that was trained.
 
     Args:
@@ -66,6 +72,7 @@ def make_policy(name: str, problem: SafetyProblem, trust: bool = False) -> Polic
             two files of the policy in it; or the path of a .zip of Stable-Baselines3.
         problem: which the policy is to act in.
         trust: load a .zip too, which runs code that it contains.
+        spaces: of observations and actions, which a .zip is to fit; by default those of the problem's env.
 
     Raises:
         ConfigurationError: there is neither such a name nor such a file, the file does not fit the problem, or it is a .zip
@@ -92,10 +99,10 @@ def make_policy(name: str, problem: SafetyProblem, trust: bool = False) -> Polic
             f"unknown policy {name!r}; {nearest(name, POLICIES)}, a folder of `safe-envs train`, or the path of a Stable-Baselines3 "
             ".zip: there is no such file"
         )
-    return _make_of_archive(files[0], problem, trust)
+    return _make_of_archive(files[0], spaces or (observation_box(problem), action_box(problem)), trust)
 
 
-def _make_of_archive(path: Path, problem: SafetyProblem, trust: bool) -> Policy:
+def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
     from agents.sb3 import SB3Policy, require_archive
 
     require_archive(path)
@@ -104,7 +111,7 @@ def _make_of_archive(path: Path, problem: SafetyProblem, trust: bool) -> Policy:
             f"loading {path} runs code that it contains; if you trust its source, pass --trust (in Python: trust=True), "
             f"or give a folder of `safe-envs train`, whose {TENSORS} and {DESCRIPTION} hold no code"
         )
-    return SB3Policy(path, problem)
+    return SB3Policy(path, *spaces)
 
 
 def policy_files(name: str) -> list[Path]:

@@ -24,16 +24,16 @@ class Promised:
         conditions: one for each barrier; none of the bare env.
         problem: whose barriers they keep.
         knowledge: of the filter, "model" or "plant".
-        asked: whether to look for a bound at all.
+        why_not: why not to look for a bound at all, if so.
     """
 
-    def __init__(self, conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str, asked: bool) -> None:
+    def __init__(self, conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str, why_not: str | None = None) -> None:
         self._horizon = problem.steps * problem.dt
         self._certified = any(isinstance(c, BayesianSCBF) and c.simultaneous is not None for c in conditions)
         self._found: ProvedBound | Certificate | None = None
-        self._why_none: str | None = "there is no filter" if not conditions else "it was not asked for"
+        self._why_none: str | None = why_not if conditions else "there is no filter"
         self._total, self._count = RunningSum(), 0
-        if conditions and asked:
+        if conditions and not why_not:
             self._look(conditions, problem, knowledge)
 
     def _look(self, conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str) -> None:

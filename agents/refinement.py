@@ -70,6 +70,8 @@ def refine(
     """
     if arguments.get("repeats", 1) != 1:
         raise ConfigurationError("repeats are of the identification and refinement of the period: ask for one of the two")
+    if arguments.get("spec") is not None:
+        raise ConfigurationError("the control period of an env of somebody else is its own, and cannot be refined")
     first = evaluate(problem, policy, progress=_share(progress, 0), record=record, **arguments)
     arguments |= {"options": None, "filters": [row["filter"] for row in first.rows], "bounds": False, "learned": first.learned}
     finer = [evaluate(_divided(first.problem, d), policy, progress=_share(progress, i), **arguments) for i, d in enumerate(DIVISORS) if i]

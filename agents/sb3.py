@@ -13,9 +13,7 @@ import gymnasium as gym
 import numpy as np
 
 from agents.blocks import BlockPolicy
-from safe_envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError
-from safe_envs.problem import SafetyProblem
 
 _STATISTICS = ("normalization.pkl", "vecnormalize.pkl", "*/vecnormalize.pkl")
 """Where a VecNormalize lies beside a .zip: that of `safe-envs train`, one of RL Zoo, and the place where RL Zoo itself puts it."""
@@ -29,17 +27,18 @@ class SB3Policy(BlockPolicy):
 
     Args:
         path: of the file. Loading it runs code that it contains: trust its source.
-        problem: which the policy is to act in.
+        observation_space: of the env that the policy is to act in.
+        action_space: of that env.
 
     Raises:
-        ConfigurationError: the file is no archive of Stable-Baselines3, or its spaces are not those of the problem; or beside it
-            lies the VecNormalize of its training, whose observations are not the problem's.
+        ConfigurationError: the file is no archive of Stable-Baselines3, or its spaces are not those of the env; or beside it
+            lies the VecNormalize of its training, whose observations are not the env's.
     """
 
-    def __init__(self, path: str | Path, problem: SafetyProblem) -> None:
-        super().__init__(len(problem.features))
+    def __init__(self, path: str | Path, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
+        super().__init__(gym.spaces.flatdim(observation_space))
         self._network = _load(Path(path))
-        require_spaces(f"the policy {path}", self._network, problem)
+        require_spaces(f"the policy {path}", self._network, observation_space, action_space)
 
     def act(self, block: np.ndarray) -> np.ndarray:
         """Call the network; see `BlockPolicy.act`."""
@@ -68,22 +67,23 @@ def _is_archive(path: Path) -> bool:
         return {"data", "policy.pth"} <= set(archive.namelist())
 
 
-def require_spaces(what: str, network: Any, problem: SafetyProblem) -> None:
-    """Raise ConfigurationError unless a network takes a problem's observations and gives its actions.
+def require_spaces(what: str, network: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
+    """Raise ConfigurationError unless a network takes an env's observations and gives its actions.
 
     Args:
         what: the network is, to begin the message with.
         network: a policy of Stable-Baselines3.
-        problem: which it is to act in.
+        observation_space: of the env that it is to act in.
+        action_space: of that env.
     """
-    spaces = (("observation", network.observation_space, observation_box(problem)), ("action", network.action_space, action_box(problem)))
+    spaces = (("observation", network.observation_space, observation_space), ("action", network.action_space, action_space))
     for kind, trained, wanted in spaces:
         if trained != wanted:
             raise ConfigurationError(f"{what} was trained for another {kind} space, {_difference(trained, wanted)}")
 
 
-def _difference(trained: gym.Space[Any], wanted: gym.spaces.Box) -> str:
-    if not isinstance(trained, gym.spaces.Box) or trained.shape != wanted.shape:
+def _difference(trained: gym.Space[Any], wanted: gym.Space[Any]) -> str:
+    if not (isinstance(trained, gym.spaces.Box) and isinstance(wanted, gym.spaces.Box)) or trained.shape != wanted.shape:
         return f"{trained}; the env's is {wanted}"
     theirs, ours = [f"between {space.low.tolist()} and {space.high.tolist()}" for space in (trained, wanted)]
     return f"{theirs}; the env's is {ours}"

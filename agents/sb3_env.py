@@ -119,7 +119,8 @@ class SafeVecEnv(VecEnv):
         self._half = np.array(center_and_half_width(self._native.problem)[1])
         self._actions = np.empty(0)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        self.metadata = dict(env.metadata)
+        # Stable-Baselines3 lists the modes that this very env can be shown in, Gymnasium those that it could be made with.
+        self.metadata = {**env.metadata, "render_modes": self.metadata["render_modes"]}
 
     def reset(self) -> np.ndarray:
         """Start an episode in every env, with the seeds of `seed` if they were not used yet.

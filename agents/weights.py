@@ -18,7 +18,7 @@ from safetensors.numpy import save as save_tensors
 from agents.blocks import BlockPolicy
 from agents.policy import DESCRIPTION, TENSORS, policy_files
 from agents.sb3 import require_spaces
-from safe_envs.env import observation_box
+from safe_envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
@@ -148,7 +148,7 @@ def save_policy(model: Any, folder: str | Path, problem: SafetyProblem, normaliz
     """
     from agents.actors import actor_of
 
-    require_spaces(f"the policy of {type(model).__name__}", model.policy, problem)
+    require_spaces(f"the policy of {type(model).__name__}", model.policy, observation_box(problem), action_box(problem))
     weights, biases, activation = actor_of(model.policy)
     _require_finite([*weights, *biases])
     scaling = Normalization.of(model.get_vec_normalize_env() if normalization is None else normalization)

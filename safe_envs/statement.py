@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import sympy as sp
 
 from safe_envs.barrier import Barrier
 from safe_envs.calculus import generator, relative_degree
-from safe_envs.errors import ConfigurationError, SystemDefinitionError
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
 from safe_envs.mistakes import require_sound
-from safe_envs.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem import SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE, finite_number
 
 _UNBOUNDED = (-sp.oo, sp.oo)
@@ -46,7 +47,8 @@ def state_problem(
         horizon: length of an episode in s.
         name: of the problem, for tables and pictures.
         model: what filters and the nominal controller believe, with the same states and inputs; `system` itself by default.
-        nominal: the controller that is to be kept safe, an expression of the states and of parameters for each input.
+        nominal: the controller that is to be kept safe, an expression of the states and of parameters for each input; where
+            `features` are given, of their symbols in place of the states'.
         reward: of a step, an expression of the state that it reaches, of the input and of `safe_envs.problem.TIME`.
         workspace: (low, high) of states; an episode ends when one leaves it. The others are unbounded.
         units: of states and inputs, by symbol. A state in "rad" without bounds is an angle.
@@ -59,9 +61,11 @@ def state_problem(
         RelativeDegreeError: no input reaches a barrier.
         ConfigurationError: a number is out of range.
     """
-    given = list(barriers) if isinstance(barriers, Sequence) else [barriers]
-    several = len(given) > 1
-    named = [b if isinstance(b, Barrier) else Barrier(b, f"h_{i}" if several else "h") for i, b in enumerate(given, 1)]
+    named = named_barriers(barriers)
+    allowed = [f.name for f in fields(SafetyProblem) if f.init]
+    for name_of in rest:
+        if name_of not in allowed:
+            raise ConfigurationError(f"a problem has no {name_of!r}; {nearest(name_of, allowed)}")
     laws = list(nominal) if isinstance(nominal, Sequence) else [nominal] * system.m
     bounds, unit = dict(workspace or {}), dict(units or {})
     _require_symbols("workspace", bounds, system.states)
@@ -70,22 +74,33 @@ def state_problem(
         name=name or "problem",
         plant=system,
         model=system if model is None else model,
-        barriers=tuple(named),
+        barriers=named,
         states=tuple(Variable(s, *_ends(f"workspace of {s}", bounds.get(s, _UNBOUNDED)), unit.get(s, "")) for s in system.states),
         inputs=tuple(Variable(u, *ends, unit.get(u, "")) for u, ends in zip(system.inputs, _boxes(system, box), strict=True)),
         reward=sp.sympify(reward),
-        nominal=tuple(_law(law, system, rest.get("features", ())) for law in laws),
+        nominal=tuple(laws if rest.get("features") else [law_of(law, system) for law in laws]),
         starts={"start": _start(system, named, start)},
         dt=finite_number("dt", dt),
         horizon=finite_number("horizon", horizon),
-        **{**_suitable(system, named), **rest},
+        **{**suitable(system, named), **rest},
     )
     require_sound(problem)
     return problem
 
 
-def _suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str, Any]:
-    """Noise, gains, filter and plane of a system."""
+def named_barriers(barriers: Any) -> tuple[Barrier, ...]:
+    """Barriers from one or several expressions or barriers, each with a name."""
+    given = list(barriers) if isinstance(barriers, Sequence) else [barriers]
+    several = len(given) > 1
+    return tuple(b if isinstance(b, Barrier) else Barrier(b, f"h_{i}" if several else "h") for i, b in enumerate(given, 1))
+
+
+def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str, Any]:
+    """The attributes noise, gains, filter and plane of a problem, as they suit a system.
+
+    Raises:
+        RelativeDegreeError: no input reaches a barrier.
+    """
     elsewhere = system.drift.free_symbols | system.input_matrix.free_symbols
     noisy = any(entry != 0 for entry in system.numeric(system.diffusion))
     degrees = [relative_degree(system, b.expression, *[generator] * noisy) for b in barriers]
@@ -97,10 +112,9 @@ def _suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str
     }
 
 
-def _law(law: Any, system: ControlAffineSDE, features: Sequence[Feature]) -> sp.Expr:
-    """A law of the states as one of the features, which have symbols of their own; where features are given, it is one already."""
-    expression = sp.sympify(law)
-    return expression if features else expression.subs({s: sp.Symbol(s.name, real=True) for s in system.states})
+def law_of(law: Any, system: ControlAffineSDE) -> sp.Expr:
+    """A law of the states as one of the features, which have symbols of their own."""
+    return sp.sympify(law).subs({s: sp.Symbol(s.name, real=True) for s in system.states})
 
 
 def _start(system: ControlAffineSDE, barriers: Sequence[Barrier], start: Sequence[Any]) -> Start:

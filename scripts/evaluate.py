@@ -22,6 +22,13 @@ LEARNED_PARAMETERS = (
 def evaluate(
     env_id: options.EnvId = None,
     system: options.System = None,
+    filter_spec: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE.py:NAME",
+            help="For an ENV_ID of somebody else, like Pendulum-v1: a FilterSpec that says how filters see it. Runs the file.",
+        ),
+    ] = None,
     filters: Annotated[
         list[str] | None,
         typer.Option(
@@ -98,9 +105,10 @@ def evaluate(
     run_all: Callable[..., Any] = refinement.refine if refine else evaluation.evaluate
     with progress_bar("Evaluating") as tell:
         answer = run_all(
-            which_env(env_id, system),
+            env_id if filter_spec and env_id and not system else which_env(env_id, system),
             policy,
             filters=names,
+            spec=filter_spec,
             trust=trust,
             options=arguments,
             episodes=episodes,

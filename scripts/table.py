@@ -81,8 +81,13 @@ def heading(evaluation: Evaluation) -> Text:
     often = f" x {repeats} identifications" if repeats > 1 else ""
     title.append(f" | policy {config['policy']['name']} | {config['episodes']} episodes{often} | seed {config['seed']}", style="not bold")
     goal = ", joint program with the goal" if config["objective"] == "clf" else ""
-    title.append(f"\n{describe_system(evaluation.problem)}; filters know the {config['knowledge']}{goal}", style="not bold")
+    title.append(f"\n{_told(evaluation)}; filters know the {config['knowledge']}{goal}", style="not bold")
     return title
+
+
+def _told(evaluation: Evaluation) -> str:
+    problem, spec = evaluation.problem, evaluation.config["filter_spec"]
+    return describe_system(problem) if spec is None else f"seen through {spec}, dt = {problem.dt:g} s, horizon {problem.horizon:g} s"
 
 
 def describe_system(problem: SafetyProblem) -> str:

@@ -24,7 +24,10 @@ from wrappers.conditions import (
     spec_of,
 )
 from wrappers.env_wrapper import SafetyFilterWrapper
+from wrappers.filter_spec import ActionMap, FilterSpec
+from wrappers.monitor import SafetyMonitor
 from wrappers.safety_filter import FilterResult, SafetyFilter
+from wrappers.vector_monitor import SafetyMonitorVector
 from wrappers.vector_wrapper import SafetyFilterVectorWrapper
 
 __all__ = [
@@ -38,16 +41,20 @@ __all__ = [
     "SCBF",
     "SRCBF",
     "SZCBF",
+    "ActionMap",
     "AffineConstraint",
     "BayesianSCBF",
     "ClassK",
     "Condition",
     "FilterResult",
+    "FilterSpec",
     "LearnedCondition",
     "LearnedHOCBF",
     "SafetyFilter",
     "SafetyFilterVectorWrapper",
     "SafetyFilterWrapper",
+    "SafetyMonitor",
+    "SafetyMonitorVector",
     "parse_condition",
     "parse_conditions",
     "power",

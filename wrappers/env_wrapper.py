@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +14,8 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info, filter_info
 from safe_envs.problem import SafetyProblem
 from wrappers.conditions import Condition, spec_of
+from wrappers.filter_spec import FilterSpec
+from wrappers.monitor import SafetyMonitor
 from wrappers.safety_filter import SafetyFilter
 
 
@@ -22,18 +24,23 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
 
     The wrapper takes and passes on actions in [-1, 1]; `info` gains the keys of `safe_envs.info`, in physical units.
 
+    Over an env of somebody else the filter is told what it needs by name, as the fields of `FilterSpec`; then actions are the env's
+    own, and `info` gains the keys of this project's envs too.
+
     Args:
-        env: one of this project's envs, possibly wrapped.
+        env: one of this project's envs, possibly wrapped; or any env with a box of actions.
         condition: a `Condition` for every barrier, one for each, or their text, like "scbf", "hocbf:p=2,8" or
             "hocbf:p=2,8+cbf:alpha=1"; without parameters it takes the env's.
         knowledge: "model" (what the designer believes) or "plant" (the true system).
         objective: "nearest" to the policy's action; or "clf" for the joint program with the env's goal, in which the policy has
             no say: `info["nominal_action"]` is what the goal alone asks for.
         priorities: of the barriers where not all can be kept: weights of their squared slacks, ones by default.
+        **view: for an env of somebody else `model`, `barriers`, `state_fn`, and what else of `FilterSpec` is needed.
 
     Raises:
-        ConfigurationError: the env is not one of this project, or an argument is unknown; or, at a step, a wrapper
+        ConfigurationError: an argument is unknown or missing, or does not fit the env; or, at a step, a wrapper
             between the filter and the env changed the action.
+        InvalidInputError: `state_fn` does not make states of observations.
         RelativeDegreeError: the condition does not suit the env's barrier.
     """
 
@@ -44,14 +51,17 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
+        **view: Any,
     ) -> None:
-        inner = env.unwrapped
-        if not isinstance(inner, SafeEnv):
-            raise ConfigurationError(f"{inner} is not one of this project's envs, so that the filter cannot read its state")
+        if view:
+            require_foreign(env.unwrapped, SafeEnv, view, knowledge)
+            env = SafetyMonitor(env, FilterSpec.of(view))
+        inner = _readable(env)
         text, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective, priorities)
+        # The monitor records the view: an env that is made again from its spec has one already.
         gym.utils.RecordConstructorArgs.__init__(self, condition=text, knowledge=knowledge, objective=objective, priorities=priorities)
         gym.Wrapper.__init__(self, env)
-        self._inner = inner
+        self._inner: Any = inner
         self._directly = _only_checks_between(env, inner)
         self._interventions = 0
         self._infeasible = 0
@@ -96,7 +106,32 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         return observation, reward, terminated, truncated, info
 
 
-def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv) -> bool:
+def _readable(env: gym.Env[Any, Any]) -> SafeEnv | SafetyMonitor:
+    """The layer of an env from which a filter reads the state."""
+    layer = env
+    while isinstance(layer, gym.Wrapper) and not isinstance(layer, SafetyMonitor):
+        layer = layer.env
+    if not isinstance(layer, SafeEnv | SafetyMonitor):
+        raise unreadable(layer)
+    return layer
+
+
+def unreadable(env: object) -> ConfigurationError:
+    """The error of a filter over an env whose state it cannot read."""
+    return ConfigurationError(
+        f"{env} is not one of this project's envs, so that a filter cannot read its state; give model, barriers, state_fn: see FilterSpec"
+    )
+
+
+def require_foreign(env: object, ours: type[Any], view: Mapping[str, Any], knowledge: str) -> None:
+    """Raise ConfigurationError where a filter is told how to see an env of this project, or to know what nobody knows."""
+    if isinstance(env, ours):
+        raise ConfigurationError(f"{', '.join(view)} are for envs of somebody else; {env} has a model and barriers of its own")
+    if knowledge != "model":
+        raise ConfigurationError(f"knowledge = {knowledge!r}: of an env of somebody else nothing is known but the model; use 'model'")
+
+
+def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv | SafetyMonitor) -> bool:
     """Whether no wrapper between the filter and the env could change a step, so that its input need not be encoded."""
     while isinstance(env, (OrderEnforcing, PassiveEnvChecker)):
         env = env.env

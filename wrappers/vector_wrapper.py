@@ -9,12 +9,13 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from safe_envs.errors import ConfigurationError
 from safe_envs.info import Info, filter_info, with_masks
 from safe_envs.vector import SafeVectorEnv, VectorStep
 from wrappers.conditions import Condition
-from wrappers.env_wrapper import build_filter, changed_action, rest_info
+from wrappers.env_wrapper import build_filter, changed_action, require_foreign, rest_info, unreadable
+from wrappers.filter_spec import FilterSpec
 from wrappers.safety_filter import Decision
+from wrappers.vector_monitor import SafetyMonitorVector
 
 
 class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
@@ -24,7 +25,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
     at reset, and counts nothing.
 
     Raises:
-        ConfigurationError: the env is not one of this project's vector envs, or an argument is unknown.
+        ConfigurationError: an argument is unknown or missing, or does not fit the env.
+        InvalidInputError: `state_fn` does not make states of observations.
         RelativeDegreeError: the condition does not suit the env's barrier.
     """
 
@@ -35,15 +37,17 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
+        **view: Any,
     ) -> None:
-        inner = env.unwrapped
-        if not isinstance(inner, SafeVectorEnv):
-            raise ConfigurationError(f"{inner} is not one of this project's vector envs, so that the filter cannot read its state")
+        if view:
+            require_foreign(env.unwrapped, SafeVectorEnv, view, knowledge)
+            env = SafetyMonitorVector(env, FilterSpec.of(view))
+        inner = readable(env)
         _, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective, priorities)
         super().__init__(env)
-        self._inner = inner
+        self._inner: Any = inner
         self._rest = rest_info(inner.problem)
-        self._mode = inner.metadata["autoreset_mode"]
+        self._mode = env.metadata["autoreset_mode"]
         self._interventions = np.zeros(self.num_envs, dtype=np.int64)
         self._infeasible = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
@@ -127,6 +131,20 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         self._interventions[envs] = 0
         self._infeasible[envs] = 0
         self._ended = self._ended & ~envs
+
+
+def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
+    """The layer of a vector env from which a filter reads the states.
+
+    Raises:
+        ConfigurationError: there is none.
+    """
+    layer = env
+    while isinstance(layer, gym.vector.VectorWrapper) and not isinstance(layer, SafetyMonitorVector):
+        layer = layer.env
+    if not isinstance(layer, SafeVectorEnv | SafetyMonitorVector):
+        raise unreadable(layer)
+    return layer
 
 
 def _beside(components: Sequence[np.ndarray]) -> np.ndarray:

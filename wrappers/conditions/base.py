@@ -157,7 +157,7 @@ def _text(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=256)
 def _constraint(condition: Condition, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
     """Remembered, for the bounds of a filter need the rows that it has, and derivatives of long expressions take their time."""
     model = condition.believed(model)

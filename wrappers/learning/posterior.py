@@ -236,12 +236,15 @@ class Posterior(LearnedModel):
         """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m) of expressions, multiplied out."""
         first, second = np.triu_indices(self.features.count)
         phi = self.features.expressions
-        products = [sp.expand(phi[k] * phi[j]) for k, j in zip(first, second, strict=True)]
+        products = [sp.expand(phi[k] * phi[j]).as_coefficients_dict() for k, j in zip(first, second, strict=True)]
+        monomials = list(dict.fromkeys(monomial for product in products for monomial in product))
+        # By numbers, not by symbols, of which there are many more.
+        shares = np.array([[float(product.get(monomial, 0)) for monomial in monomials] for product in products])
         twice = np.where(first == second, 0.5, 1.0)
 
         def entry(block: np.ndarray) -> sp.Expr:
-            weights = (block + block.T)[first, second] * twice
-            return sp.expand(sp.Add(*[sp.Float(w, 17) * p for w, p in zip(weights.tolist(), products, strict=True)]))
+            weights = ((block + block.T)[first, second] * twice) @ shares
+            return sp.Add(*[sp.Float(w, 17) * monomial for w, monomial in zip(weights.tolist(), monomials, strict=True) if w])
 
         return tuple(sp.ImmutableMatrix([[entry(block) for block in row] for row in state]) for state in self._split_covariance)
 
