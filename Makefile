@@ -1,13 +1,15 @@
 # make demo   train a small agent, and print safety rates with and without filters
 # make test   the test suite
 # make lint   style, formatting and types
+# make docs   the documentation, in site/; nothing is fetched but the packages
 # Each makes its own virtual environment in .venv first.
 
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+DOCS_READY := .venv/.docs-ready
 
-.PHONY: demo test lint clean
+.PHONY: demo test lint docs clean
 
 demo: $(READY)
 	$(BIN)/safe-envs demo
@@ -20,10 +22,17 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 
+docs: $(DOCS_READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,render]'
 	touch $@
 
+$(DOCS_READY): $(READY)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,render,docs]'
+	touch $@
+
 clean:
-	rm -rf .venv
+	rm -rf .venv site

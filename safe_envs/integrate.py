@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -28,18 +29,9 @@ class Integrator:
         h = dt / substeps
         factors = (0.5 * h, h, h / 6.0, 2.0)
         self._factors: Sequence[Any] = constants(factors) if flavour == "arrays" else factors
-        diffusion = system.numeric(system.diffusion)
-        live = [j for j in range(diffusion.cols) if any(e != 0 for e in diffusion[:, j])]
-        self._wiener = len(live)
+        self._wiener, function = _compiled(system, h, flavour)
         self.channels = self._wiener * substeps
-        rate = system.numeric(system.drift + system.input_matrix * sp.Matrix(system.inputs))
-        if live:
-            draws = sp.symbols(f"_w:{len(live)}", real=True)
-            noise = diffusion[:, live] * sp.Matrix(draws) * sp.Float(math.sqrt(h), 17)
-            moved = sp.Matrix(system.states) + rate * sp.Float(h, 17) + noise
-            self._euler = compile_function((*system.states, *system.inputs, *draws), tuple(moved), flavour)
-        else:
-            self._rate = compile_function((*system.states, *system.inputs), tuple(rate), flavour)
+        self._euler = self._rate = function
 
     def step(self, x: Components, u: Sequence[Any], draws: Sequence[Any] | np.ndarray) -> Components:
         """Return the components of the state one control period later.
@@ -65,3 +57,17 @@ class Integrator:
         k3 = rate(*[a + half * b for a, b in zip(x, k2, strict=True)], *u)
         k4 = rate(*[a + h * b for a, b in zip(x, k3, strict=True)], *u)
         return tuple(a + sixth * (b1 + two * (b2 + b3) + b4) for a, b1, b2, b3, b4 in zip(x, k1, k2, k3, k4, strict=True))
+
+
+@lru_cache(maxsize=128)
+def _compiled(system: ControlAffineSDE, h: float, flavour: Flavour) -> tuple[int, Callable[..., Components]]:
+    """The number of noise channels, and the state after a step of h in s with them, or the rate of the state without any."""
+    diffusion = system.numeric(system.diffusion)
+    live = [j for j in range(diffusion.cols) if any(e != 0 for e in diffusion[:, j])]
+    rate = system.numeric(system.drift + system.input_matrix * sp.Matrix(system.inputs))
+    if not live:
+        return 0, compile_function((*system.states, *system.inputs), tuple(rate), flavour)
+    draws = sp.symbols(f"_w:{len(live)}", real=True)
+    noise = diffusion[:, live] * sp.Matrix(draws) * sp.Float(math.sqrt(h), 17)
+    moved = sp.Matrix(system.states) + rate * sp.Float(h, 17) + noise
+    return len(live), compile_function((*system.states, *system.inputs, *draws), tuple(moved), flavour)

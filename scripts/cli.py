@@ -11,6 +11,7 @@ from scripts.console import run
 from scripts.evaluate import evaluate
 from scripts.identify import identify
 from scripts.leaderboard import leaderboard
+from scripts.render import render
 from scripts.reproduce.command import reproduce
 from scripts.train import train
 from scripts.verify import verify
@@ -27,6 +28,7 @@ app.command("identify")(identify)
 app.command("train")(train)
 app.command("leaderboard")(leaderboard)
 app.command("verify")(verify)
+app.command("render")(render)
 app.command("reproduce")(reproduce)
 
 

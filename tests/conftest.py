@@ -1,4 +1,12 @@
+"""What all tests share."""
+
 from __future__ import annotations
+
+import os
+
+# Before NumPy and torch are imported, and for processes that tests start: on small matrices, threads that wait for each other
+# take most of the processors from the other tests.
+os.environ["OMP_NUM_THREADS"] = "1"
 
 import gymnasium as gym
 import pytest

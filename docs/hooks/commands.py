@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -14,6 +15,9 @@ _INTRODUCTION = """# Command line
 Every command ends with status 0, or with status 2 and one message where the error is the user's. `--help` after a command
 says what stands here.
 """
+
+_LETTERS = {int: "N", Path: "PATH"}
+"""What stands for the value of an option that has no word for it, by the type of its default."""
 
 
 def commands() -> dict[str, Any]:
@@ -43,7 +47,7 @@ def _section(name: str, command: Any) -> str:
 
 def _written(option: Any) -> str:
     names = ", ".join((*option.opts, *option.secondary_opts))
-    return names if option.is_flag else f"{names} {option.metavar or option.type.name.upper()}"
+    return names if option.is_flag else f"{names} {option.metavar or _LETTERS.get(type(option.default), 'X')}"
 
 
 def _default(option: Any) -> str:

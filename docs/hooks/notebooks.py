@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +14,21 @@ _TIMEOUT = 120
 
 
 def executed(path: Path) -> Any:
-    """Run a notebook in a kernel of its own, beside its file, and return it with outputs.
+    """Run a notebook in a kernel and a folder of its own, and return it with outputs.
 
     Raises:
         nbclient.exceptions.CellExecutionError: a cell ended with an error.
     """
     import nbformat
     from nbclient import NotebookClient
+    from traitlets.config import Config
 
     notebook = nbformat.read(path, as_version=4)
-    client = NotebookClient(notebook, timeout=_TIMEOUT, kernel_name="python3", resources={"metadata": {"path": str(path.parent)}})
-    return client.execute()
+    with tempfile.TemporaryDirectory() as folder:
+        # Sockets of the machine's own, which nobody on a network can reach.
+        sockets = Config({"AsyncKernelManager": {"transport": "ipc", "ip": str(Path(folder) / "kernel")}})
+        client = NotebookClient(notebook, config=sockets, kernel_name="python3", timeout=_TIMEOUT, resources={"metadata": {"path": folder}})
+        return client.execute()
 
 
 def notebook_pages() -> dict[str, str | bytes]:
@@ -35,7 +41,7 @@ def notebook_pages() -> dict[str, str | bytes]:
                 parts.append(cell.source)
                 continue
             parts.append(f"```python\n{cell.source}\n```")
-            for j, output in enumerate(cell.outputs):
+            for j, output in enumerate(_joined(cell.outputs)):
                 text, picture = _output(output)
                 if picture:
                     name = f"{path.stem}-{i}-{j}.png"
@@ -45,6 +51,14 @@ def notebook_pages() -> dict[str, str | bytes]:
         parts.insert(1, f"[Download the notebook](./{path.name}); it was run when this site was built.")
         pages[f"notebooks/{path.stem}.md"] = "\n\n".join(parts) + "\n"
     return pages
+
+
+def _joined(outputs: Sequence[Any]) -> list[Any]:
+    """The outputs of a cell, with what is printed in one piece."""
+    printed = [output for output in outputs if output.output_type == "stream" and output.name == "stdout"]
+    for output in printed[1:]:
+        printed[0].text += output.text
+    return [*printed[:1], *(output for output in outputs if output.output_type != "stream")]
 
 
 def _output(output: Any) -> tuple[str, bytes | None]:

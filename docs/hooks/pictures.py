@@ -22,7 +22,9 @@ from wrappers.promise import promise
 from wrappers.verify import verify
 
 _GRID = 241
-_EPISODES = 2000
+_EPISODES = 1000
+_HORIZON = 10.0
+"""In s, of the picture of what is promised: long enough to see a bound run out."""
 
 
 def pictures() -> dict[str, bytes]:
@@ -64,7 +66,7 @@ def _chain() -> Figure:
         axes.contour(x, y, b_1, levels=[0.0], colors=COLORS[0], linewidths=1.3)
         axes.annotate("", (0.6, -2.4), (-0.6, -2.4), arrowprops={"arrowstyle": "->"})
         axes.text(0.0, -2.3, "heading", ha="center", color=QUIET)
-        axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=f"{name}: {missed.sum() / ((h > 0) & (b_1 > 0)).sum():.0%} infeasible")
+        axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=_title(name, missed.sum(), ((h > 0) & (b_1 > 0)).sum()))
     figure.legend(
         handles=[
             mpl.lines.Line2D([], [], color="black", label="h = 0"),
@@ -77,6 +79,10 @@ def _chain() -> Figure:
         ncols=5,
     )
     return figure
+
+
+def _title(name: str, missed: int, kept: int) -> str:
+    return f"{name}: in {100 * missed / kept:.0f} % of it no action meets the row"
 
 
 def _chain_values(safety_filter: SafetyFilter, problem: SafetyProblem, states: np.ndarray) -> np.ndarray:
@@ -107,7 +113,7 @@ def _program() -> Figure:
         _draw_program(axes, np.array(compiled(*state)), nominal, result)
         verdict = "feasible" if result.feasible else f"infeasible, slack {result.slack[0]:.2f}"
         axes.set_title(f"towards the obstacle at {speed:g} m/s: {verdict}")
-    figure.axes[0].legend(loc="lower left", frameon=True, framealpha=0.9)
+    figure.legend(handles=figure.axes[0].get_legend_handles_labels()[0], loc="outside lower center", ncols=3)
     return figure
 
 
@@ -121,13 +127,13 @@ def _draw_program(axes: Axes, row: np.ndarray, nominal: np.ndarray, result: Any)
     axes.plot(*result.action, "s", color=COLORS[0], markersize=8, label="executed action")
     axes.annotate("", result.action, nominal, arrowprops={"arrowstyle": "->", "color": QUIET})
     axes.text(0.98, 0.02, "grey: a u + b < 0", transform=axes.transAxes, ha="right", va="bottom", color=QUIET)
-    axes.set(aspect="equal", xlabel="a_x (m/s²)", ylabel="a_y (m/s²)")
+    axes.set(aspect="equal", xlabel="$a_x$ (m/s²)", ylabel="$a_y$ (m/s²)")
 
 
 def _promise() -> Figure:
     """The measured rate over the horizon beside what is proved, for the thesis' cubic SDE in a disk."""
-    problem = _problem("safe_envs/CubicSDEDisk-v0")
-    evaluation = evaluate(problem, filters=["none", "scbf"], options=None, episodes=_EPISODES, seed=0)
+    problem = _problem("safe_envs/CubicSDEDisk-v0").configured(horizon=_HORIZON)
+    evaluation = evaluate(problem, filters=["none", "scbf"], episodes=_EPISODES, seed=0)
     verification = verify(problem, parse_conditions("scbf", problem))
     starts = _starts(problem)
     figure = Figure(figsize=(7.5, 4.2))

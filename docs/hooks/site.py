@@ -7,16 +7,14 @@ from typing import Any
 
 from commands import command_line_page
 from contract import info_page
-from environments import env_pages, short_name
+from environments import env_pages
 from mathml import with_mathml
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
+from navigation import complete
 from notebooks import notebook_pages
 from pictures import pictures
 from runs import with_output
-
-from safe_envs import ENV_IDS
-from wrappers import CONDITIONS, LEARNED
 
 _TABLE = "<!-- table of envs -->"
 
@@ -26,9 +24,7 @@ _made: dict[str, str | bytes] = {}
 def on_config(config: Any) -> Any:
     """Add a page for each env and each filter to the navigation."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    for section in config.nav:
-        section.get("Environments", []).extend(f"envs/{short_name(env_id)}.md" for env_id in ENV_IDS)
-        section.get("Filters", []).extend(f"filters/{name}.md" for name in (*CONDITIONS, *LEARNED))
+    complete(config.nav)
     return config
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,19 +70,19 @@ class Axes:
         """The pixels of points of the world, shape (k, 2)."""
         return np.stack(self.place(x, y), axis=-1)  # pyright: ignore[reportArgumentType, reportCallIssue]  (arithmetic of arrays)
 
-    def furnish(self, canvas: Canvas, x_label: str, y_label: str, grid: bool = True, y_ticks: Sequence[float] | None = None) -> None:
+    def furnish(self, canvas: Canvas, x_label: str, y_label: str, grid: bool = True) -> None:
         """Draw the grid, the ticks with their numbers, the frame and the labels."""
         left, top, width, height = self.box
         bottom = top + height
         for tick in ticks(*self.x, most=max(2, width // 80)):
-            px = self.place(tick, 0.0)[0]
+            px = round(self.place(tick, 0.0)[0])
             if grid:
-                canvas.line((px, top), (px, bottom), LINE)
+                canvas.fill((px, top, 1, height), LINE)
             canvas.text(_tick_text(tick), (px, bottom + 4), GREY, SMALL, align=(0.5, 0.0))
-        for tick in ticks(*self.y, most=max(2, height // 55)) if y_ticks is None else y_ticks:
-            py = self.place(0.0, tick)[1]
+        for tick in ticks(*self.y, most=max(2, height // 55)):
+            py = round(self.place(0.0, tick)[1])
             if grid:
-                canvas.line((left, py), (left + width, py), LINE)
+                canvas.fill((left, py, width, 1), LINE)
             canvas.text(_tick_text(tick), (left - 6, py), GREY, SMALL, align=(1.0, 0.5))
         canvas.frame((left - 1, top - 1, width + 2, height + 2), GREY)
         canvas.text(x_label, (left + width / 2, bottom + 21), INK, SMALL, align=(0.5, 0.0))

@@ -34,6 +34,7 @@ class Moment:
         executed: input that led here, None at the start of an episode.
         decision: of a filter on that input, None without a filter.
         violated: where h was negative first, shape (n,); None if it never was.
+        violated_at: when that was, in s.
     """
 
     states: np.ndarray
@@ -43,6 +44,7 @@ class Moment:
     executed: Sequence[float] | None
     decision: Decision | None
     violated: np.ndarray | None
+    violated_at: float
 
     @property
     def state(self) -> np.ndarray:
@@ -79,6 +81,7 @@ class History:
         """Forget the past: an episode begins, or goes on from somewhere else."""
         self._count = 0
         self._violated: np.ndarray | None = None
+        self._violated_at = 0.0
         self.append(state, time, None, None)
 
     def append(self, state: Sequence[float], time: float, executed: Sequence[float] | None, decision: Decision | None) -> None:
@@ -91,11 +94,11 @@ class History:
         self._count += 1
         self._latest = tuple(map(float, barriers)), executed, decision
         if self._violated is None and min(barriers) < 0.0:
-            self._violated = np.array(state, dtype=float)
+            self._violated, self._violated_at = np.array(state, dtype=float), time
 
     @property
     def moment(self) -> Moment:
         """The instant that was added last."""
         rows = self._rows[: self._count]
         barriers, executed, decision = self._latest
-        return Moment(rows[:, 2:], rows[:, 0], rows[:, 1], barriers, executed, decision, self._violated)
+        return Moment(rows[:, 2:], rows[:, 0], rows[:, 1], barriers, executed, decision, self._violated, self._violated_at)

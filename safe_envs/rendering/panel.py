@@ -8,6 +8,7 @@ from safe_envs.problem import SafetyProblem, Variable
 from safe_envs.rendering.axes import Axes
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.history import Moment
+from safe_envs.rendering.scenes.base import runs
 from safe_envs.rendering.style import (
     EDGE,
     EXECUTED,
@@ -28,16 +29,18 @@ from safe_envs.rendering.style import (
     UNSAFE,
     VIOLATION,
     Color,
+    bound,
     label,
     mix,
     number,
+    pretty,
 )
 
 _LEFT, _RIGHT = SCENE[2] + 20, SIZE[0] - 20
 _WIDTH = _RIGHT - _LEFT
-_BARS = (148, 352)
+_BARS = (148, 348)
 _MOST_BARS = 5
-_CHART = (_LEFT + 44, 392, _WIDTH - 44, 88)
+_BOTTOM = 480
 _LEGEND = 512
 
 
@@ -51,7 +54,12 @@ class Panel:
     def __init__(self, problem: SafetyProblem) -> None:
         self._problem = problem
         shown = problem.inputs[:_MOST_BARS]
-        self._rows = [(i, _BARS[0] + 22 + round(j * self._pitch(len(shown)))) for j, i in enumerate(shown)]
+        pitch = min(58.0, (_BARS[1] - _BARS[0] - 26) / len(shown))
+        self._rows = [(variable, _BARS[0] + 26 + round(j * pitch)) for j, variable in enumerate(shown)]
+        self._ranged = pitch >= 50.0
+        below = _BARS[0] + 26 + round(len(shown) * pitch) + 10
+        self._heading = below
+        self._box = (_LEFT + 44, below + 28, _WIDTH - 44, _BOTTOM - below - 28)
         self._background = Canvas(SIZE)
         canvas = self._background
         canvas.fill((SCENE[2], 0, SIZE[0] - SCENE[2], SIZE[1]), PANEL)
@@ -61,12 +69,8 @@ class Panel:
         canvas.text("Action" + (f" (and {more} more)" if more else ""), (_LEFT, _BARS[0]), INK, NORMAL, bold=True)
         for variable, top in self._rows:
             self._track(variable, top)
-        canvas.text("Smallest h" if len(problem.barriers) > 1 else "h", (_LEFT, 360), INK, NORMAL, bold=True)
+        canvas.text("Smallest h" if len(problem.barriers) > 1 else "h", (_LEFT, below), INK, NORMAL, bold=True)
         self._legend()
-
-    @staticmethod
-    def _pitch(count: int) -> float:
-        return min(58.0, (_BARS[1] - _BARS[0] - 22) / max(count, 1))
 
     def draw(self, canvas: Canvas, moment: Moment, caption: str) -> None:
         """Draw the panel, and blank paper for the scene."""
@@ -105,9 +109,9 @@ class Panel:
         """The empty bar of an input, with its name and its range."""
         canvas = self._background
         canvas.text(label(variable.symbol.name, variable.unit), (_LEFT, top), INK, SMALL)
-        if self._pitch(len(self._rows)) >= 50.0:
+        if self._ranged:
             for value, side in ((variable.low, 0.0), (variable.high, 1.0)):
-                canvas.text(number(value), (_LEFT + side * _WIDTH, top + 36), GREY, SMALL - 2, align=(side, 0.0))
+                canvas.text(bound(value), (_LEFT + side * _WIDTH, top + 36), GREY, SMALL - 2, align=(side, 0.0))
         canvas.fill((_LEFT, top + 20, _WIDTH, 12), PAPER, 2)
         canvas.frame((_LEFT, top + 20, _WIDTH, 12), mix(GREY, PANEL, 0.6), 1, 2)
 
@@ -122,14 +126,14 @@ class Panel:
             canvas.fill((min(rest, here), top + 21, max(abs(here - rest), 2.0), 10), color)
             canvas.line((rest, top + 17), (rest, top + 34), INK)
             canvas.fill((here - 1, top + 18, 3, 16), INK)
-            right = _RIGHT
+            right, scale = _RIGHT, max(-variable.low, variable.high)
             if decision is not None:
                 place = _on_track(variable, min(max(decision.nominal[j], variable.low), variable.high))
                 canvas.diamond((place, top + 26), 7, None, INK)
-                right -= canvas.text(number(decision.nominal[j]), (right, top), INK, SMALL, align=(1.0, 0.0)) + 10
+                right -= canvas.text(number(decision.nominal[j], scale), (right, top), INK, SMALL, align=(1.0, 0.0)) + 10
                 canvas.diamond((right, top + 8), 4, None, INK, 1)
                 right -= 16
-            right -= canvas.text(number(executed[j]), (right, top), INK, SMALL, bold=True, align=(1.0, 0.0)) + 14
+            right -= canvas.text(number(executed[j], scale), (right, top), INK, SMALL, bold=True, align=(1.0, 0.0)) + 14
             canvas.fill((right, top + 3, 9, 9), color)
 
     def _chart(self, canvas: Canvas, moment: Moment) -> None:
@@ -137,16 +141,16 @@ class Panel:
         low, high = min(float(h.min()), 0.0), max(float(h.max()), 0.0)
         span = max(high - low, 1e-9)
         end = max(self._problem.horizon, float(times[-1]))
-        axes = Axes(_CHART, (end - self._problem.horizon, end), (low - 0.12 * span, high + 0.12 * span))
-        left, top, width, height = _CHART
+        axes = Axes(self._box, (end - self._problem.horizon, end), (low - 0.12 * span, high + 0.12 * span))
+        left, top, width, height = self._box
         edge = axes.place(0.0, 0.0)[1]
         canvas.fill((left, top, width, edge - top), mix(GREEN, PAPER, 0.10))
         canvas.fill((left, edge, width, top + height - edge), UNSAFE)
         canvas.line((left, edge), (left + width, edge), EDGE, 2)
         places = axes.places(times, h)
-        canvas.within(_CHART)
+        canvas.within(self._box)
         canvas.path(places, INK, 2)
-        for run in _runs(h < 0.0):
+        for run in runs(h < 0.0):
             canvas.path(places[run], VIOLATION, 3)
         canvas.disk(places[-1], 4, VIOLATION if h[-1] < 0.0 else INK)
         canvas.within(None)
@@ -157,11 +161,11 @@ class Panel:
         for tick in axes.x:
             canvas.text(f"{tick:.3g} s", (axes.place(tick, 0.0)[0], top + height + 4), GREY, SMALL - 1, align=(float(tick == end), 0.0))
         now, smallest = number(float(moment.h[-1])), number(float(moment.h.min()))
-        width = canvas.text(f"least {smallest}", (_RIGHT, 362), GREY, SMALL, align=(1.0, 0.0))
-        canvas.text(f"now {now}", (_RIGHT - width - 14, 362), INK, SMALL, bold=True, align=(1.0, 0.0))
+        width = canvas.text(f"least {smallest}", (_RIGHT, self._heading + 2), GREY, SMALL, align=(1.0, 0.0))
+        canvas.text(f"now {now}", (_RIGHT - width - 14, self._heading + 2), INK, SMALL, bold=True, align=(1.0, 0.0))
         if len(moment.barriers) > 1:
             name = self._problem.barriers[int(np.argmin(moment.barriers))].name
-            canvas.text(f"({name})", (_LEFT + 96, 362), GREY, SMALL)
+            canvas.text(f"({pretty(name)})", (_LEFT + 96, self._heading + 2), GREY, SMALL)
 
     def _legend(self) -> None:
         canvas, y = self._background, _LEGEND
@@ -189,9 +193,3 @@ def _thinned(times: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return times, h
     starts = np.arange(0, len(h), stride)
     return times[np.minimum(starts + stride - 1, len(h) - 1)], np.minimum.reduceat(h, starts)
-
-
-def _runs(flags: np.ndarray) -> list[slice]:
-    """Where flags are set, with a point on each side, so that short runs are lines too."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return [slice(max(int(a) - 1, 0), int(b) + 1) for a, b in edges.reshape(-1, 2)]

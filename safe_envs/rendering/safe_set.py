@@ -11,13 +11,22 @@ from safe_envs.codegen import compile_function, filled
 from safe_envs.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Canvas
-from safe_envs.rendering.style import EDGE, GREEN, HATCH, PAPER, UNSAFE, mix
+from safe_envs.rendering.style import EDGE, GREEN, HATCH, PAPER, UNSAFE, Color, mix
 
 _CELL = 4
 _RESOLUTION = 4
 _NEAREST, _FURTHEST = -4, 96
-_LEVELS = 4
-_TINT = (0.07, 0.055)
+
+LEVELS = 4
+"""How many tints the safe set has."""
+
+STEP = _FURTHEST // LEVELS
+"""Pixels from one tint to the next; the last one goes on for ever."""
+
+
+def tint(level: int) -> Color:
+    """The colour of the safe set from `level` steps within its edge, to the next level."""
+    return mix(GREEN, PAPER, 0.07 + 0.055 * level)
 
 
 def barriers_in(problem: SafetyProblem, states: Sequence[int]) -> list[int]:
@@ -42,7 +51,7 @@ class Barriers:
         """Each barrier at states that broadcast against each other, with the barriers in front; NaN counts as unsafe."""
         shape = np.broadcast_shapes(*(np.shape(c) for c in components))
         with np.errstate(all="ignore"):
-            values = self._read(*(np.asarray(c, dtype=float) for c in components))
+            values = self._read(*(np.array(c, dtype=float, ndmin=1) for c in components))
         return np.nan_to_num(np.stack([filled(v, shape) for v in values]), nan=-1.0)
 
     def along(self, state: np.ndarray, i: int, values: np.ndarray) -> np.ndarray:
@@ -56,14 +65,15 @@ class Barriers:
         values = np.linspace(low, high, 401)
         h = self.along(state, i, values)
         safe = np.concatenate([[False], h >= 0.0, [False]])
-        starts, ends = np.flatnonzero(safe[1:] & ~safe[:-1]), np.flatnonzero(safe[:-1] & ~safe[1:]) - 1
+        starts = np.flatnonzero(safe[1:] & ~safe[:-1]).tolist()
+        ends = (np.flatnonzero(safe[:-1] & ~safe[1:]) - 1).tolist()
         return [(_crossing(values, h, s - 1, s), _crossing(values, h, e, e + 1)) for s, e in zip(starts, ends, strict=True)]
 
 
 def _crossing(values: np.ndarray, h: np.ndarray, i: int, j: int) -> float:
     """Where h vanishes between two neighbours, or the end of the range."""
     if i < 0 or j >= len(values) or not np.isfinite(h[i] - h[j]):
-        return float(values[max(i, 0) if j >= len(values) else j])
+        return float(values[min(j, len(values) - 1)])
     return float(values[i] + (values[j] - values[i]) * h[i] / (h[i] - h[j]))
 
 
@@ -76,7 +86,7 @@ class SafeSet:
     Args:
         barriers: of the set.
         axes: where they are drawn.
-        plane: indices of the states along x and y.
+        plane: indices of the states along x and y; -1 for what is no state, the time say.
     """
 
     def __init__(self, barriers: Barriers, axes: Axes, plane: tuple[int, int]) -> None:
@@ -85,47 +95,52 @@ class SafeSet:
         self._corner = (left, top)
         columns, rows = width // _CELL + 2, height // _CELL + 2
         right, up = axes.scale
-        self._x = (axes.x[0] + np.arange(columns) * _CELL / right)[:, None]
-        self._y = (axes.y[1] - np.arange(rows) * _CELL / up)[None, :]
-        self._across, self._down = _between(width), _between(height)
-        px, py = np.arange(width)[:, None], np.arange(height)[None, :]
-        hatched = (px + py) % 10 < 2
-        self._offset = np.where(hatched, _count(), 0) - _NEAREST * _RESOLUTION
+        self._x = (axes.x[0] + np.arange(columns) * _CELL / right)[None, :]
+        self._y = (axes.y[1] - np.arange(rows) * _CELL / up)[:, None]
+        self._hatched = np.where(sum(np.ogrid[:height, :width]) % 10 < 2, _count(), 0).astype(np.int32)
         self._surface = pygame.Surface((width, height), 0, 32)
         self._colors = np.array([self._surface.map_rgb(c) for c in (*_colors(False), *_colors(True))], dtype=np.uint32)
 
     def draw(self, canvas: Canvas, state: np.ndarray) -> None:
         """Draw the set with all states but the two of the plane as they are."""
         x, y = self._plane
+        height, width = self._hatched.shape
         h = self._barriers([self._x if i == x else self._y if i == y else float(v) for i, v in enumerate(state)])
-        slope = np.hypot(np.gradient(h, _CELL, axis=1), np.gradient(h, _CELL, axis=2))
-        distance = np.clip(h / np.maximum(slope, 1e-12), _NEAREST, _FURTHEST).min(axis=0)
-        (i, v), (j, w) = self._across, self._down
-        distance = distance[i] + v[:, None] * (distance[i + 1] - distance[i])
-        distance = distance[:, j] + w * (distance[:, j + 1] - distance[:, j])
+        h = np.broadcast_to(h, (len(h), self._y.size, self._x.size))
+        distance = np.clip(_to_edge(h), _NEAREST, _FURTHEST)
+        knots = (distance - _NEAREST) * np.float32(_RESOLUTION)
+        colors = _finer(_finer(knots.T).T)[:height, :width].astype(np.int32)
+        colors += self._hatched
         pixels = pygame.surfarray.pixels2d(self._surface)
-        pixels[:] = self._colors.take((distance * _RESOLUTION).astype(np.int32) + self._offset)
+        pixels.T[:] = self._colors.take(colors)
         del pixels
         canvas.surface.blit(self._surface, self._corner)
 
 
-def _between(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """For each pixel the knot before it, and how far it is on the way to the next one."""
-    place = (np.arange(size) + 0.5) / _CELL
-    return place.astype(np.intp), place % 1.0
+def _to_edge(h: np.ndarray) -> np.ndarray:
+    """Distance from the edge in pixels, to first order, the least of all barriers: h has shape (barriers, rows, columns)."""
+    down, across = np.gradient(h, _CELL, axis=(1, 2))
+    slope = np.sqrt(np.maximum(down * down + across * across, 1e-24))
+    return (h / slope).min(axis=0).astype(np.float32)
+
+
+def _finer(knots: np.ndarray) -> np.ndarray:
+    """Values at the middles of the pixels between knots, along the last axis."""
+    share = ((np.arange(_CELL) + 0.5) / _CELL).astype(np.float32)
+    between = knots[:, :-1, None] + np.diff(knots)[:, :, None] * share
+    return between.reshape(len(knots), -1)
 
 
 def _count() -> int:
     return (_FURTHEST - _NEAREST) * _RESOLUTION + 1
 
 
-def _colors(hatched: bool) -> list[tuple[int, int, int]]:
+def _colors(hatched: bool) -> list[Color]:
     """The colour of each distance from the edge, from outside to inside."""
     found = []
     for i in range(_count()):
         distance = _NEAREST + i / _RESOLUTION
-        level = min(int(_LEVELS * max(distance, 0.0) / _FURTHEST), _LEVELS - 1)
-        inside = mix(GREEN, PAPER, _TINT[0] + _TINT[1] * level)
+        inside = tint(min(int(max(distance, 0.0) / STEP), LEVELS - 1))
         area = mix(inside, HATCH if hatched else UNSAFE, min(max(distance + 0.5, 0.0), 1.0))
         found.append(mix(EDGE, area, min(max(1.7 - abs(distance), 0.0), 1.0)))
     return found

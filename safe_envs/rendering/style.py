@@ -45,7 +45,7 @@ SIZE = (960, 540)
 SCENE = (0, 0, 600, 540)
 """Left, top, width and height of the scene; the panel is to its right."""
 
-_SUPERSCRIPTS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def mix(color: Color, background: Color, share: float) -> Color:
@@ -55,8 +55,10 @@ def mix(color: Color, background: Color, share: float) -> Color:
 
 
 def pretty(name: str) -> str:
-    """A name with Greek letters, dots and indices: theta, zdot and x_1 as θ, ż and x₁."""
-    return sp.pretty(sp.Symbol(name), use_unicode=True)
+    """A name with Greek letters and indices, and rates as such: theta, x_1 and zdot as θ, x₁ and dz/dt."""
+    base = name.removesuffix("dot")
+    text = sp.pretty(sp.Symbol(base or name), use_unicode=True)
+    return f"d{text}/dt" if base and base != name else text
 
 
 def unit_text(unit: str) -> str:
@@ -70,13 +72,26 @@ def label(name: str, unit: str = "") -> str:
     return f"{pretty(name)} [{unit_text(unit)}]" if unit else pretty(name)
 
 
-def number(value: float) -> str:
-    """Three digits that count, with a true minus sign; large numbers in whole ones, in groups of three."""
+def number(value: float, scale: float = 0.0) -> str:
+    """Three digits that count, with a true minus sign; large numbers in whole ones, in groups of three.
+
+    Args:
+        value: to write.
+        scale: what is less than a thousandth of it is written as 0.
+    """
     size = abs(value)
-    if size >= 1e7 or 0.0 < size < 1e-3:
-        text = f"{value:.2e}"
+    if size <= 1e-3 * scale:
+        value = size = 0.0
+    if size >= 1e6 or 0.0 < size < 1e-3:
+        digits, power = f"{value:.2e}".split("e")
+        text = f"{digits}\u00d710{str(int(power)).translate(_SUPERSCRIPTS)}"
     elif size >= 1000.0:
         text = f"{value:,.0f}".replace(",", "\u202f")
     else:
         text = f"{value:.{max(0, 2 - (math.floor(math.log10(size)) if size >= 1.0 else 0))}f}"
     return text.replace("-", "\u2212")
+
+
+def bound(value: float) -> str:
+    """A bound: a whole number as such, any other with three digits."""
+    return f"{value:.0f}".replace("-", "\u2212") if value == round(value) and abs(value) < 1000.0 else number(value)

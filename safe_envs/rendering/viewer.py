@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -16,6 +16,9 @@ from safe_envs.rendering.history import Decision, History
 if TYPE_CHECKING:
     from safe_envs.rendering.picture import Picture
     from safe_envs.rendering.window import Window
+
+Rows = Any
+"""A sequence or an array with an entry for each env."""
 
 RENDER_MODES = ("human", "rgb_array")
 """What a scalar env can be made with, besides None; a vector env only with the last."""
@@ -76,11 +79,11 @@ class Viewer:
         self._picture: Picture | None = None
         self._window: Window | None = None
 
-    def announce(self, nominal: Sequence[Sequence[float]], active: Sequence[bool], feasible: Sequence[bool]) -> None:
+    def announce(self, nominal: Rows, active: Rows, feasible: Rows) -> None:
         """Keep what a filter decided, a row for each env, for the step that comes next."""
         self._decisions = [Decision(tuple(n), bool(a), bool(f)) for n, a, f in zip(nominal, active, feasible, strict=True)]
 
-    def restart(self, states: Sequence[Sequence[float]], times: Sequence[float], envs: Sequence[int]) -> None:
+    def restart(self, states: Rows, times: Rows, envs: Iterable[int]) -> None:
         """Begin an episode in some envs.
 
         Args:
@@ -93,9 +96,7 @@ class Viewer:
         self._decisions = [None] * len(self._histories)
         self._go_live()
 
-    def advance(
-        self, states: Sequence[Sequence[float]], times: Sequence[float], executed: Sequence[Sequence[float]], anew: Sequence[int] = ()
-    ) -> None:
+    def advance(self, states: Rows, times: Rows, executed: Rows, anew: Iterable[int] = ()) -> None:
         """Record a step of all envs, a row for each, of which those in `anew` begin an episode."""
         fresh = frozenset(anew)
         for i, history in enumerate(self._histories):

@@ -113,6 +113,7 @@ def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> S
         noise=("sigma_1",),
         gains=(1.0,),
         plane=("x_1", "x_3"),
+        scene="road",
         explored=Exploration(region=((10.0, 25.0), (15.0, 25.0), (20.0, 200.0)), inputs=((-4000.0,), (4000.0,))),
     )
 
@@ -149,6 +150,7 @@ def acc_gap(*, distance: float = 10.0, power: int = 5, rate: float = 1.0, slack_
         noise=("sigma_1", "sigma_2"),
         gains=(1.0, 1.0),
         plane=("v", "z"),
+        scene="road",
         explored=Exploration(region=((8.0, 24.0), (10.0, 32.0)), inputs=((-4000.0,), (4000.0,))),
     )
 

@@ -83,6 +83,7 @@ def _disk(
         starts={**starts, "uniform": Start(_anywhere(r), _UNIFORMS)},
         noise=("sigma_1", "sigma_2"),
         plane=("x", "y"),
+        scene="top-view",
         explored=Exploration(region=((-r, r), (-r, r), (-math.pi, math.pi))),
         **rest,
     )

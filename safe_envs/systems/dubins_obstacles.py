@@ -94,6 +94,7 @@ def dubins_obstacles(*, num_obstacles: int = 5, radius: float = 0.4) -> SafetyPr
         gains=(3.0, 5.0),
         filter="hocbf",
         plane=("x", "y"),
+        scene="top-view",
         **way_to(edge, 0.0),
     )
 

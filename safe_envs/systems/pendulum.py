@@ -69,6 +69,7 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         gains=(5.0,),
         filter="scbf",
         plane=("theta", "thetadot"),
+        scene="pendulum",
         explored=Exploration(region=((-reach, reach), (-reach, reach))),
     )
 

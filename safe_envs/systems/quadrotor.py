@@ -139,6 +139,7 @@ def rotor_problem(name: str, *, followed: Sequence[Feature] = (), **rest: Any) -
         ),
         noise=("sigma_x", "sigma_y", "sigma_z"),
         plane=("x", "z"),
+        scene="side-view",
         **rest,
     )
 

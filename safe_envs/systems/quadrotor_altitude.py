@@ -100,6 +100,7 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         starts={"spread": Start((around(5.0, 0.5, height), around(0.0, 0.5, climb)), (height, climb)), "thesis": Start.at((5.0, 0.0))},
         noise=("sigma_z",),
         plane=("z", "zdot"),
+        scene="altitude",
         explored=Exploration(region=((center - half_width, center + half_width), CLIMB_RATES)),
     )
 

@@ -48,6 +48,7 @@ def scalar(*, limit: float = 1.0) -> SafetyProblem:
         noise=("sigma",),
         gains=(1.0,),
         filter="scbf",
+        scene="line",
     )
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from agents import sb3_speed
 from scripts import benchmark
 from wrappers import SafetyFilterWrapper
 
@@ -17,6 +19,7 @@ from wrappers import SafetyFilterWrapper
 def quick(monkeypatch):
     monkeypatch.setattr(benchmark, "_ROUNDS", 1)
     monkeypatch.setattr(benchmark, "_SECONDS_PER_ROUND", 1e-4)
+    monkeypatch.setattr(sb3_speed, "speeds", partial(sb3_speed.speeds, steps=5, rounds=1))
     few = {"learned-hocbf": {"states": 200, "epochs": 2}, "ddscbf": {"points": 30, "repetitions": 20}, "bayesian": {"starts": 50}}
     learned = {
         name: (env_id, method, {**few[method], **{k: v for k, v in settings.items() if k == "way"}})

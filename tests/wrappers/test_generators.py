@@ -29,22 +29,23 @@ class Motion:
     def __init__(self, system, noisy):
         parts = [*system.drift, *system.input_matrix, *system.diffusion]
         self.n, self.m = system.n, system.m
-        self._read = compile_function(system.states, [system.numeric(e) for e in parts], "floats")
+        self._read = compile_function(system.states, [system.numeric(e) for e in parts], "arrays")
         self._noisy = noisy
 
     def rate(self, phi, x, u):
-        """(A phi)(x, u)."""
-        values = self._read(*x)
-        drift = np.array(values[: self.n]) + np.array(values[self.n : self.n * (1 + self.m)]).reshape(self.n, self.m) @ u
-        sigma = np.array(values[self.n * (1 + self.m) :]).reshape(self.n, -1) * self._noisy
-        live = sigma[:, np.any(sigma != 0, axis=0)]
+        """(A phi)(x, u) at states of shape (n, ...), for a function from such states to numbers of shape (...)."""
+        shape = x.shape[1:]
+        values = np.array([np.broadcast_to(value, shape) for value in self._read(*x)])
+        drift = values[: self.n] + np.einsum("ij...,j->i...", values[self.n : self.n * (1 + self.m)].reshape(self.n, self.m, *shape), u)
+        sigma = values[self.n * (1 + self.m) :].reshape(self.n, -1, *shape) * self._noisy
+        live = sigma[:, [bool(np.any(column != 0)) for column in np.moveaxis(sigma, 1, 0)]]
         grid = list(itertools.product(range(len(_NODES)), repeat=live.shape[1]))
         nodes = np.array([[_NODES[i] for i in point] for point in grid]).reshape(len(grid), -1)
         weights = np.array([math.prod(_WEIGHTS[i] for i in point) for point in grid])
+        jumps = np.einsum("ij...,pj->i...p", live, nodes)
 
         def slope(t):
-            after = x + drift * t + math.sqrt(t) * nodes @ live.T
-            return (sum(w * phi(y) for w, y in zip(weights, after, strict=True)) - phi(x)) / t
+            return (phi((x + drift * t)[..., None] + math.sqrt(t) * jumps) @ weights - phi(x)) / t
 
         first, second, third, fourth = (slope(_STEP / 2**k) for k in range(4))
         firsts = [2 * b - a for a, b in itertools.pairwise((first, second, third, fourth))]
@@ -92,7 +93,7 @@ def test_rows_equal_the_mean_change_of_their_chain(env_id, text):
     found = condition.constraint(model, barrier)
     row = [*found.coefficient, found.offset, *([] if found.demand is None else [found.demand])]
     compiled = compile_function(model.states, [model.numeric(e) for e in row], "floats")
-    h = compile_function(model.states, [barrier.expression], "floats")
+    h = compile_function(model.states, [barrier.expression], "arrays")
     motion = Motion(model, noisy=condition.stochastic)
     rng = np.random.default_rng(0)
     u = rng.normal(size=model.m)
@@ -106,7 +107,7 @@ def test_rows_equal_the_mean_change_of_their_chain(env_id, text):
 def by_quadrature(condition, text, motion, h, x, u, problem):
     """The row's value by the definitions of the thesis, and the size of its largest term."""
     if "rcbf" in text:
-        beta = (lambda s: -math.log(s / (1 + s))) if "log" in text else (lambda s: 1 / s)
+        beta = (lambda s: -np.log(s / (1 + s))) if "log" in text else (lambda s: 1 / s)
         slope = -1 / (h(x) * (1 + h(x))) if "log" in text else -1 / h(x) ** 2
         rate = motion.rate(lambda y: beta(h(y)), x, u)
         return (rate - condition.gamma / beta(h(x))) / slope, abs(rate / slope)

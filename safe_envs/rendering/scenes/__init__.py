@@ -12,11 +12,11 @@ SCENES = {
     "plane": "plane:PlaneScene",
     "bars": "bars:BarsScene",
     "top-view": "top_view:TopView",
-    "altitude": "altitude:AltitudeScene",
-    "side-view": "side_view:SideView",
+    "altitude": "craft:AltitudeScene",
+    "side-view": "craft:SideView",
     "road": "road:Road",
     "pendulum": "pendulum:PendulumScene",
-    "line": "line:LineScene",
+    "line": "strip:LineScene",
 }
 """Where the scene of each name is."""
 

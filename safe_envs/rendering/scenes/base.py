@@ -14,7 +14,8 @@ from safe_envs.rendering.history import Moment
 from safe_envs.rendering.safe_set import Barriers, barriers_in
 from safe_envs.rendering.style import EXECUTED, INFEASIBLE, INK, INTERVENING, PAPER, SKY, VIOLATION, Color, mix
 
-_MOST_POINTS = 500
+_MOST_POINTS = 2000
+_AGES = 12
 _PADDING = 0.3
 
 
@@ -63,7 +64,7 @@ class Scene(ABC):
             return shown
         x, y = (np.linspace(*r, 121) for r in shown)
         components = [x[:, None] if k == i else y[None, :] if k == j else 0.0 for k in range(len(self.names))]
-        safe = (Barriers(self.problem, chosen)(components) >= 0.0).all(axis=0)
+        safe = np.broadcast_to((Barriers(self.problem, chosen)(components) >= 0.0).all(axis=0), (len(x), len(y)))
         if not safe.any():
             return shown
         return _around(x[safe.any(axis=1)], shown[0]), _around(y[safe.any(axis=0)], shown[1])
@@ -89,23 +90,38 @@ def draw_trail(canvas: Canvas, axes: Axes, x: np.ndarray, y: np.ndarray, h: np.n
         y: along the axis upwards, shape (k,).
         h: smallest barrier there, shape (k,).
     """
-    # A power of two: points once drawn stay as the trail grows.
-    stride = 1 << max(0, (len(x) - 1) // _MOST_POINTS).bit_length()
-    kept = np.r_[0 : len(x) : stride, len(x) - 1] if stride > 1 else np.arange(len(x))
+    kept = thinned(len(x))
     places, unsafe = axes.places(x[kept], y[kept]), np.minimum.reduceat(h, kept) < 0.0
-    count = len(places)
     canvas.within(axes.box)
-    for k in range(1, count):
-        age = 1.0 - (count - k) / max(count, 60)
-        color = VIOLATION if unsafe[k] or unsafe[k - 1] else mix(EXECUTED, mix(SKY, PAPER, 0.45), age)
-        canvas.line(places[k - 1], places[k], color, 2)
+    for age, part in enumerate(np.array_split(np.arange(len(places)), _AGES), start=1):
+        if part.size:
+            canvas.path(places[part[0] : part[-1] + 2], mix(EXECUTED, mix(SKY, PAPER, 0.45), age / _AGES), 2)
+    for run in runs(unsafe):
+        canvas.path(places[run], VIOLATION, 3)
     canvas.within(None)
 
 
-def draw_violation(canvas: Canvas, at: tuple[float, float]) -> None:
+def thinned(count: int) -> np.ndarray:
+    """Indices of the points of a trail that are drawn: at most some thousands, the last one among them."""
+    # A power of two: points once drawn stay as the trail grows.
+    stride = 1 << max(0, (count - 1) // _MOST_POINTS).bit_length()
+    kept = np.arange(0, count, stride)
+    return kept if kept[-1] == count - 1 else np.append(kept, count - 1)
+
+
+def runs(flags: np.ndarray) -> list[slice]:
+    """Where flags are set, with a point before, so that short runs are lines too."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [slice(max(int(a) - 1, 0), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def draw_violation(canvas: Canvas, axes: Axes, where: tuple[float, float]) -> None:
     """Mark where the first violation was."""
-    canvas.cross(at, 7, PAPER, 6)
-    canvas.cross(at, 6, VIOLATION, 3)
+    canvas.within(axes.box)
+    at = axes.place(*where)
+    canvas.cross(at, 8, PAPER, 7)
+    canvas.cross(at, 7, VIOLATION, 4)
+    canvas.within(None)
 
 
 def draw_point(canvas: Canvas, at: tuple[float, float], color: Color) -> None:

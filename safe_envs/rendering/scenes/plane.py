@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
+
 from safe_envs.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range, grown
 from safe_envs.rendering.canvas import Box, Canvas
 from safe_envs.rendering.history import Moment
-from safe_envs.rendering.safe_set import Barriers, SafeSet
+from safe_envs.rendering.safe_set import LEVELS, Barriers, SafeSet, tint
 from safe_envs.rendering.scenes.base import Scene, draw_point, draw_trail, draw_violation, warning_color
 from safe_envs.rendering.style import label
 
-_BOX = (76, 20, 504, 466)
+BOX = (76, 20, 504, 466)
+"""Of a plane that takes the whole scene."""
 
 
 class Plane:
@@ -20,11 +25,12 @@ class Plane:
 
     Args:
         scene: that it is part of.
-        names: of the states along x and y.
+        names: of the states along x and y; "" for the time along x.
         box: where.
         chosen: indices of the barriers that are shown; None for all.
         equal: the same scale along both axes.
         shown: the ranges to begin with; by default those of the scene's `window`.
+        decorate: draws what else does not change.
     """
 
     def __init__(
@@ -36,25 +42,26 @@ class Plane:
         chosen: list[int] | None = None,
         equal: bool = False,
         shown: tuple[Range, Range] | None = None,
+        decorate: Callable[[Canvas, Axes], None] | None = None,
     ) -> None:
         problem = scene.problem
-        self._labels = [label(name, scene.unit(name)) for name in names]
-        self.x, self.y = (scene.index(name) for name in names)
-        self._box, self._equal = box, equal
+        self._labels = [label(name, scene.unit(name)) if name else "t [s]" for name in names]
+        self.x, self.y = (scene.index(name) if name else -1 for name in names)
+        self._box, self._equal, self._decorate = box, equal, decorate
         self._shown = shown or scene.window(self.x, self.y)
         self._barriers = Barriers(problem, chosen)
-        inside = {problem.plant.states[self.x], problem.plant.states[self.y]}
+        inside = {problem.plant.states[i] for i in (self.x, self.y) if i >= 0}
         self._changes = any(problem.barriers[k].expression.free_symbols - inside for k in self._barriers.chosen)
         self._views: dict[Axes, tuple[SafeSet | None, Canvas]] = {}
 
     def background(self, canvas: Canvas, moment: Moment) -> Axes:
         """Draw the safe set and the axes, which grow where the trail leaves them."""
-        ranges = [grown(r, moment.states[:, i]) for r, i in zip(self._shown, (self.x, self.y), strict=True)]
+        ranges = [grown(r, _values(moment, i)) for r, i in zip(self._shown, (self.x, self.y), strict=True)]
         axes = Axes.equal(self._box, *ranges) if self._equal else Axes(self._box, *ranges)
         if axes not in self._views:
             self._views[axes] = self._view(axes, moment)
         safe_set, furniture = self._views[axes]
-        if safe_set is not None and self._changes:
+        if safe_set is not None:
             safe_set.draw(canvas, moment.state)
         canvas.lay(furniture)
         return axes
@@ -62,17 +69,24 @@ class Plane:
     def _view(self, axes: Axes, moment: Moment) -> tuple[SafeSet | None, Canvas]:
         safe_set = SafeSet(self._barriers, axes, (self.x, self.y)) if len(self._barriers.chosen) else None
         furniture = Canvas((axes.box[0] + axes.box[2] + 12, axes.box[1] + axes.box[3] + 42), clear=True)
-        if safe_set is not None and not self._changes:
+        if safe_set is None:
+            furniture.fill(axes.box, tint(LEVELS - 1))
+        elif not self._changes:
             safe_set.draw(furniture, moment.state)
+        if self._decorate is not None:
+            furniture.within(axes.box)
+            self._decorate(furniture, axes)
+            furniture.within(None)
         axes.furnish(furniture, *self._labels, grid=False)
-        return safe_set, furniture
+        return safe_set if self._changes else None, furniture
 
     def trail(self, canvas: Canvas, axes: Axes, moment: Moment) -> tuple[float, float]:
         """Draw the trail and the first violation; returns the pixel of the state."""
-        x, y = moment.states[:, self.x], moment.states[:, self.y]
+        x, y = _values(moment, self.x), _values(moment, self.y)
         draw_trail(canvas, axes, x, y, moment.h)
         if moment.violated is not None:
-            draw_violation(canvas, axes.place(moment.violated[self.x], moment.violated[self.y]))
+            x_then = moment.violated_at if self.x < 0 else moment.violated[self.x]
+            draw_violation(canvas, axes, (x_then, moment.violated[self.y]))
         return axes.place(float(x[-1]), float(y[-1]))
 
     def draw(self, canvas: Canvas, moment: Moment) -> None:
@@ -84,13 +98,18 @@ class Plane:
         canvas.within(None)
 
 
+def _values(moment: Moment, i: int) -> np.ndarray:
+    """A state along the episode; the time for -1."""
+    return moment.times if i < 0 else moment.states[:, i]
+
+
 class PlaneScene(Scene):
     """The plane of the problem, for the whole scene; with the same scale along both axes where their units are the same."""
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem)
         names = problem.plane or (self.names[0], self.names[-1])
-        self._plane = Plane(self, names, _BOX, equal=self.unit(names[0]) == self.unit(names[1]))
+        self._plane = Plane(self, names, BOX, equal=self.unit(names[0]) == self.unit(names[1]))
 
     def draw(self, canvas: Canvas, moment: Moment) -> None:
         """Draw the plane."""

@@ -112,7 +112,7 @@ def test_what_it_cannot_take_ends_with_status_2(safe_envs_command, catalogue, tm
 
 def test_processes_compute_what_a_single_one_does(safe_envs_command, tmp_path):
     """Over real artefacts, the quickest ones."""
-    names = ("example-4.2.2", "figure-6.2")
+    names = ("figure-5.1", "figure-6.2")
     for jobs in (1, 2):
         assert safe_envs_command("reproduce", *names, "--quick", "--jobs", jobs, "--out", f"by-{jobs}")[0] == 0
     for name in names:
