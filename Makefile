@@ -1,6 +1,7 @@
 # make demo   train a small agent, and print safety rates with and without filters
 # make test   the test suite
 # make lint   style, formatting and types
+# make wheel-test   a wheel, installed without extras in an environment of its own, and used there
 # make docs   the documentation, in site/; nothing is fetched but the packages
 # Each makes its own virtual environment in .venv first.
 
@@ -9,7 +10,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 DOCS_READY := .venv/.docs-ready
 
-.PHONY: demo test lint docs clean
+.PHONY: demo test lint wheel-test docs clean
 
 demo: $(READY)
 	$(BIN)/safe-envs demo
@@ -21,6 +22,9 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+
+wheel-test: $(READY)
+	sh tests/wheel_smoke.sh $(BIN)/python
 
 docs: $(DOCS_READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import copy
+import inspect
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,8 @@ OFF_POLICY = ("sac", "td3")
 ACTIONS = ("executed", "proposed", "both")
 """On which these may learn behind a filter; see `agents.replay`."""
 
+_OF_THE_ENV = ("normalize",)
+_OF_THE_NOISE = ("noise_type", "noise_std")
 _OF_THE_BUFFER = ("replay_buffer_class", "replay_buffer_kwargs")
 
 
@@ -50,6 +53,7 @@ def new_model(name: str, envs: VecEnv, problem: SafetyProblem, settings: Mapping
 
     # Stable-Baselines3 writes into what it is given.
     left = scheduled(copy.deepcopy(dict(settings)))
+    _require_known(name, left)
     try:
         envs = _normalized(envs, left.pop("normalize", False), left.get("gamma", 0.99))
         left |= _action_noise(left.pop("noise_type", None), left.pop("noise_std", None), problem.plant.m)
@@ -65,6 +69,15 @@ def new_model(name: str, envs: VecEnv, problem: SafetyProblem, settings: Mapping
     # Better now than when the first checkpoint is written.
     actor_of(model.policy)
     return model
+
+
+def _require_known(name: str, settings: Mapping[str, Any]) -> None:
+    given = ("self", "env", "seed", "device", "_init_setup_model")
+    allowed = [key for key in inspect.signature(algorithm_class(name)).parameters if key not in given]
+    allowed += [*_OF_THE_ENV, *(_OF_THE_NOISE if name in OFF_POLICY else ())]
+    for key in settings:
+        if key not in allowed:
+            raise ConfigurationError(f"{name} does not take the hyperparameter {key!r}; {nearest(key, allowed)}")
 
 
 def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:

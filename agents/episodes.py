@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from agents.bridge import Bridge, Exponentials
 from agents.comparison import Flags
 from agents.policy import Policy
 from agents.statistics import FirstValues, RunningSum, SafetyCurve, rate_interval, share
@@ -78,7 +79,7 @@ class Wave:
         self.returns = np.zeros(size)
 
     def add(self, h: np.ndarray, u: Components, reward: np.ndarray, info: Info) -> None:
-        """Count a step; it counts for the filter only if the episode was safe up to its beginning."""
+        """Count a step with its smallest h; it counts for the filter only if the episode was safe up to its beginning."""
         alive, counts = self.alive, self.alive & self.safe
         self.counted += counts
         self.lengths += alive
@@ -161,6 +162,7 @@ def run_episodes(
     progress: Progress | None = None,
     recorder: Recorder | None = None,
     on_start: OnStart | None = None,
+    bridge: Bridge | None = None,
 ) -> Totals:
     """Simulate episodes 0..episodes-1 in waves of the size of the vector env.
 
@@ -173,6 +175,7 @@ def run_episodes(
         recorder: keeps trajectories, if any.
         on_start: given the components of the start states of each wave, arrays of shape (num_envs,), and how many
             of them, from the first, are of episodes that count.
+        bridge: looks at h between control instants too; it changes neither control nor noise.
     """
     world = readable(env)
     totals = Totals(world.problem)
@@ -186,12 +189,33 @@ def run_episodes(
             started = env.reset(seed=[episode_seed(seed, i) for i in rows])
             if on_start:
                 on_start(world.components, count)
-            totals.add(_play(env, policy, started, first, count, progress, recorder), count)
+            watch = None if bridge is None else _Watch(bridge, Exponentials(seed, rows, bridge.draws), world.components, started[1])
+            totals.add(_play(env, policy, started, first, count, progress, recorder, watch), count)
     return totals
 
 
+class _Watch:
+    """Looks at h during each period of a wave."""
+
+    def __init__(self, bridge: Bridge, draws: Exponentials, x: Components, info: Info) -> None:
+        self._bridge, self._draws, self._x, self._barriers = bridge, draws, x, info["barrier"]
+
+    def lowest(self, x: Components, barriers: np.ndarray) -> np.ndarray:
+        """Smallest h of the period that led to states, shape (B,)."""
+        found = self._bridge.lowest(self._x, self._barriers, barriers, self._draws.next())
+        self._x, self._barriers = x, barriers
+        return found
+
+
 def _play(
-    env: Env, policy: Any, started: tuple[np.ndarray, Info], first: int, count: int, progress: Progress | None, recorder: Recorder | None
+    env: Env,
+    policy: Any,
+    started: tuple[np.ndarray, Info],
+    first: int,
+    count: int,
+    progress: Progress | None,
+    recorder: Recorder | None,
+    watch: _Watch | None,
 ) -> Wave:
     """Simulate a wave that was just reset, and that begins with the episode `first`."""
     world = readable(env)
@@ -206,7 +230,8 @@ def _play(
         actions, state = policy.predict(observation, state, start, deterministic=True)
         observation, reward, terminated, truncated, info = env.step(actions)
         h = _smallest(info["barrier"])
-        wave.add(h, _executed(world, actions, info), reward, info)
+        lowest = h if watch is None else watch.lowest(world.components, info["barrier"])
+        wave.add(lowest, _executed(world, actions, info), reward, info)
         if recorder:
             recorder.note(k, first, wave.alive, h, world.components)
         start = terminated | truncated

@@ -9,8 +9,8 @@ import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
 from safe_envs import ENV_IDS, SafeEnv, SafetyProblem
-from safe_envs.custom import CUSTOM_ID
 from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.systems import CUSTOM_ID
 
 
 def full_id(env_id: str) -> str:

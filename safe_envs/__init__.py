@@ -1,11 +1,12 @@
-"""Gymnasium environments of safety-critical systems under uncertainty; importing this package registers their ids."""
+"""Gymnasium environments of safety-critical systems under uncertainty; importing this package registers their ids.
 
+What is named here is imported when it is asked for: ids, errors and completion in a shell need no symbolic algebra.
+"""
+
+from importlib import import_module
 from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
 
-from safe_envs.barrier import Barrier
-from safe_envs.clf import CLF
-from safe_envs.custom import register, register_custom
-from safe_envs.env import SafeEnv
 from safe_envs.errors import (
     ConfigurationError,
     InvalidInputError,
@@ -15,11 +16,17 @@ from safe_envs.errors import (
     SystemDefinitionError,
     SystemDefinitionWarning,
 )
-from safe_envs.problem import SafetyProblem
-from safe_envs.sde import ControlAffineSDE
-from safe_envs.statement import state_problem
 from safe_envs.systems import ENV_IDS, register_all
-from safe_envs.vector import SafeVectorEnv
+
+if TYPE_CHECKING:
+    from safe_envs.barrier import Barrier
+    from safe_envs.clf import CLF
+    from safe_envs.custom import register
+    from safe_envs.env import SafeEnv
+    from safe_envs.problem import SafetyProblem
+    from safe_envs.sde import ControlAffineSDE
+    from safe_envs.statement import state_problem
+    from safe_envs.vector import SafeVectorEnv
 
 __all__ = [
     "CLF",
@@ -42,5 +49,27 @@ __all__ = [
 
 __version__ = version("safe-envs")
 
+_MODULES = {
+    "Barrier": "barrier",
+    "CLF": "clf",
+    "ControlAffineSDE": "sde",
+    "SafeEnv": "env",
+    "SafeVectorEnv": "vector",
+    "SafetyProblem": "problem",
+    "register": "custom",
+    "state_problem": "statement",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = globals()[name] = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
 register_all()
-register_custom()

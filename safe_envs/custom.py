@@ -21,9 +21,6 @@ from safe_envs.mistakes import require_sound
 from safe_envs.problem import SafetyProblem
 from safe_envs.vector import AutoresetMode, SafeVectorEnv
 
-CUSTOM_ID = "safe_envs/Custom-v0"
-"""The id that takes any system, as its argument `system`."""
-
 Factory = Callable[..., SafetyProblem]
 
 
@@ -190,8 +187,3 @@ class CustomVector(SafeVectorEnv):
     ) -> None:
         problem = make_problem(system, load_system(system), barrier, options)
         super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)
-
-
-def register_custom() -> None:
-    """Register the id that takes any system."""
-    gym.register(CUSTOM_ID, entry_point="safe_envs.custom:Custom", vector_entry_point="safe_envs.custom:CustomVector")

@@ -77,6 +77,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
 
     Attributes:
         executed: the physical input of the last step.
+        viewer: what is drawn, and its caption; None without a render mode.
 
     Args:
         problem: what to simulate.
@@ -91,7 +92,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 20}  # noqa: RUF012  (as in the base class)
 
     def __init__(self, problem: SafetyProblem, max_episode_steps: int | None = None, render_mode: str | None = None) -> None:
-        self._viewer = open_viewer(problem, render_mode)
+        self.viewer = open_viewer(problem, render_mode)
         self.metadata = {**self.metadata, "render_fps": frames_a_second(problem)}
         self.problem = problem
         self.observation_space = self._bounds = observation_box(problem)
@@ -151,8 +152,8 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self._h_min = math.inf
         self._episode_cost = 0.0
         observation, _, _, info = self._observe([c for c, _ in self._scales])
-        if self._viewer is not None:
-            self._viewer.restart([self._x], [0.0], [0])
+        if self.viewer is not None:
+            self.viewer.restart([self._x], [0.0], [0])
         return observation, info
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Info]:
@@ -173,20 +174,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             observation, reward, terminated, info = self._observe(u)
         except (OverflowError, ZeroDivisionError, ValueError) as error:
             raise NumericalError(f"the simulation of {self.problem.name!r} broke down at {self._x}: {error}") from error
-        if self._viewer is not None:
-            self._viewer.advance([self._x], [self._steps * self.problem.dt], [u])
+        if self.viewer is not None:
+            self.viewer.advance([self._x], [self._steps * self.problem.dt], [u])
         return observation, reward, terminated, self._steps >= self._limit, info
-
-    def announce(self, nominal: Sequence[float], active: bool, feasible: bool) -> None:
-        """Tell the picture of the next step what a filter decided; without a render mode nobody needs to know.
-
-        Args:
-            nominal: the physical input that was proposed.
-            active: whether a condition of the filter was active.
-            feasible: whether an input met the conditions.
-        """
-        if self._viewer is not None:
-            self._viewer.announce([nominal], [active], [feasible])
 
     def render(self) -> Any:
         """Draw the state, with the trail of the episode and what a filter decided.
@@ -199,27 +189,17 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             ResetNeeded: there is no state yet.
             ConfigurationError: there is no display for a window.
         """
-        if self._viewer is None:
+        if self.viewer is None:
             gym.logger.warn('render() draws nothing without a render mode; make the env with render_mode="rgb_array" or "human"')
             return None
         if self._x is None:
             raise gym.error.ResetNeeded("the env has no state yet: call reset() first")
-        return self._viewer.render()
+        return self.viewer.render()
 
     def close(self) -> None:
         """Close the window of the mode "human"."""
-        if self._viewer is not None:
-            self._viewer.close()
-
-    @property
-    def caption(self) -> str:
-        """What the pictures say above the scene, the name of a filter say; empty without a render mode."""
-        return "" if self._viewer is None else self._viewer.caption
-
-    @caption.setter
-    def caption(self, text: str) -> None:
-        if self._viewer is not None:
-            self._viewer.caption = text
+        if self.viewer is not None:
+            self.viewer.close()
 
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
         x = self.components

@@ -34,6 +34,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     Attributes:
         executed: the components of the physical inputs of the last step.
+        viewer: what is drawn, and its caption; None without a render mode.
 
     Args:
         problem: what to simulate.
@@ -59,7 +60,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> None:
         if not isinstance(num_envs, int) or num_envs < 1:
             raise ConfigurationError(f"num_envs = {num_envs!r}; give a whole number from 1")
-        self._viewer = open_viewer(problem, render_mode, num_envs)
+        self.viewer = open_viewer(problem, render_mode, num_envs)
         self.render_mode = render_mode
         try:
             self._autoreset = AutoresetMode(autoreset_mode)
@@ -149,8 +150,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
         self._restart(np.flatnonzero(mask))
         observation, _, _, _, info = self._observe(tuple(self._center), counted=mask)
-        if self._viewer is not None:
-            self._viewer.restart(self.state, self._steps * self.problem.dt, np.flatnonzero(mask).tolist())
+        if self.viewer is not None:
+            self.viewer.restart(self.state, self._steps * self.problem.dt, np.flatnonzero(mask).tolist())
         return observation, with_masks(info, mask)
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -174,8 +175,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._x = tuple(np.array(snapshot["state"], dtype=float).T.copy())
         for name in _OF_EPISODES:
             setattr(self, f"_{name}", np.array(snapshot[name]))
-        if self._viewer is not None:
-            self._viewer.restart(self.state, self._steps * self.problem.dt, range(self.num_envs))
+        if self.viewer is not None:
+            self.viewer.restart(self.state, self._steps * self.problem.dt, range(self.num_envs))
 
     def step(self, actions: Any) -> VectorStep:
         """Hold an action in each env for one control period.
@@ -213,21 +214,10 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             anew = ended
         else:
             self._ended = ended
-        if self._viewer is not None:
+        if self.viewer is not None:
             fresh = [] if anew is None else np.flatnonzero(anew).tolist()
-            self._viewer.advance(self.state, self._steps * self.problem.dt, np.stack(u, axis=-1), fresh)
+            self.viewer.advance(self.state, self._steps * self.problem.dt, np.stack(u, axis=-1), fresh)
         return observation, reward, terminated, truncated, {**with_masks(info, self._everywhere.copy()), **last}
-
-    def announce(self, nominal: Sequence[Any], active: np.ndarray, feasible: np.ndarray) -> None:
-        """Tell the pictures of the next step what a filter decided; see `SafeEnv.announce`.
-
-        Args:
-            nominal: components of the physical inputs that were proposed.
-            active: whether a condition was active, shape (num_envs,).
-            feasible: whether an input met the conditions, shape (num_envs,).
-        """
-        if self._viewer is not None:
-            self._viewer.announce(np.stack(nominal, axis=-1), active, feasible)
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw every env, with the trail of its episode and what a filter decided.
@@ -239,12 +229,12 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             gymnasium.error.DependencyNotInstalled: pygame is missing.
             ResetNeeded: there is no state yet.
         """
-        if self._viewer is None:
+        if self.viewer is None:
             gym.logger.warn('render() draws nothing without a render mode; make the envs with render_mode="rgb_array"')
             return None
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
-        return self._viewer.frames()
+        return self.viewer.frames()
 
     def _last_of_episode(self, ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
         """Keep what the ended envs showed last, and restart them."""

@@ -18,8 +18,7 @@ from rich.table import Table
 import safe_envs
 from agents.problems import load_problem
 from safe_envs import Barrier, ControlAffineSDE
-from safe_envs.files import require_writable, write_json
-from scripts.console import stdout
+from scripts.console import require_result, stdout, write_result
 from wrappers import (
     CBF,
     DDSCBF,
@@ -77,14 +76,12 @@ def benchmark(json_file: Path | None = None) -> None:
     Raises:
         ConfigurationError: the file cannot be written.
     """
-    if json_file is not None:
-        require_writable(json_file)
+    require_result(json_file)
     figures = measure()
     console = stdout()
     console.print(f"{_ID} with scbf, safe-envs {safe_envs.__version__}, on one of {os.cpu_count()} cores\n", highlight=False)
     console.print(_table(figures))
-    if json_file is not None:
-        write_json(json_file, figures)
+    write_result(json_file, lambda: figures)
 
 
 def measure() -> Figures:
@@ -256,3 +253,9 @@ def _table(figures: Figures) -> Table:
     for name, value in figures.items():
         table.add_row(name, f"{value:.3g}")
     return table
+
+
+if __name__ == "__main__":
+    from scripts.cli import main
+
+    main("benchmark")

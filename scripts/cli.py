@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from scripts.console import run
+from scripts.console import Json, Quiet, quietly, run, with_quiet
 from scripts.evaluate import evaluate
 from scripts.identify import identify
 from scripts.leaderboard import leaderboard
 from scripts.render import render
 from scripts.reproduce.command import reproduce
+from scripts.sweep import sweep
 from scripts.train import train
 from scripts.verify import verify
 
@@ -20,47 +22,66 @@ app = typer.Typer(
     name="safe-envs",
     help="Safety-critical systems as Gymnasium envs, and safety filters over any policy.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.command("evaluate")(evaluate)
-app.command("identify")(identify)
-app.command("train")(train)
-app.command("leaderboard")(leaderboard)
-app.command("verify")(verify)
-app.command("render")(render)
-app.command("reproduce")(reproduce)
+for command in (evaluate, identify, train, leaderboard, verify, render, reproduce, sweep):
+    app.command(command.__name__)(with_quiet(command))
+
+
+@app.callback()
+def options_of_all(context: typer.Context, quiet: Quiet = False) -> None:
+    """Safety-critical systems as Gymnasium envs, and safety filters over any policy."""
+    context.with_resource(quietly(quiet))
 
 
 @app.command("list")
-def list_command() -> None:
+@with_quiet
+def list_command(json: Json = None) -> None:
     """List the registered envs."""
     from scripts.listing import list_envs
 
-    list_envs()
+    list_envs(json)
+
+
+@app.command("doctor")
+@with_quiet
+def doctor_command(json: Json = None) -> None:
+    """Check the installation: packages and extras, the solvers against known answers, every env with its filter, and the speed."""
+    from scripts.doctor import doctor
+
+    doctor(json)
 
 
 @app.command("demo")
+@with_quiet
 def demo_command(
     folder: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the trained policy and the pictures go.")] = Path("demo-results"),
     episodes: Annotated[int, typer.Option(min=1, help="Episodes for each filter.")] = 1000,
+    json: Json = None,
 ) -> None:
     """Train PPO briefly without a filter, then show the safety of it and of the nominal controller, bare and filtered."""
     from scripts.demo import demo
 
-    demo(folder, episodes)
+    demo(folder, episodes, json_file=json)
 
 
 @app.command("benchmark")
-def benchmark_command(
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the measurements.")] = None,
-) -> None:
+@with_quiet
+def benchmark_command(json: Json = None) -> None:
     """Measure the speed of filters and envs."""
     from scripts.benchmark import benchmark
 
     benchmark(json)
 
 
-def main() -> None:
-    """Entry point of the console command: errors of the user's making exit with status 2."""
-    run(app)
+def main(command: str | None = None) -> None:
+    """Entry point of the console command: errors of the user's making exit with status 2.
+
+    Args:
+        command: the one to run, for a script that is one; that of the command line by default.
+    """
+    run(lambda: app(None if command is None else [command, *sys.argv[1:]], prog_name="safe-envs"))
+
+
+if __name__ == "__main__":
+    main()

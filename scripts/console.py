@@ -2,42 +2,130 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
+import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import NoReturn
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
 
-from gymnasium.error import Error as GymnasiumError
+import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 from safe_envs.errors import SafeEnvsError
+from safe_envs.files import require_writable, write_json
 
 _LEAST_WIDTH = 104
 _PIPE_WIDTH = 240
 _TOO_LARGE = ("can't allocate memory", "Maximum allowed dimension exceeded", "Maximum allowed size exceeded", "array is too big")
 """What PyTorch and NumPy say of sizes beyond the memory, where it is no MemoryError."""
 
+STDOUT = Path("-")
+"""As the file of --json: the standard output, which has nothing else on it then."""
+
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print the tables only: no progress bar, no headings, no notes.")]
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results; - writes them to stdout, and nothing else.")]
+
+
+class _Terminal:
+    """How much is printed just now."""
+
+    quiet = False
+    silent = False
+
+
+class _Tables(Console):
+    """A console that leaves out all but tables."""
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        tables = [found for found in objects if isinstance(found, Table)]
+        if tables:
+            super().print(*tables, **how)
+
+
+@contextmanager
+def quietly(quiet: bool, silent: bool = False) -> Iterator[None]:
+    """Print less within this context.
+
+    Args:
+        quiet: no progress bar, and of what is printed only the tables.
+        silent: nothing on stdout, which is for `write_result`.
+    """
+    before = (_Terminal.quiet, _Terminal.silent)
+    _Terminal.quiet, _Terminal.silent = before[0] or quiet, before[1] or silent
+    try:
+        yield
+    finally:
+        _Terminal.quiet, _Terminal.silent = before
+
+
+def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
+    """The function of a command with the option --quiet, and without other output where its --json goes to stdout."""
+
+    @functools.wraps(command)
+    def wrapped(*, quiet: bool = False, **arguments: Any) -> None:
+        with quietly(quiet, silent=STDOUT in (arguments.get("json"), arguments.get("json_file"))):
+            command(**arguments)
+
+    signature = inspect.signature(command, eval_str=True)
+    option = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Quiet)
+    wrapped.__signature__ = signature.replace(parameters=[*signature.parameters.values(), option])  # pyright: ignore[reportAttributeAccessIssue]
+    wrapped.__annotations__ = {**command.__annotations__, "quiet": Quiet}
+    return wrapped
+
 
 def stdout() -> Console:
     """Console for results: wide enough for a table, and on a pipe for whatever is in it."""
-    if sys.stdout.isatty():
-        return Console(width=max(Console().width, _LEAST_WIDTH))
-    return Console(width=_PIPE_WIDTH)
+    kind = _Tables if _Terminal.quiet else Console
+    width = max(Console().width, _LEAST_WIDTH) if sys.stdout.isatty() else _PIPE_WIDTH
+    return kind(width=width, quiet=_Terminal.silent)
+
+
+def require_result(path: Path | None) -> None:
+    """Raise ConfigurationError if the file of --json cannot be written: asked before a long run, not after it."""
+    if path is not None and path != STDOUT:
+        require_writable(path)
+
+
+def write_result(path: Path | None, document: Callable[[], Any]) -> None:
+    """Write what --json asks for, if it does.
+
+    Args:
+        path: of --json.
+        document: makes what is to be written.
+
+    Raises:
+        ConfigurationError: the file cannot be written.
+    """
+    if path == STDOUT:
+        print(json.dumps(document(), indent=2, allow_nan=False))
+    elif path is not None:
+        write_json(path, document())
 
 
 def run(command: Callable[[], object]) -> None:
     """Run a command; an error of the user's making ends it with a message and the exit status 2."""
     try:
         command()
-    except (SafeEnvsError, GymnasiumError) as error:
+    except SafeEnvsError as error:
         _fail(str(error))
     except (MemoryError, RuntimeError, ValueError) as error:
         if not isinstance(error, MemoryError) and not any(text in str(error) for text in _TOO_LARGE):
             raise
         reason = str(error) or type(error).__name__
         _fail(f"not enough memory for what was asked ({reason}); choose smaller settings, or fewer episodes")
+    except Exception as error:
+        # Not imported before it is needed: completion has to be quick.
+        from gymnasium.error import Error
+
+        if not isinstance(error, Error):
+            raise
+        _fail(str(error))
 
 
 def _fail(message: str) -> NoReturn:
@@ -48,7 +136,7 @@ def _fail(message: str) -> NoReturn:
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
     """A progress bar on stderr, if that is a terminal: yields the function to tell which part is done, or None."""
-    if not sys.stderr.isatty():
+    if _Terminal.quiet or not sys.stderr.isatty():
         yield None
         return
     columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())

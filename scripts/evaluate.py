@@ -8,9 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from safe_envs.files import write_json
-from scripts import options
-from scripts.console import progress_bar, run, stdout
+from scripts import completion, options
+from scripts.console import progress_bar, stdout, write_result
 
 LEARNED_PARAMETERS = (
     "learned-hocbf:p=..:level=.95:eps=.. (quantile of the held-out errors that is the margin, or the margin itself), ddscbf:margin=0, "
@@ -34,6 +33,7 @@ def evaluate(
         typer.Option(
             "--filter",
             metavar="NAME",
+            autocompletion=completion.filters,
             help="none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf, scbf, and learned ones: learned-hocbf, ddscbf, bayesian-scbf; with "
             "parameters: hocbf:p=2,8; one for each barrier: hocbf:p=2,8+cbf:alpha=1. Repeatable. By default none and the env's own. "
             f"Parameters of learned ones: {LEARNED_PARAMETERS}.",
@@ -43,6 +43,7 @@ def evaluate(
         str,
         typer.Option(
             metavar="NAME|FOLDER|FILE",
+            autocompletion=completion.policies,
             help="nominal, clf, zero, random, a folder of `safe-envs train`, or with --trust a .zip of Stable-Baselines3.",
         ),
     ] = "nominal",
@@ -73,7 +74,12 @@ def evaluate(
         bool, typer.Option("--refine", help="Repeat with dt/2 and dt/4, and say whether the safety rate has converged.")
     ] = False,
     num_envs: Annotated[int, typer.Option(help="Episodes side by side; it changes the speed, not the answer.")] = 1024,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write configuration, versions, rows, comparisons and timing.")] = None,
+    json: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write configuration, versions, rows, comparisons and timing; - for stdout, and nothing else there."
+        ),
+    ] = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help=f"Draw h and the safety rate over time, and trajectories: {options.FORMATS}")
     ] = None,
@@ -126,8 +132,7 @@ def evaluate(
     print_evaluation(stdout(), given)
     if refine:
         print_refinement(stdout(), answer)
-    if json is not None:
-        write_json(json, answer.document())
+    write_result(json, lambda: answer.document())
     if plot is not None:
         from scripts.figure import draw
 
@@ -135,4 +140,6 @@ def evaluate(
 
 
 if __name__ == "__main__":
-    run(lambda: typer.run(evaluate))
+    from scripts.cli import main
+
+    main("evaluate")

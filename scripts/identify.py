@@ -13,9 +13,8 @@ from typing import Annotated, Any
 import typer
 
 from safe_envs.errors import ConfigurationError, nearest, require_whole
-from safe_envs.files import write_json
-from scripts import options
-from scripts.console import progress_bar, run, stdout
+from scripts import completion, options
+from scripts.console import progress_bar, stdout, write_result
 
 _NOT_SETTINGS = ("problem", "data", "seed", "step", "progress")
 _OF_COLLECTING = ("starts", "steps", "points", "repetitions")
@@ -39,6 +38,7 @@ def identify(
         str,
         typer.Option(
             metavar="NAME",
+            autocompletion=completion.words(tuple(SETTINGS)),
             help="learned-hocbf: residuals of derivatives of the barriers; ddscbf: unknown noise; bayesian: the whole system.",
         ),
     ],
@@ -61,7 +61,10 @@ def identify(
     substeps: options.Substeps = None,
     box: options.Box = None,
     seed: options.Seed = 0,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write configuration, versions, record and errors.")] = None,
+    json: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write configuration, versions, record and errors; - for stdout, and nothing else there."),
+    ] = None,
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help=f"Draw the truth against the estimate: {options.FORMATS}")] = None,
 ) -> None:
     """Learn of a system by a method, and print how far what was learned is from the truth.
@@ -115,8 +118,7 @@ def identify(
         use=_use(["--system", system] if system else [known], method, out, of_env),
     )
     print_report(stdout(), found)
-    if json is not None:
-        write_json(json, document(found))
+    write_result(json, lambda: document(found))
     if plot is not None:
         from scripts.identify_figure import draw
 
@@ -205,4 +207,6 @@ def _use(env: Sequence[str], method: str, out: Path, of_env: Mapping[str, Any]) 
 
 
 if __name__ == "__main__":
-    run(lambda: typer.run(identify))
+    from scripts.cli import main
+
+    main("identify")

@@ -14,7 +14,8 @@ from rich.table import Table
 from safe_envs import ENV_IDS
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import write_json
-from scripts.console import progress_bar, run, stdout
+from scripts import completion
+from scripts.console import Json, progress_bar, require_result, stdout, write_result
 
 _RESULTS = "results.json"
 _QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 50}
@@ -26,8 +27,10 @@ Row = dict[str, Any]
 
 
 def leaderboard(
-    env_ids: Annotated[list[str] | None, typer.Argument(metavar="[ENV_ID]...", help="Envs; by default all.")] = None,
-    algo: Annotated[str, typer.Option(metavar="NAME", help="ppo, a2c, sac or td3.")] = "ppo",
+    env_ids: Annotated[
+        list[str] | None, typer.Argument(metavar="[ENV_ID]...", help="Envs; by default all.", autocompletion=completion.env_ids)
+    ] = None,
+    algo: Annotated[str, typer.Option(metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3.")] = "ppo",
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where agents and results go. What is in it already is not done again.")] = Path(
         "leaderboard"
     ),
@@ -35,6 +38,7 @@ def leaderboard(
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
     quick: Annotated[bool, typer.Option("--quick", help="Train for moments only: to see that it works, not how good agents get.")] = False,
     markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown, with a row for each env.")] = False,
+    json_file: Json = None,
 ) -> None:
     """Train an agent on each env, without a filter and with the env's own in the loop, and compare it with the nominal controller.
 
@@ -44,6 +48,7 @@ def leaderboard(
     """
     from agents.problems import full_id
 
+    require_result(json_file)
     ids = list(dict.fromkeys(full_id(env_id) for env_id in (env_ids or ENV_IDS)))
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -70,6 +75,7 @@ def leaderboard(
         stdout().print("\n".join(_markdown(found)), highlight=False, markup=False, soft_wrap=True)
     else:
         stdout().print(_table(found))
+    write_result(json_file, lambda: _document(known, found))
 
 
 def _of_env(env_id: str, known: dict[str, Any], settings: dict[str, Any], out: Path, tell: Any) -> list[Row]:
@@ -109,9 +115,13 @@ def _read(path: Path, known: dict[str, Any]) -> list[Row]:
 
 
 def _write(path: Path, known: dict[str, Any], rows: Sequence[Row]) -> None:
+    write_json(path, _document(known, rows))
+
+
+def _document(known: dict[str, Any], rows: Sequence[Row]) -> dict[str, Any]:
     from agents.evaluation import package_versions
 
-    write_json(path, {"settings": known, "versions": package_versions(), "rows": list(rows)})
+    return {"settings": known, "versions": package_versions(), "rows": list(rows)}
 
 
 def _rate(row: Row) -> str:
@@ -148,4 +158,6 @@ def _markdown(rows: Sequence[Row]) -> list[str]:
 
 
 if __name__ == "__main__":
-    run(lambda: typer.run(leaderboard))
+    from scripts.cli import main
+
+    main("leaderboard")

@@ -11,8 +11,15 @@ import typer
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import require_writable
+from scripts import completion
+from scripts.console import STDOUT
 
-EnvId = Annotated[str | None, typer.Argument(metavar="[ENV_ID]", help="Registered id; `safe-envs list` shows all.", show_default=False)]
+EnvId = Annotated[
+    str | None,
+    typer.Argument(
+        metavar="[ENV_ID]", help="Registered id; `safe-envs list` shows all.", show_default=False, autocompletion=completion.env_ids
+    ),
+]
 System = Annotated[
     str | None,
     typer.Option(
@@ -96,7 +103,7 @@ def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = 
     """
     taken = {path.resolve(): f"{option} {path}" for option, path in inputs}
     for option, path in (("--out", out), ("--json", json), ("--plot", plot)):
-        if path is None:
+        if path is None or (option == "--json" and path == STDOUT):
             continue
         require_writable(path)
         place = path.resolve()

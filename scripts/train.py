@@ -14,19 +14,22 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from safe_envs.errors import ConfigurationError
-from scripts import options
-from scripts.console import progress_bar, run, stdout
+from scripts import completion, options
+from scripts.console import Json, progress_bar, require_result, stdout, write_result
 
 
 def train(
-    algo: Annotated[str, typer.Option(metavar="NAME", help="ppo, a2c, sac or td3.")],
+    algo: Annotated[str, typer.Option(metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="New folder for the policy, its evaluations and the checkpoint.")],
     env_id: options.EnvId = None,
     system: options.System = None,
     filters: Annotated[
         list[str] | None,
         typer.Option(
-            "--filter", metavar="NAME", help="Filter in the loop; none by default. A learned one with its file: ddscbf:file=FILE."
+            "--filter",
+            metavar="NAME",
+            autocompletion=completion.filters,
+            help="Filter in the loop; none by default. A learned one with its file: ddscbf:file=FILE.",
         ),
     ] = None,
     n_timesteps: Annotated[
@@ -64,6 +67,7 @@ def train(
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the unfinished training in --out after its last checkpoint.")
     ] = False,
+    json_file: Json = None,
 ) -> None:
     """Train an agent, evaluate it on the way, and keep the last and the best policy.
 
@@ -75,6 +79,7 @@ def train(
     from agents.trainer import train as train_agent
     from agents.training import Training
 
+    require_result(json_file)
     if len(filters or []) > 1:
         raise ConfigurationError(f"--filter was given {len(filters or [])} times; a training has one filter in the loop")
     arguments = options.of_env(
@@ -113,7 +118,9 @@ def train(
             raise
     given = {"noise": noise, "plant": plant, "model": model, "barrier": barrier, "knowledge": knowledge if knowledge != "model" else None}
     given |= {"dt": dt, "substeps": substeps, "horizon": horizon, "box": box, "start": start}
-    _report(["--system", system] if system else [training.env_id], out, training.filter or "none", given)
+    rows = json.loads((out / "evaluations.json").read_text())
+    _report(["--system", system] if system else [training.env_id], out, training.filter or "none", rows, given)
+    write_result(json_file, lambda: {"folder": str(out), "config": json.loads((out / "config.json").read_text()), "evaluations": rows})
 
 
 def _settings(texts: list[str]) -> dict[str, Any]:
@@ -140,13 +147,13 @@ def _number(value: Any) -> Any:
         return value
 
 
-def _report(env: list[str], out: Path, filter_name: str, given: Mapping[str, Any]) -> None:
+def _report(env: list[str], out: Path, filter_name: str, rows: list[dict[str, Any]], given: Mapping[str, Any]) -> None:
     """Print how safe and how good the agent was in each evaluation."""
     console = stdout()
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for title in ("steps", "safe [95 % interval]", "return", "violations in training"):
         table.add_column(title, justify="right")
-    for row in json.loads((out / "evaluations.json").read_text()):
+    for row in rows:
         rate = f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]"
         table.add_row(f"{row['timesteps']:,}", rate, f"{row['return_mean']:.4g}", f"{row['training']['violations']:.0f}")
     console.print(f"Evaluations with the filter {filter_name}:", highlight=False, markup=False)
@@ -158,4 +165,6 @@ def _report(env: list[str], out: Path, filter_name: str, given: Mapping[str, Any
 
 
 if __name__ == "__main__":
-    run(lambda: typer.run(train))
+    from scripts.cli import main
+
+    main("train")

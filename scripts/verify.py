@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import require_whole
-from safe_envs.files import write_json
-from scripts import options
-from scripts.console import progress_bar, run, stdout
+from scripts import completion, options
+from scripts.console import progress_bar, stdout, write_result
 
 
 def verify(
@@ -18,7 +17,12 @@ def verify(
     system: options.System = None,
     filter_name: Annotated[
         str | None,
-        typer.Option("--filter", metavar="NAME", help="As for evaluate: scbf, hocbf:p=2,8, ... By default the env's own."),
+        typer.Option(
+            "--filter",
+            metavar="NAME",
+            autocompletion=completion.filters,
+            help="As for evaluate: scbf, hocbf:p=2,8, ... By default the env's own.",
+        ),
     ] = None,
     noise: options.Noise = None,
     plant: options.Plant = None,
@@ -30,12 +34,17 @@ def verify(
     horizon: options.Horizon = None,
     box: options.Box = None,
     start: options.StartAt = None,
-    policy: Annotated[str, typer.Option(metavar="NAME|FOLDER|FILE", help="Who acts in the simulation, as for evaluate.")] = "nominal",
+    policy: Annotated[
+        str,
+        typer.Option(metavar="NAME|FOLDER|FILE", autocompletion=completion.policies, help="Who acts in the simulation, as for evaluate."),
+    ] = "nominal",
     trust: options.Trust = False,
     episodes: Annotated[int, typer.Option(help="Episodes of the simulation, from each start.")] = 500,
     seed: options.Seed = 0,
     simulate: Annotated[bool, typer.Option("--simulate/--no-simulate", help="Measure the safety, and hold it against the bounds.")] = True,
-    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Write all that was found.")] = None,
+    json: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write all that was found; - for stdout, and nothing else there.")
+    ] = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="FILE", help=f"Draw where the conditions cannot be met, h and the boundaries: {options.FORMATS}")
     ] = None,
@@ -79,14 +88,13 @@ def verify(
         with progress_bar("Simulating") as tell:
             measurements = measure(found, actor, episodes=episodes, seed=seed, progress=tell)
     print_report(stdout(), title, found, starts, bounds, policy, measurements)
-    if json is not None:
-        config = {
-            "env_id": known,
-            "options": {k: v for k, v in arguments.items() if v is not None},
-            "policy": policy,
-            "seed": seed,
-        }
-        write_json(json, document(config, found, bounds, measurements))
+    config = {
+        "env_id": known,
+        "options": {k: v for k, v in arguments.items() if v is not None},
+        "policy": policy,
+        "seed": seed,
+    }
+    write_result(json, lambda: document(config, found, bounds, measurements))
     if plot is not None:
         from scripts.verify_figure import draw
 
@@ -94,4 +102,6 @@ def verify(
 
 
 if __name__ == "__main__":
-    run(lambda: typer.run(verify))
+    from scripts.cli import main
+
+    main("verify")

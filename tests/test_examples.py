@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from agents import evaluate
-from safe_envs.custom import CUSTOM_ID
+from safe_envs.systems import CUSTOM_ID
 from scripts.cli import app
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

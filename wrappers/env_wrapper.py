@@ -62,6 +62,8 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         gym.utils.RecordConstructorArgs.__init__(self, condition=text, knowledge=knowledge, objective=objective, priorities=priorities)
         gym.Wrapper.__init__(self, env)
         self._inner: Any = inner
+        if inner.viewer is not None:
+            inner.viewer.caption = text
         self._directly = _only_checks_between(env, inner)
         self._interventions = 0
         self._infeasible = 0
@@ -78,8 +80,8 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         proposed = self._inner.physical_action(action)
         decision = self.safety_filter.decide_floats(self._inner.components, proposed)
         executed, nominal, active = decision.action, decision.proposed, True in decision.active
-        if self._inner.render_mode is not None:
-            self._inner.announce(nominal, active, decision.feasible)
+        if self._inner.viewer is not None:
+            self._inner.viewer.announce([nominal], [active], [decision.feasible])
         if self._directly:
             observation, reward, terminated, truncated, info = self._inner.step_physical(executed)
         else:

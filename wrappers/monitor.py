@@ -12,6 +12,7 @@ import numpy as np
 from safe_envs.codegen import Components, Flavour, compile_function, stacked
 from safe_envs.errors import InvalidInputError, NumericalError
 from safe_envs.info import Info, safety_info
+from safe_envs.rendering.viewer import Viewer
 from wrappers.filter_spec import FilterSpec
 
 
@@ -25,6 +26,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
     Attributes:
         problem: the model as a problem.
         executed: the model's input of the last step.
+        viewer: what the pictures are drawn from; None unless the render mode is "rgb_array".
 
     Raises:
         ConfigurationError: the spec does not fit the env.
@@ -38,6 +40,8 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         self._spec = spec
         self._barriers = barriers_of(spec, "floats")
         self._low, self._high, self._kind = ends_of(env.action_space)
+        self.viewer = Viewer(self.problem, "rgb_array", 1) if env.render_mode == "rgb_array" else None
+        self._steps = 0
         self.executed: Sequence[float] = ()
         self._x: tuple[float, ...] | None = None
         self._h_min = math.inf
@@ -68,18 +72,34 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         """Start an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._h_min, self._episode_cost = math.inf, 0.0
-        return observation, {**info, **self._seen(observation)}
+        self._h_min, self._episode_cost, self._steps = math.inf, 0.0, 0
+        seen = self._seen(observation)
+        if self.viewer is not None:
+            self.viewer.restart([self.components], [0.0], [0])
+        return observation, {**info, **seen}
 
     def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, Info]:
         """Pass on an action, and look at what comes of it."""
         self.executed = self.physical_action(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, {**info, **self._seen(observation)}
+        seen = self._seen(observation)
+        if self.viewer is not None:
+            self._steps += 1
+            self.viewer.advance([self.components], [self._steps * self.problem.dt], [self.executed])
+        return observation, reward, terminated, truncated, {**info, **seen}
 
     def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, Any, bool, bool, Info]:
         """`step` for the model's input."""
         return self.step(self.normalized_action(u))
+
+    def render(self) -> Any:
+        """The env's own picture, in the mode "rgb_array" with what the filter does and the barrier beside it.
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: pygame is missing.
+        """
+        picture = self.env.render()
+        return picture if self.viewer is None else self.viewer.frames([np.asarray(picture)])[0]
 
     def _seen(self, observation: Any) -> Info:
         self._x = tuple(self._spec.state(np.asarray(observation)).tolist())

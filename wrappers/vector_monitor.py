@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from safe_envs.codegen import Components
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.info import Info, safety_info, with_masks
+from safe_envs.rendering.viewer import Viewer
 from safe_envs.vector import VectorStep
 from wrappers.filter_spec import FilterSpec
 from wrappers.monitor import barrier_table, barriers_of, ends_of, named_and_limited
@@ -30,6 +31,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     Attributes:
         problem: the model as a problem.
         executed: the components of the model's inputs of the last step.
+        viewer: what the pictures are drawn from; None unless the render mode is "rgb_array".
 
     Raises:
         ConfigurationError: the spec does not fit the env, or the env does not say how it resets.
@@ -45,6 +47,8 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
             raise ConfigurationError(f"{env} does not say when it resets: its metadata has no autoreset_mode of Gymnasium") from error
         self._barriers = barriers_of(spec, "arrays")
         self._low, self._high, self._kind = ends_of(env.single_action_space)
+        self.viewer = Viewer(self.problem, "rgb_array", self.num_envs) if env.render_mode == "rgb_array" else None
+        self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self.executed: Components = ()
         self._x: Components = ()
         self._everywhere = np.ones(self.num_envs, dtype=bool)
@@ -79,7 +83,10 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         observation, info = self.env.reset(seed=seed, options=options)
         anew = np.asarray((options or {}).get("reset_mask", self._everywhere), dtype=bool)
         self._forget(anew)
-        return observation, {**info, **with_masks(self._seen(observation, anew), anew)}
+        seen = self._seen(observation, anew)
+        if self.viewer is not None:
+            self.viewer.restart(np.stack(self._x, axis=-1), self._steps * self.problem.dt, np.flatnonzero(anew).tolist())
+        return observation, {**info, **with_masks(seen, anew)}
 
     def step(self, actions: Any) -> VectorStep:
         """Pass on actions, and look at what comes of them."""
@@ -87,16 +94,30 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         observation, reward, terminated, truncated, info = self.env.step(actions)
         ended = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP:
-            shown = self._of_same_step(observation, ended, info)
+            anew, shown = ended, self._of_same_step(observation, ended, info)
         else:
-            self._forget(self._ended)
+            anew = self._ended
+            self._forget(anew)
             self._ended = ended.copy()
             shown = self._seen(observation, self._everywhere)
+        if self.viewer is not None:
+            self._steps += ~anew
+            times, begun = self._steps * self.problem.dt, np.flatnonzero(anew).tolist()
+            self.viewer.advance(np.stack(self._x, axis=-1), times, np.stack(self.executed, axis=-1), begun)
         return observation, reward, terminated, truncated, {**info, **with_masks(shown, self._everywhere.copy())}
 
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
         """`step` for the components of the model's inputs."""
         return self.step(self.normalized_action(u))
+
+    def render(self) -> Any:
+        """The envs' own pictures, in the mode "rgb_array" with what the filter does and the barrier beside each.
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: pygame is missing.
+        """
+        pictures: Any = self.env.render()
+        return pictures if self.viewer is None else self.viewer.frames([np.asarray(picture) for picture in pictures])
 
     def _of_same_step(self, observation: np.ndarray, ended: np.ndarray, info: Info) -> Info:
         """What is shown after a step that restarted the envs that ended: their last step goes to `final_info`."""
@@ -123,6 +144,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     def _forget(self, envs: np.ndarray) -> None:
         self._h_min[envs] = np.inf
         self._episode_cost[envs] = 0.0
+        self._steps[envs] = 0
         self._ended = self._ended & ~envs
 
 

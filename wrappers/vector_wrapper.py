@@ -43,9 +43,11 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             require_foreign(env.unwrapped, SafeVectorEnv, view, knowledge)
             env = SafetyMonitorVector(env, FilterSpec.of(view))
         inner = readable(env)
-        _, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective, priorities)
+        text, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective, priorities)
         super().__init__(env)
         self._inner: Any = inner
+        if inner.viewer is not None:
+            inner.viewer.caption = text
         self._rest = rest_info(inner.problem)
         self._mode = env.metadata["autoreset_mode"]
         self._interventions = np.zeros(self.num_envs, dtype=np.int64)
@@ -76,8 +78,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         proposed = self._inner.physical_action(actions)
         decision = self.safety_filter.decide_arrays(self._inner.components, proposed)
         active = decision.active[0] if len(decision.active) == 1 else np.logical_or.reduce(decision.active)
-        if self._inner.render_mode is not None:
-            self._inner.announce(decision.proposed, active, decision.feasible)
+        if self._inner.viewer is not None:
+            self._inner.viewer.announce(np.stack(decision.proposed, axis=-1), active, decision.feasible)
         if self.env is self._inner:
             observation, reward, terminated, truncated, info = self._inner.step_physical(decision.action)
         else:

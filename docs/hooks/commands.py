@@ -13,7 +13,7 @@ from scripts.cli import app
 _INTRODUCTION = """# Command line
 
 Every command ends with status 0, or with status 2 and one message where the error is the user's. `--help` after a command
-says what stands here.
+says what stands here. Before a command may stand:
 """
 
 _LETTERS = {int: "N", Path: "PATH"}
@@ -32,17 +32,22 @@ def options_of(command: Any) -> set[str]:
 
 def command_line_page() -> str:
     """Markdown with a section for each command."""
-    return "\n".join([_INTRODUCTION, *(_section(name, command) for name, command in commands().items())])
+    common = _table(typer.main.get_command(app))
+    return "\n".join([_INTRODUCTION, *common, "", *(_section(name, command) for name, command in commands().items())])
 
 
 def _section(name: str, command: Any) -> str:
+    arguments = [p.metavar or p.name.upper() for p in command.params if p.param_type_name == "argument"]
+    usage = " ".join(["safe-envs", name, *arguments, "[OPTIONS]"])
+    return "\n".join([f"## {name}", "", f"```text\n{usage}\n```", "", inspect.cleandoc(command.help or ""), "", *_table(command), ""])
+
+
+def _table(command: Any) -> list[str]:
     arguments = [p for p in command.params if p.param_type_name == "argument"]
     options = [p for p in command.params if p.param_type_name == "option"]
-    usage = " ".join(["safe-envs", name, *(p.metavar or p.name.upper() for p in arguments), *["[OPTIONS]"] * bool(options)])
-    rows = [f"| `{_code(p.metavar or p.name.upper())}` | {_cell(p.help)} | |" for p in arguments]
-    rows += [f"| `{_code(_written(p))}` | {_cell(p.help)} | {_default(p)} |" for p in options]
-    table = ["| | meaning | default |", "|---|---|---|", *rows] if rows else []
-    return "\n".join([f"## {name}", "", f"```text\n{usage}\n```", "", inspect.cleandoc(command.help or ""), "", *table, ""])
+    rows = [f"| `{p.metavar or p.name.upper()}` | {_cell(p.help)} | |" for p in arguments]
+    rows += [f"| `{_written(p)}` | {_cell(p.help)} | {_default(p)} |" for p in options]
+    return ["| | meaning | default |", "|---|---|---|", *rows] if rows else []
 
 
 def _written(option: Any) -> str:
@@ -51,12 +56,8 @@ def _written(option: Any) -> str:
 
 
 def _default(option: Any) -> str:
-    return "" if option.default is None or option.is_flag or callable(option.default) else f"`{_code(str(option.default))}`"
+    return "" if option.default is None or option.is_flag or callable(option.default) else f"`{option.default}`"
 
 
 def _cell(text: str | None) -> str:
     return (text or "").replace("|", "\\|").replace("<", "&lt;").replace("*", "\\*")
-
-
-def _code(text: str) -> str:
-    return text.replace("|", "\\|")

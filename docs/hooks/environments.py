@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import io
+import re
 from typing import Any
 
 import gymnasium as gym
@@ -15,12 +16,13 @@ from safe_envs import ENV_IDS, SafetyProblem
 from safe_envs.calculus import relative_degree
 from wrappers import SafetyFilterWrapper
 
-_SHOWN = 0.4
-"""Part of an episode after which the picture is taken."""
+_SHOWN, _MOST_STEPS = 0.4, 400
+"""Part of an episode after which the picture is taken, and the most steps until then."""
 
-_MOST_STEPS = 400
-_LONGEST_EQUATION = 12
-"""Number of states up to which the equations of a system fit a page."""
+_HEADER = "| env | what is to be kept safe | states | inputs | degree | filter |\n|---|---|---|---|---|---|"
+_WORD = re.compile(r"^[A-Za-z]{2,}")
+_FUNCTION = re.compile(r"(?<=[A-Za-z0-9}]) (?=\\(?:sin|cos|tan|exp|log)\b)")
+_LOW = re.compile(r"\\left\(((?:(?!\\left|\\right|\\frac).)*)\\right\)")
 
 
 def short_name(env_id: str) -> str:
@@ -35,12 +37,12 @@ def env_pages() -> dict[str, str | bytes]:
     for env_id in ENV_IDS:
         name = short_name(env_id)
         env: Any = gym.make(env_id, render_mode="rgb_array")
-        problem, summary, text = env.unwrapped.problem, *_docstring(env)
+        problem, (summary, text) = env.unwrapped.problem, _docstring(env)
         pages[f"envs/{name}.md"] = _page(env_id, problem, summary, text)
         pages[f"envs/{name}.png"] = _picture(env)
         rows.append(_row(name, problem, summary))
         env.close()
-    pages["envs/table.md"] = "\n".join(["| env | what is to be kept safe | states | inputs | degree | filter |", "|---|---|---|---|---|---|", *rows])
+    pages["envs/table.md"] = "\n".join([_HEADER, *rows])
     return pages
 
 
@@ -52,36 +54,29 @@ def _docstring(env: Any) -> tuple[str, str]:
 
 def _page(env_id: str, problem: SafetyProblem, summary: str, text: str) -> str:
     name = short_name(env_id)
-    facts = [
-        f"| Control period, horizon | {problem.dt:g} s, {problem.horizon:g} s = {problem.steps} steps |",
-        f"| Relative degree | {_degrees(problem)} |",
-        f"| Natural filter, gains | [`{problem.filter}`](../filters/{problem.filter}.md), {_gains(problem)} |",
-    ]
-    return "\n".join(
-        [
-            f"# {name}",
-            "",
-            summary,
-            "",
-            f"![{name} under its filter](./{name}.png)",
-            "",
-            f"The nominal controller under `{problem.filter}`, {_SHOWN:.0%} into an episode, seed 0.",
-            "",
-            f'```python\nenv = gym.make("{env_id}")\n```',
-            "",
-            "| | |",
-            "|---|---|",
-            *facts,
-            "",
-            text,
-            "",
-            "## As it is simulated",
-            "",
-            "The plant and the barriers, from the symbols that the env is derived from.",
-            "",
-            *[f"$$\n{equation}\n$$\n" for equation in _equations(problem)],
-        ]
-    )
+    before, states, after = text.partition("## States\n")
+    return f"""# {name}
+
+{summary}
+
+![{name} under its filter](./{name}.png)
+
+*The nominal controller under [`{problem.filter}`](../filters/{problem.filter}.md), seed 0.*
+
+```python
+env = gym.make("{env_id}")
+```
+
+Control period {problem.dt:g} s, horizon {problem.horizon:g} s. Relative degree {_degrees(problem)}. Gains {_gains(problem)}, natural filter
+[`{problem.filter}`](../filters/{problem.filter}.md).
+
+{before}
+The plant and the barriers, from the symbols that are simulated:
+
+{_equations(problem)}
+
+{states}{after}
+"""
 
 
 def _row(name: str, problem: SafetyProblem, summary: str) -> str:
@@ -99,31 +94,43 @@ def _gains(problem: SafetyProblem) -> str:
     return "; ".join(", ".join(f"{p:g}" for p in rates) for rates in each)
 
 
-def _equations(problem: SafetyProblem) -> list[str]:
-    """LaTeX of the plant, a line for each state, and of the barriers; names alone where there are many states."""
+def _equations(problem: SafetyProblem) -> str:
+    """Markdown with the plant, a line for each state, and the barriers."""
     plant = problem.plant
     drift = plant.drift + plant.input_matrix * sp.Matrix(plant.inputs)
-    noise = [sp.Symbol(f"dW_{j + 1}") for j in range(plant.diffusion.shape[1])]
+    noise = [f"dW_{{{j + 1}}}" for j in range(plant.diffusion.shape[1])]
     found = []
     for i, state in enumerate(plant.states):
-        terms = [f"\\left({sp.latex(drift[i])}\\right) dt" if drift[i] != 0 else ""]
-        terms += [f"{_factor(plant.diffusion[i, j])} {sp.latex(noise[j])}" for j in range(len(noise)) if plant.diffusion[i, j] != 0]
-        found.append(f"d {sp.latex(state)} = {' + '.join(filter(None, terms)) or '0'}")
-    return [*found[:_LONGEST_EQUATION], *(f"{_name(b.name)} = {sp.latex(b.expression)}" for b in problem.barriers)]
+        terms = [f"{_factor(drift[i])}\\, dt"] if drift[i] != 0 else []
+        terms += [f"{_factor(level)}\\, {dW}" for level, dW in zip(plant.diffusion[i, :], noise, strict=True) if level != 0]
+        found.append(f"d{_latex(state)} = {' + '.join(terms) or '0'}")
+    found += [f"{_name(b.name)} = {_latex(b.expression)}" for b in problem.barriers]
+    return "\n".join(f"$$\n{equation}\n$$\n" for equation in found)
+
+
+def _latex(expression: Any) -> str:
+    """LaTeX with short numbers, upright words, room before functions, and no tall parentheses around what is not tall."""
+    floats = {f: sp.Integer(int(f)) if f == int(f) else sp.Float(f, 4) for f in expression.atoms(sp.Float)}
+    words = {s: _WORD.sub(r"\\mathrm{\g<0>}", sp.latex(s)) for s in expression.free_symbols}
+    latex, count = sp.latex(expression.xreplace(floats), symbol_names=words), 1
+    while count:
+        latex, count = _LOW.subn(r"(\1)", latex)
+    return _FUNCTION.sub(r"\\, ", latex)
 
 
 def _factor(expression: Any) -> str:
-    return f"\\left({sp.latex(expression)}\\right)" if expression.is_Add else sp.latex(expression)
+    return f"\\left({_latex(expression)}\\right)" if expression.is_Add else _latex(expression)
 
 
 def _name(text: str) -> str:
-    return sp.latex(sp.Symbol(text)) if len(text) < 4 else f"h_{{\\text{{{text}}}}}"
+    return _latex(sp.Symbol(text)) if len(text) < 4 else f"h_{{\\text{{{text}}}}}"
 
 
 def _picture(env: Any) -> bytes:
     """A frame of an episode under the env's own filter."""
     problem = env.unwrapped.problem
-    filtered, policy = SafetyFilterWrapper(env, problem.filter), NominalController(problem)
+    filtered: Any = SafetyFilterWrapper(env, problem.filter)
+    policy = NominalController(problem)
     observation, _ = filtered.reset(seed=0)
     for _ in range(min(int(_SHOWN * problem.steps), _MOST_STEPS)):
         action, _ = policy.predict(observation)

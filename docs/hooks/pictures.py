@@ -11,9 +11,12 @@ import numpy as np
 import sympy as sp
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
 
 import safe_envs  # noqa: F401  (registers the ids)
 from agents import evaluate
+from agents.verification import starts_of
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.codegen import compile_function
 from scripts.figure import COLORS, QUIET, STYLE, UNSAFE
@@ -69,11 +72,11 @@ def _chain() -> Figure:
         axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=_title(name, missed.sum(), ((h > 0) & (b_1 > 0)).sum()))
     figure.legend(
         handles=[
-            mpl.lines.Line2D([], [], color="black", label="h = 0"),
-            mpl.lines.Line2D([], [], color=COLORS[0], label="b₁ = 0"),
-            mpl.patches.Patch(color=UNSAFE, alpha=0.35, label="unsafe"),
-            mpl.patches.Patch(color=COLORS[4], alpha=0.45, label="C₀ ∩ C₁, which is kept"),
-            mpl.patches.Patch(color=COLORS[3], alpha=0.8, label="no action in the box meets the row"),
+            Line2D([], [], color="black", label="h = 0"),
+            Line2D([], [], color=COLORS[0], label="b₁ = 0"),
+            Patch(color=UNSAFE, alpha=0.35, label="unsafe"),
+            Patch(color=COLORS[4], alpha=0.45, label="C₀ ∩ C₁, which is kept"),
+            Patch(color=COLORS[3], alpha=0.8, label="no action in the box meets the row"),
         ],
         loc="outside lower center",
         ncols=5,
@@ -122,10 +125,10 @@ def _draw_program(axes: Axes, row: np.ndarray, nominal: np.ndarray, result: Any)
     allowed = row[0] * u + row[1] * v + row[2]
     axes.contourf(u, v, allowed, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35)
     axes.contour(u, v, allowed, levels=[0.0], colors="black", linewidths=1.3)
-    axes.add_patch(mpl.patches.Rectangle((-2, -2), 4, 4, fill=False, linestyle="--", edgecolor=QUIET, label="box"))
+    axes.add_patch(Rectangle((-2, -2), 4, 4, fill=False, linestyle="--", edgecolor=QUIET, label="box"))
     axes.plot(*nominal, "o", color="#D55E00", markersize=8, label="nominal action")
     axes.plot(*result.action, "s", color=COLORS[0], markersize=8, label="executed action")
-    axes.annotate("", result.action, nominal, arrowprops={"arrowstyle": "->", "color": QUIET})
+    axes.annotate("", tuple(result.action), tuple(nominal), arrowprops={"arrowstyle": "->", "color": QUIET})
     axes.text(0.98, 0.02, "grey: a u + b < 0", transform=axes.transAxes, ha="right", va="bottom", color=QUIET)
     axes.set(aspect="equal", xlabel="$a_x$ (m/s²)", ylabel="$a_y$ (m/s²)")
 
@@ -135,7 +138,7 @@ def _promise() -> Figure:
     problem = _problem("safe_envs/CubicSDEDisk-v0").configured(horizon=_HORIZON)
     evaluation = evaluate(problem, filters=["none", "scbf"], episodes=_EPISODES, seed=0)
     verification = verify(problem, parse_conditions("scbf", problem))
-    starts = _starts(problem)
+    starts = starts_of(problem)
     figure = Figure(figsize=(7.5, 4.2))
     axes = figure.subplots()
     for row, color in zip(evaluation.rows, ("#D55E00", COLORS[0]), strict=True):
@@ -143,18 +146,10 @@ def _promise() -> Figure:
         axes.fill_between(curve["time"], curve["ci_low"], curve["ci_high"], color=color, alpha=0.25, linewidth=0)
         axes.plot(curve["time"], curve["rate"], color=color, label=f"{row['filter']}: measured, {_EPISODES} episodes, with its 95 % band")
     times = np.linspace(0.0, problem.horizon, 41)
-    bounds = {bound.name.split(",")[0]: bound for bound in promise(verification, starts, problem.horizon)}
-    for name, color in zip(bounds, (QUIET, COLORS[1]), strict=False):
-        values = [next(b.value for b in promise(verification, starts, t) if b.name.split(",")[0] == name) for t in times]
-        axes.plot(times, values, color=color, linestyle="--", label=f"{name}: {bounds[name].status}")
+    at_times = zip(*[promise(verification, starts, t) for t in times.tolist()], strict=True)
+    for bounds, color in zip(at_times, (QUIET, COLORS[1]), strict=True):
+        label = f"{bounds[-1].name.split(',')[0]}: {bounds[-1].status}"
+        axes.plot(times, [bound.value or 0.0 for bound in bounds], color=color, linestyle="--", label=label)
     axes.set(xlim=(0.0, problem.horizon), ylim=(0.0, 1.02), xlabel="horizon T (s)", ylabel="probability of no violation")
-    axes.legend(loc="lower left")
+    figure.legend(handles=axes.get_legend_handles_labels()[0], loc="outside lower center", ncols=2)
     return figure
-
-
-def _starts(problem: SafetyProblem) -> np.ndarray:
-    from agents.verification import starts_of
-
-    return starts_of(problem)
-
-

@@ -1,9 +1,10 @@
-"""Examples in pages that are run when the site is built, so that what they print is what the program prints.
+r"""Examples in pages that are run when the site is built, so that what they print is what the program prints.
 
 A fence that begins with ```python run is executed, one after the other in one namespace for each page. In ```console run
-every line that begins with "$ safe-envs" is a command, "\\" at its end goes on with it. What is printed follows in the page.
+every line that begins with "$ safe-envs" is a command, "\" at its end goes on with it. What is printed follows in the page.
 Options: `lines=N` shows the first N lines of it only, `fails` says that the command is to end with an error of the user's.
-All runs of a page share a folder of their own, in which `examples` is that of the repository.
+All runs of a page share a folder of their own, in which `examples` is that of the repository. A line "<!-- file PATH -->"
+stands for a Python file of it.
 """
 
 from __future__ import annotations
@@ -21,20 +22,22 @@ ROOT = Path(__file__).resolve().parents[2]
 
 _FENCE = re.compile(r"^```(python|console) run([^\n]*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 _ANY_FENCE = re.compile(r"^```(python|console)[^\n]*\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+_FILE = re.compile(r"^<!-- file (\S+) -->$", re.MULTILINE)
 _COMMAND = re.compile(r"^\$ (safe-envs(?:[^\n]*\\\n)*[^\n]*)$", re.MULTILINE)
 
 
 def with_output(markdown: str) -> str:
-    """Run the examples of a page, and put what they print behind them.
+    """Run the examples of a page, put what they print behind them, and put in the files that it shows.
 
     Raises:
         RuntimeError: a command ended otherwise than its fence says.
     """
+    markdown = _FILE.sub(lambda found: f"```python\n{(ROOT / found[1]).read_text()}```", markdown)
     if not _FENCE.search(markdown):
         return markdown
     names: dict[str, Any] = {}
     with _folder():
-        return _FENCE.sub(lambda found: _shown(*found.groups(), names), markdown)
+        return _FENCE.sub(lambda found: _shown(found[1], found[2], found[3], names), markdown)
 
 
 def run_python(markdown: str) -> None:
@@ -65,14 +68,15 @@ def _folder() -> Iterator[None]:
 
 
 def _shown(kind: str, options: str, code: str, names: dict[str, Any]) -> str:
-    settings = dict(option.partition("=")[::2] for option in options.split())
+    settings = {name: value for name, _, value in (option.partition("=") for option in options.split())}
     if kind == "python":
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
             exec(code, names)
         return f"```python\n{code}```\n\n```text\n{_first(printed.getvalue(), settings)}\n```"
-    parts = [f"$ {command}\n{_first(_output(_words(command), 'fails' in settings), settings)}" for command in _COMMAND.findall(code)]
-    return "```console\n" + "\n\n".join(parts) + "\n```"
+    # What is printed is no console to Pygments, which would take a % for a prompt.
+    printed = {command: _first(_output(_words(command), "fails" in settings), settings) for command in _COMMAND.findall(code)}
+    return "\n\n".join(f"```console\n$ {command}\n```\n\n```text\n{text}\n```" for command, text in printed.items())
 
 
 def _first(text: str, settings: dict[str, str]) -> str:

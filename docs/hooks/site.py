@@ -8,7 +8,7 @@ from typing import Any
 from commands import command_line_page
 from contract import info_page
 from environments import env_pages
-from mathml import with_mathml
+from mathml import font, with_mathml
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 from navigation import complete
@@ -31,7 +31,7 @@ def on_config(config: Any) -> Any:
 def on_files(files: Any, config: Any) -> Any:
     """Add the pages and pictures that are made from the program."""
     _made.update({**env_pages(), **notebook_pages(), **pictures()})
-    _made.update({"reference/command-line.md": command_line_page(), "reference/info.md": info_page()})
+    _made.update({"reference/command-line.md": command_line_page(), "reference/info.md": info_page(), "assets/STIXGeneral.ttf": font()})
     for path, content in _made.items():
         if path != "envs/table.md":
             files.append(File.generated(config, path, content=content))

@@ -23,8 +23,8 @@ _FAR = 20_000.0
 
 _BRUSHES = {
     1: ((0.0, 0.0),),
-    2: ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)),
-    3: ((0.0, 0.0), (-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0), (-0.7, -0.7), (-0.7, 0.7), (0.7, -0.7), (0.7, 0.7)),
+    2: ((0.0, -0.5), (0.43, 0.25), (-0.43, 0.25)),
+    3: ((0.0, -0.9), (0.9, 0.0), (0.0, 0.9), (-0.9, 0.0), (0.0, 0.0)),
 }
 """Offsets of the thin lines that make a line of 1, 2 or 3 pixels."""
 
@@ -43,6 +43,12 @@ def _font(size: int, bold: bool) -> pygame.font.Font:
 def _text(text: str, size: int, bold: bool, color: Color, turned: bool) -> pygame.Surface:
     surface = _font(size, bold).render(text, True, color)
     return pygame.transform.rotate(surface, 90) if turned else surface
+
+
+def _apart(points: np.ndarray) -> np.ndarray:
+    """Indices of points that lie about a pixel and a half apart along a path, the first and the last among them."""
+    steps = np.floor(np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))]) / 1.5)
+    return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(steps)) + 1, [len(points) - 1]]))
 
 
 class Canvas:
@@ -64,6 +70,14 @@ class Canvas:
         """Lay another canvas over this one."""
         self.surface.blit(other.surface, at)
 
+    def photograph(self, pixels: np.ndarray, box: Box) -> None:
+        """Show a picture, uint8 of shape (height, width, 3), as large as it fits into a box."""
+        left, top, width, height = box
+        shown = pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
+        scale = min(width / shown.get_width(), height / shown.get_height())
+        size = max(1, round(scale * shown.get_width())), max(1, round(scale * shown.get_height()))
+        self.surface.blit(pygame.transform.smoothscale(shown, size), (left + (width - size[0]) // 2, top + (height - size[1]) // 2))
+
     def within(self, box: Box | None) -> None:
         """Draw only inside a box from now on; None for everywhere."""
         self.surface.set_clip(box)
@@ -81,19 +95,26 @@ class Canvas:
         length = math.dist(start, end)
         if not all(-_FAR < v < _FAR for v in (*start, *end)) or length < 1e-6:
             return
-        if width == 1:
-            pygame.draw.aaline(self.surface, color, start, end)
+        left, top, thick = min(start[0], end[0]), min(start[1], end[1]), 0.5 * (width - 1)
+        if start[1] == end[1]:
+            self.fill((left, top - thick, length, width), color)
             return
-        across = 0.5 * (width - 1) * (start[1] - end[1]) / length, 0.5 * (width - 1) * (end[0] - start[0]) / length
-        corners = [(x + s * across[0], y + s * across[1]) for (x, y), s in ((start, 1), (end, 1), (end, -1), (start, -1))]
-        pygame.draw.polygon(self.surface, color, corners)
-        pygame.draw.aalines(self.surface, color, True, corners)
+        if start[0] == end[0]:
+            self.fill((left - thick, top, width, length), color)
+            return
+        across = (start[1] - end[1]) / length, (end[0] - start[0]) / length
+        # Side by side, half a pixel apart: a polygon has no smooth edges, and lines a whole pixel apart have gaps.
+        for k in range(1 - width, width):
+            x, y = (0.5 * k * step for step in across)
+            pygame.draw.aaline(self.surface, color, (start[0] + x, start[1] + y), (end[0] + x, end[1] + y))
 
     def path(self, points: np.ndarray, color: Color, width: int = 1) -> None:
         """Draw lines through points, shape (k, 2), up to 3 pixels wide."""
         if len(points) < 2:
             return
         points = np.clip(points, -_FAR, _FAR)
+        if len(points) > 200:
+            points = points[_apart(points)]
         # Wide lines of the library have gaps at their corners: a brush of thin ones has none.
         for offset in _BRUSHES[min(width, 3)]:
             pygame.draw.aalines(self.surface, color, False, (points + offset).tolist())

@@ -59,7 +59,7 @@ class Panel:
         self._ranged = pitch >= 50.0
         below = _BARS[0] + 26 + round(len(shown) * pitch) + 10
         self._heading = below
-        self._box = (_LEFT + 44, below + 28, _WIDTH - 44, _BOTTOM - below - 28)
+        self._box = (_LEFT + 56, below + 28, _WIDTH - 56, _BOTTOM - below - 28)
         self._background = Canvas(SIZE)
         canvas = self._background
         canvas.fill((SCENE[2], 0, SIZE[0] - SCENE[2], SIZE[1]), PANEL)

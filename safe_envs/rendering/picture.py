@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import pygame
 
@@ -10,31 +12,42 @@ from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.history import Moment
 from safe_envs.rendering.panel import Panel
 from safe_envs.rendering.scenes import make_scene
-from safe_envs.rendering.style import SIZE
+from safe_envs.rendering.scenes.base import Scene
+from safe_envs.rendering.style import SCENE, SIZE
 
 
 class Picture:
     """Draws instants of a problem's episodes; it holds no episode, so that one object serves any number of envs.
 
     Args:
-        problem: that is drawn.
-
-    Raises:
-        ConfigurationError: there is no scene of the problem's name for it.
+        problem: that is drawn. A scene of its name is only looked for when it is to be shown.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
         self._canvas = Canvas(SIZE)
         self._panel = Panel(problem)
-        self._scene = make_scene(problem)
+        self._problem = problem
 
-    def draw(self, moment: Moment, caption: str = "") -> pygame.Surface:
-        """Draw an instant; the surface is drawn over by the next call."""
+    @cached_property
+    def _scene(self) -> Scene:
+        return make_scene(self._problem)
+
+    def draw(self, moment: Moment, caption: str = "", shot: np.ndarray | None = None) -> pygame.Surface:
+        """Draw an instant; the surface is drawn over by the next call.
+
+        Args:
+            moment: what is drawn.
+            caption: above it.
+            shot: somebody else's picture of it, uint8 of shape (height, width, 3), to show in place of the scene.
+        """
         self._panel.draw(self._canvas, moment, caption)
-        self._scene.draw(self._canvas, moment)
+        if shot is None:
+            self._scene.draw(self._canvas, moment)
+        else:
+            self._canvas.photograph(shot, SCENE)
         return self._canvas.surface
 
-    def frame(self, moment: Moment, caption: str = "") -> np.ndarray:
-        """Draw an instant; uint8 of shape (height, width, 3)."""
-        self.draw(moment, caption)
+    def frame(self, moment: Moment, caption: str = "", shot: np.ndarray | None = None) -> np.ndarray:
+        """Draw an instant; uint8 of shape (height, width, 3). Arguments as for `draw`."""
+        self.draw(moment, caption, shot)
         return self._canvas.pixels()

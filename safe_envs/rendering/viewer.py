@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -24,9 +24,13 @@ RENDER_MODES = ("human", "rgb_array")
 """What a scalar env can be made with, besides None; a vector env only with the last."""
 
 
+_MOST_FRAMES = 1_000_000
+"""A second of the shortest control periods has more than can be counted."""
+
+
 def frames_a_second(problem: SafetyProblem) -> int:
     """Frame rate at which a picture of each control period makes a film in real time."""
-    return max(1, round(1 / problem.dt))
+    return max(1, round(min(1 / problem.dt, _MOST_FRAMES)))
 
 
 def open_viewer(problem: SafetyProblem, mode: str | None, num_envs: int | None = None) -> Viewer | None:
@@ -107,14 +111,19 @@ class Viewer:
         self._decisions = [None] * len(self._histories)
         self._go_live()
 
-    def frames(self) -> tuple[np.ndarray, ...]:
+    def frames(self, shots: Sequence[np.ndarray] | None = None) -> tuple[np.ndarray, ...]:
         """A picture of each env now, uint8 of shape (height, width, 3).
+
+        Args:
+            shots: somebody else's pictures of the envs, to show in place of the scenes.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.
+            ConfigurationError: there is no scene of the problem's name for it.
         """
         picture = self._drawn()
-        return tuple([picture.frame(history.moment, self.caption) for history in self._histories])
+        each = shots or [None] * len(self._histories)
+        return tuple([picture.frame(history.moment, self.caption, shot) for history, shot in zip(self._histories, each, strict=True)])
 
     def render(self) -> Any:
         """The picture of a single env; in human mode it goes to the window, and None is returned.

@@ -24,8 +24,13 @@ ENV_IDS = tuple(f"safe_envs/{name}-v0" for name in _CLASSES)
 """Every registered id."""
 
 
+CUSTOM_ID = "safe_envs/Custom-v0"
+"""The id that takes any system, as its argument `system`; see `safe_envs.custom`."""
+
+
 def register_all() -> None:
     """Register every id with Gymnasium; the systems themselves are imported when an env is made."""
+    gym.register(CUSTOM_ID, entry_point="safe_envs.custom:Custom", vector_entry_point="safe_envs.custom:CustomVector")
     for name, module in _CLASSES.items():
         path = f"safe_envs.systems.{module}:{name}"
         gym.register(f"safe_envs/{name}-v0", entry_point=path, vector_entry_point=f"{path}Vector")

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,8 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from safe_envs.errors import ConfigurationError, nearest
-from scripts import options
-from scripts.console import progress_bar, run, stdout
+from scripts import completion, options
+from scripts.console import Json, progress_bar, require_result, stdout, write_result
 
 if TYPE_CHECKING:
     from scripts.reproduce.artefact import Artefact, Sample
@@ -24,7 +25,10 @@ _ALL = "all"
 
 def reproduce(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[all | NAME]...", help="Such as table-4.1 or figure-3.3; all by default.")
+        list[str] | None,
+        typer.Argument(
+            metavar="[all | NAME]...", help="Such as table-4.1 or figure-3.3; all by default.", autocompletion=completion.artefacts
+        ),
     ] = None,
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each rate; by default the thesis' numbers.")] = None,
     seed: options.Seed = 0,
@@ -33,6 +37,7 @@ def reproduce(
         Path, typer.Option(metavar="DIR", help="Where results and the page go. What is in it already is not done again.")
     ] = Path("report"),
     quick: Annotated[bool, typer.Option("--quick", help="A twentieth of the work: to see that it works, not what comes out.")] = False,
+    json_file: Json = None,
 ) -> None:
     """Compute the tables and figures of the thesis, and hold them against the print.
 
@@ -44,6 +49,7 @@ def reproduce(
     from scripts.reproduce.page import write_page
     from scripts.reproduce.store import read
 
+    require_result(json_file)
     sample = Sample(episodes, seed, quick)
     chosen = _chosen(names or [_ALL])
     try:
@@ -55,7 +61,9 @@ def reproduce(
         failures = _compute(missing, sample, out, jobs, tell or (lambda _: None))
     found = [(artefact, *answer) for artefact in _chosen([_ALL]) if (answer := read(out, artefact, sample)) is not None]
     write_page(out, found, sample)
-    _report([entry for entry in found if entry[0] in chosen], out)
+    reported = [entry for entry in found if entry[0] in chosen]
+    _report(reported, out)
+    write_result(json_file, lambda: _document(reported, sample))
     if failures:
         raise ConfigurationError("; ".join(f"{name} failed: {error}" for name, error in failures.items()))
 
@@ -108,6 +116,18 @@ def compute_one(name: str, sample: Sample, out: Path) -> None:
     keep(out, artefact, sample, outcome, time.perf_counter() - began)
 
 
+def _document(found: Sequence[tuple[Artefact, Any, float]], sample: Sample) -> dict[str, Any]:
+    """What was asked for, with its verdict and all that came out."""
+    from scripts.reproduce.verdict import judge
+
+    rows = []
+    for artefact, outcome, seconds in found:
+        judgement = judge(artefact, outcome)
+        verdict = {"verdict": judgement.verdict.value, "reasons": list(judgement.reasons)}
+        rows.append({"name": artefact.name, **verdict, "seconds": seconds, "outcome": outcome.document()})
+    return {"sample": asdict(sample), "artefacts": rows}
+
+
 def _report(found: Sequence[tuple[Artefact, Any, float]], out: Path) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
@@ -126,4 +146,6 @@ def _report(found: Sequence[tuple[Artefact, Any, float]], out: Path) -> None:
 
 
 if __name__ == "__main__":
-    run(lambda: typer.run(reproduce))
+    from scripts.cli import main
+
+    main("reproduce")

@@ -201,10 +201,9 @@ def test_wrappers_are_found():
     env.close()
 
 
-def test_nothing_is_drawn_yet():
+def test_nothing_is_drawn_without_a_render_mode():
     env = make_sb3_env(DUBINS, 2)
     assert env.render_mode is None
-    assert env.metadata["render_modes"] == []
     with pytest.warns(UserWarning, match="no images"):
         assert env.get_images() == [None, None]
     with pytest.warns(UserWarning, match="no `render_mode`"):

@@ -176,7 +176,8 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
 @pytest.mark.parametrize(
     ("algorithm", "settings", "message"),
     [
-        ("ppo", {"speed": 3}, r"ppo does not take these hyperparameters.*speed"),
+        ("ppo", {"learning_rat": 3}, "ppo does not take the hyperparameter 'learning_rat'; did you mean 'learning_rate'"),
+        ("ppo", {"policy_kwargs": {"speed": 3}}, r"ppo does not take these hyperparameters.*speed"),
         ("a2c", {"n_epochs": 3}, "a2c does not take"),
         ("ppo", {"normalize": "no thanks"}, "normalize|does not take"),
         ("ppo", {"normalize": {"bogus": 1}}, "bogus"),

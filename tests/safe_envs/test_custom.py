@@ -12,7 +12,8 @@ from gymnasium.utils.env_checker import check_env
 
 import safe_envs
 from safe_envs import ConfigurationError, SafetyProblem, SystemDefinitionError, state_problem
-from safe_envs.custom import CUSTOM_ID, load_system
+from safe_envs.custom import load_system
+from safe_envs.systems import CUSTOM_ID
 
 STATEMENT = """
 import sympy as sp

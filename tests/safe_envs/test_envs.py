@@ -194,7 +194,7 @@ def test_actions_that_are_none_are_errors(action):
         ({"start": [0.0, math.nan, 0.0]}, "start of y"),
         ({"start": [100.0, 0.0, 0.0]}, "outside the workspace"),
         ({"start": "inwards"}, "did you mean 'inward'"),
-        ({"render_mode": "human"}, "render_mode"),
+        ({"render_mode": "movie"}, "render_mode"),
         ({"max_episode_steps": 0}, "max_episode_steps = 0"),
     ],
 )
@@ -258,6 +258,15 @@ def test_classes_are_documented(env_id):
         "Source",
     ):
         assert f"## {heading}" in text
+
+
+def test_a_problem_is_stated_once_for_the_same_arguments():
+    first, again, other = (problem_of("safe_envs/DubinsDisk-v0", radius=radius) for radius in (2.0, 2.0, 3.0))
+    assert first.barriers[0] is again.barriers[0]
+    assert first.barriers != other.barriers
+    # What cannot be looked up is an error of ours all the same.
+    with pytest.raises(ConfigurationError, match="radius"):
+        gym.make("safe_envs/DubinsDisk-v0", radius=[2.0])
 
 
 def test_import_is_light():

@@ -169,9 +169,9 @@ def test_bad_actions_and_bad_arguments_are_errors():
         SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0"), "scbf", knowledge="none")
     with pytest.raises(RelativeDegreeError, match="use hocbf"):
         SafetyFilterWrapper(gym.make("safe_envs/DubinsDisk-v0"), "cbf")
-    with pytest.raises(ConfigurationError, match="none of this project's envs"):
+    with pytest.raises(ConfigurationError, match="is not one of this project's envs"):
         SafetyFilterWrapper(gym.make("Pendulum-v1"), "scbf")
-    with pytest.raises(ConfigurationError, match="none of this project's envs"):
+    with pytest.raises(ConfigurationError, match="is not one of this project's envs"):
         SafetyFilterVectorWrapper(gym.make_vec("Pendulum-v1", num_envs=2), "scbf")
 
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 
 import numpy as np
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, SystemDefinitionError
 from safe_envs.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Canvas
@@ -14,7 +15,7 @@ from safe_envs.rendering.history import Moment
 from safe_envs.rendering.safe_set import Barriers, barriers_in
 from safe_envs.rendering.style import EXECUTED, INFEASIBLE, INK, INTERVENING, PAPER, SKY, VIOLATION, Color, mix
 
-_MOST_POINTS = 2000
+_MOST_POINTS = 1000
 _AGES = 12
 _PADDING = 0.3
 
@@ -52,9 +53,14 @@ class Scene(ABC):
         return self.problem.states[self.index(name)].unit
 
     def range_of(self, i: int) -> Range:
-        """The workspace of a state; where that has no end, the range that is explored."""
+        """The workspace of a state; where that has no end, the range that is explored, or else one to begin with."""
         state = self.problem.states[i]
-        return (state.low, state.high) if np.isfinite([state.low, state.high]).all() else self.problem.exploration.region[i]
+        if math.isfinite(state.low) and math.isfinite(state.high):
+            return state.low, state.high
+        try:
+            return self.problem.exploration.region[i]
+        except SystemDefinitionError:
+            return -1.0, 1.0
 
     def window(self, i: int, j: int) -> tuple[Range, Range]:
         """The part of a plane of two states to look at: around the safe set if that is bounded in it, else the workspace."""
@@ -101,10 +107,10 @@ def draw_trail(canvas: Canvas, axes: Axes, x: np.ndarray, y: np.ndarray, h: np.n
     canvas.within(None)
 
 
-def thinned(count: int) -> np.ndarray:
-    """Indices of the points of a trail that are drawn: at most some thousands, the last one among them."""
+def thinned(count: int, most: int = _MOST_POINTS) -> np.ndarray:
+    """Indices of the points of a trail that are drawn: at most so many, the last one among them."""
     # A power of two: points once drawn stay as the trail grows.
-    stride = 1 << max(0, (count - 1) // _MOST_POINTS).bit_length()
+    stride = 1 << max(0, (count - 1) // most).bit_length()
     kept = np.arange(0, count, stride)
     return kept if kept[-1] == count - 1 else np.append(kept, count - 1)
 

@@ -17,6 +17,9 @@ from safe_envs.rendering.style import label
 BOX = (76, 20, 504, 466)
 """Of a plane that takes the whole scene."""
 
+_LONGEST = 4.0
+"""How many times longer than wide a plane may be to be drawn to scale: a longer one would be a line."""
+
 
 class Plane:
     """The safe set, the trail and the state in a box of a scene, the other states held at their values now.
@@ -68,7 +71,7 @@ class Plane:
 
     def _view(self, axes: Axes, moment: Moment) -> tuple[SafeSet | None, Canvas]:
         safe_set = SafeSet(self._barriers, axes, (self.x, self.y)) if len(self._barriers.chosen) else None
-        furniture = Canvas((axes.box[0] + axes.box[2] + 12, axes.box[1] + axes.box[3] + 42), clear=True)
+        furniture = Canvas((axes.box[0] + axes.box[2] + 20, axes.box[1] + axes.box[3] + 42), clear=True)
         if safe_set is None:
             furniture.fill(axes.box, tint(LEVELS - 1))
         elif not self._changes:
@@ -104,12 +107,15 @@ def _values(moment: Moment, i: int) -> np.ndarray:
 
 
 class PlaneScene(Scene):
-    """The plane of the problem, for the whole scene; with the same scale along both axes where their units are the same."""
+    """The plane of the problem, for the whole scene; to scale where the units of its axes are the same, and it is no long road."""
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem)
         names = problem.plane or (self.names[0], self.names[-1])
-        self._plane = Plane(self, names, BOX, equal=self.unit(names[0]) == self.unit(names[1]))
+        shown = self.window(self.index(names[0]), self.index(names[1]))
+        wide, tall = (high - low for low, high in shown)
+        alike = self.unit(names[0]) == self.unit(names[1]) and max(wide, tall) <= _LONGEST * min(wide, tall)
+        self._plane = Plane(self, names, BOX, equal=alike, shown=shown)
 
     def draw(self, canvas: Canvas, moment: Moment) -> None:
         """Draw the plane."""

@@ -1,0 +1,190 @@
+"""Episodes that can be taken up again at each instant at which h was smaller than ever before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from agents.bridge import Bridge
+from agents.episodes import Env, episode_seed
+from agents.policy import Policy
+from safe_envs.errors import ConfigurationError
+from wrappers.vector_wrapper import readable
+
+MakeEnv = Callable[[int], Env]
+"""An env with so many episodes side by side, for a filter."""
+
+_FIRST_ROOM = 64
+_FEWEST_ENVS = 64
+
+
+class Records:
+    """The instants at which each path's h was smaller than ever before, in arrays that grow as they fill.
+
+    Args:
+        paths: how many.
+        states: entries of a state.
+        features: entries of an observation.
+    """
+
+    def __init__(self, paths: int, states: int, features: int) -> None:
+        self._count = np.zeros(paths, dtype=np.int64)
+        self._h = np.full((_FIRST_ROOM, paths), -np.inf)
+        self._time = np.zeros((_FIRST_ROOM, paths), dtype=np.int64)
+        self._ended = np.zeros((_FIRST_ROOM, paths), dtype=bool)
+        self._state = np.zeros((_FIRST_ROOM, paths, states))
+        self._observation = np.zeros((_FIRST_ROOM, paths, features), dtype=np.float32)
+
+    def clear(self, paths: np.ndarray) -> None:
+        """Forget the records of some paths."""
+        self._count[paths] = 0
+        self._h[:, paths] = -np.inf
+
+    def add(self, paths: np.ndarray, *entries: np.ndarray) -> None:
+        """Note a record of each of some paths: h, control instant, whether the episode ended there, state, observation."""
+        rows = self._count[paths]
+        if rows.size and int(rows.max()) == len(self._h):
+            self._grow()
+        for kept, values in zip((self._h, self._time, self._ended, self._state, self._observation), entries, strict=True):
+            kept[rows, paths] = values
+        self._count[paths] += 1
+
+    def first_below(self, levels: np.ndarray, paths: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The first records of paths below levels, one for each, in the order of the arguments of `add`."""
+        # Records fall along the first axis, and what was not filled is lower than all.
+        rows = (self._h[:, paths] >= levels).sum(axis=0)
+        return tuple(kept[rows, paths] for kept in (self._h, self._time, self._ended, self._state, self._observation))
+
+    def _grow(self) -> None:
+        room = len(self._h)
+        for name in ("_h", "_time", "_ended", "_state", "_observation"):
+            old = getattr(self, name)
+            fill = np.full((room, *old.shape[1:]), -np.inf if name == "_h" else 0, dtype=old.dtype)
+            setattr(self, name, np.concatenate([old, fill]))
+
+
+class Particles:
+    """Paths of a policy in an env, up to their first violations.
+
+    Noise is drawn by the envs, whose generators are seeded once and run on, so that paths that were taken up again get fresh
+    noise. What comes of it depends on the seed, and on the number of paths and of envs.
+
+    Args:
+        make: an env with next-step autoreset and so many episodes side by side.
+        policy: anything with Stable-Baselines3's `predict`, without memory.
+        paths: how many.
+        seed: of all randomness.
+        num_envs: the most episodes side by side.
+        bridge: looks at h between control instants too.
+
+    Attributes:
+        lowest: smallest h of each path, shape (paths,).
+        steps: control periods that were simulated.
+    """
+
+    def __init__(self, make: MakeEnv, policy: Any, paths: int, seed: int, num_envs: int, bridge: Bridge | None = None, power=0.0) -> None:
+        self.lowest = np.full(paths, np.inf)
+        self.steps = 0
+        self._make, self._policy, self._seed, self._bridge = make, policy, seed, bridge
+        self._envs: dict[int, Env] = {}
+        self._largest = min(num_envs, paths)
+        self._generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, 2)))
+        world = readable(self._env(self._largest))
+        self._horizon = world.problem.steps
+        self._weights = ((self._horizon + 1.0 - np.arange(self._horizon+1))/(self._horizon+1.0)) ** -power
+        self._records = Records(paths, world.problem.plant.n, len(world.problem.features))
+
+    def begin(self) -> None:
+        """Simulate all paths from their starts."""
+        paths = np.arange(len(self.lowest))
+        for first in range(0, len(paths), self._largest):
+            some = paths[first : first + self._largest]
+            env = self._env(len(some))
+            observation, info = env.reset()
+            world, count = readable(env), len(some)
+            h = info["barrier"].min(axis=1)[:count]
+            begun = (h, np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool), world.state[:count], observation[:count])
+            self._play(env, some, observation, begun)
+
+    def branch(self, paths: np.ndarray, parents: np.ndarray, levels: np.ndarray) -> None:
+        """Replace paths by what goes on from where others first fell below levels.
+
+        Args:
+            paths: those that are replaced, shape (B,).
+            parents: those that are continued, none of which is replaced, shape (B,).
+            levels: of h, each above its parent's smallest h, shape (B,).
+        """
+        entries = self._records.first_below(levels, parents)
+        # Paths that have equally far to go share a batch, which takes as long as the longest of them.
+        order = np.argsort(entries[1], kind="stable")
+        self._records.clear(paths)
+        for first in range(0, len(paths), self._largest):
+            some = order[first : first + self._largest]
+            self._resume(paths[some], tuple(entry[some] for entry in entries))
+
+    def _resume(self, paths: np.ndarray, entries: tuple[np.ndarray, ...]) -> None:
+        env = self._env(len(paths))
+        snapshot = env.snapshot()
+        for name, values in (("state", entries[3]), ("steps", entries[1])):
+            snapshot[name][:] = values[0]
+            snapshot[name][: len(paths)] = values
+        snapshot["ended"][:] = False
+        env.restore(snapshot)
+        observation = np.repeat(entries[4][:1], env.num_envs, axis=0)
+        observation[: len(paths)] = entries[4]
+        self._play(env, paths, observation, entries)
+
+    def _play(self, env: Env, paths: np.ndarray, observation: np.ndarray, entries: tuple[np.ndarray, ...]) -> None:
+        """Simulate paths, in the first rows of an env, from entries of `Records.add` until they end or violate."""
+        count, world, records = len(paths), readable(env), self._records
+        lowest, time, ended = entries[0].copy(), entries[1].copy(), entries[2]
+        records.add(paths, *entries)
+        alive = (lowest > 0.0) & ~ended & (time < self._horizon)
+        barriers = self._barriers(world)
+        if isinstance(self._policy, Policy):
+            self._policy.begin(range(env.num_envs), int(self._generator.integers(2**63)))
+        with threadpool_limits(1, "blas"):
+            while alive.any():
+                x = world.components
+                actions, memory = self._policy.predict(observation, None, np.zeros(env.num_envs, dtype=bool), deterministic=True)
+                if memory is not None:
+                    raise ConfigurationError("the policy has a memory, which splitting cannot take up again; estimate with plain episodes")
+                observation, _, terminated, truncated, info = env.step(actions)
+                time += 1
+                h = self._lowest(x, barriers, info["barrier"])[:count] * self._weights[np.minimum(time, self._horizon)]
+                barriers = info["barrier"]
+                self.steps += int(np.count_nonzero(alive))
+                fell = np.flatnonzero(alive & (h < lowest))
+                ended = (terminated | truncated)[:count]
+                if fell.size:
+                    lowest[fell] = h[fell]
+                    state = np.stack([component[fell] for component in world.components], axis=-1)
+                    records.add(paths[fell], h[fell], time[fell], ended[fell], state, observation[fell])
+                alive &= (lowest > 0.0) & ~ended
+        self.lowest[paths] = lowest
+
+    def _lowest(self, x: Any, before: np.ndarray | None, after: np.ndarray) -> np.ndarray:
+        if self._bridge is None or before is None:
+            return after[:, 0] if after.shape[1] == 1 else after.min(axis=1)
+        return self._bridge.lowest(x, before, after, self._generator.standard_exponential(after.shape))
+
+    def _barriers(self, world: Any) -> np.ndarray | None:
+        """Barriers at the states of an env, shape (B, k), where they are needed."""
+        return None if self._bridge is None else self._bridge.barriers(world.components)
+
+    def _env(self, count: int) -> Env:
+        """An env with at least so many episodes side by side, seeded when it is first used."""
+        size = self._largest
+        while size // 2 >= max(count, _FEWEST_ENVS):
+            size //= 2
+        if size not in self._envs:
+            env = self._envs[size] = self._make(size)
+            # Sizes are told apart, so that no two envs have equal noise.
+            env.reset(seed=[episode_seed(self._seed, self._offset(size) + i) for i in range(size)])
+        return self._envs[size]
+
+    def _offset(self, size: int) -> int:
+        return sum(self._envs) - size

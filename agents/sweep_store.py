@@ -1,0 +1,182 @@
+"""Results of a sweep on disk: a Parquet file for each cell, there whole or not at all, and the table of all of them."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agents.sweep import Sweep, text_of
+from agents.sweep_cell import Cell, Outcome
+from safe_envs.errors import ConfigurationError
+from safe_envs.files import write_atomically, write_json
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+INDEX = "sweep.json"
+"""Name of the file with the order of the cells and the names of the swept settings."""
+
+_CELLS = "cells"
+_COUNTS = ("safe", "violations")
+_STATISTICS = (
+    "safety_rate",
+    "ci_low",
+    "ci_high",
+    "min_h_median",
+    "min_h_p05",
+    "intervention_rate",
+    "infeasible_rate",
+    "effort_mean",
+    "return_mean",
+    "bound",
+)
+_DOCUMENTS = ("settings", "files", "versions", "config", "row")
+
+
+class Store:
+    """The folder of a sweep.
+
+    Args:
+        folder: made if it is not there.
+        sweep: whose cells are kept in it. Those of another sweep in the same folder stay, and are not read.
+
+    Raises:
+        ConfigurationError: the folder cannot be made or written, or pyarrow is not installed.
+    """
+
+    def __init__(self, folder: Path, sweep: Sweep) -> None:
+        _require_pyarrow()
+        self._folder, self._cells = folder, {cell.key: cell for cell in sweep.cells}
+        try:
+            (folder / _CELLS).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigurationError(f"{folder} cannot be made: {error.strerror}; give another folder") from error
+        self._finished = {key for key in self._cells if _is_finished(_file_of(folder, key))}
+        index = {"cells": list(self._cells), "swept": sweep.swept}
+        self._write(folder / INDEX, lambda: write_json(folder / INDEX, index))
+
+    @property
+    def missing(self) -> list[Cell]:
+        """Cells that are not there yet, or failed."""
+        return [cell for key, cell in self._cells.items() if key not in self._finished]
+
+    def keep(self, outcome: Outcome) -> None:
+        """Write an outcome.
+
+        Raises:
+            ConfigurationError: it cannot be written, as on a full disk.
+        """
+        path = _file_of(self._folder, outcome.key)
+        self._write(path, lambda: write_atomically(path, lambda part: _write_table(part, self._cells[outcome.key], outcome)))
+        if outcome.error is None:
+            self._finished.add(outcome.key)
+
+    def _write(self, path: Path, write: Any) -> None:
+        try:
+            write()
+        except (OSError, ConfigurationError) as error:
+            reason = str(error) if isinstance(error, ConfigurationError) else f"cannot write {path}: {error.strerror or error}"
+            raise ConfigurationError(
+                f"{reason}. {len(self._finished)} of {len(self._cells)} cells are finished and kept in {self._folder}; "
+                "see to it that files can be written there and start again, and only the others are computed"
+            ) from error
+
+
+def read(folder: Path | str) -> pa.Table:
+    """The cells of a sweep that are there, in the order of its file.
+
+    Columns: `key`; each setting that some cell has, null where another one leaves it to the env; counts and statistics as in the
+    rows of `agents.evaluation.evaluate`; `error`, null for cells that did not fail; `seconds`, the only one that depends on the
+    machine; and as JSON the whole row, its configuration, the versions and the checksums of files.
+
+    Raises:
+        ConfigurationError: the folder holds no sweep, a file in it cannot be read, or pyarrow is not installed.
+    """
+    _require_pyarrow()
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    folder = Path(folder)
+    paths = [path for key in read_index(folder)["cells"] if (path := _file_of(folder, key)).is_file()]
+    if not paths:
+        return _schema().empty_table()
+    try:
+        kept = pa.concat_tables([pq.ParquetFile(path).read() for path in paths])
+    except (OSError, pa.ArrowException) as error:
+        raise ConfigurationError(f"a file in {folder / _CELLS} cannot be read ({error}); remove it and start the sweep again") from error
+    settings = [json.loads(text) for text in kept["settings"].to_pylist()]
+    names = dict.fromkeys(name for each in settings for name in each)
+    columns = {"key": kept["key"], **{name: _column([each.get(name) for each in settings]) for name in names}}
+    return pa.table(columns | {name: kept[name] for name in kept.column_names if name not in ("key", "settings")})
+
+
+def read_index(folder: Path) -> dict[str, Any]:
+    """Keys of all cells of a sweep in their order, under "cells", and names of the swept settings, under "swept".
+
+    Raises:
+        ConfigurationError: the folder holds no sweep.
+    """
+    try:
+        return json.loads((folder / INDEX).read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"{folder} holds no sweep: it has no {INDEX}; give the folder of `safe-envs sweep ... --out`") from error
+
+
+def _require_pyarrow() -> None:
+    if find_spec("pyarrow") is None:
+        raise ConfigurationError('pyarrow is not installed; install it with pip install "safe-envs[sweep]"')
+
+
+def _file_of(folder: Path, key: str) -> Path:
+    return folder / _CELLS / f"{key}.parquet"
+
+
+def _is_finished(path: Path) -> bool:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        return pq.ParquetFile(path).read(columns=["error"])["error"][0].as_py() is None
+    except (OSError, pa.ArrowException):
+        return False
+
+
+def _schema() -> pa.Schema:
+    import pyarrow as pa
+
+    kinds = [("key", pa.string()), *((name, pa.int64()) for name in _COUNTS), *((name, pa.float64()) for name in _STATISTICS)]
+    kinds += [("error", pa.string()), ("seconds", pa.float64()), *((name, pa.string()) for name in _DOCUMENTS)]
+    return pa.schema(kinds)
+
+
+def _write_table(path: Path, cell: Cell, outcome: Outcome) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    row: Mapping[str, Any] = outcome.row or {}
+    documents = {"settings": cell.settings, "files": cell.files, "versions": cell.versions, "config": outcome.config, "row": outcome.row}
+    columns = {"key": outcome.key, "error": outcome.error, "seconds": outcome.seconds}
+    columns |= {name: row.get(name) for name in (*_COUNTS, *_STATISTICS)}
+    columns |= {name: None if document is None else json.dumps(document) for name, document in documents.items()}
+    table = pa.Table.from_pylist([columns], schema=_schema())
+    with path.open("wb") as file:
+        pq.write_table(table, file)
+        # A disk may say only now that it is full.
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _column(values: Sequence[Any]) -> pa.Array:
+    """The values of a setting: numbers, truth values or texts as they are, and all others as JSON."""
+    import pyarrow as pa
+
+    kinds = {type(value) for value in values if value is not None}
+    if kinds <= {int, float}:
+        return pa.array(values, pa.int64() if kinds == {int} else pa.float64())
+    if kinds in ({bool}, {str}):
+        return pa.array(values)
+    return pa.array([None if value is None else text_of(value) for value in values], pa.string())

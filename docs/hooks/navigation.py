@@ -1,0 +1,18 @@
+"""The navigation: what mkdocs.yml says, and a page for each env and each condition that there is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from environments import short_name
+
+from safe_envs import ENV_IDS
+from wrappers import CONDITIONS, LEARNED
+
+
+def complete(nav: Sequence[dict[str, Any]]) -> None:
+    """Add the pages of envs and conditions to the sections of the navigation that are theirs."""
+    for section in nav:
+        section.get("Environments", []).extend(f"envs/{short_name(env_id)}.md" for env_id in ENV_IDS)
+        section.get("Filters", []).extend(f"filters/{name}.md" for name in (*CONDITIONS, *LEARNED))

@@ -1,0 +1,55 @@
+"""A bar for each state, for any problem without a plane."""
+
+from __future__ import annotations
+
+from safe_envs.problem import SafetyProblem
+from safe_envs.rendering.axes import grown
+from safe_envs.rendering.canvas import Canvas
+from safe_envs.rendering.history import Moment
+from safe_envs.rendering.safe_set import Barriers, tint
+from safe_envs.rendering.scenes.base import Scene, draw_point, warning_color
+from safe_envs.rendering.style import EDGE, GREY, INK, SMALL, UNSAFE, VIOLATION, bound, label, number
+
+_LEFT, _WIDTH, _TOP, _BOTTOM = 40, 520, 58, 520
+_MOST = 10
+
+
+class BarsScene(Scene):
+    """Where each state is in its range, and where it may be for h >= 0 with the others as they are."""
+
+    def __init__(self, problem: SafetyProblem) -> None:
+        super().__init__(problem)
+        self._barriers = Barriers(problem)
+        self._ranges = [self.range_of(i) for i in range(min(len(self.names), _MOST))]
+        self._pitch = min(74.0, (_BOTTOM - _TOP) / len(self._ranges))
+
+    def draw(self, canvas: Canvas, moment: Moment) -> None:
+        """Draw the bars."""
+        more = len(self.names) - len(self._ranges)
+        rest = f" (and {more} more)" if more else ""
+        canvas.text(f"States{rest}: tinted where each is safe while the others stay", (_LEFT, 18), INK, SMALL, bold=True)
+        for i, usual in enumerate(self._ranges):
+            self._draw_bar(canvas, moment, i, round(_TOP + i * self._pitch), *grown(usual, moment.states[:, i]))
+
+    def _draw_bar(self, canvas: Canvas, moment: Moment, i: int, top: int, low: float, high: float) -> None:
+        value = float(moment.state[i])
+
+        def place(at: float) -> float:
+            return _LEFT + _WIDTH * (min(max(at, low), high) - low) / (high - low)
+
+        canvas.text(label(self.names[i], self.problem.states[i].unit), (_LEFT, top), INK, SMALL)
+        canvas.text(number(value, max(abs(low), abs(high))), (_LEFT + _WIDTH, top), INK, SMALL, bold=True, align=(1.0, 0.0))
+        bar = (_LEFT, top + 20, _WIDTH, 14)
+        canvas.fill(bar, UNSAFE)
+        for start, end in self._barriers.intervals(moment.state, i, low, high):
+            canvas.fill((place(start), top + 20, place(end) - place(start), 14), tint(2))
+            for edge in (start, end):
+                if low < edge < high:
+                    canvas.line((place(edge), top + 18), (place(edge), top + 35), EDGE, 3)
+        canvas.frame(bar, GREY)
+        if moment.violated is not None:
+            canvas.cross((place(float(moment.violated[i])), top + 27), 5, VIOLATION)
+        draw_point(canvas, (place(value), top + 27), warning_color(moment))
+        if self._pitch >= 60.0:
+            for end, side in ((low, 0.0), (high, 1.0)):
+                canvas.text(bound(end), (_LEFT + side * _WIDTH, top + 38), GREY, SMALL - 2, align=(side, 0.0))

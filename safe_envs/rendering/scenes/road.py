@@ -1,0 +1,152 @@
+"""A car behind its lead: the road to scale, and the gap over time beside the one that is required."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from safe_envs.problem import SafetyProblem
+from safe_envs.rendering.axes import Axes
+from safe_envs.rendering.canvas import Box, Canvas
+from safe_envs.rendering.history import Moment
+from safe_envs.rendering.safe_set import STEP, Barriers, tint
+from safe_envs.rendering.scenes.base import Scene, draw_point, draw_trail, draw_violation, thinned, warning_color
+from safe_envs.rendering.style import EDGE, GREY, HATCH, INK, LINE, PAPER, SMALL, UNSAFE, VIOLATION, Color, label, mix, number
+
+_ROAD: Box = (90, 84, 420, 64)
+_CHART: Box = (76, 232, 504, 254)
+_CAR = (46, 20)
+_SHORTEST = 25.0
+_HALVINGS = 24
+_MOST = 250
+
+
+class Road(Scene):
+    """The plane of the problem names the own speed and the gap.
+
+    Distances on the road are to scale, from bumper to bumper; the cars are symbols of a fixed size. What is required is the gap
+    at which the smallest barrier vanishes at the speeds of that moment.
+    """
+
+    def __init__(self, problem: SafetyProblem) -> None:
+        super().__init__(problem)
+        speed, gap = problem.plane or ("v", "z")
+        self._speed, self._gap = self.index(speed), self.index(gap)
+        self._barriers = Barriers(problem)
+        self._lead = self._other_speed()
+        self._charts: dict[Axes, Canvas] = {}
+
+    def _other_speed(self) -> int | float | None:
+        """The lead's speed: another state in the unit of the own one, or else the parameter v_f."""
+        unit = self.problem.states[self._speed].unit
+        others = [i for i, s in enumerate(self.problem.states) if s.unit == unit and i != self._speed]
+        if others:
+            return others[0]
+        return next((float(value) for symbol, value in self.problem.plant.parameters.items() if symbol.name == "v_f"), None)
+
+    def required(self, states: np.ndarray) -> np.ndarray:
+        """The gap at which the smallest barrier vanishes at the other values of some states, shape (k,), by bisection."""
+        low, high = (np.full(len(states), bound) for bound in self.range_of(self._gap))
+        columns = [states[:, i] for i in range(states.shape[1])]
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (low + high)
+            columns[self._gap] = middle
+            safe = self._barriers(columns).min(axis=0) >= 0.0
+            low, high = np.where(safe, low, middle), np.where(safe, middle, high)
+        return 0.5 * (low + high)
+
+    def draw(self, canvas: Canvas, moment: Moment) -> None:
+        """Draw the road and the chart."""
+        kept = thinned(len(moment.times), _MOST)
+        required = self.required(moment.states[kept])
+        self._draw_road(canvas, moment, float(required[-1]))
+        self._draw_chart(canvas, moment, kept, required)
+
+    def _draw_road(self, canvas: Canvas, moment: Moment, required: float) -> None:
+        _, top, _, height = _ROAD
+        gap = float(moment.state[self._gap])
+        axes = Axes(_ROAD, (0.0, _reach(max(gap, required))), (0.0, 1.0))
+        canvas.text("Road, to scale", (76, 18), INK, SMALL, bold=True)
+        canvas.fill((10, top, 580, height), (228, 230, 234))
+        own, edge, lead = (axes.place(v, 0.0)[0] for v in (0.0, required, gap))
+        lane = (top + 12, height - 24)
+        canvas.fill((own, lane[0], edge - own, lane[1]), UNSAFE)
+        canvas.within((round(own), lane[0], max(round(edge - own), 0), lane[1]))
+        for x in np.arange(own - lane[1], edge, 10.0).tolist():
+            canvas.line((x, lane[0] + lane[1]), (x + lane[1], lane[0]), HATCH, 2)
+        canvas.within(None)
+        for level in range(4):
+            start = edge + level * STEP / 2
+            if start < lead:
+                canvas.fill((start, lane[0], lead - start, lane[1]), tint(level))
+        for y in (top + 4, top + height - 5):
+            canvas.line((10, y), (590, y), PAPER, 3)
+        canvas.line((edge, top - 4), (edge, top + height + 4), EDGE, 3)
+        _draw_car(canvas, (own - _CAR[0] / 2, top + height / 2), warning_color(moment))
+        _draw_car(canvas, (lead + _CAR[0] / 2, top + height / 2), GREY)
+        self._draw_dimension(canvas, own, lead, top - 12, f"gap {number(gap)} m", INK if gap >= required else VIOLATION, True)
+        self._draw_dimension(canvas, own, edge, top + height + 14, f"required {number(required)} m", EDGE, False)
+        self._draw_speeds(canvas, moment, own, lead)
+
+    def _draw_dimension(self, canvas: Canvas, start: float, end: float, y: float, text: str, color: Color, above: bool) -> None:
+        middle = 0.5 * (start + end)
+        canvas.arrow((middle, y), (start, y), color)
+        canvas.arrow((middle, y), (end, y), color)
+        at = (max(middle, start + 60), y - 4 if above else y + 4)
+        canvas.text(text, at, mix(color, INK, 0.7), SMALL, bold=True, align=(0.5, 1.0 if above else 0.0))
+
+    def _draw_speeds(self, canvas: Canvas, moment: Moment, own: float, lead: float) -> None:
+        y = _ROAD[1] + _ROAD[3] + 34
+        speed = float(moment.state[self._speed])
+        canvas.text(f"own {number(speed)} m/s", (14, y), INK, SMALL)
+        if self._lead is not None:
+            other = float(moment.state[self._lead]) if isinstance(self._lead, int) else self._lead
+            canvas.text(f"lead {number(other)} m/s", (586, y), INK, SMALL, align=(1.0, 0.0))
+
+    def _draw_chart(self, canvas: Canvas, moment: Moment, kept: np.ndarray, required: np.ndarray) -> None:
+        times, gaps = moment.times[kept], moment.states[kept, self._gap]
+        end = max(self.problem.horizon, float(times[-1]))
+        axes = Axes(_CHART, (end - self.problem.horizon, end), (0.0, _reach(max(float(gaps.max()), float(required.max())))))
+        if axes not in self._charts:
+            furniture = self._charts[axes] = Canvas((600, 540), clear=True)
+            axes.furnish(furniture, "t [s]", label(self.names[self._gap], "m"))
+        canvas.fill(_CHART, PAPER)
+        canvas.within(_CHART)
+        edge = axes.places(times, required)
+        if len(edge) > 1:
+            bottom, top = _CHART[1] + _CHART[3], _CHART[1]
+            canvas.shape([(edge[0, 0], top), *edge, (edge[-1, 0], top)], tint(1))
+            canvas.shape([(edge[0, 0], bottom), *edge, (edge[-1, 0], bottom)], UNSAFE)
+        canvas.within(None)
+        canvas.lay(self._charts[axes])
+        canvas.within(_CHART)
+        canvas.path(edge, EDGE, 3)
+        ahead = np.array([edge[-1], (_CHART[0] + _CHART[2], edge[-1, 1])])
+        canvas.dashes(ahead, EDGE, 1)
+        canvas.text("required now", (ahead[1, 0] - 6, edge[-1, 1] - 3), mix(EDGE, INK, 0.7), SMALL, align=(1.0, 1.0))
+        canvas.within(None)
+        draw_trail(canvas, axes, moment.times, moment.states[:, self._gap], moment.h)
+        if moment.violated is not None:
+            draw_violation(canvas, axes, (moment.violated_at, float(moment.violated[self._gap])))
+        canvas.within(_CHART)
+        draw_point(canvas, axes.place(float(times[-1]), float(gaps[-1])), warning_color(moment))
+        canvas.within(None)
+
+
+def _reach(distance: float) -> float:
+    """25, 50, 100, ...: the first in which a distance fits with some space to spare."""
+    return _SHORTEST * 2.0 ** max(0, math.ceil(math.log2(max(1.1 * distance, 1.0) / _SHORTEST)))
+
+
+def _draw_car(canvas: Canvas, center: tuple[float, float], color: Color) -> None:
+    """Draw the symbol of a car that drives to the right, seen from above."""
+    (x, y), (length, width) = center, _CAR
+    left, top = x - length / 2, y - width / 2
+    for wheel in (left + 7, left + length - 16):
+        canvas.fill((wheel, top - 2, 9, width + 4), INK, 2)
+    canvas.fill((left, top, length, width), color, 6)
+    canvas.fill((left + 8, top + 3, 22, width - 6), mix(PAPER, color, 0.55), 4)
+    canvas.fill((left + 24, top + 3, 7, width - 6), mix(INK, color, 0.55), 2)
+    canvas.frame((left, top, length, width), INK, 1, 6)
+    canvas.line((left + length - 2, top + 4), (left + length - 2, top + width - 5), LINE, 2)

@@ -1,0 +1,126 @@
+"""A vehicle seen from above, with obstacles and a goal, to scale."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.codegen import compile_function
+from safe_envs.problem import SafetyProblem
+from safe_envs.rendering.axes import Axes
+from safe_envs.rendering.canvas import Canvas
+from safe_envs.rendering.history import Moment
+from safe_envs.rendering.safe_set import LEVELS, STEP, tint
+from safe_envs.rendering.scenes.base import Scene, warning_color
+from safe_envs.rendering.scenes.plane import BOX, Plane
+from safe_envs.rendering.style import GOAL, GREY, INK, PAPER, SMALL, VIOLATION, mix
+
+_LENGTH = 15.0
+
+
+@dataclass(frozen=True)
+class Circle:
+    """A circle, whose middle may move with the states.
+
+    Attributes:
+        radius: in the unit of the coordinates.
+        encloses: whether what is safe is inside.
+        middle: its coordinates, a compiled function of the components of the states.
+    """
+
+    radius: float
+    encloses: bool
+    middle: Callable[..., Any]
+
+    def middles(self, states: np.ndarray) -> np.ndarray:
+        """Its middle at each of some states, shape (k, 2)."""
+        return np.stack(np.broadcast_arrays(*self.middle(*states.T), states[:, 0])[:2], axis=-1)
+
+
+def circle_of(problem: SafetyProblem, expression: sp.Expr, x: sp.Symbol, y: sp.Symbol) -> Circle | None:
+    """The circle on which an expression vanishes in the plane of two coordinates; None if it is another curve."""
+    if not expression.is_polynomial(x, y):
+        return None
+    polynomial = sp.Poly(expression, x, y)
+    square, mixed, other = (polynomial.coeff_monomial(term) for term in (x**2, x * y, y**2))
+    if polynomial.total_degree() != 2 or not (square.is_number and other.is_number and mixed.is_number):
+        return None
+    if float(square) != float(other) or float(mixed) != 0.0:
+        return None
+    middle = [-polynomial.coeff_monomial(s) / (2 * square) for s in (x, y)]
+    area = middle[0] ** 2 + middle[1] ** 2 - polynomial.coeff_monomial(1) / square
+    # Constant up to cos^2 + sin^2 and rounding, which numbers tell more surely than a simplification.
+    (areas,) = compile_function(problem.plant.states, [area], "arrays")(*np.random.default_rng(0).uniform(-3, 3, (problem.plant.n, 8)))
+    if not np.ptp(areas) <= 1e-9 * np.max(areas):
+        return None
+    return Circle(math.sqrt(float(np.max(areas))), bool(square < 0), compile_function(problem.plant.states, middle, "arrays"))
+
+
+class TopView(Scene):
+    """The plane of x and y; a triangle points along theta.
+
+    Vehicles are points, so that the triangle has a fixed size in pixels. Obstacles are where a barrier that is positive outside
+    a circle is negative: at their places now, with the way that they came.
+    """
+
+    def __init__(self, problem: SafetyProblem) -> None:
+        super().__init__(problem)
+        self._heading = self.index("theta")
+        x, y = (problem.plant.states[self.index(name)] for name in ("x", "y"))
+        circles = [circle_of(problem, barrier.expression, x, y) for barrier in problem.barriers]
+        self._obstacles = [circle for circle in circles if circle is not None and not circle.encloses]
+        self._goal = None if problem.goal is None else circle_of(problem, problem.goal, x, y)
+        self._rings = len(self._obstacles) == len(circles)
+        self._plane = Plane(self, ("x", "y"), BOX, chosen=[] if self._rings else None, equal=True)
+
+    def draw(self, canvas: Canvas, moment: Moment) -> None:
+        """Draw the vehicle and what is around it."""
+        axes = self._plane.background(canvas, moment)
+        canvas.within(axes.box)
+        self._draw_obstacles(canvas, axes, moment)
+        if self._goal is not None:
+            self._draw_goal(canvas, axes, moment, self._goal)
+        at = self._plane.trail(canvas, axes, moment)
+        canvas.within(axes.box)
+        draw_vehicle(canvas, at, float(moment.state[self._heading]), moment)
+        canvas.within(None)
+
+    def _draw_goal(self, canvas: Canvas, axes: Axes, moment: Moment, goal: Circle) -> None:
+        at = axes.place(*goal.middles(moment.states[-1:])[0])
+        radius = goal.radius * axes.scale[0]
+        canvas.disk(at, radius, mix(GOAL, PAPER, 0.35), GOAL, 2)
+        canvas.disk(at, 2, INK)
+        canvas.text("goal", (at[0], at[1] - radius - 3), INK, SMALL, align=(0.5, 1.0))
+
+    def _draw_obstacles(self, canvas: Canvas, axes: Axes, moment: Moment) -> None:
+        ways = [axes.places(*obstacle.middles(moment.states[-60:]).T) for obstacle in self._obstacles]
+        sizes = [obstacle.radius * axes.scale[0] for obstacle in self._obstacles]
+        if self._rings:
+            # What the field of h would show, and much quicker: the circles move.
+            for level in reversed(range(LEVELS - 1)):
+                for way, size in zip(ways, sizes, strict=True):
+                    canvas.disk(way[-1], size + STEP * (level + 1), tint(level))
+        for obstacle, way, size in zip(self._obstacles, ways, sizes, strict=True):
+            canvas.dashes(way, GREY, 1, 8.0)
+            middle = way[-1]
+            canvas.disk(middle, size, mix(VIOLATION, PAPER, 0.45), VIOLATION, 2)
+            canvas.disk(middle, 2, INK)
+            if size >= 14.0:
+                canvas.line(middle, (middle[0] + size, middle[1]), INK)
+                canvas.text(f"{obstacle.radius:g} m", (middle[0] + size / 2, middle[1] - 1), INK, SMALL - 2, align=(0.5, 1.0))
+
+
+def draw_vehicle(canvas: Canvas, at: tuple[float, float], heading: float, moment: Moment) -> None:
+    """Draw a triangle that points along a heading, and a line ahead of it."""
+    ahead = math.cos(heading), -math.sin(heading)
+    aside = -ahead[1], ahead[0]
+    canvas.line(at, (at[0] + 2.2 * _LENGTH * ahead[0], at[1] + 2.2 * _LENGTH * ahead[1]), INK)
+    outline = [(1.0, 0.0), (-0.6, 0.6), (-0.3, 0.0), (-0.6, -0.6)]
+    for size, fill, edge in ((_LENGTH + 3, PAPER, PAPER), (_LENGTH, warning_color(moment), INK)):
+        corners = [(at[0] + size * (a * ahead[0] + b * aside[0]), at[1] + size * (a * ahead[1] + b * aside[1])) for a, b in outline]
+        canvas.shape(corners, fill, edge)

@@ -1,0 +1,116 @@
+"""`safe-envs sweep`: many evaluations from one file, on this machine or on a cluster; a stopped one goes on."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from safe_envs.errors import ConfigurationError
+from scripts import options
+from scripts.console import progress_bar, stdout
+
+if TYPE_CHECKING:
+    from agents.sweep import Sweep
+    from agents.sweep_cell import Outcome
+    from agents.sweep_run import Place
+    from agents.sweep_store import Store
+
+_SHOWN = 10
+
+
+def sweep(
+    spec: Annotated[Path, typer.Argument(metavar="SPEC.yaml", help="What to sweep: sections fixed, grid and cells.", show_default=False)],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Where results go. Cells that are in it already are not computed again.")],
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes of this machine; by default 2.", show_default=False)] = None,
+    backend: Annotated[str, typer.Option(metavar="local|dask|ray", help="Who computes: this machine, or the workers of a cluster.")] = "local",
+    address: Annotated[
+        str | None, typer.Option(metavar="ADDR", help="Of the cluster: tcp://HOST:PORT of a Dask scheduler, HOST:PORT of Ray.")
+    ] = None,
+    trust: options.Trust = False,
+) -> None:
+    """Evaluate each cell of a sweep: one env, filter, policy, seed and set of parameters.
+
+    The file has settings under fixed, lists of values under grid, which multiply, and single cells under cells. All of it is checked
+    before the first cell. Each result is written as it ends, with its configuration and versions: a run that was stopped goes on, and
+    computes what is missing. A cell that fails is reported and stops no other. Results depend neither on the backend nor on the jobs.
+    """
+    from agents.sweep import read_sweep
+    from agents.sweep_run import Place
+    from agents.sweep_store import Store
+
+    if jobs is not None and backend != "local":
+        raise ConfigurationError(f"--jobs {jobs} is of this machine; with --backend {backend} all workers of the cluster compute")
+    place = Place(backend, address, jobs or 2)
+    found = read_sweep(spec, trust)
+    store = Store(out, found)
+    before = len(found.cells) - len(store.missing)
+    failures = _compute(store, place, out)
+    done = len(found.cells) - len(store.missing)
+    kept = f", of which {before} were there before" if before else ""
+    stdout().print(f"{done} of {len(found.cells)} cells are in {out}{kept}.", highlight=False, markup=False, soft_wrap=True)
+    if failures:
+        raise ConfigurationError(_told(found, failures))
+
+
+def _compute(store: Store, place: Place, out: Path) -> list[Outcome]:
+    """Compute what is missing; return the outcomes that failed."""
+    from agents.sweep_run import run
+
+    missing, failures, done = store.missing, [], 0
+    with progress_bar(f"{len(missing)} cells to do") as bar:
+        tell = bar or (lambda _: None)
+
+        def keep(outcome: Outcome) -> None:
+            nonlocal done
+            store.keep(outcome)
+            done += 1
+            failures.extend([outcome] * (outcome.error is not None))
+            tell(done / len(missing))
+
+        try:
+            with _stoppable():
+                run(missing, place, keep)
+        except KeyboardInterrupt:
+            print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
+            raise
+    return failures
+
+
+@contextmanager
+def _stoppable() -> Iterator[None]:
+    """Let a request to terminate, as job managers send it, end like Ctrl-C: with the processes that were started."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _told(found: Sweep, failures: list[Outcome]) -> str:
+    """What failed and why, in the order of the file."""
+    from agents.sweep import describe
+
+    errors = {outcome.key: outcome.error for outcome in failures}
+    lines = [f"{describe(cell, found.swept) or 'the only cell'}: {errors[cell.key]}" for cell in found.cells if cell.key in errors]
+    more = [f"and {len(lines) - _SHOWN} more, which `safe-envs sweep-report` lists"] if len(lines) > _SHOWN else []
+    return "\n  ".join([f"{len(lines)} of {len(found.cells)} cells failed; the same command tries them again:", *lines[:_SHOWN], *more])
+
+
+if __name__ == "__main__":
+    from scripts.cli import main
+
+    main("sweep")

@@ -1,0 +1,123 @@
+"""The documentation: a page for each env and condition, commands that exist, examples and notebooks that run."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import agents
+import safe_envs
+import wrappers
+from safe_envs import ENV_IDS
+from wrappers import CONDITIONS, LEARNED
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+WITH_PYTHON = [page for page in PAGES if "```python" in page.read_text()]
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(DOCS).as_posix()
+
+
+@pytest.fixture
+def hook(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Imports a module that makes the site; mkdocs itself is not needed."""
+    monkeypatch.syspath_prepend(DOCS / "hooks")
+    return import_module
+
+
+@pytest.fixture
+def pages_in_navigation(hook: Any) -> list[str]:
+    nav = yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"]
+    hook("navigation").complete(nav)
+    return list(leaves(nav))
+
+
+def leaves(nav: Any) -> Iterator[str]:
+    if isinstance(nav, str):
+        yield nav
+    else:
+        for entry in nav.values() if isinstance(nav, dict) else nav:
+            yield from leaves(entry)
+
+
+def test_every_env_and_condition_has_a_page(pages_in_navigation: list[str]):
+    assert {f"envs/{env_id.split('/')[1].removesuffix('-v0')}.md" for env_id in ENV_IDS} <= set(pages_in_navigation)
+    for name in (*CONDITIONS, *LEARNED):
+        assert f"filters/{name}.md" in pages_in_navigation
+        assert (DOCS / "filters" / f"{name}.md").is_file()
+
+
+def test_every_page_is_in_the_navigation(pages_in_navigation: list[str]):
+    notebooks = {f"notebooks/{path.stem}.md" for path in (DOCS / "notebooks").glob("*.ipynb")}
+    written = {name_of(page) for page in PAGES} | notebooks
+    made = {"reference/command-line.md", "reference/info.md"}
+    assert written <= set(pages_in_navigation)
+    assert {page for page in pages_in_navigation if not page.startswith("envs/")} <= written | made
+
+
+@pytest.mark.parametrize("name", [*CONDITIONS, *LEARNED])
+def test_page_of_a_condition_has_equation_promise_and_an_example_of_it(name: str, hook: Any):
+    text = (DOCS / "filters" / f"{name}.md").read_text()
+    assert text.startswith(f"# {name}\n\n$$")
+    assert all(f"**{part}" in text for part in ("When.", "What it promises.", "Outside its assumptions."))
+    filters = [word.split(":")[0] for words in hook("runs").commands_in(text) for word in words]
+    assert name in filters
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name_of)
+def test_commands_exist(page: Path, hook: Any):
+    known = hook("commands")
+    for _, name, *words in hook("runs").commands_in(page.read_text()):
+        assert name in known.commands()
+        options = {word.split("=")[0] for word in words if word.startswith("--")}
+        assert options <= known.options_of(known.commands()[name])
+
+
+def test_page_of_the_command_line_has_every_option(hook: Any):
+    known = hook("commands")
+    page = known.command_line_page()
+    for name, command in known.commands().items():
+        section = page.split(f"\n## {name}\n")[1].split("\n## ")[0]
+        assert all(option in section for option in known.options_of(command) - {"--help"})
+
+
+@pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
+def test_python_runs(page: Path, hook: Any):
+    hook("runs").run_python(page.read_text())
+
+
+@pytest.mark.parametrize("path", sorted((DOCS / "notebooks").glob("*.ipynb")), ids=name_of)
+def test_notebook_is_kept_without_outputs_and_runs(path: Path, hook: Any):
+    assert '"outputs": []' in path.read_text()
+    assert not re.search(r'"outputs": \[\s*\{', path.read_text())
+    cells = [cell for cell in hook("notebooks").executed(path).cells if cell.cell_type == "code"]
+    assert any("image/png" in output.get("data", {}) for cell in cells for output in cell.outputs)
+
+
+@pytest.mark.parametrize("package", [safe_envs, wrappers, agents], ids=lambda package: package.__name__)
+def test_everything_public_is_in_the_reference(package: Any):
+    shown = set(re.findall(r"^::: (\S+)$", "".join(page.read_text() for page in (DOCS / "reference").glob("*.md")), re.MULTILINE))
+    written = (DOCS / "reference" / "envs.md").read_text()
+    for name in package.__all__:
+        module = getattr(getattr(package, name), "__module__", "")
+        places = {f"{package.__name__}.{name}", f"{module}.{name}", module}
+        assert places & shown or f"`{package.__name__}.{name}`" in written, name
+
+
+def test_what_an_example_prints_follows_it(hook: Any):
+    runs = hook("runs")
+    page = "```python run\nprint(6 * 7)\n```\n\ntext\n\n```console run fails\n$ safe-envs evaluate safe_envs/Nothing-v0\n```\n"
+    shown = runs.with_output(page)
+    assert shown.startswith("```python\nprint(6 * 7)\n```\n\n```text\n42\n```\n\ntext")
+    assert "```console\n$ safe-envs evaluate safe_envs/Nothing-v0\n```\n\n```text\nError: " in shown
+    with pytest.raises(RuntimeError, match="status 2"):
+        runs.with_output(page.replace(" fails", ""))

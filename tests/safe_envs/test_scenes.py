@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, SafeEnv, SafetyProblem
+from safe_envs.problem import Feature, Start, Variable
+from safe_envs.rendering import style
+from tests.conftest import problem_of
+from tests.safe_envs.test_rendering import SCENE, shown, stepped
+
+
+def test_the_disk_is_to_scale():
+    from safe_envs.rendering.picture import Picture
+
+    for radius in (1.0, 2.5):
+        env = SafeEnv(problem_of("safe_envs/DubinsDisk-v0", radius=radius, start=[0.0, 0.0, 1.0]), render_mode="rgb_array")
+        env.reset(seed=0)
+        frame = env.render()
+        picture = Picture(env.problem)
+        axes = picture._scene._plane.background(picture._canvas, env._viewer._histories[0].moment)
+        assert axes.scale[0] == pytest.approx(axes.scale[1])
+        for angle in (0.3, 2.0, 4.0):
+            x, y = axes.place(radius * np.cos(angle), radius * np.sin(angle))
+            around = frame[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2]
+            assert (np.abs(around.astype(int) - style.EDGE).sum(axis=-1) < 60).any(), "the edge is not where h = 0"
+            for share, safe in ((0.97, True), (1.03, False)):
+                x, y = axes.place(share * radius * np.cos(angle), share * radius * np.sin(angle))
+                pixel = frame[int(y), int(x)].astype(int)
+                assert (pixel[1] > pixel[0]) == safe, "green within, reddish beyond"
+
+
+def test_obstacles_and_goal_are_to_scale():
+    env = SafeEnv(problem_of("safe_envs/DubinsObstacle-v0", radius=0.7), render_mode="rgb_array")
+    env.reset(seed=0)
+    frame = env.render()
+    scene = env._viewer._picture._scene
+    axes = next(iter(scene._plane._views))
+    assert [circle.radius for circle in scene._obstacles] == pytest.approx([0.7])
+    assert scene._goal.radius == pytest.approx(0.3)
+    center = env.state[3:5]
+    x, y = axes.place(center[0], center[1] - 0.7)
+    column = frame[int(y) - 3 : int(y) + 4, int(x)].astype(int)
+    assert (np.abs(column - style.VIOLATION).sum(axis=-1) < 60).any()
+    x, y = axes.place(3.0, 1.5 - 0.3)
+    assert (np.abs(frame[int(y) - 3 : int(y) + 4, int(x)].astype(int) - style.GOAL).sum(axis=-1) < 60).any()
+
+
+def test_required_gap_is_where_the_barrier_vanishes():
+    from safe_envs.rendering.scenes import make_scene
+
+    road = make_scene(problem_of("safe_envs/ACC-v0", tau=1.5))
+    states = np.array([[20.0, 20.0, 100.0], [10.0, 20.0, 3.0]])
+    np.testing.assert_allclose(road.required(states), [30.0, 15.0], atol=1e-3)
+    road = make_scene(problem_of("safe_envs/ACCGap-v0", distance=12.0))
+    np.testing.assert_allclose(road.required(np.array([[20.0, 30.0]])), [12.0], atol=1e-3)
+
+
+def own_problem(**changes) -> SafetyProblem:
+    """A problem of a user: a mass whose drag is a state, with two barriers."""
+    p, v, c, force = sp.symbols("p v c force", real=True)
+    system = ControlAffineSDE((p, v, c), (force,), [v, -c * v, 0], [0, 1, 0], [0, 0, 0])
+    given = {
+        "name": "mine",
+        "plant": system,
+        "model": system,
+        "barriers": (Barrier(1 - p**2 - v**2 / 4), Barrier(2 - c * v, "drag")),
+        "states": tuple(Variable(s, -3.0, 3.0) for s in (p, v, c)),
+        "inputs": (Variable(force, -1.0, 2.0, "N"),),
+        "reward": sp.Integer(0),
+        "nominal": (sp.Integer(1),),
+        "starts": {"origin": Start.at((0.0, 0.0, 1.0))},
+        "dt": 0.1,
+        "horizon": 2.0,
+    }
+    return SafetyProblem(**{**given, **changes})
+
+
+@pytest.mark.parametrize("plane", [None, ("p", "v")])
+def test_any_problem_is_drawn(plane):
+    env = SafeEnv(own_problem(plane=plane), render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert shown(first[:, SCENE], style.EDGE) > 20
+    assert (stepped(env, 3, 1.0).render()[:, SCENE] != first[:, SCENE]).any()
+
+
+@pytest.mark.parametrize("plane", [None, ("p", "v")])
+def test_states_without_bounds_are_drawn(plane):
+    p, v, c = own_problem().plant.states
+    states = tuple(Variable(s, -np.inf, np.inf) for s in (p, v, c))
+    env = SafeEnv(own_problem(plane=plane, states=states, features=(Feature("p", p, -1.0, 1.0),)), render_mode="rgb_array")
+    env.reset(seed=0)
+    before = env.render()
+    assert (stepped(env, 30, 1.0).render()[:, SCENE] != before[:, SCENE]).any()
+    assert env.state[0] > 2.0
+
+
+def test_a_wrong_scene_is_named():
+    for scene, message in (("top", "top-view"), ("road", "has p, v, c"), ("pendulum", "'theta'")):
+        env = SafeEnv(own_problem(scene=scene), render_mode="rgb_array")
+        env.reset(seed=0)
+        with pytest.raises(ConfigurationError, match=message):
+            env.render()
+
+
+def test_the_view_grows_with_the_trail():
+    from safe_envs.rendering.axes import grown
+
+    assert grown((0.0, 2.0), np.array([0.5, 1.9])) == (0.0, 2.0)
+    assert grown((0.0, 2.0), np.array([0.5, 2.1])) == (-1.0, 3.0)
+    assert grown((0.0, 2.0), np.array([8.9, np.inf])) == (-7.0, 9.0)

@@ -1,0 +1,85 @@
+"""The doctor finds a sound installation sound, and says what is wrong with another."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from importlib.metadata import PackageNotFoundError
+
+import pytest
+
+import safe_envs
+from scripts import doctor
+from tests.scripts.conftest import strictly
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Two envs, and no measurement of speed."""
+    monkeypatch.setattr(doctor, "ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0"))
+    monkeypatch.setattr(doctor, "speeds", lambda: {"env": 1000.0})
+
+
+def test_a_sound_installation_is_sound(safe_envs_command, quick):
+    status, out, err = safe_envs_command("doctor", "--json", "found.json")
+    assert (status, err) == (0, "")
+    assert "All is well." in out
+    assert "1,000 steps/s" in out
+    document = strictly("found.json")
+    assert document["healthy"]
+    assert document["safe-envs"] == safe_envs.__version__
+    checks = document["checks"]
+    assert {"gymnasium", "torch", "proxsuite", "python"} <= {check["name"] for check in checks["packages"]}
+    assert [check["name"] for check in checks["solvers"]] == [program.name for program in doctor.PROGRAMS]
+    assert [check["name"] for check in checks["envs"]] == ["safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0"]
+    assert document["steps_per_second"] == {"env": 1000.0}
+
+
+def test_each_solver_is_looked_at():
+    kinds = {(len(program.proposed), len(program.b) > 1, program.feasible) for program in doctor.PROGRAMS}
+    assert kinds == {(1, True, True), *((m, several, met) for m, several in ((2, False), (2, True), (3, True)) for met in (True, False))}
+    assert all(check.ok for check in doctor.solvers())
+
+
+@pytest.mark.parametrize("change", [{"answer": (0.6, 0.5)}, {"feasible": False}])
+def test_a_wrong_answer_ends_with_status_1(safe_envs_command, quick, monkeypatch, change):
+    monkeypatch.setattr(doctor, "PROGRAMS", (replace(doctor.PROGRAMS[0], **change),))
+    status, out, _ = safe_envs_command("doctor", "--json", "found.json")
+    assert status == 1
+    assert "WRONG" in out
+    assert "reinstall proxsuite" in out
+    document = strictly("found.json")
+    assert not document["healthy"]
+    assert document["steps_per_second"] == {}
+
+
+def test_an_env_that_breaks_is_named(quick, monkeypatch):
+    monkeypatch.setattr(doctor, "ENV_IDS", ("safe_envs/Nothing-v0",))
+    (check,) = doctor.envs()
+    assert check.ok is False
+    assert "ConfigurationError" in check.found
+    assert check.advice
+
+
+def test_what_is_missing_says_how_to_install_it(monkeypatch):
+    def version(package):
+        if package in ("tensorboard", "torch"):
+            raise PackageNotFoundError(package)
+        return "1.0"
+
+    monkeypatch.setattr(doctor, "version", version)
+    monkeypatch.setattr(
+        doctor, "requires", lambda _: ["torch>=2.3", "numpy>=2", "tensorboard>=2; extra == 'tensorboard'", "ruff; extra == 'dev'"]
+    )
+    found = {check.name: check for check in doctor.packages()}
+    assert list(found) == ["python", "torch", "numpy", "tensorboard"]
+    assert (found["torch"].ok, found["torch"].advice) == (False, 'pip install "torch"')
+    assert (found["tensorboard"].ok, found["tensorboard"].advice) == (None, 'pip install "safe-envs[tensorboard]"')
+    assert found["numpy"].ok
+    assert found["numpy"].found == "1.0"
+
+
+def test_speeds_are_of_single_envs(monkeypatch):
+    monkeypatch.setattr(doctor, "_NUM_ENVS", 8)
+    found = doctor.speeds()
+    assert len(found) == 4
+    assert all(steps > 0 for steps in found.values())
