@@ -130,7 +130,9 @@ def _require_alike(cell: Cell) -> None:
         ConfigurationError: it has not.
     """
     here = versions()
-    differing = [f"{name} {here.get(name, 'missing')} in place of {value}" for name, value in cell.versions.items() if here.get(name) != value]
+    differing = [
+        f"{name} {here.get(name, 'missing')} in place of {value}" for name, value in cell.versions.items() if here.get(name) != value
+    ]
     if differing:
         raise ConfigurationError(f"the worker has {', '.join(differing)}; install the same versions on all machines")
     for path, digest in cell.files.items():

@@ -17,6 +17,9 @@ BACKENDS = ("local", "dask", "ray")
 _MOST_LOSSES = 3
 """How often all workers may be started again, and how many single cells in a row may lose theirs, before something must be wrong."""
 
+_IDLE = 30
+"""Seconds after which a process of this machine ends that has nothing to do, as when the one that started it was killed."""
+
 
 class WorkersLostError(SafeEnvsError, RuntimeError):
     """Processes that compute cells end, again and again."""
@@ -123,8 +126,11 @@ def _outcomes(cells: Sequence[Cell], place: Place) -> Iterator[Outcome]:
 def _settings(place: Place, count: int) -> Iterator[dict[str, Any]]:
     """The arguments of joblib for a place, connected as long as the context lasts."""
     if place.backend == "local":
+        from joblib._parallel_backends import LokyBackend
+
         # A single cell of several jobs is to have a process of its own too.
-        yield {"backend": "loky", "n_jobs": place.jobs if place.jobs == 1 else max(2, min(place.jobs, count))}
+        jobs = 1 if place.jobs == 1 else max(2, min(place.jobs, count))
+        yield {"backend": LokyBackend(idle_worker_timeout=_IDLE), "n_jobs": jobs}
     else:
         from agents.sweep_clusters import dask_settings, ray_settings
 

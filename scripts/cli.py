@@ -15,6 +15,7 @@ from scripts.leaderboard import leaderboard
 from scripts.render import render
 from scripts.reproduce.command import reproduce
 from scripts.sweep import sweep
+from scripts.sweep_report import sweep_report
 from scripts.train import train
 from scripts.verify import verify
 
@@ -24,8 +25,8 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (evaluate, identify, train, leaderboard, verify, render, reproduce, sweep):
-    app.command(command.__name__)(with_quiet(command))
+for command in (evaluate, identify, train, leaderboard, verify, render, reproduce, sweep, sweep_report):
+    app.command(command.__name__.replace("_", "-"))(with_quiet(command))
 
 
 @app.callback()

@@ -29,7 +29,9 @@ def sweep(
     spec: Annotated[Path, typer.Argument(metavar="SPEC.yaml", help="What to sweep: sections fixed, grid and cells.", show_default=False)],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Where results go. Cells that are in it already are not computed again.")],
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes of this machine; by default 2.", show_default=False)] = None,
-    backend: Annotated[str, typer.Option(metavar="local|dask|ray", help="Who computes: this machine, or the workers of a cluster.")] = "local",
+    backend: Annotated[
+        str, typer.Option(metavar="local|dask|ray", help="Who computes: this machine, or the workers of a cluster.")
+    ] = "local",
     address: Annotated[
         str | None, typer.Option(metavar="ADDR", help="Of the cluster: tcp://HOST:PORT of a Dask scheduler, HOST:PORT of Ray.")
     ] = None,

@@ -8,24 +8,30 @@ import re
 from pathlib import Path
 
 import safe_envs
+from scripts.cli import app
 
-README = (Path(__file__).parent.parent / "README.md").read_text()
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
 
 
-def test_examples_run_and_the_first_prints_what_is_shown():
-    codes = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
-    shown = re.search(r"```python\n.*?```\n\n```\n(.*?)```", README, re.DOTALL)
-    assert shown is not None
-    names: dict[str, object] = {}
-    for i, code in enumerate(codes):
+def test_examples_run_and_print_what_is_shown():
+    examples = re.findall(r"```python\n(.*?)```(?:\n\n```\n(.*?)```)?", README, re.DOTALL)
+    assert sum(bool(shown) for _, shown in examples) == 2
+    for code, shown in examples:
         with contextlib.redirect_stdout(io.StringIO()) as printed:
-            exec(code, names)
-        if i == 0:
-            assert printed.getvalue() == shown.group(1)
-        elif i == len(codes) - 1:
-            assert printed.getvalue()
+            exec(code, {})
+        assert printed.getvalue()
+        assert not shown or printed.getvalue() == shown
 
 
-def test_every_id_is_listed():
+def test_every_id_and_command_is_listed():
     for env_id in safe_envs.ENV_IDS:
         assert f"`{env_id}`" in README
+    table = README.partition("## Commands")[2]
+    for command in app.registered_commands:
+        assert re.search(rf"`(safe-envs )?{command.name}\b", table), command.name
+
+
+def test_its_picture_is_there():
+    for path in re.findall(r"!\[.*?\]\((.*?)\)", README):
+        assert (ROOT / path).is_file()

@@ -114,7 +114,7 @@ def test_every_command_has_both_options(safe_envs_command):
 @pytest.mark.parametrize("command", [command.name or "" for command in cli.app.registered_commands])
 def test_a_script_is_its_command(safe_envs_command, monkeypatch, capsys, command):
     expected = safe_envs_command(command, "--help")[1]
-    path = ROOT / "scripts" / SCRIPTS.get(command, f"{command}.py")
+    path = ROOT / "scripts" / SCRIPTS.get(command, f"{command.replace('-', '_')}.py")
     monkeypatch.setattr(sys, "argv", [str(path), "--help"])
     with pytest.raises(SystemExit) as ended:
         runpy.run_path(str(path), run_name="__main__")
