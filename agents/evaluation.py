@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
-import re
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,23 +10,20 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from agents.bridge import Bridge, require_monitoring
 from agents.comparison import Comparison, Flags, compare_all
-from agents.episodes import Env, Progress, Recorder, Row, Totals, run_episodes
-from agents.learning import Learning, describe, seconds_of
-from agents.policy import policy_files
+from agents.episodes import Progress, Recorder, Row, Totals, run_episodes
+from agents.learning import describe, seconds_of
 from agents.promised import Promised, together
 from agents.repeats import pooled
+from agents.setting import BARE, Setting, Work
 from agents.statistics import require_confidence
-from agents.worlds import world_of
-from safe_envs.errors import ConfigurationError, nearest, require_whole
+from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.problem import SafetyProblem
-from wrappers import CONDITIONS, LEARNED, Condition, FilterSpec, parse_conditions, require_readable, spec_of
+from wrappers import FilterSpec
 from wrappers.learning import LearnedModel
 
-BARE = "none"
-"""Name of the row without any filter."""
+__all__ = ["BARE", "Evaluation", "evaluate", "package_versions"]
 
 _PACKAGES = ("safe-envs", "gymnasium", "numpy", "scipy", "sympy", "proxsuite", "stable-baselines3", "torch")
 
@@ -92,14 +87,16 @@ def evaluate(
     spec: FilterSpec | str | None = None,
     learned: Sequence[LearnedModel | Path | str] = (),
     repeats: int = 1,
+    monitoring: str = "discrete",
     progress: Progress | None = None,
     record: bool = False,
 ) -> Evaluation:
     """Estimate the safety of a policy under each filter.
 
-    An episode is safe if every barrier is positive at every control instant, its start included. After its first
-    violation an episode's interventions, infeasible steps and effort are no longer counted: the conditions mean
-    nothing outside the safe set. Its simulation goes on, and its return and smallest h are of the whole episode.
+    An episode is safe if every barrier is positive at every control instant, its start included; with continuous monitoring
+    between them too, see `agents.bridge.Bridge`, which changes neither control nor noise. After its first violation an
+    episode's interventions, infeasible steps and effort are no longer counted: the conditions mean nothing outside the safe
+    set. Its simulation goes on, and its return and smallest h are of the whole episode.
 
     Beside the rate stands the largest bound that is proved for the filter, on average over the starts: see
     `wrappers.bounds`. It is of continuous time and rests on suprema that are estimated.
@@ -127,6 +124,7 @@ def evaluate(
             episodes are simulated one by one.
         learned: models, or files of `safe-envs identify`, to use in place of learning.
         repeats: number of identifications of what is learned, from the seed and from children of it; 1 where nothing is.
+        monitoring: when h is looked at: "discrete" for control instants, "continuous" for between them too.
         progress: told the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
 
@@ -135,42 +133,41 @@ def evaluate(
         RelativeDegreeError: a condition does not suit a barrier.
         NumericalError: a simulation or a condition left the finite numbers.
     """
-    for name, value, least in (("episodes", episodes, 1), ("seed", seed, 0), ("num_envs", num_envs, 1)):
+    for name, value, least in (("episodes", episodes, 1), ("num_envs", num_envs, 1)):
         require_whole(name, value, least)
-    for name, value, allowed in (("knowledge", knowledge, ("model", "plant")), ("objective", objective, ("nearest", "clf"))):
-        if value not in allowed:
-            raise ConfigurationError(f"{name} = {value!r}; {nearest(value, allowed)}")
     require_confidence(confidence)
-    simulated = world_of(problem, options, spec)
-    world = simulated.problem
-    actor = simulated.policy(policy, trust) if isinstance(policy, str) else policy
-    names = list(dict.fromkeys((BARE, simulated.filter) if filters is None else filters))
-    specs = [_checked(name, world) for name in names]
-    learning = Learning(world, names, learned, repeats, seed)
-    if simulated.spec is not None and learning.missing():
-        raise ConfigurationError("a filter over an env of somebody else takes what was learned from a log: NAME:file=FILE")
-    work = _Work(progress, len(learning.missing()) + sum(learning.repeats(name) for name in names))
-    for method, repeat in learning.missing():
-        learning.learn(method, repeat, work.part())
-    filters_of = {name: [_conditions(name, learning, r) for r in range(learning.repeats(name))] for name in names}
-    envs = {
-        name: [_ready(simulated.env(c, knowledge, objective, min(num_envs, episodes))) for c in each] for name, each in filters_of.items()
-    }
+    require_monitoring(monitoring)
+    setting = Setting(
+        problem,
+        policy,
+        filters,
+        trust=trust,
+        options=options,
+        seed=seed,
+        knowledge=knowledge,
+        objective=objective,
+        spec=spec,
+        learned=learned,
+        repeats=repeats,
+    )
+    simulated, world, names, learning = setting.simulated, setting.problem, setting.names, setting.learning
+    if monitoring == "continuous" and simulated.spec is not None:
+        raise ConfigurationError(
+            "monitoring = 'continuous': how an env of somebody else moves between its steps is not known; use 'discrete'"
+        )
+    work = Work(progress, len(learning.missing()) + sum(learning.repeats(name) for name in names))
+    setting.learn(work.part)
+    filters_of = setting.filters
+    envs = {name: [setting.env(conditions, min(num_envs, episodes)) for conditions in each] for name, each in filters_of.items()}
     config = {
-        "title": simulated.title,
-        "env_id": simulated.env_id,
-        "options": simulated.options,
-        "filter_spec": None if spec is None else spec if isinstance(spec, str) else type(spec).__name__,
-        "problem": _describe(world),
-        "policy": _describe_policy(policy),
-        "filters": [{"name": name, "spec": spec or spec_of(filters_of[name][0])} for name, spec in zip(names, specs, strict=True)],
-        "knowledge": knowledge,
-        "objective": objective,
+        **setting.config(),
         "episodes": episodes,
         "seed": seed,
         "repeats": repeats,
         "confidence": confidence,
+        "monitoring": monitoring,
     }
+    bridge = Bridge(world) if monitoring == "continuous" else None
     why_not = simulated.why_no_bound or (None if bounds else "it was not asked for")
     rows, speeds, flags = [], [], {}
     recorders = {name: Recorder(world.steps, world.plant.n, episodes) for name in names} if record else {}
@@ -178,7 +175,9 @@ def evaluate(
         promised = [Promised(conditions, world, knowledge, why_not) for conditions in filters_of[name]]
         begun = time.perf_counter()
         totals = [
-            run_episodes(env, actor, episodes, seed, work.part(episodes), recorders.get(name) if r == 0 else None, promised[r].add)
+            run_episodes(
+                env, setting.actor, episodes, seed, work.part(episodes), recorders.get(name) if r == 0 else None, promised[r].add, bridge
+            )
             for r, env in enumerate(envs[name])
         ]
         speeds.append({**_speed(name, totals, time.perf_counter() - begun), "learning_seconds": seconds_of(filters_of[name])})
@@ -195,74 +194,14 @@ def evaluate(
         flags[name] = [each.flags for each in totals]
     timing = {"num_envs": num_envs, "rows": speeds}
     comparisons = compare_all(flags, confidence)
-    return Evaluation(world, config, rows, comparisons, timing, recorders, flags, learning.models(), simulated.is_deterministic(actor))
-
-
-class _Work:
-    """Tells the progress of a number of equal parts, one after the other."""
-
-    def __init__(self, progress: Progress | None, parts: int) -> None:
-        self._progress, self._parts, self._begun = progress, parts, 0
-
-    def part(self, whole: float = 1.0) -> Progress | None:
-        """The next part, told how much of `whole` is done."""
-        before, self._begun = self._begun, self._begun + 1
-        told = self._progress
-        return None if told is None else lambda done: told((before + done / whole) / self._parts)
+    return Evaluation(
+        world, config, rows, comparisons, timing, recorders, flags, learning.models(), simulated.is_deterministic(setting.actor)
+    )
 
 
 def _speed(name: str, totals: Sequence[Totals], seconds: float) -> dict[str, Any]:
     steps = sum(each.steps for each in totals)
     return {"filter": name, "seconds": seconds, "steps": steps, "steps_per_second": steps / seconds}
-
-
-def _checked(name: str, problem: SafetyProblem) -> str | None:
-    """The text of a filter with all its parameters, where it rests on nothing learned; the others are read once that is there."""
-    if name == BARE:
-        return BARE
-    if BARE in name.split("+"):
-        raise ConfigurationError(f"filter {name!r}: {BARE!r} is the bare env and no condition of a barrier; give it alone or leave it out")
-    if re.split("[:+]", name)[0] not in (*CONDITIONS, *LEARNED):
-        raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, (BARE, *CONDITIONS, *LEARNED))}")
-    if any(re.split(":", part)[0] in LEARNED for part in name.split("+")):
-        require_readable(name, problem)
-        return None
-    return spec_of(parse_conditions(name, problem))
-
-
-def _conditions(name: str, learning: Learning, repeat: int) -> tuple[Condition, ...]:
-    """The conditions of a filter in a repeat; none of the bare env."""
-    return () if name == BARE else learning.conditions(name, repeat)
-
-
-def _ready(env: Env) -> Env:
-    """The env after a first step, which compiles what the filter needs: an error shows before a long run, and the timing is of steps."""
-    env.reset(seed=0)
-    env.step(np.zeros(env.action_space.shape or (), dtype=np.float32))
-    return env
-
-
-def _describe(problem: SafetyProblem) -> dict[str, Any]:
-    return {
-        "name": problem.name,
-        "plant": {p.name: v for p, v in problem.plant.parameters.items()},
-        "model": {p.name: v for p, v in problem.model.parameters.items()},
-        "barriers": [str(b.expression) for b in problem.barriers],
-        "box": [[float(low), float(high)] for low, high in problem.box],
-        "start": problem.start,
-        "dt": problem.dt,
-        "substeps": problem.substeps,
-        "horizon": problem.horizon,
-    }
-
-
-def _describe_policy(policy: Any) -> dict[str, Any]:
-    if not isinstance(policy, str):
-        return {"name": type(policy).__name__}
-    files = policy_files(policy)
-    if not files:
-        return {"name": policy}
-    return {"name": policy, "sha256": hashlib.sha256(files[0].read_bytes()).hexdigest()}
 
 
 def package_versions() -> dict[str, str]:

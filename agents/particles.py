@@ -1,4 +1,4 @@
-"""Episodes that can be taken up again at each instant at which h was smaller than ever before."""
+"""Episodes that can be taken up again at each instant at which their score was better than ever before."""
 
 from __future__ import annotations
 
@@ -6,10 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from agents.bridge import Bridge
-from agents.episodes import Env, episode_seed
+from agents.episodes import Env
 from agents.policy import Policy
 from safe_envs.errors import ConfigurationError
 from wrappers.vector_wrapper import readable
@@ -22,7 +21,7 @@ _FEWEST_ENVS = 64
 
 
 class Records:
-    """The instants at which each path's h was smaller than ever before, in arrays that grow as they fill.
+    """The instants at which each path was nearer to a violation than ever before, in arrays that grow as they fill.
 
     Args:
         paths: how many.
@@ -32,7 +31,7 @@ class Records:
 
     def __init__(self, paths: int, states: int, features: int) -> None:
         self._count = np.zeros(paths, dtype=np.int64)
-        self._h = np.full((_FIRST_ROOM, paths), -np.inf)
+        self._height = np.full((_FIRST_ROOM, paths), -np.inf)
         self._time = np.zeros((_FIRST_ROOM, paths), dtype=np.int64)
         self._ended = np.zeros((_FIRST_ROOM, paths), dtype=bool)
         self._state = np.zeros((_FIRST_ROOM, paths, states))
@@ -41,33 +40,40 @@ class Records:
     def clear(self, paths: np.ndarray) -> None:
         """Forget the records of some paths."""
         self._count[paths] = 0
-        self._h[:, paths] = -np.inf
+        self._height[:, paths] = -np.inf
 
     def add(self, paths: np.ndarray, *entries: np.ndarray) -> None:
-        """Note a record of each of some paths: h, control instant, whether the episode ended there, state, observation."""
+        """Note a record of each of some paths: height, control instant, whether the episode ended there, state, observation."""
         rows = self._count[paths]
-        if rows.size and int(rows.max()) == len(self._h):
+        if rows.size and int(rows.max()) == len(self._height):
             self._grow()
-        for kept, values in zip((self._h, self._time, self._ended, self._state, self._observation), entries, strict=True):
+        for kept, values in zip((self._height, self._time, self._ended, self._state, self._observation), entries, strict=True):
             kept[rows, paths] = values
         self._count[paths] += 1
 
     def first_below(self, levels: np.ndarray, paths: np.ndarray) -> tuple[np.ndarray, ...]:
         """The first records of paths below levels, one for each, in the order of the arguments of `add`."""
         # Records fall along the first axis, and what was not filled is lower than all.
-        rows = (self._h[:, paths] >= levels).sum(axis=0)
-        return tuple(kept[rows, paths] for kept in (self._h, self._time, self._ended, self._state, self._observation))
+        rows = (self._height[:, paths] >= levels).sum(axis=0)
+        return tuple(kept[rows, paths] for kept in (self._height, self._time, self._ended, self._state, self._observation))
+
+    def last_times(self, paths: np.ndarray) -> np.ndarray:
+        """Control instants of the last records of paths."""
+        return self._time[self._count[paths] - 1, paths]
 
     def _grow(self) -> None:
-        room = len(self._h)
-        for name in ("_h", "_time", "_ended", "_state", "_observation"):
+        room = len(self._height)
+        for name in ("_height", "_time", "_ended", "_state", "_observation"):
             old = getattr(self, name)
-            fill = np.full((room, *old.shape[1:]), -np.inf if name == "_h" else 0, dtype=old.dtype)
+            fill = np.full((room, *old.shape[1:]), -np.inf if name == "_height" else 0, dtype=old.dtype)
             setattr(self, name, np.concatenate([old, fill]))
 
 
 class Particles:
     """Paths of a policy in an env, up to their first violations.
+
+    The height of a path at control instant k of K is its smallest h since the last one, times (1 - k/(K + 1))^-p: for p = 0 that is
+    h, and for p = 1/2 it is h against what a Brownian motion may do in the time that is left. It is 0 or less at a violation.
 
     Noise is drawn by the envs, whose generators are seeded once and run on, so that paths that were taken up again get fresh
     noise. What comes of it depends on the seed, and on the number of paths and of envs.
@@ -75,27 +81,31 @@ class Particles:
     Args:
         make: an env with next-step autoreset and so many episodes side by side.
         policy: anything with Stable-Baselines3's `predict`, without memory.
-        paths: how many.
+        powers: p of each path.
         seed: of all randomness.
         num_envs: the most episodes side by side.
         bridge: looks at h between control instants too.
 
     Attributes:
-        lowest: smallest h of each path, shape (paths,).
+        lowest: smallest height of each path, shape (paths,).
         steps: control periods that were simulated.
     """
 
-    def __init__(self, make: MakeEnv, policy: Any, paths: int, seed: int, num_envs: int, bridge: Bridge | None = None, power=0.0) -> None:
-        self.lowest = np.full(paths, np.inf)
+    def __init__(
+        self, make: MakeEnv, policy: Any, powers: np.ndarray, seed: np.random.SeedSequence, num_envs: int, bridge: Bridge | None = None
+    ) -> None:
+        self.lowest = np.full(len(powers), np.inf)
         self.steps = 0
-        self._make, self._policy, self._seed, self._bridge = make, policy, seed, bridge
+        self._make, self._policy, self._bridge = make, policy, bridge
         self._envs: dict[int, Env] = {}
-        self._largest = min(num_envs, paths)
-        self._generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(0, 2)))
+        self._largest = min(num_envs, len(powers))
+        self._seed, self._generator = seed, np.random.default_rng(seed.spawn(1)[0])
         world = readable(self._env(self._largest))
         self._horizon = world.problem.steps
-        self._weights = ((self._horizon + 1.0 - np.arange(self._horizon+1))/(self._horizon+1.0)) ** -power
-        self._records = Records(paths, world.problem.plant.n, len(world.problem.features))
+        kinds, self._kind = np.unique(powers, return_inverse=True)
+        left = 1.0 - np.arange(self._horizon + 1) / (self._horizon + 1)
+        self._weights = left[:, None] ** -kinds
+        self._records = Records(len(powers), world.problem.plant.n, len(world.problem.features))
 
     def begin(self) -> None:
         """Simulate all paths from their starts."""
@@ -106,16 +116,21 @@ class Particles:
             observation, info = env.reset()
             world, count = readable(env), len(some)
             h = info["barrier"].min(axis=1)[:count]
+            # At the start the weight is 1.
             begun = (h, np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool), world.state[:count], observation[:count])
             self._play(env, some, observation, begun)
 
+    def h_at_lowest(self, paths: np.ndarray) -> np.ndarray:
+        """The h of paths where their heights were smallest, shape as given."""
+        return self.lowest[paths] / self._weights[self._records.last_times(paths), self._kind[paths]]
+
     def branch(self, paths: np.ndarray, parents: np.ndarray, levels: np.ndarray) -> None:
-        """Replace paths by what goes on from where others first fell below levels.
+        """Replace paths by what goes on from where others of the same p first fell below levels.
 
         Args:
             paths: those that are replaced, shape (B,).
             parents: those that are continued, none of which is replaced, shape (B,).
-            levels: of h, each above its parent's smallest h, shape (B,).
+            levels: heights, each above its parent's smallest, shape (B,).
         """
         entries = self._records.first_below(levels, parents)
         # Paths that have equally far to go share a batch, which takes as long as the longest of them.
@@ -139,41 +154,40 @@ class Particles:
 
     def _play(self, env: Env, paths: np.ndarray, observation: np.ndarray, entries: tuple[np.ndarray, ...]) -> None:
         """Simulate paths, in the first rows of an env, from entries of `Records.add` until they end or violate."""
-        count, world, records = len(paths), readable(env), self._records
+        count, world, records, kind = len(paths), readable(env), self._records, self._kind[paths]
         lowest, time, ended = entries[0].copy(), entries[1].copy(), entries[2]
         records.add(paths, *entries)
-        alive = (lowest > 0.0) & ~ended & (time < self._horizon)
-        barriers = self._barriers(world)
+        alive = (lowest > 0.0) & ~ended
+        barriers = None if self._bridge is None else self._bridge.barriers(world.components)
         if isinstance(self._policy, Policy):
             self._policy.begin(range(env.num_envs), int(self._generator.integers(2**63)))
-        with threadpool_limits(1, "blas"):
-            while alive.any():
-                x = world.components
-                actions, memory = self._policy.predict(observation, None, np.zeros(env.num_envs, dtype=bool), deterministic=True)
-                if memory is not None:
-                    raise ConfigurationError("the policy has a memory, which splitting cannot take up again; estimate with plain episodes")
-                observation, _, terminated, truncated, info = env.step(actions)
-                time += 1
-                h = self._lowest(x, barriers, info["barrier"])[:count] * self._weights[np.minimum(time, self._horizon)]
-                barriers = info["barrier"]
-                self.steps += int(np.count_nonzero(alive))
-                fell = np.flatnonzero(alive & (h < lowest))
-                ended = (terminated | truncated)[:count]
-                if fell.size:
-                    lowest[fell] = h[fell]
-                    state = np.stack([component[fell] for component in world.components], axis=-1)
-                    records.add(paths[fell], h[fell], time[fell], ended[fell], state, observation[fell])
-                alive &= (lowest > 0.0) & ~ended
+        while alive.any():
+            x = world.components
+            observation, _, terminated, truncated, info = env.step(self._act(observation))
+            time += 1
+            h = self._smallest(x, barriers, info["barrier"])[:count]
+            height = h * self._weights[np.minimum(time, self._horizon), kind]
+            barriers = info["barrier"]
+            self.steps += int(np.count_nonzero(alive))
+            fell = np.flatnonzero(alive & (height < lowest))
+            ended = (terminated | truncated)[:count]
+            if fell.size:
+                lowest[fell] = height[fell]
+                state = np.stack([component[fell] for component in world.components], axis=-1)
+                records.add(paths[fell], height[fell], time[fell], ended[fell], state, observation[fell])
+            alive &= (lowest > 0.0) & ~ended
         self.lowest[paths] = lowest
 
-    def _lowest(self, x: Any, before: np.ndarray | None, after: np.ndarray) -> np.ndarray:
+    def _act(self, observation: np.ndarray) -> np.ndarray:
+        actions, memory = self._policy.predict(observation, None, np.zeros(len(observation), dtype=bool), deterministic=True)
+        if memory is not None:
+            raise ConfigurationError("the policy has a memory, which splitting cannot take up again; estimate with plain episodes")
+        return actions
+
+    def _smallest(self, x: Any, before: np.ndarray | None, after: np.ndarray) -> np.ndarray:
         if self._bridge is None or before is None:
             return after[:, 0] if after.shape[1] == 1 else after.min(axis=1)
         return self._bridge.lowest(x, before, after, self._generator.standard_exponential(after.shape))
-
-    def _barriers(self, world: Any) -> np.ndarray | None:
-        """Barriers at the states of an env, shape (B, k), where they are needed."""
-        return None if self._bridge is None else self._bridge.barriers(world.components)
 
     def _env(self, count: int) -> Env:
         """An env with at least so many episodes side by side, seeded when it is first used."""
@@ -182,9 +196,5 @@ class Particles:
             size //= 2
         if size not in self._envs:
             env = self._envs[size] = self._make(size)
-            # Sizes are told apart, so that no two envs have equal noise.
-            env.reset(seed=[episode_seed(self._seed, self._offset(size) + i) for i in range(size)])
+            env.reset(seed=self._seed.spawn(1)[0].generate_state(size, np.uint64).tolist())
         return self._envs[size]
-
-    def _offset(self, size: int) -> int:
-        return sum(self._envs) - size
