@@ -85,6 +85,21 @@ class Bridge:
         return ends[:, 0] if ends.shape[1] == 1 else ends.min(axis=1)
 
 
+def bridge_notes(problem: SafetyProblem) -> list[str]:
+    """What has to be known to read numbers of continuous monitoring."""
+    reached = Bridge(problem).reached
+    missed = [barrier.name for barrier, reaches in zip(problem.barriers, reached, strict=True) if not reaches]
+    notes = []
+    if missed:
+        notes.append(
+            f"continuous monitoring changes nothing for {', '.join(missed)}, which no noise reaches directly: there only a smaller dt does "
+            "anything."
+        )
+    if sum(reached) > 1:
+        notes.append("between control instants each barrier is taken by itself, independently of the others.")
+    return notes
+
+
 class Exponentials:
     """Standard exponentials of episodes side by side, a stream for each: what an episode gets does not depend on its neighbours.
 

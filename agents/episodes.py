@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -177,21 +177,56 @@ def run_episodes(
             of them, from the first, are of episodes that count.
         bridge: looks at h between control instants too; it changes neither control nor noise.
     """
+    return totals_of(readable(env).problem, play(env, policy, range(episodes), seed, progress, recorder, bridge), on_start)
+
+
+class Played(NamedTuple):
+    """A wave that was simulated.
+
+    Attributes:
+        wave: its counts.
+        count: how many of its episodes, from the first, count.
+        starts: components of their start states, arrays of shape (num_envs,).
+    """
+
+    wave: Wave
+    count: int
+    starts: Components
+
+
+def totals_of(problem: SafetyProblem, waves: Iterable[Played], on_start: OnStart | None = None) -> Totals:
+    """Add up waves, in order; see `run_episodes` for `on_start`."""
+    totals = Totals(problem)
+    for played in waves:
+        if on_start:
+            on_start(played.starts, played.count)
+        totals.add(played.wave, played.count)
+    return totals
+
+
+def play(
+    env: Env,
+    policy: Any,
+    episodes: range,
+    seed: int,
+    progress: Progress | None = None,
+    recorder: Recorder | None = None,
+    bridge: Bridge | None = None,
+) -> Iterator[Played]:
+    """Simulate consecutive episodes wave by wave; see `run_episodes` for the arguments."""
     world = readable(env)
-    totals = Totals(world.problem)
-    # Threads of BLAS gain nothing on small networks, and on a busy machine they wait for each other for most of the time.
-    with threadpool_limits(1, "blas"):
-        for first in range(0, episodes, env.num_envs):
-            count = min(env.num_envs, episodes - first)
-            rows = range(first, first + env.num_envs)
+    for first in range(episodes.start, episodes.stop, env.num_envs):
+        count = min(env.num_envs, episodes.stop - first)
+        rows = range(first, first + env.num_envs)
+        # Threads of BLAS gain nothing on small networks, and on a busy machine they wait for each other for most of the time.
+        with threadpool_limits(1, "blas"):
             if isinstance(policy, Policy):
                 policy.begin(rows, seed)
             started = env.reset(seed=[episode_seed(seed, i) for i in rows])
-            if on_start:
-                on_start(world.components, count)
-            watch = None if bridge is None else _Watch(bridge, Exponentials(seed, rows, bridge.draws), world.components, started[1])
-            totals.add(_play(env, policy, started, first, count, progress, recorder, watch), count)
-    return totals
+            starts = world.components
+            watch = None if bridge is None else _Watch(bridge, Exponentials(seed, rows, bridge.draws), starts, started[1])
+            wave = _play(env, policy, started, first, count, progress, recorder, watch)
+        yield Played(wave, count, starts)
 
 
 class _Watch:

@@ -12,8 +12,9 @@ from typing import Any
 
 from agents.bridge import Bridge, require_monitoring
 from agents.comparison import Comparison, Flags, compare_all
-from agents.episodes import Progress, Recorder, Row, Totals, run_episodes
+from agents.episodes import Progress, Recorder, Row, Totals, play, totals_of
 from agents.learning import describe, seconds_of
+from agents.processes import play_in_processes
 from agents.promised import Promised, together
 from agents.repeats import pooled
 from agents.setting import BARE, Setting, Work
@@ -88,6 +89,7 @@ def evaluate(
     learned: Sequence[LearnedModel | Path | str] = (),
     repeats: int = 1,
     monitoring: str = "discrete",
+    jobs: int = 1,
     progress: Progress | None = None,
     record: bool = False,
 ) -> Evaluation:
@@ -125,6 +127,7 @@ def evaluate(
         learned: models, or files of `safe-envs identify`, to use in place of learning.
         repeats: number of identifications of what is learned, from the seed and from children of it; 1 where nothing is.
         monitoring: when h is looked at: "discrete" for control instants, "continuous" for between them too.
+        jobs: in how many processes to simulate; the answer is the same.
         progress: told the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
 
@@ -133,8 +136,10 @@ def evaluate(
         RelativeDegreeError: a condition does not suit a barrier.
         NumericalError: a simulation or a condition left the finite numbers.
     """
-    for name, value, least in (("episodes", episodes, 1), ("num_envs", num_envs, 1)):
+    for name, value, least in (("episodes", episodes, 1), ("num_envs", num_envs, 1), ("jobs", jobs, 1)):
         require_whole(name, value, least)
+    if jobs > 1 and record:
+        raise ConfigurationError(f"jobs = {jobs}: trajectories for pictures are kept in one process; leave jobs out, or the picture")
     require_confidence(confidence)
     require_monitoring(monitoring)
     setting = Setting(
@@ -158,6 +163,7 @@ def evaluate(
     work = Work(progress, len(learning.missing()) + sum(learning.repeats(name) for name in names))
     setting.learn(work.part)
     filters_of = setting.filters
+    # Made before the first episode: what is wrong with any of them shows at once.
     envs = {name: [setting.env(conditions, min(num_envs, episodes)) for conditions in each] for name, each in filters_of.items()}
     config = {
         **setting.config(),
@@ -175,8 +181,12 @@ def evaluate(
         promised = [Promised(conditions, world, knowledge, why_not) for conditions in filters_of[name]]
         begun = time.perf_counter()
         totals = [
-            run_episodes(
-                env, setting.actor, episodes, seed, work.part(episodes), recorders.get(name) if r == 0 else None, promised[r].add, bridge
+            totals_of(
+                world,
+                play_in_processes(setting, filters_of[name][r], episodes, seed, num_envs, jobs, bridge is not None, work.part(episodes))
+                if jobs > 1
+                else play(env, setting.actor, range(episodes), seed, work.part(episodes), recorders.get(name) if r == 0 else None, bridge),
+                promised[r].add,
             )
             for r, env in enumerate(envs[name])
         ]

@@ -11,6 +11,7 @@ from agents.bridge import Bridge
 from agents.episodes import Env
 from agents.policy import Policy
 from safe_envs.errors import ConfigurationError
+from safe_envs.vector import SafeVectorEnv
 from wrappers.vector_wrapper import readable
 
 MakeEnv = Callable[[int], Env]
@@ -100,7 +101,7 @@ class Particles:
         self._envs: dict[int, Env] = {}
         self._largest = min(num_envs, len(powers))
         self._seed, self._generator = seed, np.random.default_rng(seed.spawn(1)[0])
-        world = readable(self._env(self._largest))
+        world = _own(self._env(self._largest))
         self._horizon = world.problem.steps
         kinds, self._kind = np.unique(powers, return_inverse=True)
         left = 1.0 - np.arange(self._horizon + 1) / (self._horizon + 1)
@@ -114,7 +115,7 @@ class Particles:
             some = paths[first : first + self._largest]
             env = self._env(len(some))
             observation, info = env.reset()
-            world, count = readable(env), len(some)
+            world, count = _own(env), len(some)
             h = info["barrier"].min(axis=1)[:count]
             # At the start the weight is 1.
             begun = (h, np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool), world.state[:count], observation[:count])
@@ -141,7 +142,7 @@ class Particles:
             self._resume(paths[some], tuple(entry[some] for entry in entries))
 
     def _resume(self, paths: np.ndarray, entries: tuple[np.ndarray, ...]) -> None:
-        env = self._env(len(paths))
+        env: Any = self._env(len(paths))
         snapshot = env.snapshot()
         for name, values in (("state", entries[3]), ("steps", entries[1])):
             snapshot[name][:] = values[0]
@@ -154,7 +155,7 @@ class Particles:
 
     def _play(self, env: Env, paths: np.ndarray, observation: np.ndarray, entries: tuple[np.ndarray, ...]) -> None:
         """Simulate paths, in the first rows of an env, from entries of `Records.add` until they end or violate."""
-        count, world, records, kind = len(paths), readable(env), self._records, self._kind[paths]
+        count, world, records, kind = len(paths), _own(env), self._records, self._kind[paths]
         lowest, time, ended = entries[0].copy(), entries[1].copy(), entries[2]
         records.add(paths, *entries)
         alive = (lowest > 0.0) & ~ended
@@ -198,3 +199,15 @@ class Particles:
             env = self._envs[size] = self._make(size)
             env.reset(seed=self._seed.spawn(1)[0].generate_state(size, np.uint64).tolist())
         return self._envs[size]
+
+
+def _own(env: Env) -> SafeVectorEnv:
+    """The layer of an env that holds the states.
+
+    Raises:
+        ConfigurationError: it is of somebody else, who cannot put it back to where it was.
+    """
+    world = readable(env)
+    if not isinstance(world, SafeVectorEnv):
+        raise ConfigurationError("an env of somebody else cannot be put back to where it was: estimate its safety with plain episodes")
+    return world

@@ -39,7 +39,7 @@ class Repetitions:
         paths: how many these are.
         length: their mean length, up to a violation, in control periods.
         stuck: for each repetition all of whose paths stood at one level, h there.
-        endless: for each one that fell below `LEAST`, the smallest h.
+        endless: for each one that fell below `LEAST`, h of its last level.
     """
 
     estimates: np.ndarray
@@ -181,8 +181,8 @@ class _Run:
         killed, survivors = own[lowest >= level], own[lowest < level]
         self.estimates[r] *= survivors.size / self._particles
         if self.estimates[r] < LEAST:
-            kept, near = (self.endless, survivors) if survivors.size else (self.stuck, killed)
-            kept.append(float(self.paths.h_at_lowest(near).min()))
+            kept = self.endless if survivors.size else self.stuck
+            kept.append(float(self.paths.h_at_lowest(killed).min()))
             self.estimates[r] = 0.0
             return None
         return killed, self._generator.choice(survivors, killed.size), np.full(killed.size, level)

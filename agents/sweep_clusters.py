@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -30,10 +32,11 @@ def dask_settings(address: str) -> Iterator[dict[str, Any]]:
             # joblib computes in this process where there is one worker.
             return max(super().effective_n_jobs(n_jobs), 2)
 
-        def submit(self, func: Any, callback: Callable[[Any], None]) -> Any:
+        def submit(self, func: Any, callback: Callable[[Any], None] | None = None) -> Any:
             future = super().submit(func, callback)
-            # Of a task that ended with an error outside of its function, joblib would never hear.
-            future.add_done_callback(lambda done: callback(done.exception()) if done.exception() else None)
+            if callback is not None:
+                # Of a task that ended with an error outside of its function, joblib would never hear.
+                future.add_done_callback(lambda done: callback(done.exception()) if done.exception() else None)
             return future
 
         def retrieve_result_callback(self, out: Any) -> Any:
@@ -65,12 +68,13 @@ def ray_settings(address: str) -> Iterator[dict[str, Any]]:
     class Ray(RayBackend):
         supports_return_generator = True
 
-        def retrieve_result_callback(self, out: Any) -> Any:
-            return super().retrieve_result_callback(_require_result(out))
+        def retrieve_result_callback(self, result: Any) -> Any:
+            return super().retrieve_result_callback(_require_result(result))
 
     try:
-        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
-    except (ConnectionError, ValueError, RuntimeError) as error:
+        _require_listener(address)
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except (OSError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
         raise ConfigurationError(f"no Ray cluster answers at {address} ({reason}); start one by: ray start --head") from error
     try:
@@ -78,6 +82,13 @@ def ray_settings(address: str) -> Iterator[dict[str, Any]]:
         yield {"backend": Ray(ray_remote_args=remote), "n_jobs": -1}
     finally:
         ray.shutdown()
+
+
+def _require_listener(address: str) -> None:
+    """Raise OSError unless something listens at HOST:PORT; Ray itself would try for minutes."""
+    host, _, port = address.rpartition(":")
+    if host and port.isdecimal() and "/" not in host:
+        socket.create_connection((host, int(port)), timeout=_PATIENCE).close()
 
 
 def _require_result(out: Any) -> Any:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, cast
 
 from agents.sweep_cell import Cell, Outcome, compute
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, require_whole
@@ -15,14 +15,14 @@ from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, require
 BACKENDS = ("local", "dask", "ray")
 
 _MOST_LOSSES = 3
-"""How often all workers may be started again, and how many single cells in a row may lose theirs, before something must be wrong."""
+"""How often cells are computed side by side before they are computed one by one, and how many may then be lost with none computed."""
 
 _IDLE = 30
 """Seconds after which a process of this machine ends that has nothing to do, as when the one that started it was killed."""
 
 
 class WorkersLostError(SafeEnvsError, RuntimeError):
-    """Processes that compute cells end, again and again."""
+    """Processes that are to compute cells end before they have computed any."""
 
 
 class _LossError(Exception):
@@ -71,38 +71,40 @@ def run(cells: Iterable[Cell], place: Place, keep: Callable[[Outcome], None]) ->
 
     Raises:
         ConfigurationError: a cluster cannot be reached, or has no workers.
-        WorkersLostError: workers end, whatever they compute.
+        WorkersLostError: workers end before they have computed anything.
     """
     missing = {cell.key: cell for cell in cells}
+    any_computed = False
 
     def take(some: Sequence[Cell]) -> None:
+        nonlocal any_computed
         with closing(_outcomes(some, place)) as outcomes:
             for outcome in outcomes:
                 keep(outcome)
                 del missing[outcome.key]
+                any_computed = True
 
     for _ in range(_MOST_LOSSES):
         try:
-            return take(list(missing.values()))
+            take(list(missing.values()))
         except _LossError:
             continue
-    in_a_row = 0
+        return
+    lost = 0
     for cell in list(missing.values()):
         try:
             take([cell])
-            in_a_row = 0
         except _LossError as error:
-            in_a_row += 1
-            if in_a_row == _MOST_LOSSES:
+            lost += 1
+            if lost == _MOST_LOSSES and not any_computed:
                 raise WorkersLostError(
-                    f"{in_a_row} cells one after the other lost the process that computed them; the last: {error}. Look for its reason, such "
-                    "as too little memory or another installation on the workers, and start again: what is finished is not done again"
+                    f"no cell could be computed, since the processes for it end; the last: {error}. Look for the reason, such as too "
+                    "little memory or another installation on the workers, and start again"
                 ) from error
             keep(Outcome(cell.key, None, None, f"the process that computed it ended: {error}", 0.0))
-    return None
 
 
-def _outcomes(cells: Sequence[Cell], place: Place) -> Iterator[Outcome]:
+def _outcomes(cells: Sequence[Cell], place: Place) -> Generator[Outcome, None, None]:
     """Outcomes as they come.
 
     Raises:
@@ -112,14 +114,15 @@ def _outcomes(cells: Sequence[Cell], place: Place) -> Iterator[Outcome]:
 
     with _settings(place, len(cells)) as settings:
         # One cell is one task, so that each is kept as soon as it is done.
-        parallel = Parallel(return_as="generator_unordered", batch_size=1, **settings)
-        with closing(parallel(delayed(compute)(cell) for cell in cells)) as outcomes, warnings.catch_warnings():
+        parallel = Parallel(return_as="generator_unordered", batch_size=1, **settings)  # pyright: ignore[reportArgumentType]
+        tasks = (delayed(compute)(cell) for cell in cells)
+        with closing(cast("Generator[Outcome, None, None]", parallel(tasks))) as outcomes, warnings.catch_warnings():
             # joblib warns of what is not waited for, which is meant when this is closed early.
             warnings.simplefilter("ignore", UserWarning)
             try:
                 yield from outcomes
             except Exception as error:  # Those of cells are in their outcomes.
-                raise _LossError(f"{type(error).__name__}: {error}".splitlines()[0]) from error
+                raise _LossError(f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")) from error
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 import timeit
@@ -18,6 +19,7 @@ from rich.table import Table
 import safe_envs
 from agents.problems import load_problem
 from safe_envs import Barrier, ControlAffineSDE
+from safe_envs.errors import ConfigurationError
 from scripts.console import require_result, stdout, write_result
 from wrappers import (
     CBF,
@@ -67,20 +69,22 @@ class Case(NamedTuple):
     calls: int | None = None
 
 
-def benchmark(json_file: Path | None = None) -> None:
+def benchmark(json_file: Path | None = None, compare: Path | None = None) -> None:
     """Measure, print and, if asked, write the speed of filter calls, scalar and vector steps, the fused limit, and of learning.
 
     Args:
         json_file: where the figures go.
+        compare: figures of an earlier run, to print what has become of them.
 
     Raises:
-        ConfigurationError: the file cannot be written.
+        ConfigurationError: the file cannot be written, or that of an earlier run not be read.
     """
     require_result(json_file)
+    earlier = {} if compare is None else read_figures(compare)
     figures = measure()
     console = stdout()
     console.print(f"{_ID} with scbf, safe-envs {safe_envs.__version__}, on one of {os.cpu_count()} cores\n", highlight=False)
-    console.print(_table(figures))
+    console.print(table_of(figures, earlier))
     write_result(json_file, lambda: figures)
 
 
@@ -246,12 +250,31 @@ def _fused_loop() -> Case:
     return Case(step, _NUM_ENVS)
 
 
-def _table(figures: Figures) -> Table:
+def read_figures(path: Path) -> Figures:
+    """Read what an earlier run wrote with --json.
+
+    Raises:
+        ConfigurationError: there is no such file, or something else is in it.
+    """
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"--compare {path} cannot be read: {error}; give what `safe-envs benchmark --json FILE` wrote") from error
+    if not isinstance(found, dict) or not all(isinstance(value, int | float) for value in found.values()):
+        raise ConfigurationError(f"--compare {path} holds no figures; give what `safe-envs benchmark --json FILE` wrote")
+    return found
+
+
+def table_of(figures: Figures, earlier: Figures) -> Table:
+    """The figures, and where there are earlier ones, those and the ratio to them."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column(f"microseconds for each state, seconds where they are named, or a ratio; vector envs of {_NUM_ENVS}")
-    table.add_column("figure", justify="right")
+    for title in ("figure", *["earlier", "figure / earlier"] * bool(earlier)):
+        table.add_column(title, justify="right")
     for name, value in figures.items():
-        table.add_row(name, f"{value:.3g}")
+        before = earlier.get(name)
+        beside = ["-", "-"] if not before else [f"{before:.3g}", f"{value / before:.2f}"]
+        table.add_row(name, f"{value:.3g}", *beside * bool(earlier))
     return table
 
 

@@ -68,11 +68,14 @@ def demo_command(
 
 @app.command("benchmark")
 @with_quiet
-def benchmark_command(json: Json = None) -> None:
+def benchmark_command(
+    json: Json = None,
+    compare: Annotated[Path | None, typer.Option(metavar="FILE", help="Of an earlier run with --json: print the ratios to it.")] = None,
+) -> None:
     """Measure the speed of filters and envs."""
     from scripts.benchmark import benchmark
 
-    benchmark(json)
+    benchmark(json, compare)
 
 
 def main(command: str | None = None) -> None:

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from safe_envs.errors import ConfigurationError
 from scripts import completion, options
 from scripts.console import progress_bar, stdout, write_result
 
@@ -73,6 +74,15 @@ def evaluate(
     refine: Annotated[
         bool, typer.Option("--refine", help="Repeat with dt/2 and dt/4, and say whether the safety rate has converged.")
     ] = False,
+    monitoring: Annotated[
+        str,
+        typer.Option(metavar="discrete|continuous", help="Look at h at control instants only, or by Brownian bridges between them too."),
+    ] = "discrete",
+    rare: Annotated[
+        bool, typer.Option("--rare", help="Estimate P(violation) where it is too small for plain episodes, by splitting on h.")
+    ] = False,
+    particles: Annotated[int | None, typer.Option(help="With --rare, in place of --episodes: episodes of a repetition. [250]")] = None,
+    repetitions: Annotated[int | None, typer.Option(help="With --rare: independent ones, which give the interval. [20]")] = None,
     num_envs: Annotated[int, typer.Option(help="Episodes side by side; it changes the speed, not the answer.")] = 1024,
     json: Annotated[
         Path | None,
@@ -86,9 +96,12 @@ def evaluate(
 ) -> None:
     """Print the safety rate of a policy under each filter with its interval, and compare the filters pair by pair.
 
-    An episode is safe if every barrier is positive at every control instant. After an episode's first violation its
-    interventions, infeasible steps and effort are no longer counted. All filters see the same episodes. The intervals
-    are Wilson's (Clopper and Pearson's where all or no episodes are safe), and Newcombe's for differences.
+    An episode is safe if every barrier is positive at every control instant, or with --monitoring continuous between them
+    too. After an episode's first violation its interventions, infeasible steps and effort are no longer counted. All
+    filters see the same episodes. The intervals are Wilson's (Clopper and Pearson's where all or no episodes are safe),
+    and Newcombe's for differences.
+
+    With --rare the probability of a violation is printed instead, with its interval and what plain Monte Carlo would need.
     """
     from agents import evaluation, refinement
     from agents.problems import which_env
@@ -108,6 +121,30 @@ def evaluate(
         start=start,
     )
     names = list(dict.fromkeys(filters)) if filters else None
+    if rare:
+        from scripts.rare_report import run_rare
+
+        refused = {"--filter-spec": filter_spec, "--refine": refine, "--plot": plot, "--repeats": repeats != 1}
+        run_rare(
+            json,
+            refused,
+            which_env(env_id, system),
+            policy,
+            filters=names,
+            trust=trust,
+            options=arguments,
+            particles=particles,
+            repetitions=repetitions,
+            seed=seed,
+            knowledge=knowledge,
+            objective=objective,
+            confidence=confidence,
+            learned=learned or (),
+            monitoring=monitoring,
+        )
+        return
+    if particles is not None or repetitions is not None:
+        raise ConfigurationError("--particles and --repetitions are of --rare: give that too, or --episodes in their place")
     run_all: Callable[..., Any] = refinement.refine if refine else evaluation.evaluate
     with progress_bar("Evaluating") as tell:
         answer = run_all(
@@ -125,6 +162,7 @@ def evaluate(
             confidence=confidence,
             learned=learned or (),
             repeats=repeats,
+            monitoring=monitoring,
             progress=tell,
             record=plot is not None,
         )

@@ -107,7 +107,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
     """Rates over the setting across: with bands where it is a number, and else with bars."""
     numeric = layout.x is not None and _is_numeric(everything, layout.x)
     places = [None] if layout.x is None else _values(everything, layout.x)
-    position = {value: value if numeric else k for k, value in enumerate(places)}
+    position: dict[Any, Any] = {value: value if numeric else k for k, value in enumerate(places)}
     kinds = [None] if layout.lines is None else _values(everything, layout.lines)
     colors = _shades(len(kinds)) if layout.lines and _is_numeric(everything, layout.lines) else COLORS
     for k, kind in enumerate(kinds):

@@ -9,7 +9,7 @@ import typer
 
 from safe_envs.errors import ConfigurationError, nearest
 from scripts import options
-from scripts.console import Json, require_result, stdout, write_result
+from scripts.console import Json, stdout, write_result
 
 _PICTURE = "report.png"
 _SHOWN = 10
@@ -38,14 +38,11 @@ def sweep_report(
     independent.
     """
     from agents.sweep_store import read, read_index
-    from scripts.figure import require_format
     from scripts.sweep_figure import Layout, draw
 
     path = plot or folder / _PICTURE
-    require_result(json)
-    options.require_outputs(None, plot)
-    require_format(path)
     index, rows = read_index(folder), read(folder).to_pylist()
+    options.require_outputs(json, path)
     swept = index["swept"]
     for option, name in (("--x", x), ("--lines", lines)):
         if name is not None and name not in swept:

@@ -7,6 +7,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from agents.bridge import bridge_notes
 from agents.comparison import Comparison
 from agents.episodes import Row
 from agents.evaluation import BARE, Evaluation
@@ -81,7 +82,8 @@ def heading(evaluation: Evaluation) -> Text:
     often = f" x {repeats} identifications" if repeats > 1 else ""
     title.append(f" | policy {config['policy']['name']} | {config['episodes']} episodes{often} | seed {config['seed']}", style="not bold")
     goal = ", joint program with the goal" if config["objective"] == "clf" else ""
-    title.append(f"\n{_told(evaluation)}; filters know the {config['knowledge']}{goal}", style="not bold")
+    watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
+    title.append(f"\n{_told(evaluation)}{watched}; filters know the {config['knowledge']}{goal}", style="not bold")
     return title
 
 
@@ -163,6 +165,8 @@ def _notes(evaluation: Evaluation) -> list[str]:
         for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True)
         if speed["steps"] < 0.99 * steps * episodes
     ]
+    if evaluation.config["monitoring"] == "continuous":
+        notes += bridge_notes(evaluation.problem)
     if evaluation.repeats:
         notes.append(
             "nothing is random here (no noise, a fixed start, a deterministic policy), so that all episodes are "

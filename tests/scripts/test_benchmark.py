@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from agents import sb3_speed
+from safe_envs.errors import ConfigurationError
 from scripts import benchmark
 from wrappers import SafetyFilterWrapper
 
@@ -49,6 +50,24 @@ def test_command_prints_and_writes_the_figures(monkeypatch, tmp_path, capsys):
     out = capsys.readouterr().out
     for name in figures:
         assert name in out
+
+
+def test_earlier_figures_stand_beside_with_their_ratio(monkeypatch, tmp_path, capsys):
+    earlier = tmp_path / "earlier.json"
+    earlier.write_text('{"filter call, 1 state": 4.0}')
+    monkeypatch.setattr(benchmark, "measure", lambda: {"filter call, 1 state": 5.0, "new": 0.5})
+    benchmark.benchmark(compare=earlier)
+    lines = {line.rsplit("  ")[0].strip(): line.split()[-3:] for line in capsys.readouterr().out.splitlines() if line.strip()}
+    rows = [cells for name, cells in lines.items() if name.startswith(("filter call", "new"))]
+    assert rows == [["5", "4", "1.25"], ["0.5", "-", "-"]]
+
+
+@pytest.mark.parametrize("text", ["[1]", '{"a": "b"}', "no json", None])
+def test_what_holds_no_earlier_figures_is_refused(tmp_path, text):
+    if text is not None:
+        (tmp_path / "earlier.json").write_text(text)
+    with pytest.raises(ConfigurationError, match="safe-envs benchmark --json FILE"):
+        benchmark.benchmark(compare=tmp_path / "earlier.json")
 
 
 def test_the_fused_loop_does_the_work_of_the_filter():

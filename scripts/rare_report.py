@@ -1,0 +1,106 @@
+"""The answer of `safe-envs evaluate --rare` as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from agents.bridge import bridge_notes
+from agents.episodes import Row
+from agents.rare import RareEvaluation, estimate_rare
+from safe_envs.errors import ConfigurationError
+from scripts.console import progress_bar, stdout, write_result
+from scripts.table import describe_system
+
+_WIDEST = 1000
+
+
+def run_rare(json: Path | None, refused: Mapping[str, Any], env: Any, policy: str, **arguments: Any) -> None:
+    """Estimate, print the answer and write it.
+
+    Args:
+        json: of --json, if given.
+        refused: options that splitting knows nothing of, and what was given for them.
+        env: id or problem.
+        policy: as for `estimate_rare`.
+        **arguments: of `estimate_rare`; None for its default.
+
+    Raises:
+        ConfigurationError: one of the refused options was given, or as `estimate_rare`.
+    """
+    given = [name for name, value in refused.items() if value]
+    if given:
+        raise ConfigurationError(f"--rare does not go with {', '.join(given)}; leave one of them out")
+    with progress_bar("Splitting") as tell:
+        answer = estimate_rare(env, policy, progress=tell, **{k: v for k, v in arguments.items() if v is not None})
+    print_rare(stdout(), answer)
+    write_result(json, answer.document)
+
+
+def print_rare(console: Console, answer: RareEvaluation) -> None:
+    """Print a heading, a row for each filter, and what has to be known to read them."""
+    config = answer.config
+    interval = f"{100 * config['confidence']:.10g} % interval"
+    console.print(_heading(answer), soft_wrap=True, highlight=False)
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True)
+    table.add_column("filter", overflow="fold", vertical="bottom")
+    table.add_column(f"P(violation) [{interval}]", justify="right", no_wrap=True, vertical="bottom")
+    for name in ("score", "levels", "simulated\nsteps", "plain Monte Carlo\nwould need", "seen in the first\nepisodes", "steps/s"):
+        table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
+    for row, speed in zip(answer.rows, answer.timing["rows"], strict=True):
+        table.add_row(Text(row["filter"]), *_cells(row, speed["steps_per_second"]))
+    # A column that is cut off would be a number that is wrong.
+    console.width = max(console.width, console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum)
+    console.print()
+    console.print(table)
+    console.print()
+    for note in _notes(answer):
+        console.print(note, soft_wrap=True, highlight=False, markup=False)
+
+
+def _heading(answer: RareEvaluation) -> Text:
+    config = answer.config
+    title = Text(config["title"], style="bold")
+    how = f"{config['repetitions']} repetitions of {config['particles']} particles"
+    title.append(f" | policy {config['policy']['name']} | splitting: {how} | seed {config['seed']}", style="not bold")
+    watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
+    goal = ", joint program with the goal" if config["objective"] == "clf" else ""
+    title.append(f"\n{describe_system(answer.problem)}{watched}; filters know the {config['knowledge']}{goal}", style="not bold")
+    return title
+
+
+def _cells(row: Row, speed: float) -> list[str]:
+    plain = row["plain"]
+    p, needed = row["probability"], row["plain_episodes_needed"]
+    return [
+        "none, see below" if p is None else f"{p:.3g} [{row['ci_low']:.2g}, {row['ci_high']:.2g}]",
+        row["score"] or "-",
+        f"{row['levels']:.1f}" if row["score"] else "-",
+        _large(row["steps"]) if row["steps"] else "-",
+        f"{_large(needed)} episodes, {_large(row['plain_steps_needed'])} steps" if needed else "-",
+        f"{plain['violations']} of {plain['episodes']}" if plain else "-",
+        _large(speed) if row["steps"] else "-",
+    ]
+
+
+def _notes(answer: RareEvaluation) -> list[str]:
+    notes = [f"Splitting cannot work here for {row['filter']}: {row['reason']}." for row in answer.rows if row["reason"]]
+    notes += [f"Note: doubt the estimate of {row['filter']}: {row['doubt']}." for row in answer.rows if row["doubt"]]
+    if answer.config["monitoring"] == "continuous":
+        notes += [f"Note: {note}" for note in bridge_notes(answer.problem)]
+    return notes
+
+
+def _large(number: float) -> str:
+    if number >= 1e12:
+        return f"{number:.1e}"
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if number >= size:
+            return f"{number / size:.3g} {letter}"
+    return f"{number:.0f}"

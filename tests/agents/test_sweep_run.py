@@ -1,0 +1,257 @@
+"""Sweeps over real processes, some of which end in the middle: on this machine, on a Dask scheduler, and on a Ray cluster."""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agents import sweep_run
+from agents.sweep import sweep_of
+from agents.sweep_cell import Cell, Outcome, compute
+from agents.sweep_run import Place, WorkersLostError, run
+from agents.sweep_store import Store, read
+from safe_envs.errors import ConfigurationError
+
+# With "ends", the first process that simulates it is killed, in the middle of the cell.
+SYSTEM = """
+import os, signal
+from pathlib import Path
+from agents.problems import load_problem
+
+def problem(kind="plain"):
+    marker = Path(__file__).with_suffix(".ended")
+    if kind == "fails":
+        raise OSError("no such thing")
+    if kind == "ends" and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return load_problem("Scalar-v0", {"horizon": 0.2})
+"""
+
+# The sweep of a file, told where: in a process of its own, which may be made to end after some cells.
+DRIVER = """
+import json, os, signal, sys
+from pathlib import Path
+from agents.sweep import sweep_of
+from agents.sweep_run import Place, run
+from agents.sweep_store import Store
+
+spec, out, backend, address, jobs, last = sys.argv[1:]
+store = Store(Path(out), sweep_of(json.loads(Path(spec).read_text())))
+left = int(last)
+
+def keep(outcome):
+    global left
+    store.keep(outcome)
+    left -= 1
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+run(store.missing, Place(backend, address or None, int(jobs)), keep)
+"""
+
+LONG = 240
+"""Seconds that nothing here takes, on whatever machine."""
+
+Document = dict[str, Any]
+
+
+@pytest.fixture
+def document(tmp_path: Path) -> Document:
+    (tmp_path / "system.py").write_text(SYSTEM)
+    fixed = {"system": f"{tmp_path / 'system.py'}:problem", "filter": "scbf", "episodes": 20}
+    return {"fixed": fixed, "grid": {"noise": [0.1, 0.3], "seed": [0, 1, 2]}, "cells": [{"barrier.kind": "fails"}]}
+
+
+def with_end(document: Document) -> Document:
+    """The same, and a cell in front that ends the first process that computes it."""
+    return {**document, "grid": {"barrier.kind": ["ends", "plain"], **document["grid"]}}
+
+
+def computed(document: Document, folder: Path, place: Place) -> list[dict[str, Any]]:
+    store = Store(folder, sweep_of(document))
+    run(store.missing, place, store.keep)
+    return rows(folder)
+
+
+def rows(folder: Path) -> list[dict[str, Any]]:
+    """What must be the same wherever it is computed."""
+    return read(folder).drop_columns(["seconds"]).to_pylist()
+
+
+def driver(document: Document, folder: Path, place: Place, last: int = -1) -> subprocess.CompletedProcess[str]:
+    spec = folder.with_suffix(".json")
+    spec.write_text(json.dumps(document))
+    words = [str(spec), str(folder), place.backend, place.address or "", str(place.jobs), str(last)]
+    return subprocess.run([sys.executable, "-c", DRIVER, *words], capture_output=True, text=True, timeout=LONG, check=False)
+
+
+def local_answer(document: Document, folder: Path) -> list[dict[str, Any]]:
+    """In this process; what ends a process once has done so already."""
+    Path(document["fixed"]["system"].rpartition(":")[0]).with_suffix(".ended").touch()
+    return computed(document, folder, Place(jobs=1))
+
+
+@contextmanager
+def started(*commands: list[str], log: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
+    """Processes with sessions of their own, which end with this context, and with all that they started."""
+    processes = []
+    try:
+        with log.open("wb") as file:
+            processes += [subprocess.Popen(words, stdout=file, stderr=file, start_new_session=True) for words in commands]
+        yield processes
+    finally:
+        for process in reversed(processes):
+            process.terminate()
+        for process in processes:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(30)
+            with suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def wait_for(path: Path, text: str = "", log: Path | None = None) -> str:
+    """What is in a file, once it is there and has a text in it; the log says what went wrong."""
+    for _ in range(LONG * 10):
+        if path.exists() and text in path.read_text():
+            return path.read_text()
+        time.sleep(0.1)
+    raise TimeoutError(f"{path} has no {text!r}: {(log or path).read_text()}")
+
+
+def test_a_killed_worker_and_a_failing_cell_cost_no_other(tmp_path: Path, document: Document):
+    document = with_end(document)
+    found = computed(document, tmp_path / "two", Place(jobs=2))
+    assert (tmp_path / "system.ended").exists()
+    assert [row["error"] for row in found] == [None] * 12 + ["OSError: no such thing"]
+    assert found == local_answer(document, tmp_path / "one")
+
+
+def test_a_cell_that_ends_every_worker_is_found(tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch):
+    # Three in a row, too: others have shown that the workers are sound.
+    begun: list[int] = []
+
+    def outcomes(cells: Sequence[Cell], place: Place) -> Iterator[Outcome]:
+        begun.append(len(cells))
+        for cell in cells:
+            if cell.settings.get("noise") == 0.3:
+                raise sweep_run._LossError("it went away")
+            yield compute(cell)
+
+    monkeypatch.setattr(sweep_run, "_outcomes", outcomes)
+    found = computed(document, tmp_path / "out", Place())
+    ended = "the process that computed it ended: it went away"
+    assert [row["error"] for row in found] == [None] * 3 + [ended] * 3 + ["OSError: no such thing"]
+    # All that is left three times, and then one by one.
+    assert begun == [7, 4, 4, *[1] * 4]
+
+
+def test_workers_that_end_whatever_they_compute(tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch):
+    def outcomes(cells: Sequence[Cell], place: Place) -> Iterator[Outcome]:
+        raise sweep_run._LossError("they went away")
+        yield
+
+    monkeypatch.setattr(sweep_run, "_outcomes", outcomes)
+    store = Store(tmp_path / "out", sweep_of(document))
+    with pytest.raises(WorkersLostError, match=r"no cell could be computed, .* the last: they went away"):
+        run(store.missing, Place(), store.keep)
+
+
+def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, document: Document):
+    folder = tmp_path / "out"
+    assert driver(document, folder, Place(jobs=1), last=3).returncode == -signal.SIGKILL
+    before = {path: path.stat().st_mtime_ns for path in (folder / "cells").iterdir()}
+    assert len(before) == 3
+    seen: list[str] = []
+    store = Store(folder, sweep_of(document))
+    run(store.missing, Place(jobs=1), lambda outcome: (seen.append(outcome.key), store.keep(outcome))[0])
+    assert len(seen) == 4
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    assert rows(folder) == local_answer(document, tmp_path / "one")
+
+
+def test_dask_with_a_killed_worker(tmp_path: Path, document: Document):
+    document = with_end(document)
+    file, log = tmp_path / "scheduler.json", tmp_path / "log"
+    common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
+    scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", *common]
+    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1", "--no-nanny", *common]
+    with started(scheduler, log=log):
+        address = json.loads(wait_for(file, "}", log))["address"]
+        with started(worker, worker, log=tmp_path / "log-of-workers") as workers:
+            ended = driver(document, tmp_path / "dask", Place("dask", address))
+            assert ended.returncode == 0, ended.stderr
+            assert sorted(process.poll() is None for process in workers) == [False, True]
+    assert rows(tmp_path / "dask") == local_answer(document, tmp_path / "one")
+
+
+@pytest.fixture
+def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Where a Ray cluster of this test alone keeps what it has: a short name, since those of sockets are."""
+    with tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as folder:
+        for name, value in (
+            ("RAY_TMPDIR", folder),
+            ("RAY_AUTH_MODE", "token"),
+            ("RAY_AUTH_TOKEN", secrets.token_hex(32)),
+            ("RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S", "0"),
+            # Ray takes 127.0.0.1 for the address of a node only where it takes itself to be confined to one machine.
+            ("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0"),
+        ):
+            monkeypatch.setenv(name, value)
+        yield Path(folder)
+
+
+def test_ray_with_a_killed_worker(tmp_path: Path, document: Document, ray_folder: Path):
+    document = with_end(document)
+    log = tmp_path / "log"
+    where = ["--head", "--block", "--node-ip-address=127.0.0.1", "--port=0", "--ray-client-server-port=0", "--include-dashboard=false"]
+    size = ["--num-cpus=2", "--object-store-memory=100000000", "--disable-usage-stats"]
+    with started([sys.executable, "-m", "ray.scripts.scripts", "start", *where, *size], log=log):
+        wait_for(log, "Ray runtime started")
+        address = wait_for(ray_folder / "ray" / "ray_current_cluster", ":", log).strip()
+        ended = driver(document, tmp_path / "ray", Place("ray", address))
+        assert ended.returncode == 0, ended.stderr
+    assert (tmp_path / "system.ended").exists()
+    assert rows(tmp_path / "ray") == local_answer(document, tmp_path / "one")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("rai", "127.0.0.1:1"), "did you mean 'ray'"),
+        (("dask",), "needs the address"),
+        (("local", "127.0.0.1:1"), "takes no address"),
+        (("local", None, 0), "give a whole number from 1"),
+    ],
+)
+def test_places_that_are_none(arguments: tuple[Any, ...], message: str):
+    with pytest.raises(ConfigurationError, match=message):
+        Place(*arguments)
+
+
+def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sweep_run, "find_spec", lambda name: None if name == "distributed" else name)
+    with pytest.raises(ConfigurationError, match=r"distributed is not installed.*safe-envs\[dask\]"):
+        Place("dask", "tcp://127.0.0.1:1")
+
+
+def test_an_address_where_nobody_listens(monkeypatch: pytest.MonkeyPatch):
+    from agents import sweep_clusters
+
+    monkeypatch.setattr(sweep_clusters, "_PATIENCE", 1)
+    for settings, port in ((sweep_clusters.dask_settings, "tcp://127.0.0.1:9"), (sweep_clusters.ray_settings, "127.0.0.1:9")):
+        with pytest.raises(ConfigurationError, match=f"answers at {port}"), settings(port):
+            pass

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import errno
+import json
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from agents.sweep import Sweep, sweep_of
+from agents.sweep_cell import Outcome, compute
+from agents.sweep_store import Store, read
+from safe_envs.errors import ConfigurationError
+
+SMALL: dict[str, Any] = {"env": "Scalar-v0", "filter": "scbf", "episodes": 20, "horizon": 0.2}
+
+
+@pytest.fixture(scope="module")
+def sweep() -> Sweep:
+    return sweep_of({"fixed": SMALL, "grid": {"noise": [0.1, [0.2], 0.3]}, "cells": [{"start": [0.5]}]})
+
+
+@pytest.fixture(scope="module")
+def outcomes(sweep: Sweep) -> list[Outcome]:
+    return [compute(cell) for cell in sweep.cells]
+
+
+def test_what_was_kept_is_read_in_the_order_of_the_file(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+    store = Store(tmp_path, sweep)
+    assert store.missing == list(sweep.cells)
+    for outcome in reversed(outcomes[1:]):
+        store.keep(outcome)
+    table = read(tmp_path)
+    assert table["key"].to_pylist() == [cell.key for cell in sweep.cells[1:]]
+    assert table["noise"].to_pylist() == ["[0.2]", "0.3", None]
+    assert table["start"].to_pylist() == [None, None, "[0.5]"]
+    assert table["episodes"].to_pylist() == [20] * 3
+    for row, outcome in zip(table.to_pylist(), outcomes[1:], strict=True):
+        assert outcome.row is not None
+        assert all(row[name] == outcome.row[name] for name in ("safe", "safety_rate", "ci_low", "min_h_p05", "return_mean", "bound"))
+        assert json.loads(row["row"]) == outcome.row
+        assert json.loads(row["config"])["problem"]["dt"] == 0.01
+        assert set(json.loads(row["versions"])) > {"python", "numpy", "safe-envs", "source"}
+    assert Store(tmp_path, sweep).missing == [sweep.cells[0]]
+
+
+def test_a_failed_cell_is_told_and_tried_again(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+    store = Store(tmp_path, sweep)
+    store.keep(Outcome(sweep.cells[0].key, None, None, "it broke", 0.1))
+    assert read(tmp_path)["error"].to_pylist() == ["it broke"]
+    assert Store(tmp_path, sweep).missing == list(sweep.cells)
+    store.keep(outcomes[0])
+    assert read(tmp_path)["error"].to_pylist() == [None]
+
+
+def test_cells_of_another_sweep_stay_and_are_not_read(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+    store = Store(tmp_path, sweep)
+    for outcome in outcomes:
+        store.keep(outcome)
+    smaller = Sweep(sweep.cells[:1], ())
+    assert Store(tmp_path, smaller).missing == []
+    assert len(read(tmp_path)) == 1
+    assert Store(tmp_path, sweep).missing == []
+
+
+def test_a_full_disk_loses_nothing_that_is_finished(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome], monkeypatch: pytest.MonkeyPatch):
+    store = Store(tmp_path, sweep)
+    store.keep(outcomes[0])
+
+    def full(table: Any, file: Any) -> None:
+        file.write(b"PAR1")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pq, "write_table", full)
+        with pytest.raises(ConfigurationError, match=r"No space left on device\. 1 of 4 cells are finished and kept"):
+            store.keep(outcomes[1])
+    assert [path.stem for path in (tmp_path / "cells").iterdir()] == [sweep.cells[0].key]
+    again = Store(tmp_path, sweep)
+    assert again.missing == list(sweep.cells[1:])
+    again.keep(outcomes[1])
+    assert len(read(tmp_path)) == 2
+
+
+def test_a_broken_file_is_computed_again(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+    store = Store(tmp_path, sweep)
+    store.keep(outcomes[0])
+    (file,) = (tmp_path / "cells").iterdir()
+    file.write_bytes(file.read_bytes()[:100])
+    with pytest.raises(ConfigurationError, match="remove it and start the sweep again"):
+        read(tmp_path)
+    assert Store(tmp_path, sweep).missing == list(sweep.cells)
+
+
+def test_folders_that_cannot_be(tmp_path: Path, sweep: Sweep):
+    with pytest.raises(ConfigurationError, match="holds no sweep"):
+        read(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigurationError, match="cannot be made"):
+        Store(tmp_path / "file", sweep)
+    Store(tmp_path / "empty", sweep)
+    assert len(read(tmp_path / "empty")) == 0
+
+
+def test_without_pyarrow_the_extra_is_named(tmp_path: Path, sweep: Sweep, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("agents.sweep_store.find_spec", lambda name: None)
+    with pytest.raises(ConfigurationError, match=r"safe-envs\[sweep\]"):
+        Store(tmp_path, sweep)

@@ -1,0 +1,62 @@
+"""`safe-envs evaluate --rare` and `--monitoring` as a person types them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from tests.scripts.conftest import strictly
+
+ACC = ("evaluate", "safe_envs/ACC-v0", "--filter", "scbf", "--start=10,10,40", "--horizon", "6", "--dt", "0.1")
+FEW = ("--particles", "60", "--repetitions", "8")
+
+
+def test_acceptance_in_small(safe_envs_command):
+    status, out, err = safe_envs_command(*ACC, "--rare", *FEW, "--json", "rare.json")
+    assert (status, err) == (0, "")
+    assert "splitting: 8 repetitions of 60 particles" in out
+    assert "P(violation) [95 % interval]" in out
+    (row,) = strictly("rare.json")["rows"]
+    # h_0 = 22 m is 5 deviations of the Gaussian law away: 2 Phi(-h_0/(tau sigma sqrt(T))), and a little less at control instants.
+    law = math.erfc((22 + 0.5826 * 1.8 * math.sqrt(0.1)) / (1.8 * math.sqrt(6)) / math.sqrt(2))
+    assert law < 1e-6
+    assert row["ci_low"] < law < row["ci_high"]
+    assert f"{row['probability']:.3g} [" in out
+
+
+def test_reason_in_place_of_a_number(safe_envs_command):
+    status, out, _ = safe_envs_command("evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--rare", *FEW, "--json", "-")
+    assert status == 0
+    assert '"probability": null' in out
+    status, out, _ = safe_envs_command("evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--rare", *FEW)
+    assert status == 0
+    assert "none, see below" in out
+    assert "Splitting cannot work here for hocbf: nothing is random after the start" in out
+
+
+def test_continuous_monitoring_is_told_in_the_heading(safe_envs_command):
+    arguments = ("evaluate", "Scalar-v0", "--filter", "none", "--episodes", "20", "--horizon", "0.2")
+    assert "monitored" not in safe_envs_command(*arguments)[1]
+    status, out, _ = safe_envs_command(*arguments, "--monitoring", "continuous")
+    assert status == 0
+    assert "horizon 0.2 s, monitored continuously" in out
+    status, out, _ = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", "--rare", "--monitoring", "continuous", *FEW)
+    assert "monitored continuously" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--rare", "--refine"), "--rare does not go with --refine"),
+        (("--rare", "--plot", "a.png", "--repeats", "2"), "--rare does not go with --plot, --repeats"),
+        (("--particles", "100"), "are of --rare"),
+        (("--rare", "--particles", "3"), "particles = 3"),
+        (("--monitoring", "often"), "monitoring = 'often'"),
+        (("--rare", "--monitoring", "often"), "monitoring = 'often'"),
+    ],
+)
+def test_mistakes_are_told(safe_envs_command, arguments, message):
+    status, _, err = safe_envs_command("evaluate", "Scalar-v0", *arguments)
+    assert status == 2
+    assert message in err.replace("\n", " ")

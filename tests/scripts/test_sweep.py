@@ -1,0 +1,130 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from agents.sweep_store import read
+from tests.scripts.conftest import strictly
+
+SPEC = """
+fixed: {env: Scalar-v0, episodes: 20, horizon: 0.2}
+grid:
+  filter: [none, scbf]
+  noise: [0.1, 0.3]
+  seed: [0, 1]
+"""
+
+SYSTEM = """
+from agents.problems import load_problem
+
+def problem(first=0, second=0):
+    1 / (2 - first - second)
+    return load_problem("Scalar-v0", {"horizon": 0.2})
+"""
+
+
+@pytest.fixture
+def spec(tmp_path: Path) -> Path:
+    path = tmp_path / "sweep.yaml"
+    path.write_text(SPEC)
+    return path
+
+
+def test_a_sweep_its_second_run_and_its_report(safe_envs_command, spec: Path, tmp_path: Path):
+    status, out, _ = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)
+    assert (status, out) == (0, "8 of 8 cells are in done.\n")
+    spec.write_text(SPEC.replace("[0, 1]", "[0, 1, 2]"))
+    status, out, _ = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)
+    assert (status, out) == (0, "12 of 12 cells are in done, of which 8 were there before.\n")
+
+    status, out, _ = safe_envs_command("sweep-report", "done", "--worst", 2, "--json", "report.json")
+    assert status == 0
+    assert "12 of 12 cells are done, 0 failed, 0 are missing." in out
+    assert (tmp_path / "done" / "report.png").stat().st_size > 10_000
+    report = strictly(tmp_path / "report.json")
+    rates = sorted(read(tmp_path / "done")["safety_rate"].to_pylist())
+    assert [row["safety_rate"] for row in report["worst"]] == rates[:2]
+    assert report["swept"] == ["filter", "noise", "seed"]
+
+
+def test_a_cell_that_fails_stops_no_other(safe_envs_command, spec: Path, tmp_path: Path):
+    (tmp_path / "mine.py").write_text(SYSTEM)
+    # Each value works with some other one, so that nothing is found beforehand.
+    spec.write_text("""
+fixed: {system: "mine.py:problem", filter: scbf, episodes: 20}
+grid: {barrier.first: [0, 1], barrier.second: [0, 1], seed: [0, 1]}
+""")
+    told = "2 of 8 cells failed; the same command tries them again:\n  seed = 0, barrier.first = 1, barrier.second = 1: ZeroDivisionError"
+    for there in ("", ", of which 6 were there before"):
+        status, out, err = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)
+        assert (status, out) == (2, f"6 of 8 cells are in done{there}.\n")
+        assert told in err
+    (tmp_path / "done" / "cells" / f"{read(tmp_path / 'done')['key'][0]}.parquet").unlink()
+    status, out, _ = safe_envs_command("sweep-report", "done", "--plot", "rates.svg")
+    assert status == 0
+    assert "5 of 8 cells are done, 2 failed, 1 are missing." in out
+    assert "\nFailed:\n  seed = 0, barrier.first = 1, barrier.second = 1: ZeroDivisionError: division by zero\n" in out
+    assert "barrier.first" in (tmp_path / "rates.svg").read_text()
+
+
+def test_mistakes_end_before_anything_is_made(safe_envs_command, spec: Path, tmp_path: Path):
+    spec.write_text(SPEC.replace("scbf", "scfb"))
+    status, _, err = safe_envs_command("sweep", spec, "--out", "done")
+    assert status == 2
+    assert "cell filter = scfb, noise = 0.1, seed = 0: unknown filter 'scfb'; did you mean 'scbf'" in err
+    status, _, err = safe_envs_command("sweep", spec, "--out", "done", "--backend", "dask", "--address", "tcp://127.0.0.1:1", "--jobs", 2)
+    assert status == 2
+    assert "--jobs 2 is of this machine" in err
+    assert not (tmp_path / "done").exists()
+
+
+def test_mistakes_in_a_report(safe_envs_command, spec: Path, tmp_path: Path):
+    assert safe_envs_command("sweep-report", tmp_path)[0] == 2
+    spec.write_text("fixed: {env: Scalar-v0, episodes: 20, horizon: 0.2}\ngrid: {filter: [none, scbf]}")
+    assert safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)[0] == 0
+    for option in ("--x", "--lines"):
+        status, _, err = safe_envs_command("sweep-report", "done", option, "noise")
+        assert status == 2
+        assert f"{option} noise: it was not swept; allowed: filter" in err
+    status, _, err = safe_envs_command("sweep-report", "done", "--plot", "picture.txt")
+    assert status == 2
+    assert "unknown format" in err
+
+
+def test_ctrl_c_keeps_what_is_done_and_leaves_no_process(spec: Path, tmp_path: Path):
+    spec.write_text(SPEC.replace("seed: [0, 1]", f"seed: {list(range(1000))}"))
+    words = [sys.executable, "-m", "scripts.sweep", str(spec), "--out", str(tmp_path / "out"), "--jobs", "2"]
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        cells = tmp_path / "out" / "cells"
+        while process.poll() is None and not (cells.exists() and len(list(cells.glob("[!.]*.parquet"))) >= 3):
+            time.sleep(0.05)
+        # As a terminal sends it: to all of them.
+        os.killpg(process.pid, signal.SIGINT)
+        _, err = process.communicate(timeout=240)
+        assert "Stopped. The same command goes on" in err
+        assert process.returncode not in (0, 2)
+        assert 3 <= len(read(tmp_path / "out")) < 4000
+        for _ in range(600):
+            if not _is_there(process.pid):
+                break
+            time.sleep(0.1)
+        assert not _is_there(process.pid)
+    finally:
+        if _is_there(process.pid):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def _is_there(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
