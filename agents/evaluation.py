@@ -74,7 +74,7 @@ class Evaluation:
 def evaluate(
     problem: SafetyProblem | str,
     policy: Any = "nominal",
-    filters: Sequence[str] | None = None,
+    filters: Sequence[str] | str | None = None,
     *,
     trust: bool = False,
     options: Mapping[str, Any] | None = None,
@@ -112,7 +112,7 @@ def evaluate(
     Args:
         problem: what to simulate, or the id of a registered env; with a spec, the id of any env that Gymnasium knows.
         policy: a name or a path for `make_policy`, or anything with Stable-Baselines3's `predict`.
-        filters: texts for `parse_conditions`, and "none" for the bare env; by default that and the problem's own.
+        filters: texts for `parse_conditions`, or one, and "none" for the bare env; by default that and the problem's own.
         trust: load a policy's .zip, which runs code that it contains.
         options: arguments of `gym.make` for an id.
         episodes: number for each filter.

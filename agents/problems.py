@@ -52,7 +52,10 @@ def require_ours(env_id: str) -> None:
     spec = gym.spec(full_id(env_id))
     creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
     if not (isinstance(creator, type) and issubclass(creator, SafeEnv)):
-        raise ConfigurationError(f"{env_id} is not one of this project's envs; {nearest(env_id, ENV_IDS)}")
+        raise ConfigurationError(
+            f"{env_id} is not one of this project's envs; {nearest(env_id, ENV_IDS)}. A filter goes over any env of Gymnasium's: "
+            f"`safe-envs evaluate {env_id} --filter-spec FILE.py:NAME`"
+        )
 
 
 def make_env(env_id: str, options: Mapping[str, Any] | None = None) -> SafeEnv:

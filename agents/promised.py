@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from agents.episodes import Row
 from agents.statistics import RunningSum, share
-from safe_envs.codegen import Components
+from safe_envs.codegen import Components, compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem import SafetyProblem
 from wrappers import BayesianSCBF, Condition, LearnedCondition
@@ -19,6 +19,9 @@ from wrappers.proved import ProvedBound, proved_bound
 
 class Promised:
     """The proved bound on P(safe up to the horizon) of conditions, or their certificate, averaged over the starts.
+
+    For relative degree r >= 2 a condition keeps the intersection of the sets C_j = {b_j >= 0}, j < r, and from a start in C but
+    outside of it, it promises nothing. How many starts are there is counted too.
 
     Args:
         conditions: one for each barrier; none of the bare env.
@@ -33,6 +36,8 @@ class Promised:
         self._found: ProvedBound | Certificate | None = None
         self._why_none: str | None = why_not if conditions else "there is no filter"
         self._total, self._count = RunningSum(), 0
+        self._outside = _outside_of(conditions, problem, knowledge)
+        self._lost, self._starts = 0, 0
         if conditions and not why_not:
             self._look(conditions, problem, knowledge)
 
@@ -52,21 +57,31 @@ class Promised:
 
     def add(self, start: Components, count: int) -> None:
         """Take the starts of a wave."""
+        states = np.stack(start, axis=1)[:count]
         if self._found is not None and not self._why_none:
-            self._total.add(self._found.at(np.stack(start, axis=1)[:count], self._horizon))
+            self._total.add(self._found.at(states, self._horizon))
             self._count += count
+        if self._outside is not None:
+            self._lost += int(np.count_nonzero(self._outside(states)))
+            self._starts += count
 
     def row(self) -> Row:
-        """The mean bound or certificate, None where there is none, and why there is none or why it is weak."""
+        """The mean bound or certificate, None where there is none, and why there is none or why it is weak.
+
+        Beside them the share of the starts with h > 0 that lie outside the sets C_j; None of the bare env, and where numbers that
+        are learned stand in the chain.
+        """
         bound, note = self._mean()
+        outside = share(self._lost, self._starts)
         if not self._certified:
-            return {"bound": bound, "bound_note": note, "certificate": None}
+            return {"bound": bound, "bound_note": note, "certificate": None, "outside_rate": outside}
         found = self._found if isinstance(self._found, Certificate) else None
         sizes = {} if found is None else {"delta": found.delta, "supremum": found.supremum, "shortfall": found.shortfall}
         return {
             "bound": None,
             "bound_note": "it rests on something learned: see its certificate",
             "certificate": {"probability": bound, "note": note, **sizes},
+            "outside_rate": outside,
         }
 
     def _mean(self) -> tuple[float | None, str | None]:
@@ -76,9 +91,31 @@ class Promised:
         return (mean, remark) if mean else (None, remark or "it is 0 at these starts up to this horizon")
 
 
+def _outside_of(conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Tells of states (B, n) which of them are in C, and outside the sets C_j that conditions keep; None where these are not known."""
+    corrected = any(c.corrects_model for c in conditions)
+    known = problem.plant if knowledge == "plant" and not corrected else problem.model
+    rows = [c.constraint(known, barrier) for c, barrier in zip(conditions, problem.barriers, strict=bool(conditions))]
+    if not rows or any(row.terms is not None for row in rows):
+        return None
+    later = [b for row in rows for b in row.chain[1:]]
+    if not later:
+        return lambda x: np.zeros(len(x), dtype=bool)
+    expressions = [*(row.chain[0] for row in rows), *later]
+    chain = compile_function(known.states, [known.numeric(e) for e in expressions], "arrays")
+
+    def outside(x: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            values = stacked(chain(*np.ascontiguousarray(x.T)), len(x))
+        return (values[:, : len(rows)] > 0.0).all(axis=1) & (values[:, len(rows) :] <= 0.0).any(axis=1)
+
+    return outside
+
+
 def together(rows: Sequence[Row]) -> Row:
     """The rows of several identifications as one: the mean of their certificates, with 0 for those that have none, and the worst's note."""
-    first = rows[0]
+    outside = [row["outside_rate"] for row in rows]
+    first = {**rows[0], "outside_rate": None if None in outside else math.fsum(outside) / len(rows)}
     certificates = [row["certificate"] for row in rows]
     if len(rows) == 1 or first["certificate"] is None:
         return first

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from agents.bridge import Bridge, require_monitoring
+from agents.drifting import Drifting
 from agents.episodes import Progress, Row
 from agents.evaluation import package_versions
 from agents.policy import Policy
@@ -73,7 +74,10 @@ def estimate_rare(
 ) -> RareEvaluation:
     """Estimate the probability of a violation under each filter by splitting on h; see `agents.splitting.Splitting`.
 
-    An episode is safe as in `agents.evaluation.evaluate`. The interval is that of independent repetitions; see
+    Where the noise reaches h directly, importance sampling tries too, see `agents.drifting.Drifting`. Its estimate is taken if its
+    relative error is less than half of splitting's and the two intervals overlap; splitting's is the check on it then.
+
+    An episode is safe as in `agents.evaluation.evaluate`. The intervals are those of independent repetitions; see
     `agents.statistics.log_normal_interval`. Where splitting cannot work a row has the reason in place of numbers.
 
     Args:
@@ -121,14 +125,15 @@ def estimate_rare(
     work = Work(progress, len(setting.learning.missing()) + 2 * len(setting.names))
     setting.learn(work.part)
     bridge = Bridge(setting.problem) if monitoring == "continuous" else None
-    frozen = _is_frozen(setting)
+    frozen, sizes = _is_frozen(setting), (particles, repetitions)
     rows, speeds = [], []
     for name in setting.names:
         begun = time.perf_counter()
         conditions = setting.filters[name][0]
         splitting = Splitting(lambda size, c=conditions: setting.env(c, size), setting.actor, seed, num_envs, bridge)
+        drifting = Drifting(lambda lengths, c=conditions: setting.drifting_env(c, lengths), setting.actor, seed, num_envs, bridge)
         row = {"filter": name, "policy": setting.config()["policy"]["name"]}
-        row |= _none(frozen) if frozen else _row(splitting, setting.problem, particles, repetitions, confidence, work)
+        row |= _none(frozen) if frozen else _row(splitting, drifting, setting.problem, sizes, confidence, work)
         seconds = time.perf_counter() - begun
         speeds.append({"filter": name, "seconds": seconds, "steps_per_second": row["steps"] / seconds})
         rows.append(row)
@@ -152,40 +157,72 @@ def _is_frozen(setting: Setting) -> str:
     return "nothing is random after the start, so that copies of an episode go on like it; plain episodes say all that there is"
 
 
-def _row(splitting: Splitting, problem: SafetyProblem, particles: int, repetitions: int, confidence: float, work: Work) -> Row:
+def _row(splitting: Splitting, drifting: Drifting, problem: SafetyProblem, sizes: tuple[int, int], confidence: float, work: Work) -> Row:
+    particles, repetitions = sizes
     power, pilot_steps = splitting.choose(particles, work.part())
     found = splitting.estimate(power, particles, repetitions, work.part())
-    steps = found.steps + pilot_steps
     low, high = rate_interval(found.first, found.paths, confidence)
     plain = {"episodes": found.paths, "violations": found.first, "ci_low": low, "ci_high": high}
-    score = "h" if power == POWERS[0] else "h/sqrt(T - t)"
-    rest = {"levels": float(found.levels.mean()), "score": score, "steps": steps, "plain": plain}
+    rest = {"levels": float(found.levels.mean()), "steps": found.steps + pilot_steps, "plain": plain}
     if found.given_up:
         return _none(_why_none(found, particles)) | rest
-    p = math.fsum(found.estimates) / repetitions
     # Without a level they are plain episodes, and nothing else.
-    p_low, p_high = log_normal_interval(found.estimates, confidence) if found.levels.any() else (low, high)
-    error = float(np.std(found.estimates, ddof=1)) / math.sqrt(repetitions) / p
+    interval = log_normal_interval(found.estimates, confidence) if found.levels.any() else (low, high)
+    answer = _estimate("splitting on h" if power == POWERS[0] else "splitting on h/sqrt(T - t)", found.estimates, interval)
+    check, drift_steps = None, 0
+    if found.levels.any():
+        check, drift_steps = _by_drift(drifting, problem, sizes, confidence)
+    doubt = _doubt(found, interval, (low, high))
+    if check is not None and 2.0 * check["relative_error"] < answer["relative_error"]:
+        if check["ci_low"] <= answer["ci_high"] and answer["ci_low"] <= check["ci_high"]:
+            answer, check, doubt = check, answer, None
+        else:
+            doubt = f"importance sampling says {check['probability']:.2g} [{check['ci_low']:.2g}, {check['ci_high']:.2g}]"
+    p, error = answer["probability"], answer["relative_error"]
     needed = (1.0 - p) / (p * error**2) if error else None
     return {
         "status": "estimated",
         "reason": None,
-        "probability": p,
-        "ci_low": p_low,
-        "ci_high": min(p_high, 1.0),
-        "relative_error": error,
-        "estimates": found.estimates.tolist(),
+        **answer,
         "plain_episodes_needed": needed,
         "plain_steps_needed": None if needed is None else needed * found.length,
-        "doubt": _doubt(found, (p_low, p_high), (low, high)),
+        "doubt": doubt,
+        "check": check,
         **rest,
+        "steps": rest["steps"] + drift_steps,
+    }
+
+
+def _by_drift(drifting: Drifting, problem: SafetyProblem, sizes: tuple[int, int], confidence: float) -> tuple[Row | None, int]:
+    """The estimate by importance sampling, if there is one, and the control periods that it took."""
+    if not any(Bridge(problem).reached):
+        return None, 0
+    length, steps = drifting.choose(problem.steps * problem.dt)
+    if length is None:
+        return None, steps
+    estimates, more = drifting.estimate(length, *sizes)
+    if not (estimates > 0.0).all():
+        return None, steps + more
+    return _estimate(f"drift of {length:.3g}/sqrt(s)", estimates, log_normal_interval(estimates, confidence)), steps + more
+
+
+def _estimate(method: str, estimates: np.ndarray, interval: tuple[float, float]) -> Row:
+    p = math.fsum(estimates) / len(estimates)
+    error = float(np.std(estimates, ddof=1)) / math.sqrt(len(estimates)) / p
+    return {
+        "method": method,
+        "probability": p,
+        "ci_low": interval[0],
+        "ci_high": min(interval[1], 1.0),
+        "relative_error": error,
+        "estimates": estimates.tolist(),
     }
 
 
 def _none(reason: str) -> Row:
     """A row without an estimate."""
-    names = ("probability", "ci_low", "ci_high", "relative_error", "plain_episodes_needed", "plain_steps_needed", "doubt")
-    nothing = {"levels": 0.0, "score": None, "steps": 0, "plain": None}
+    names = ("probability", "ci_low", "ci_high", "relative_error", "plain_episodes_needed", "plain_steps_needed", "doubt", "check")
+    nothing = {"levels": 0.0, "method": None, "steps": 0, "plain": None}
     return {"status": "none", "reason": reason, "estimates": [], **dict.fromkeys(names), **nothing}
 
 

@@ -218,7 +218,7 @@ class SafeVecEnv(VecEnv):
     def env_method(self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any) -> list[Any]:
         """Call a method of the filter's wrapper or else of the native env, once for the whole batch.
 
-        Its arguments have the batch in front, and its result is handed out as by `get_attr`.
+        Its arguments have the batch in front, and its result is handed out as by `get_attr`; of `render`, each env gets its picture.
 
         Raises:
             AttributeError: neither has it.
@@ -231,7 +231,10 @@ class SafeVecEnv(VecEnv):
             return [self.has_attr(*method_args) for _ in self._get_indices(indices)]
         if method_name in _OF_THE_BATCH:
             raise ConfigurationError(f"env_method does not call {method_name!r}, which acts on all envs at once; call that of the VecEnv")
-        return self._for_each(self._find(method_name)(*method_args, **method_kwargs), indices)
+        result = self._find(method_name)(*method_args, **method_kwargs)
+        if method_name == "render" and result is not None:
+            return [result[i] for i in self._get_indices(indices)]
+        return self._for_each(result, indices)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
         """Say for each env whether it is in such a wrapper; `SafetyFilterWrapper` stands for that of vector envs as well."""

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from agents.drifting import DriftingEnv
 from agents.episodes import Env, Progress
 from agents.learning import Learning
 from agents.policy import policy_files
 from agents.worlds import world_of
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.problem import SafetyProblem
-from wrappers import CONDITIONS, LEARNED, Condition, FilterSpec, parse_conditions, require_readable, spec_of
+from wrappers import CONDITIONS, LEARNED, Condition, FilterSpec, SafetyFilterVectorWrapper, parse_conditions, require_readable, spec_of
 from wrappers.learning import LearnedModel
 
 BARE = "none"
@@ -39,7 +40,7 @@ class Setting:
         self,
         problem: SafetyProblem | str,
         policy: Any,
-        filters: Sequence[str] | None,
+        filters: Sequence[str] | str | None,
         *,
         trust: bool,
         options: Mapping[str, Any] | None,
@@ -57,7 +58,8 @@ class Setting:
         self.simulated = world_of(problem, options, spec)
         self.problem = self.simulated.problem
         self.actor = self.simulated.policy(policy, trust) if isinstance(policy, str) else policy
-        self.names = list(dict.fromkeys((BARE, self.simulated.filter) if filters is None else filters))
+        asked = [filters] if isinstance(filters, str) else filters
+        self.names = list(dict.fromkeys((BARE, self.simulated.filter) if asked is None else asked))
         self._texts = [_checked(name, self.problem) for name in self.names]
         self.learning = Learning(self.problem, self.names, learned, repeats, seed)
         if self.simulated.spec is not None and self.learning.missing():
@@ -86,6 +88,11 @@ class Setting:
         env.reset(seed=0)
         env.step(np.zeros(env.action_space.shape or (), dtype=np.float32))
         return env
+
+    def drifting_env(self, conditions: Sequence[Condition], lengths: np.ndarray) -> Env:
+        """A batch of envs of this project's whose noise drifts, behind the filter of conditions; see `DriftingEnv`."""
+        env = DriftingEnv(self.problem, lengths)
+        return SafetyFilterVectorWrapper(env, conditions, self._knowledge, self._objective) if conditions else env
 
     def config(self) -> dict[str, Any]:
         """All of it as JSON-able data, for filters that were read."""

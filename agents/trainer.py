@@ -106,7 +106,8 @@ def _require_folder(folder: Path, training: Training, resume: bool) -> None:
             f"--resume: {path} cannot be read ({error}); it is damaged or altered: start anew in another folder"
         ) from error
     wanted = _flat(json.loads(json.dumps(asdict(training))))
-    for name in sorted({*known, *wanted}):
+    # What another system changes besides, such as a default, comes after it.
+    for name in sorted({*known, *wanted}, key=lambda name: (name != "env_id", name != "system", name)):
         if known.get(name) != wanted.get(name):
             raise ConfigurationError(
                 f"--resume: the training in {folder} has {name} = {known.get(name)!r}, not {wanted.get(name)!r}; give the same arguments"
@@ -114,8 +115,8 @@ def _require_folder(folder: Path, training: Training, resume: bool) -> None:
 
 
 def _flat(document: Mapping[str, Any]) -> dict[str, Any]:
-    """A training's attributes, the hyperparameters among them."""
-    return {**document, **document["hyperparameters"], "hyperparameters": None}
+    """A training's attributes, the hyperparameters and a system of one's own among them."""
+    return {**document, **document["hyperparameters"], "hyperparameters": None, "system": document["options"].get("system")}
 
 
 class _Session:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
@@ -248,8 +249,13 @@ def _identity(problem: SafetyProblem) -> dict[str, Any]:
         "states": [s.symbol.name for s in problem.states],
         "features": [f.name for f in problem.features],
         "inputs": [i.symbol.name for i in problem.inputs],
-        "observation": {"shape": list(box.shape), "low": box.low.tolist(), "high": box.high.tolist()},
+        "observation": {"shape": list(box.shape), "low": _strict(box.low), "high": _strict(box.high)},
     }
+
+
+def _strict(bounds: np.ndarray) -> list[float | str]:
+    """Bounds as strict JSON has them: it knows no infinity, which an unbounded state has, and gets a text for it."""
+    return [bound if math.isfinite(bound) else str(bound) for bound in bounds.tolist()]
 
 
 def _require_problem(folder: Path, trained: Mapping[str, Any], problem: SafetyProblem) -> None:

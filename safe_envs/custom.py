@@ -2,26 +2,23 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
 import inspect
-import sys
-import zlib
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import gymnasium as gym
 
 from safe_envs.env import SafeEnv, make_problem
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
+from safe_envs.errors import ConfigurationError
 from safe_envs.mistakes import require_sound
+from safe_envs.places import called, load_object, resolved
 from safe_envs.problem import SafetyProblem
 from safe_envs.vector import AutoresetMode, SafeVectorEnv
 
 Factory = Callable[..., SafetyProblem]
+
+_ENTRY = "safe_envs.custom:Custom"
 
 
 def load_system(place: str) -> Factory:
@@ -44,89 +41,34 @@ def load_system(place: str) -> Factory:
         raise ConfigurationError(f"{place} is {type(found).__name__}; give a SafetyProblem, or a function that returns one")
 
     def factory(**arguments: Any) -> SafetyProblem:
-        problem = found(**arguments)
-        if not isinstance(problem, SafetyProblem):
-            raise ConfigurationError(f"{place} returned {type(problem).__name__}; it is to return a SafetyProblem")
-        require_sound(problem)
-        return problem
+        given = tuple(sorted(arguments.items()))
+        remembered = all(isinstance(value, int | float | str) for value in arguments.values())
+        return (_stated if remembered else _stated.__wrapped__)(found, place, given)
 
     factory.__signature__ = inspect.signature(found)  # pyright: ignore[reportFunctionMemberAccess]
     return factory
 
 
-def load_object(place: str) -> Any:
-    """Import what stands at FILE.py:NAME or MODULE:NAME.
-
-    Raises:
-        ConfigurationError: there is no such place, or the code there ends with an error.
-    """
-    source, colon, name = place.rpartition(":")
-    if not (colon and source and name):
-        raise ConfigurationError(f"{place!r} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like my_system.py:problem")
-    module = _of_file(Path(source)) if source.endswith(".py") else _of_module(source)
-    if not hasattr(module, name):
-        public = [key for key in vars(module) if not key.startswith("_")]
-        raise ConfigurationError(f"{source} has no {name!r}; {nearest(name, public)}")
-    return getattr(module, name)
-
-
-def _of_file(path: Path) -> ModuleType:
-    if not path.is_file():
-        raise ConfigurationError(f"there is no file {path}; give the path of a Python file, as in my_system.py:problem")
-    return _loaded(path.resolve(), path.stat().st_mtime_ns)
-
-
-@lru_cache(maxsize=32)
-def _loaded(path: Path, _changed: int) -> ModuleType:
-    """Remembered until the file changes, so that the symbols of all envs of a file are compiled once."""
-    name = f"_{path.stem}_{zlib.crc32(bytes(path)):08x}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ConfigurationError(f"{path} cannot be read as Python")
-    module = sys.modules[name] = importlib.util.module_from_spec(spec)
-    sys.path.insert(0, str(path.parent))  # As when Python runs the file: modules beside it can be imported.
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        del sys.modules[name]
-        if isinstance(error, SafeEnvsError):
-            raise
-        raise ConfigurationError(f"{path} ended with an error: {_described(error, path)}") from error
-    finally:
-        sys.path.remove(str(path.parent))
-    return module
-
-
-def _of_module(name: str) -> ModuleType:
-    try:
-        return sys.modules.get(name) or importlib.import_module(name)
-    except SafeEnvsError:
-        raise
-    except Exception as error:
-        raise ConfigurationError(f"module {name} cannot be imported: {_described(error, None)}; a file is named with .py") from error
-
-
-def _described(error: Exception, path: Path | None) -> str:
-    """The error, and the last line of the file that led to it."""
-    lines, trace = [], error.__traceback__
-    while trace is not None:
-        if path is not None and trace.tb_frame.f_code.co_filename == str(path):
-            lines.append(trace.tb_lineno)
-        trace = trace.tb_next
-    where = f" in line {lines[-1]}" if lines else ""
-    return f"{type(error).__name__}{where}: {error}"
+@lru_cache(maxsize=64)
+def _stated(function: Callable[..., Any], place: str, arguments: tuple[tuple[str, Any], ...]) -> SafetyProblem:
+    """Remembered: an env is often made more than once, and stating its problem takes longer than all else."""
+    problem = called(function, place, dict(arguments))
+    if not isinstance(problem, SafetyProblem):
+        raise ConfigurationError(f"{place} returned {type(problem).__name__}; it is to return a SafetyProblem")
+    require_sound(problem)
+    return problem
 
 
 def register(env_id: str, system: str | Factory) -> None:
     """Register an id with Gymnasium for a system of your own: `gym.make`, `gym.make_vec` and all commands know it then.
 
     Args:
-        env_id: like "my_lab/CartPole-v0".
+        env_id: like "my_lab/CartPole-v0"; one that was registered here before is replaced.
         system: where it is stated, see `load_system`; or the function itself, if it is at the top of a module. An env's spec
             holds the place as text, so that it can be made again elsewhere.
 
     Raises:
-        ConfigurationError: there is no such place, or what is there is no problem. A mistake in the problem is an error of its own.
+        ConfigurationError: there is no such place, what is there is neither a problem nor a function, or the id is another env's.
     """
     if isinstance(system, SafetyProblem):
         raise ConfigurationError(
@@ -137,13 +79,13 @@ def register(env_id: str, system: str | Factory) -> None:
         if not name.isidentifier():
             raise ConfigurationError(f"{system!r} is no function at the top of a module, so that others could find it; define it there")
         system = f"{system.__module__}:{name}"
-    load_system(system)()
-    gym.register(
-        env_id,
-        entry_point="safe_envs.custom:Custom",
-        vector_entry_point="safe_envs.custom:CustomVector",
-        kwargs={"system": system},
-    )
+    place = resolved(system)
+    load_system(place)
+    taken = gym.registry.get(env_id)
+    if taken is not None and taken.entry_point != _ENTRY:
+        raise ConfigurationError(f"the id {env_id} is taken by {taken.entry_point}; choose another, like my_lab/{env_id.split('/')[-1]}")
+    gym.registry.pop(env_id, None)
+    gym.register(env_id, entry_point=_ENTRY, vector_entry_point=f"{_ENTRY}Vector", kwargs={"system": place})
 
 
 class Custom(SafeEnv):

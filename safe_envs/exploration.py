@@ -46,7 +46,9 @@ class Exploration:
             raise SystemDefinitionError(f"the region of an exploration has {len(region)} ranges for {len(states)} states")
         for state, (low, high) in zip(states, region, strict=True):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
-                raise SystemDefinitionError(f"cannot explore {state} in [{low}, {high}]; give Exploration(region=...) finite ranges")
+                raise SystemDefinitionError(
+                    f"cannot explore {state} in [{low}, {high}]; give Exploration(region=...) finite ranges, or the problem a workspace"
+                )
         if any(len(u) != len(box) or not all(map(math.isfinite, u)) for u in self.inputs):
             raise SystemDefinitionError(f"an input of an exploration needs {len(box)} finite numbers; given {self.inputs}")
         clipped = tuple(tuple(min(max(v, low), high) for v, (low, high) in zip(u, box, strict=True)) for u in self.inputs)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -68,6 +69,9 @@ class ControlAffineSDE:
     parameters: Mapping[sp.Symbol, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for symbol in (*self.states, *self.inputs, *self.parameters):
+            if not isinstance(symbol, sp.Symbol):
+                raise SystemDefinitionError(f"{symbol!r} among states, inputs and parameters is no symbol; make it by sympy.symbols")
         n, m = len(self.states), len(self.inputs)
         if not n or not m:
             raise SystemDefinitionError(f"a system needs a state and an input; given {n} states and {m} inputs")
@@ -104,6 +108,8 @@ class ControlAffineSDE:
         Raises:
             SystemDefinitionError: the rate is not affine in the inputs, or see the class.
         """
+        if not all(isinstance(given, list | tuple) and given for given in (states, inputs)):
+            raise SystemDefinitionError(f"states = {states!r} and inputs = {inputs!r}; give lists of symbols, not empty")
         column = _matrix("rate", rate, (len(states), 1))
         used = set(inputs)
         effect = column.jacobian(list(inputs)).applyfunc(lambda e: sp.simplify(e) if e.free_symbols & used else e)
@@ -115,6 +121,15 @@ class ControlAffineSDE:
                         "for the input, or make the input a state whose rate is the new input"
                     )
         drift = column.subs(dict.fromkeys(inputs, 0))
+        rest = column - drift - effect * sp.Matrix(inputs)
+        for state, entry, at_zero in zip(states, rest, drift, strict=True):
+            if at_zero.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
+                raise SystemDefinitionError(f"the rate of {state} has no value where the inputs are 0; cancel what divides by an input")
+            if not _is_zero(entry):
+                raise SystemDefinitionError(
+                    f"the rate of {state} is not affine in the inputs: beside f + g u there is {entry}. Give f and g themselves where a "
+                    "system has several pieces"
+                )
         return cls(tuple(states), tuple(inputs), drift, effect, [[0]] * len(states) if diffusion is None else diffusion, parameters or {})
 
     def __hash__(self) -> int:
@@ -139,10 +154,13 @@ class ControlAffineSDE:
         """Raise SystemDefinitionError if an expression uses a symbol that is not allowed in it."""
         unknown = set(used) - set(allowed)
         if unknown:
-            raise SystemDefinitionError(
-                f"{what} uses the unknown symbol {_names(unknown)}; allowed: {_names(allowed)}. "
-                "A symbol is known by name and assumptions: Symbol('x', real=True) is not Symbol('x')"
+            twins = {s.name for s in unknown} & {s.name for s in allowed}
+            hint = (
+                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not Symbol('x')"
+                if twins
+                else "a parameter gets its value in parameters={...} of the system"
             )
+            raise SystemDefinitionError(f"{what} uses the unknown symbol {_names(unknown)}; allowed: {_names(allowed)}. Note: {hint}")
 
     @property
     def n(self) -> int:
@@ -175,6 +193,19 @@ class ControlAffineSDE:
     def exact(self, expression: Any) -> Any:
         """Like `numeric`, with the decimal value of each parameter as a rational, so that terms cancel exactly."""
         return expression.subs({p: sp.Rational(repr(v)) for p, v in self.parameters.items()})
+
+
+def _is_zero(expression: Any) -> bool:
+    """Whether an expression is zero, to all appearances: as it stands, simplified, or at numbers of either sign."""
+    if expression == 0 or sp.expand(expression) == 0:
+        return True
+    points = random.Random(0)
+    for scale in (0.1, 1.0, 3.0, 30.0):
+        at = {s: sp.Rational(points.randint(-(10**6), 10**6), 10**6) * sp.Rational(str(scale)) for s in expression.free_symbols}
+        value = expression.subs(at).evalf(30, maxn=200)
+        if value.is_finite and abs(value) > sp.Float("1e-20"):
+            return False
+    return True
 
 
 @lru_cache(maxsize=1024)

@@ -6,16 +6,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
 import sympy as sp
 
-from safe_envs.barrier import Barrier
-from safe_envs.calculus import generator, relative_degree
+from safe_envs.barrier import Barrier, formula
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
-from safe_envs.mistakes import require_sound
+from safe_envs.mistakes import degree_of, require_sound
 from safe_envs.problem import SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE, finite_number
 
 _UNBOUNDED = (-sp.oo, sp.oo)
+
+_STATED = ("name", "plant", "model", "barriers", "states", "inputs", "reward", "nominal", "starts", "start", "dt", "horizon")
+"""Attributes of a problem that are made of the arguments."""
 
 Range = tuple[float, float]
 
@@ -24,8 +27,8 @@ def state_problem(
     system: ControlAffineSDE,
     barriers: Any,
     *,
-    box: Sequence[Any],
-    start: Sequence[Any],
+    box: Any,
+    start: Any,
     dt: float,
     horizon: float,
     name: str = "",
@@ -42,7 +45,8 @@ def state_problem(
         system: what is simulated.
         barriers: h, safe where h >= 0: an expression of the states or a `Barrier`, or several of them.
         box: physical bounds (low, high) of every input, or one such pair for each.
-        start: of each state a number, or (low, high) to draw it from, uniformly, where every barrier is positive.
+        start: of each state a number, or (low, high) to draw it from, uniformly, where every barrier is positive; always one entry
+            for each state.
         dt: control period in s.
         horizon: length of an episode in s.
         name: of the problem, for tables and pictures.
@@ -62,24 +66,24 @@ def state_problem(
         ConfigurationError: a number is out of range.
     """
     named = named_barriers(barriers)
-    allowed = [f.name for f in fields(SafetyProblem) if f.init]
-    for name_of in rest:
-        if name_of not in allowed:
-            raise ConfigurationError(f"a problem has no {name_of!r}; {nearest(name_of, allowed)}")
-    laws = list(nominal) if isinstance(nominal, Sequence) else [nominal] * system.m
+    if not isinstance(system, ControlAffineSDE):
+        raise SystemDefinitionError(f"system is {type(system).__name__}; give a ControlAffineSDE")
+    _require_known(rest, system)
+    laws = _listed(nominal, system.m)
     bounds, unit = dict(workspace or {}), dict(units or {})
     _require_symbols("workspace", bounds, system.states)
     _require_symbols("units", unit, (*system.states, *system.inputs))
+    states = tuple(Variable(s, *_ends(f"workspace of {s}", bounds.get(s, _UNBOUNDED)), unit.get(s, "")) for s in system.states)
     problem = SafetyProblem(
         name=name or "problem",
         plant=system,
         model=system if model is None else model,
         barriers=named,
-        states=tuple(Variable(s, *_ends(f"workspace of {s}", bounds.get(s, _UNBOUNDED)), unit.get(s, "")) for s in system.states),
+        states=states,
         inputs=tuple(Variable(u, *ends, unit.get(u, "")) for u, ends in zip(system.inputs, _boxes(system, box), strict=True)),
-        reward=sp.sympify(reward),
-        nominal=tuple(laws if rest.get("features") else [law_of(law, system) for law in laws]),
-        starts={"start": _start(system, named, start)},
+        reward=formula("reward", reward),
+        nominal=tuple(formula("nominal", law) if rest.get("features") else law_of(law, system) for law in laws),
+        starts={"start": _start(states, named, start)},
         dt=finite_number("dt", dt),
         horizon=finite_number("horizon", horizon),
         **{**suitable(system, named), **rest},
@@ -89,8 +93,14 @@ def state_problem(
 
 
 def named_barriers(barriers: Any) -> tuple[Barrier, ...]:
-    """Barriers from one or several expressions or barriers, each with a name."""
-    given = list(barriers) if isinstance(barriers, Sequence) else [barriers]
+    """Barriers from one or several expressions or barriers, each with a name.
+
+    Raises:
+        SystemDefinitionError: there is none, or one is no expression.
+    """
+    given = list(barriers) if isinstance(barriers, list | tuple) else [barriers]
+    if not given:
+        raise SystemDefinitionError("barriers is empty; give h, an expression of the states, or several")
     several = len(given) > 1
     return tuple(b if isinstance(b, Barrier) else Barrier(b, f"h_{i}" if several else "h") for i, b in enumerate(given, 1))
 
@@ -103,7 +113,7 @@ def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str,
     """
     elsewhere = system.drift.free_symbols | system.input_matrix.free_symbols
     noisy = any(entry != 0 for entry in system.numeric(system.diffusion))
-    degrees = [relative_degree(system, b.expression, *[generator] * noisy) for b in barriers]
+    degrees = [degree_of(system, b.expression) for b in barriers]
     return {
         "noise": tuple(p.name for p in system.parameters if p in system.diffusion.free_symbols - elsewhere),
         "gains": tuple((1.0,) * degree for degree in degrees) if len(set(degrees)) > 1 else (1.0,) * degrees[0],
@@ -114,26 +124,57 @@ def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str,
 
 def law_of(law: Any, system: ControlAffineSDE) -> sp.Expr:
     """A law of the states as one of the features, which have symbols of their own."""
-    return sp.sympify(law).subs({s: sp.Symbol(s.name, real=True) for s in system.states})
+    return formula("nominal", law).subs({s: sp.Symbol(s.name, real=True) for s in system.states})
 
 
-def _start(system: ControlAffineSDE, barriers: Sequence[Barrier], start: Sequence[Any]) -> Start:
-    if isinstance(start, str) or not isinstance(start, Sequence) or len(start) != system.n:
-        names = ", ".join(map(str, system.states))
-        raise SystemDefinitionError(f"start = {start!r}; give a number or (low, high) for each of the {system.n} states: {names}")
-    ends = [_ends(f"start of {s}", v if isinstance(v, Sequence) else (v, v)) for s, v in zip(system.states, start, strict=True)]
-    for s, (low, high) in zip(system.states, ends, strict=True):
-        finite_number(f"start of {s}", low)
-        finite_number(f"start of {s}", high)
+def _require_known(rest: Mapping[str, Any], system: ControlAffineSDE) -> None:
+    """Raise ConfigurationError where a further attribute is unknown, or names what is not there."""
+    allowed = [f.name for f in fields(SafetyProblem) if f.init and f.name not in _STATED]
+    for name in rest:
+        if name not in allowed:
+            raise ConfigurationError(f"a problem has no further {name!r}; {nearest(name, allowed)}")
+    parameters, states = [p.name for p in system.parameters], [s.name for s in system.states]
+    for name, known, what in (("noise", parameters, "parameters of the diffusion"), ("plane", states, "states, two of them")):
+        given = rest.get(name)
+        if given is not None and not (isinstance(given, list | tuple) and set(given) <= set(known)):
+            raise ConfigurationError(f"{name} = {given!r}; it names {what} ({', '.join(known) or 'there are none'}), like {name}=(...,)")
+    if "gains" in rest and not isinstance(rest["gains"], list | tuple):
+        raise ConfigurationError(f"gains = {rest['gains']!r}; give a tuple of rates, one for each order, or such a tuple for each barrier")
+
+
+def _listed(laws: Any, count: int) -> list[Any]:
+    if isinstance(laws, sp.MatrixBase):
+        return laws.flat()
+    return list(laws) if isinstance(laws, list | tuple) else [laws] * count
+
+
+def _start(states: Sequence[Variable], barriers: Sequence[Barrier], start: Any) -> Start:
+    names = ", ".join(s.symbol.name for s in states)
+    given = start.tolist() if isinstance(start, np.ndarray) else start
+    if not isinstance(given, list | tuple) or len(given) != len(states):
+        raise SystemDefinitionError(f"start = {start!r}; give a number or (low, high) for each of the {len(states)} states: {names}")
+    ends = [
+        _ends(f"start of {s.symbol}", v if isinstance(v, list | tuple | np.ndarray) else (v, v)) for s, v in zip(states, given, strict=True)
+    ]
+    for s, (low, high) in zip(states, ends, strict=True):
+        finite_number(f"start of {s.symbol}", low)
+        finite_number(f"start of {s.symbol}", high)
     if all(low == high for low, high in ends):
         return Start.at([low for low, _ in ends])
-    uniforms = sp.symbols(f"uniform_1:{system.n + 1}", real=True)
+    uniforms = sp.symbols(f"uniform_1:{len(states) + 1}", real=True)
     state = tuple(low + (high - low) * uniform for (low, high), uniform in zip(ends, uniforms, strict=True))
-    return Start(state, uniforms, sp.Min(*[b.expression for b in barriers]))
+    within = [
+        distance
+        for s, (low, high) in zip(states, ends, strict=True)
+        for distance, leaves in ((s.symbol - s.low, low < s.low), (s.high - s.symbol, high > s.high))
+        if leaves
+    ]
+    return Start(state, uniforms, sp.Min(*[b.expression for b in barriers], *within))
 
 
-def _boxes(system: ControlAffineSDE, box: Sequence[Any]) -> list[Range]:
-    pairs = list(box) if isinstance(box, Sequence) and box and isinstance(box[0], Sequence) else [box] * system.m
+def _boxes(system: ControlAffineSDE, box: Any) -> list[Range]:
+    given = box.tolist() if isinstance(box, np.ndarray) else box
+    pairs = list(given) if isinstance(given, list | tuple) and given and isinstance(given[0], list | tuple) else [given] * system.m
     if len(pairs) != system.m:
         raise ConfigurationError(f"box = {box!r}; give (low, high), or one such pair for each of the {system.m} inputs")
     return [_ends(f"box of {u}", pair) for u, pair in zip(system.inputs, pairs, strict=True)]

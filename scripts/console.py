@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import functools
 import inspect
+import io
 import json
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, TextIO
 
 import typer
 from rich.console import Console
@@ -48,6 +50,26 @@ class _Tables(Console):
             super().print(*tables, **how)
 
 
+class _Trimmed(io.TextIOBase):
+    """A stream without the blanks that fill the lines of a table."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    @property
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What decides which characters a table is drawn with."""
+        return self._stream.encoding
+
+    def write(self, text: str, /) -> int:
+        """Write whole lines, as a console does."""
+        return self._stream.write(re.sub(r" +$", "", text, flags=re.MULTILINE))
+
+    def flush(self) -> None:
+        """See `io.TextIOBase`."""
+        self._stream.flush()
+
+
 @contextmanager
 def quietly(quiet: bool, silent: bool = False) -> Iterator[None]:
     """Print less within this context.
@@ -82,8 +104,9 @@ def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
 def stdout() -> Console:
     """Console for results: wide enough for a table, and on a pipe for whatever is in it."""
     kind = _Tables if _Terminal.quiet else Console
-    width = max(Console().width, _LEAST_WIDTH) if sys.stdout.isatty() else _PIPE_WIDTH
-    return kind(width=width, quiet=_Terminal.silent)
+    if sys.stdout.isatty():
+        return kind(width=max(Console().width, _LEAST_WIDTH), quiet=_Terminal.silent)
+    return kind(width=_PIPE_WIDTH, quiet=_Terminal.silent, file=_Trimmed(sys.stdout))
 
 
 def require_result(path: Path | None) -> None:

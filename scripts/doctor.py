@@ -8,6 +8,7 @@ import sys
 import timeit
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from importlib.util import find_spec
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from safe_envs import ENV_IDS, __version__
+from safe_envs.rendering.viewer import require_pygame
 from scripts.console import progress_bar, require_result, stdout, write_result
 
 _NEEDED = ""
@@ -125,11 +127,26 @@ def packages() -> Iterator[Check]:
     """Python, what is required, and the optional packages with their extras."""
     yield Check("python", sys.version_info >= (3, 11), platform.python_version(), "Python 3.11 or newer is needed")
     for package, extra in required():
+        if package == "pygame-ce" and (wrong := _other_pygame()):
+            yield wrong
+            continue
         try:
             yield Check(package, True, version(package))
         except PackageNotFoundError:
             target = package if extra == _NEEDED else f"safe-envs[{extra}]"
             yield Check(package, False if extra == _NEEDED else None, "missing", f'pip install "{target}"')
+
+
+def _other_pygame() -> Check | None:
+    """What is wrong if pygame, or a pygame-ce that is too old, is imported in place of the pygame-ce that draws; else None."""
+    if find_spec("pygame") is None:
+        return None
+    try:
+        require_pygame()
+    except gym.error.DependencyNotInstalled as error:
+        found, _, advice = str(error).partition(": ")
+        return Check("pygame-ce", False, found, advice)
+    return None
 
 
 def required() -> list[tuple[str, str]]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import require_writable, write_atomically
+from safe_envs.rendering.viewer import require_pygame
 
 SUFFIXES = (".mp4", ".gif", ".png")
 """What can be written."""
@@ -27,11 +28,12 @@ def require_film(path: Path) -> None:
 
     Raises:
         ConfigurationError: its suffix is none of `SUFFIXES`, or there can be no such file.
-        gymnasium.error.DependencyNotInstalled: what writes such files is missing.
+        gymnasium.error.DependencyNotInstalled: what draws, or what writes such files, is missing.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigurationError(f"--out {path} ends in {path.suffix!r}; give a file that ends in {', '.join(SUFFIXES)}")
     require_writable(path)
+    require_pygame()
     if path.suffix.lower() == ".mp4":
         _video_writer()
 
@@ -102,14 +104,23 @@ def _write_animation(path: Path, frames: Iterator[np.ndarray], seconds: float) -
     from PIL import Image
 
     first = next(frames)
-    palette = _palette(first)
+    palette, shown, lengths = _palette(first), _durations(seconds), []
 
     def reduced(pixels: np.ndarray) -> Image.Image:
+        # The library looks up how long a frame is shown after it has taken the frame, of which nobody knows how many there will be.
+        lengths.append(next(shown))
         return Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE)
 
-    # The format counts in hundredths of a second.
-    duration = 10 * max(1, round(100 * seconds))
-    reduced(first).save(path, save_all=True, append_images=(reduced(frame) for frame in frames), duration=duration, loop=0)
+    reduced(first).save(path, save_all=True, append_images=(reduced(frame) for frame in frames), duration=lengths, loop=0)
+
+
+def _durations(seconds: float) -> Iterator[int]:
+    """How long each frame of an animation is shown, in ms: a frame ends at the multiple of 10 ms nearest to its true end."""
+    # The format counts in hundredths of a second. Rounding the ends, not the lengths, carries the error on to the next frame.
+    end = 0
+    for k in itertools.count(1):
+        start, end = end, max(end + 1, round(100 * k * seconds))
+        yield 10 * (end - start)
 
 
 def _write_still(path: Path, frames: Iterator[np.ndarray], seconds: float) -> None:

@@ -18,6 +18,15 @@ from safe_envs.errors import ConfigurationError
 from scripts.console import progress_bar, stdout, write_result
 from scripts.table import describe_system
 
+_COLUMNS = (
+    "method",
+    "levels",
+    "by the other method",
+    "simulated\nsteps",
+    "plain Monte Carlo\nwould need",
+    "seen in the first\nepisodes",
+    "steps/s",
+)
 _WIDEST = 1000
 
 
@@ -51,7 +60,7 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True)
     table.add_column("filter", overflow="fold", vertical="bottom")
     table.add_column(f"P(violation) [{interval}]", justify="right", no_wrap=True, vertical="bottom")
-    for name in ("score", "levels", "simulated\nsteps", "plain Monte Carlo\nwould need", "seen in the first\nepisodes", "steps/s"):
+    for name in _COLUMNS:
         table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
     for row, speed in zip(answer.rows, answer.timing["rows"], strict=True):
         table.add_row(Text(row["filter"]), *_cells(row, speed["steps_per_second"]))
@@ -68,7 +77,7 @@ def _heading(answer: RareEvaluation) -> Text:
     config = answer.config
     title = Text(config["title"], style="bold")
     how = f"{config['repetitions']} repetitions of {config['particles']} particles"
-    title.append(f" | policy {config['policy']['name']} | splitting: {how} | seed {config['seed']}", style="not bold")
+    title.append(f" | policy {config['policy']['name']} | rare violations, {how} | seed {config['seed']}", style="not bold")
     watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
     goal = ", joint program with the goal" if config["objective"] == "clf" else ""
     title.append(f"\n{describe_system(answer.problem)}{watched}; filters know the {config['knowledge']}{goal}", style="not bold")
@@ -79,14 +88,19 @@ def _cells(row: Row, speed: float) -> list[str]:
     plain = row["plain"]
     p, needed = row["probability"], row["plain_episodes_needed"]
     return [
-        "none, see below" if p is None else f"{p:.3g} [{row['ci_low']:.2g}, {row['ci_high']:.2g}]",
-        row["score"] or "-",
-        f"{row['levels']:.1f}" if row["score"] else "-",
+        "none, see below" if p is None else _probability(row),
+        row["method"] or "-",
+        f"{row['levels']:.1f}" if row["steps"] else "-",
+        _probability(row["check"]) if row["check"] else "-",
         _large(row["steps"]) if row["steps"] else "-",
         f"{_large(needed)} episodes, {_large(row['plain_steps_needed'])} steps" if needed else "-",
         f"{plain['violations']} of {plain['episodes']}" if plain else "-",
         _large(speed) if row["steps"] else "-",
     ]
+
+
+def _probability(row: Row) -> str:
+    return f"{row['probability']:.3g} [{row['ci_low']:.3g}, {row['ci_high']:.3g}]"
 
 
 def _notes(answer: RareEvaluation) -> list[str]:

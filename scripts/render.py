@@ -12,7 +12,7 @@ import typer
 
 from safe_envs.errors import ConfigurationError
 from scripts import options
-from scripts.console import Json, progress_bar, require_result, stdout, write_result
+from scripts.console import Json, progress_bar, stdout, write_result
 from scripts.film import require_film, steps_a_frame, write_film
 
 if TYPE_CHECKING:
@@ -77,11 +77,8 @@ def render(
     if filter_name is not None and compare is not None:
         raise ConfigurationError(f"--filter {filter_name} and --compare {compare} are both there; give one of them")
     require_film(out)
-    require_result(json_file)
     names = None if filter_name is None and compare is None else [filter_name] if filter_name is not None else split_filters(compare or "")
-    for option, path in options.inputs_of(policy, names or (), learned or ()):
-        if path.resolve() == out.resolve():
-            raise ConfigurationError(f"--out {out} would overwrite the file of {option}; name another file")
+    options.require_outputs(json_file, None, out=out, inputs=options.inputs_of(policy, names or (), learned or ()))
     arguments = options.of_env(
         system=system,
         noise=noise,
@@ -204,10 +201,13 @@ def make_runs(
     require_whole("seed", seed, 0)
     if knowledge not in ("model", "plant"):
         raise ConfigurationError(f"knowledge = {knowledge!r}; {nearest(knowledge, ('model', 'plant'))}")
+    known = (BARE, *CONDITIONS, *LEARNED)
     for name in names:
+        # A comma that is left in the name is one of --compare before an unknown name.
+        for word in re.split("[:+]", name)[0].split(","):
+            if word.strip() not in known:
+                raise ConfigurationError(f"unknown filter {word.strip()!r}; {nearest(word.strip(), known)}")
         if name != BARE:
-            if re.split("[:+]", name)[0] not in (*CONDITIONS, *LEARNED):
-                raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, (BARE, *CONDITIONS, *LEARNED))}")
             require_readable(name, problem)
     actors = [make_policy(policy, problem, trust) for _ in names]
     learning = Learning(problem, names, learned, 1, seed)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,7 +14,7 @@ import typer
 
 from safe_envs.errors import ConfigurationError
 from scripts import options
-from scripts.console import progress_bar, stdout
+from scripts.console import Json, progress_bar, require_result, stdout, write_result
 
 if TYPE_CHECKING:
     from agents.sweep import Sweep
@@ -36,6 +36,7 @@ def sweep(
         str | None, typer.Option(metavar="ADDR", help="Of the cluster: tcp://HOST:PORT of a Dask scheduler, HOST:PORT of Ray.")
     ] = None,
     trust: options.Trust = False,
+    json: Json = None,
 ) -> None:
     """Evaluate each cell of a sweep: one env, filter, policy, seed and set of parameters.
 
@@ -47,6 +48,7 @@ def sweep(
     from agents.sweep_run import Place
     from agents.sweep_store import Store
 
+    require_result(json)
     if jobs is not None and backend != "local":
         raise ConfigurationError(f"--jobs {jobs} is of this machine; with --backend {backend} all workers of the cluster compute")
     place = Place(backend, address, jobs or 2)
@@ -57,8 +59,18 @@ def sweep(
     done = len(found.cells) - len(store.missing)
     kept = f", of which {before} were there before" if before else ""
     stdout().print(f"{done} of {len(found.cells)} cells are in {out}{kept}.", highlight=False, markup=False, soft_wrap=True)
+    counts = {"cells": len(found.cells), "done": done, "before": before}
+    write_result(json, lambda: _document(found, failures, counts))
     if failures:
         raise ConfigurationError(_told(found, failures))
+
+
+def _document(found: Sweep, failures: Sequence[Outcome], counts: dict[str, int]) -> dict[str, Any]:
+    from agents.sweep_cell import versions
+
+    errors = {outcome.key: outcome.error for outcome in failures}
+    failed = [{"key": cell.key, "settings": cell.settings, "error": errors[cell.key]} for cell in found.cells if cell.key in errors]
+    return {**counts, "failed": failed, "swept": found.swept, "versions": versions()}
 
 
 def _compute(store: Store, place: Place, out: Path) -> list[Outcome]:
@@ -102,7 +114,7 @@ def _stoppable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _told(found: Sweep, failures: list[Outcome]) -> str:
+def _told(found: Sweep, failures: Sequence[Outcome]) -> str:
     """What failed and why, in the order of the file."""
     from agents.sweep import describe
 

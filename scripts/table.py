@@ -89,12 +89,17 @@ def heading(evaluation: Evaluation) -> Text:
 
 def _told(evaluation: Evaluation) -> str:
     problem, spec = evaluation.problem, evaluation.config["filter_spec"]
-    return describe_system(problem) if spec is None else f"seen through {spec}, dt = {problem.dt:g} s, horizon {problem.horizon:g} s"
+    return describe_system(problem) if spec is None else f"seen through {spec}, {_timing(problem)}"
 
 
 def describe_system(problem: SafetyProblem) -> str:
     """Noise, mismatch and timing of a problem."""
-    return f"{describe_plant(problem)}, dt = {problem.dt:g} s, horizon {problem.horizon:g} s"
+    return f"{describe_plant(problem)}, {_timing(problem)}"
+
+
+def _timing(problem: SafetyProblem) -> str:
+    # The horizon that is simulated: a whole number of periods.
+    return f"dt = {problem.dt:g} s, horizon {problem.steps * problem.dt:g} s"
 
 
 def describe_plant(problem: SafetyProblem) -> str:
@@ -103,7 +108,8 @@ def describe_plant(problem: SafetyProblem) -> str:
     model = {p.name: value for p, value in problem.model.parameters.items()}
     noise = ", ".join(f"{name} = {plant[name]:g}" for name in problem.noise)
     differing = [f"{name} = {plant[name]:g} (model {model[name]:g})" for name in plant if plant[name] != model[name]]
-    told = f"noise {noise}" if any(plant[name] for name in problem.noise) else "no noise"
+    still = problem.plant.numeric(problem.plant.diffusion).is_zero_matrix
+    told = f"noise {noise}" if any(plant[name] for name in problem.noise) else "no noise" if still else "fixed noise"
     mismatch = f"plant {', '.join(differing)}" if differing else "model = plant"
     return f"{told}, {mismatch}"
 
@@ -151,6 +157,12 @@ def _notes(evaluation: Evaluation) -> list[str]:
         f"no proved bound for {row['filter']}: {row['bound_note']}"
         for row in evaluation.rows
         if row["filter"] != BARE and row["bound"] is None and row["learning"] is None
+    ]
+    notes += [
+        f"{100 * row['outside_rate']:.3g} % of the starts lie outside the sets C_j = {{b_j >= 0}}, j >= 1, that {row['filter']} keeps: "
+        "nothing is promised from there"
+        for row in evaluation.rows
+        if row["outside_rate"]
     ]
     notes += learned_notes(evaluation.rows, evaluation.problem)
     notes += [

@@ -75,6 +75,7 @@ def train(
     asked for, to tensorboard: the safety rate of the last episodes, their cost and smallest h, and violations, interventions and
     infeasible steps in the training so far. The folder is what `safe-envs evaluate --policy DIR` reads.
     """
+    from agents.policy import DESCRIPTION
     from agents.problems import which_env
     from agents.trainer import train as train_agent
     from agents.training import Training
@@ -110,6 +111,8 @@ def train(
         eval_episodes=eval_episodes,
         threads=threads,
     )
+    # The policy itself is written at the very end.
+    finished = resume and (out / DESCRIPTION).exists()
     with progress_bar("Training") as tell:
         try:
             train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)
@@ -118,6 +121,8 @@ def train(
             raise
     given = {"noise": noise, "plant": plant, "model": model, "barrier": barrier, "knowledge": knowledge if knowledge != "model" else None}
     given |= {"dt": dt, "substeps": substeps, "horizon": horizon, "box": box, "start": start}
+    if finished:
+        stdout().print(f"The training in {out} was finished already: nothing was left to do.", highlight=False, markup=False, soft_wrap=True)
     rows = json.loads((out / "evaluations.json").read_text())
     _report(["--system", system] if system else [training.env_id], out, training.filter or "none", rows, given)
     write_result(json_file, lambda: {"folder": str(out), "config": json.loads((out / "config.json").read_text()), "evaluations": rows})

@@ -42,10 +42,10 @@ def print_report(
     title.append(f" | filter {spec_of(formulas.conditions)} | start {problem.start}", style="not bold")
     title.append(f"\n{describe_system(problem)}; the conditions know the {formulas.knowledge}", style="not bold")
     console.print(title, soft_wrap=True, highlight=False)
-    _section(console, "Safe set", _set_lines(found))
+    _section(console, "Safe set", _set_lines(found, starts))
     for barrier in found.barriers:
         _section(
-            console, f"Barrier {barrier.name}: relative degree {barrier.degree} with {barrier.condition}", _barrier_lines(problem, barrier)
+            console, f"Barrier {barrier.name}: relative degree {barrier.degree} with {barrier.condition}", _barrier_lines(found, barrier)
         )
     _section(console, "Where no action in the box meets the condition" + "s" * (len(found.barriers) > 1), _part_lines(found))
     _print_bounds(console, found, starts, bounds)
@@ -111,30 +111,49 @@ def _say(console: Console, text: str) -> None:
     console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
-def _set_lines(found: Verification) -> list[str]:
+def _searched(found: Verification) -> str:
+    """What shares are of: C, or what is left of it in ranges that were chosen for states without any."""
+    return "the part of C that is searched" if found.beyond and found.region.chosen.any() else "C"
+
+
+def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
     ranges = f" ({'; '.join(found.region.notes)})" if found.region.notes else ""
     lines = [
         f"{found.drawn} states were drawn from the workspace{ranges}; C is {_percent(found.safe.share)} of it, and "
         f"{found.safe.points} of its states are looked at",
     ]
-    if found.beyond:
+    if found.beyond and found.region.chosen.any():
+        lines.append("C reaches beyond these ranges: shares and shortfalls are of the part inside")
+    elif found.beyond:
         lines.append("C reaches beyond the workspace: shares and shortfalls are of the part inside, where the episodes are")
     if found.undefined:
-        lines.append(f"a condition has no finite value on {_percent(found.undefined)} of C; nothing can be met or missed there")
+        lines.append(f"a condition has no finite value on {_percent(found.undefined)} of {_searched(found)}; nothing can be met or missed there")
     if found.kept is None:
         lines.append("the sets C_j = {b_j >= 0} have no state in common: nothing is kept")
     elif not found.formulas.first_order:
-        lines.append(f"the intersection of the C_j = {{b_j >= 0}}, which the condition keeps, is {_percent(found.kept.share)} of C")
+        lines.append(
+            f"the intersection of the C_j = {{b_j >= 0}}, which the condition keeps, is {_percent(found.kept.share)} of {_searched(found)}"
+        )
+        outside = _outside(found, starts)
+        if outside:
+            lines.append(f"{_percent(outside)} of the starts are in C and outside this intersection: nothing is promised from there")
     return lines
 
 
-def _barrier_lines(problem: SafetyProblem, b: BarrierFindings) -> list[str]:
+def _outside(found: Verification, starts: np.ndarray) -> float:
+    """The share of starts that are safe, but not in the set that the condition keeps."""
+    chain = found.formulas.chain(starts)
+    return float(((chain[:, found.formulas.barriers] > 0.0).all(axis=1) & (chain <= 0.0).any(axis=1)).mean())
+
+
+def _barrier_lines(found: Verification, b: BarrierFindings) -> list[str]:
+    problem = found.formulas.problem
     size = f"{_number(b.typical)} in the median"
     if b.vanishes:
         lines = [
             f"leading term: it vanishes at {_state(problem, b.leading_at)}: there the input has no say, and the condition holds only if "
             "its offset is >= 0",
-            f"  its reach over the box is {size}, below {100 * SMALL:g} % of that on {_percent(b.small)} of C"
+            f"  its reach over the box is {size}, below {100 * SMALL:g} % of that on {_percent(b.small)} of {_searched(found)}"
             + (f"; no action meets the condition on {_percent(b.small_infeasible)} of this part" if b.small else ""),
         ]
     else:
@@ -152,7 +171,7 @@ def _barrier_lines(problem: SafetyProblem, b: BarrierFindings) -> list[str]:
 
 
 def _part_lines(found: Verification) -> list[str]:
-    parts = [("C", found.safe)]
+    parts = [(_searched(found), found.safe)]
     if found.kept is not None and not found.formulas.first_order:
         parts.append(("the intersection", found.kept))
     return [f"{name}: {_describe_part(found, part)}" for name, part in parts]

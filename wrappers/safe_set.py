@@ -74,7 +74,7 @@ def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Seq
         expressions: all that will be asked of a state: where they repeat after 2 pi, a period is enough.
     """
     low, high = [np.array([getattr(v, end) for v in problem.states]) for end in ("low", "high")]
-    periodic, chosen, notes = np.zeros(len(low), dtype=bool), np.zeros(len(low), dtype=bool), []
+    periodic, chosen = np.zeros(len(low), dtype=bool), np.zeros(len(low), dtype=bool)
     unbounded = np.flatnonzero(~(np.isfinite(low) & np.isfinite(high)))
     for i in unbounded.tolist():
         s = problem.states[i].symbol
@@ -86,7 +86,11 @@ def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Seq
         reach = 10.0 * max(float(np.ptp(starts)), float(abs(starts).max()), 1.0)
         low[i] = low[i] if np.isfinite(low[i]) else starts.min() - reach
         high[i] = high[i] if np.isfinite(high[i]) else starts.max() + reach
-        notes.append(f"{s} in [{low[i]:.4g}, {high[i]:.4g}], chosen around the starts: its workspace is unbounded")
+    notes = []
+    if chosen.any():
+        ranges = [f"{problem.states[i].symbol} in [{low[i]:.4g}, {high[i]:.4g}]" for i in np.flatnonzero(chosen).tolist()]
+        whose = "its workspace is" if len(ranges) == 1 else "their workspace is"
+        notes.append(f"{', '.join(ranges)}, chosen around the starts: {whose} unbounded")
     if periodic.any():
         names = ", ".join(str(problem.states[i].symbol) for i in np.flatnonzero(periodic))
         notes.append(f"{names} over a period of 2 pi, since nothing here tells the periods apart")

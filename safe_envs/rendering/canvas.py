@@ -29,9 +29,20 @@ _BRUSHES = {
 """Offsets of the thin lines that make a line of 1, 2 or 3 pixels."""
 
 
-@lru_cache(maxsize=16)
 def _font(size: int, bold: bool) -> pygame.font.Font:
     """DejaVu Sans, which has all the letters and comes with matplotlib: the same picture on every machine."""
+    font = _loaded_font(size, bold)
+    try:
+        font.get_height()
+    except pygame.error:
+        # Gymnasium's own envs quit pygame when they close, after which no font that was loaded before can be used.
+        _loaded_font.cache_clear()
+        font = _loaded_font(size, bold)
+    return font
+
+
+@lru_cache(maxsize=16)
+def _loaded_font(size: int, bold: bool) -> pygame.font.Font:
     pygame.font.init()
     spec = importlib.util.find_spec("matplotlib")
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -31,6 +32,7 @@ class Moment:
         times: since the start of the episode in s, shape (k,).
         h: smallest barrier, shape (k,).
         barriers: each barrier now.
+        least: smallest h since the start of the episode, of states that are not kept as well.
         executed: input that led here, None at the start of an episode.
         decision: of a filter on that input, None without a filter.
         violated: where h was negative first, shape (n,); None if it never was.
@@ -41,6 +43,7 @@ class Moment:
     times: np.ndarray
     h: np.ndarray
     barriers: Sequence[float]
+    least: float
     executed: Sequence[float] | None
     decision: Decision | None
     violated: np.ndarray | None
@@ -80,6 +83,7 @@ class History:
     def restart(self, state: Sequence[float], time: float) -> None:
         """Forget the past: an episode begins, or goes on from somewhere else."""
         self._count = 0
+        self._least = math.inf
         self._violated: np.ndarray | None = None
         self._violated_at = 0.0
         self.append(state, time, None, None)
@@ -90,10 +94,12 @@ class History:
             self._rows[:_KEPT] = self._rows[-_KEPT:]
             self._count = _KEPT
         barriers = self._barriers(*state)
-        self._rows[self._count] = (time, min(barriers), *state)
+        h = float(min(barriers))
+        self._least = min(self._least, h)
+        self._rows[self._count] = (time, h, *state)
         self._count += 1
         self._latest = tuple(map(float, barriers)), executed, decision
-        if self._violated is None and min(barriers) < 0.0:
+        if self._violated is None and h < 0.0:
             self._violated, self._violated_at = np.array(state, dtype=float), time
 
     @property
@@ -101,4 +107,4 @@ class History:
         """The instant that was added last."""
         rows = self._rows[: self._count]
         barriers, executed, decision = self._latest
-        return Moment(rows[:, 2:], rows[:, 0], rows[:, 1], barriers, executed, decision, self._violated, self._violated_at)
+        return Moment(rows[:, 2:], rows[:, 0], rows[:, 1], barriers, self._least, executed, decision, self._violated, self._violated_at)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from safe_envs.problem import SafetyProblem, Variable
-from safe_envs.rendering.axes import Axes
+from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.history import Moment
 from safe_envs.rendering.scenes.base import runs
@@ -42,6 +44,7 @@ _BARS = (148, 348)
 _MOST_BARS = 5
 _BOTTOM = 480
 _LEGEND = 512
+_FIRST_STEPS = 100
 
 
 class Panel:
@@ -53,6 +56,8 @@ class Panel:
 
     def __init__(self, problem: SafetyProblem) -> None:
         self._problem = problem
+        # Over somebody else's env without a limit of time, the problem's horizon is a single control period.
+        self._endless = problem.steps == 1
         shown = problem.inputs[:_MOST_BARS]
         pitch = min(58.0, (_BARS[1] - _BARS[0] - 26) / len(shown))
         self._rows = [(variable, _BARS[0] + 26 + round(j * pitch)) for j, variable in enumerate(shown)]
@@ -79,9 +84,10 @@ class Panel:
             canvas.text(caption, (_LEFT, 42), GREY, NORMAL, widest=_WIDTH)
         time = float(moment.times[-1])
         canvas.text(f"t = {time:.2f} s", (_LEFT, 68), INK, NORMAL)
-        canvas.text(f"of {self._problem.horizon:g} s", (_RIGHT, 68), GREY, NORMAL, align=(1.0, 0.0))
-        canvas.fill((_LEFT, 91, _WIDTH, 3), LINE)
-        canvas.fill((_LEFT, 91, _WIDTH * min(time / self._problem.horizon, 1.0), 3), GREY)
+        if not self._endless:
+            canvas.text(f"of {self._problem.horizon:g} s", (_RIGHT, 68), GREY, NORMAL, align=(1.0, 0.0))
+            canvas.fill((_LEFT, 91, _WIDTH, 3), LINE)
+            canvas.fill((_LEFT, 91, _WIDTH * min(time / self._problem.horizon, 1.0), 3), GREY)
         self._status(canvas, moment)
         self._actions(canvas, moment)
         self._chart(canvas, moment)
@@ -140,8 +146,7 @@ class Panel:
         times, h = _thinned(moment.times, moment.h)
         low, high = min(float(h.min()), 0.0), max(float(h.max()), 0.0)
         span = max(high - low, 1e-9)
-        end = max(self._problem.horizon, float(times[-1]))
-        axes = Axes(self._box, (end - self._problem.horizon, end), (low - 0.12 * span, high + 0.12 * span))
+        axes = Axes(self._box, self._period(float(times[-1])), (low - 0.12 * span, high + 0.12 * span))
         left, top, width, height = self._box
         edge = axes.place(0.0, 0.0)[1]
         canvas.fill((left, top, width, edge - top), mix(GREEN, PAPER, 0.10))
@@ -159,13 +164,22 @@ class Panel:
         far = high if high >= -low else low
         canvas.text(number(far), (left - 6, axes.place(0.0, far)[1]), GREY, SMALL, align=(1.0, 0.5))
         for tick in axes.x:
-            canvas.text(f"{tick:.3g} s", (axes.place(tick, 0.0)[0], top + height + 4), GREY, SMALL - 1, align=(float(tick == end), 0.0))
-        now, smallest = number(float(moment.h[-1])), number(float(moment.h.min()))
-        width = canvas.text(f"least {smallest}", (_RIGHT, self._heading + 2), GREY, SMALL, align=(1.0, 0.0))
-        canvas.text(f"now {now}", (_RIGHT - width - 14, self._heading + 2), INK, SMALL, bold=True, align=(1.0, 0.0))
+            canvas.text(f"{tick:.3g} s", (axes.place(tick, 0.0)[0], top + height + 4), GREY, SMALL - 1, align=(float(tick == axes.x[1]), 0.0))
+        now = number(float(moment.h[-1]))
+        right = canvas.text(f"least {number(moment.least)}", (_RIGHT, self._heading + 2), GREY, SMALL, align=(1.0, 0.0))
+        canvas.text(f"now {now}", (_RIGHT - right - 14, self._heading + 2), INK, SMALL, bold=True, align=(1.0, 0.0))
         if len(moment.barriers) > 1:
             name = self._problem.barriers[int(np.argmin(moment.barriers))].name
-            canvas.text(f"({pretty(name)})", (_LEFT + 96, self._heading + 2), GREY, SMALL)
+            middle, room = left + width / 2, width - 120
+            canvas.text(f"smallest: {pretty(name)}", (middle, top + height + 4), GREY, SMALL - 1, align=(0.5, 0.0), widest=room)
+
+    def _period(self, now: float) -> Range:
+        """The times that the chart shows: the horizon, or the last one; without a horizon all, for 100, 200, 400, ... control periods."""
+        if self._endless:
+            first = _FIRST_STEPS * self._problem.dt
+            return 0.0, first * 2.0 ** max(0, math.ceil(math.log2(max(now, first) / first)))
+        end = max(self._problem.horizon, now)
+        return end - self._problem.horizon, end
 
     def _legend(self) -> None:
         canvas, y = self._background, _LEGEND

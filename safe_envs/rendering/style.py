@@ -77,7 +77,7 @@ def number(value: float, scale: float = 0.0) -> str:
 
     Args:
         value: to write.
-        scale: what is less than a thousandth of it is written as 0.
+        scale: what is less than a thousandth of it is written as 0, and the digits count at this size.
     """
     size = abs(value)
     if size <= 1e-3 * scale:
@@ -88,7 +88,9 @@ def number(value: float, scale: float = 0.0) -> str:
     elif size >= 1000.0:
         text = f"{value:,.0f}".replace(",", "\u202f")
     else:
-        text = f"{value:.{max(0, 2 - (math.floor(math.log10(size)) if size >= 1.0 else 0))}f}"
+        # A value of a scale keeps its decimals while it moves around 0.
+        counted = max(size, min(scale, 1.0)) or 1.0
+        text = f"{value:.{max(0, 2 - math.floor(math.log10(counted)))}f}"
     return text.replace("-", "\u2212")
 
 

@@ -54,12 +54,18 @@ def open_viewer(problem: SafetyProblem, mode: str | None, num_envs: int | None =
 
 
 def require_pygame() -> None:
-    """Raise gymnasium.error.DependencyNotInstalled, with what to install, if pygame is missing."""
+    """Raise gymnasium.error.DependencyNotInstalled, with what to install, if pygame-ce is missing or the other pygame is in its place."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
-        import pygame  # noqa: F401
+        import pygame
     except ImportError as error:
-        raise gym.error.DependencyNotInstalled('drawing needs pygame: pip install "safe-envs[render]"') from error
+        raise gym.error.DependencyNotInstalled('drawing needs pygame-ce: pip install "safe-envs[render]"') from error
+    if not hasattr(pygame.draw, "aacircle"):
+        # Two distributions share the name of the import, and each overwrites files of the other.
+        raise gym.error.DependencyNotInstalled(
+            f"drawing needs pygame-ce 2.5 or newer, and what is imported is pygame {pygame.version.ver}: "
+            'pip uninstall pygame pygame-ce, and then pip install "safe-envs[render]"'
+        )
 
 
 class Viewer:
@@ -82,6 +88,10 @@ class Viewer:
         self._decisions: list[Decision | None] = [None] * num_envs
         self._picture: Picture | None = None
         self._window: Window | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy gets: neither the window nor the canvas, which it makes for itself when it draws."""
+        return {**vars(self), "_picture": None, "_window": None}
 
     def announce(self, nominal: Rows, active: Rows, feasible: Rows) -> None:
         """Keep what a filter decided, a row for each env, for the step that comes next."""

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from weakref import WeakSet
+
 import pygame
 
 from safe_envs.errors import ConfigurationError
 
+_OPEN: WeakSet[Window] = WeakSet()
+
 
 class Window:
-    """Shows pictures in real time.
+    """Shows pictures in real time, each object in a window of its own.
 
     Args:
         size: width and height in pixels.
@@ -20,25 +24,40 @@ class Window:
     """
 
     def __init__(self, size: tuple[int, int], title: str, fps: int) -> None:
+        self._size, self._title, self._fps = size, title, fps
+        self._clock = pygame.time.Clock()
+        self._window = self._opened()
+        _OPEN.add(self)
+
+    def _opened(self) -> pygame.Window:
         try:
             pygame.display.init()
-            self._screen = pygame.display.set_mode(size)
+            window = pygame.Window(self._title, self._size)
+            window.get_surface()
         except pygame.error as error:
-            pygame.display.quit()
             raise ConfigurationError(
                 f'no window can be opened ({error}); make the env with render_mode="rgb_array", which needs no display'
             ) from error
-        pygame.display.set_caption(title)
-        self._clock = pygame.time.Clock()
-        self._fps = fps
+        return window
 
     def show(self, surface: pygame.Surface) -> None:
         """Show a picture, once the time of the one before is over."""
-        self._screen.blit(surface, (0, 0))
+        try:
+            self._show(surface)
+        except pygame.error:
+            # Gymnasium's own envs quit the display when they close, and with it all windows.
+            self._window = self._opened()
+            self._show(surface)
+
+    def _show(self, surface: pygame.Surface) -> None:
+        self._window.get_surface().blit(surface, (0, 0))
         pygame.event.pump()
         self._clock.tick(self._fps)
-        pygame.display.flip()
+        self._window.flip()
 
     def close(self) -> None:
-        """Close the window."""
-        pygame.display.quit()
+        """Close the window, and after the last one the display, unless somebody else shows something on it."""
+        self._window.destroy()
+        _OPEN.discard(self)
+        if not _OPEN and pygame.display.get_init() and pygame.display.get_surface() is None:
+            pygame.display.quit()

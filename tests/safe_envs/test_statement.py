@@ -19,6 +19,7 @@ from safe_envs import (
     SystemDefinitionWarning,
     state_problem,
 )
+from safe_envs.mistakes import require_sound
 
 x, v, u, w, k, sigma = sp.symbols("x v u w k sigma", real=True)
 SYSTEM = ControlAffineSDE.from_rate((x, v), (u,), [v, k * u - x], diffusion=[0, sigma], parameters={k: 2.0, sigma: 0.1})
@@ -89,9 +90,21 @@ def test_a_nominal_law_may_use_symbols_without_assumptions():
         ({"barriers": sp.Integer(1)}, RelativeDegreeError, "no relative degree"),
         ({"barriers": 1 - w**2}, SystemDefinitionError, "unknown symbol w"),
         ({"barriers": 1 - sp.sqrt(x - 5)}, SystemDefinitionError, "no finite value at the start"),
-        ({"nominal": -5000 * (x + 2)}, SystemDefinitionError, "check that both have the unit"),
-        ({"box": (-1e-4, 1e-4), "start": [0.9, 0.9]}, SystemDefinitionError, "the box is too small for h"),
         ({"workspace": {x: (2.0, 3.0)}}, SystemDefinitionError, "outside the workspace"),
+        ({"barriers": [x - 0.1, -0.2 - x]}, SystemDefinitionError, "no start is safe for all barriers at once"),
+        ({"barriers": []}, SystemDefinitionError, "barriers is empty"),
+        ({"barriers": 1 - x**2 > 0}, SystemDefinitionError, "give the expression itself"),
+        ({"barriers": "1 - x**2"}, SystemDefinitionError, "give a sympy expression"),
+        ({"barriers": 1 - sp.Abs(x)}, SystemDefinitionError, "has kinks and relative degree 2"),
+        ({"nominal": lambda state: -state}, SystemDefinitionError, "nominal is a function"),
+        ({"nominal": sp.log(x - 5)}, SystemDefinitionError, "the nominal controller has no finite value"),
+        ({"gains": (1.0,)}, SystemDefinitionError, "its relative degree is 2"),
+        ({"gains": (1.0, -1.0)}, SystemDefinitionError, "as many positive numbers"),
+        ({"gains": 2.0}, ConfigurationError, "give a tuple of rates"),
+        ({"noise": 0.1}, ConfigurationError, "it names parameters of the diffusion"),
+        ({"plane": ("x", "y")}, ConfigurationError, "it names states"),
+        ({"states": (x,)}, ConfigurationError, "no further 'states'"),
+        ({"filters": "scbf"}, ConfigurationError, "did you mean 'filter'"),
         ({"workspace": {"x": (-2.0, 3.0)}}, SystemDefinitionError, "give the symbol itself"),
         ({"start": [0.0]}, SystemDefinitionError, "2 states: x, v"),
         ({"start": [(0.0, math.inf), 0.0]}, ConfigurationError, "not finite"),
@@ -124,6 +137,60 @@ def test_a_rate_that_is_not_affine_in_the_input_is_found(rate):
         ControlAffineSDE.from_rate((x, v), (u,), [v, rate])
 
 
-def test_a_box_that_throws_the_state_about_is_doubtful():
-    with pytest.warns(SystemDefinitionWarning, match="across its whole workspace"):
-        stated(box=(-500.0, 500.0), workspace={v: (-3.0, 3.0)})
+@pytest.mark.parametrize("rate", [sp.Piecewise((u + 1, u > 0), (u - 1, True)), x + sp.Heaviside(u)])
+def test_a_rate_of_pieces_is_not_affine(rate):
+    with pytest.raises(SystemDefinitionError, match="the rate of v is not affine in the input"):
+        ControlAffineSDE.from_rate((x, v), (u,), [v, rate])
+
+
+def test_a_rate_that_cannot_be_taken_apart_is_told_so():
+    with pytest.raises(SystemDefinitionError, match="cancel what divides by an input"):
+        ControlAffineSDE.from_rate((x,), (u,), [(u**2 + u) / u])
+    with pytest.raises(SystemDefinitionError, match="give lists of symbols"):
+        ControlAffineSDE.from_rate(x, u, [v])  # pyright: ignore[reportArgumentType]
+    with pytest.raises(SystemDefinitionError, match="is no symbol"):
+        ControlAffineSDE(("x",), (u,), [0], [1], [0])  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"box": (-500.0, 500.0), "workspace": {v: (-3.0, 3.0)}}, "across its whole workspace"),
+        ({"nominal": -5000 * (x + 2)}, "check that both have the unit"),
+        ({"box": (-1e-4, 1e-4), "start": [0.9, 0.9]}, "the box is too small for h"),
+        ({"start": [(-300.0, 300.0), 0.0]}, "degrees for radians"),
+    ],
+)
+def test_what_other_units_would_explain_is_doubtful(change, says):
+    with pytest.warns(SystemDefinitionWarning, match=says) as told:
+        problem = stated(**change)
+    assert len(told) == 1
+    require_sound(problem)  # Once for each problem.
+    assert len(told) == 1
+
+
+def test_what_is_sound_is_not_doubted():
+    stated(system=ControlAffineSDE.from_rate((x, v), (u,), [v, u - 1000]), box=(990.0, 1010.0), workspace={v: (-50.0, 50.0)})
+    by_the_noise_alone = ControlAffineSDE((x, v), (u,), [-x, 0], [0, 1], [v, 0])
+    assert len(stated(by_the_noise_alone).gains) == 2
+
+
+def test_starts_are_in_the_workspace_and_where_the_system_has_a_value():
+    system = ControlAffineSDE.from_rate((x,), (u,), [sp.sqrt(x) + u])
+    problem = state_problem(system, x - 0.1, box=(-5, 5), start=[(-0.5, 2.0)], dt=0.1, horizon=1.0, workspace={x: (0.5, 3.0)})
+    envs = SafeVectorEnv(problem, 100)
+    envs.reset(seed=0)
+    assert envs.components[0].min() >= 0.5
+    assert envs.components[0].max() < 2.0
+
+
+def test_arrays_are_taken_for_start_and_box():
+    assert stated(start=np.array([0.1, 0.0]), box=np.array([-5.0, 5.0])).box == ((-5.0, 5.0),)
+    assert stated(start=np.array([[-0.1, 0.1], [0.0, 0.0]]), box=np.array([[-5.0, 5.0]])).box == ((-5.0, 5.0),)
+
+
+def test_a_missing_parameter_and_a_symbol_of_other_assumptions_are_told_apart():
+    with pytest.raises(SystemDefinitionError, match="gets its value in parameters"):
+        ControlAffineSDE((x,), (u,), [k * x], [1], [0])
+    with pytest.raises(SystemDefinitionError, match="x has other assumptions there"):
+        ControlAffineSDE((x,), (u,), [sp.Symbol("x")], [1], [0])

@@ -42,6 +42,7 @@ ROW_KEYS = [
     "bound",
     "bound_note",
     "certificate",
+    "outside_rate",
     "learning",
 ]
 

@@ -15,7 +15,7 @@ FEW = ("--particles", "60", "--repetitions", "8")
 def test_acceptance_in_small(safe_envs_command):
     status, out, err = safe_envs_command(*ACC, "--rare", *FEW, "--json", "rare.json")
     assert (status, err) == (0, "")
-    assert "splitting: 8 repetitions of 60 particles" in out
+    assert "rare violations, 8 repetitions of 60 particles" in out
     assert "P(violation) [95 % interval]" in out
     (row,) = strictly("rare.json")["rows"]
     # h_0 = 22 m is 5 deviations of the Gaussian law away: 2 Phi(-h_0/(tau sigma sqrt(T))), and a little less at control instants.

@@ -28,14 +28,17 @@ _MOST_PARAMETERS = 10_000_000
 _PATIENCE = 60
 _TRAINED, _VALIDATED = 0.7, 0.15
 
+_ROUNDING = 64 * np.finfo(float).eps
+"""Part of its largest entry by which a target may vary and still be constant."""
+
 
 @dataclass(frozen=True, eq=False)
 class Trained:
     """A network and how well it was trained.
 
     Attributes:
-        network: with the weights of the epoch of least validation loss.
-        epochs: that were run.
+        network: with the weights of the epoch of least validation loss; a constant for each target that is one.
+        epochs: that were run; none where there are only constants.
         validation_loss: the least one: mean squared error of the standardised targets.
         heldout: absolute errors (N_h, q) at rows that neither the training nor the choice of the epoch has seen, in the
             units of the targets.
@@ -61,6 +64,9 @@ def train(
     progress: Progress | None = None,
 ) -> Trained:
     """Fit a network: 70 % of the rows train it, 15 % choose the epoch, 15 % measure it. One thread, no global generator.
+
+    A target that is the same in all rows, up to rounding, is answered by this constant: of a barrier to which the noise adds
+    nothing, a network would learn its own error.
 
     Args:
         inputs: (N, p).
@@ -94,11 +100,15 @@ def train(
     parts = np.split(rows, [fitted, fitted + validated])
     ends = (*_standardisation(inputs), *_standardisation(targets, sizes))
     x, y = (inputs - ends[0]) / ends[1], (targets - ends[2]) / ends[3]
+    constant = np.ptp(targets, axis=0) <= _ROUNDING * np.abs(targets).max(axis=0)
     with _single_thread():
-        layers, run, loss = _fit(x, y, parts, widths, activation, epochs, batch, rate, int(seed), progress)
+        layers, run, loss = _fit(x, y, parts, widths, activation, 0 if constant.all() else epochs, batch, rate, int(seed), progress)
+    # In the last layer, whose output the mean is added to.
+    for numbers in layers[-1]:
+        numbers[constant] = 0.0
     network = Network(tuple(w for w, _ in layers), tuple(b for _, b in layers), activation, *ends)
     predicted = np.stack(network.arrays(tuple(inputs[parts[2]].T)), axis=1)
-    return Trained(network, run, loss, np.abs(predicted - targets[parts[2]]))
+    return Trained(network, run, 0.0 if constant.all() else loss, np.abs(predicted - targets[parts[2]]))
 
 
 def hidden_widths(hidden: Any) -> tuple[int, ...]:

@@ -1,27 +1,33 @@
-"""A bar for each state, for any problem without a plane."""
+"""A bar for each state, over its trail where there is room, for any problem without a plane."""
 
 from __future__ import annotations
 
 from safe_envs.problem import SafetyProblem
-from safe_envs.rendering.axes import grown
+from safe_envs.rendering.axes import Axes, Range, grown, ticks
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.history import Moment
 from safe_envs.rendering.safe_set import Barriers, tint
-from safe_envs.rendering.scenes.base import Scene, draw_point, warning_color
-from safe_envs.rendering.style import EDGE, GREY, INK, SMALL, UNSAFE, VIOLATION, bound, label, number
+from safe_envs.rendering.scenes.base import Scene, draw_point, draw_trail, draw_violation, warning_color
+from safe_envs.rendering.style import EDGE, GREY, INK, LINE, PANEL, SMALL, UNSAFE, VIOLATION, bound, label, number
 
-_LEFT, _WIDTH, _TOP, _BOTTOM = 40, 520, 58, 520
+_LEFT, _WIDTH, _TOP, _BOTTOM = 40, 520, 58, 532
 _MOST = 10
+_HIGHEST = 240.0
+_WITH_ENDS, _WITH_TRAIL = 60.0, 100.0
+"""Pixels from one state to the next from which there is room for the ends of its range, and for its trail."""
 
 
 class BarsScene(Scene):
-    """Where each state is in its range, and where it may be for h >= 0 with the others as they are."""
+    """Where each state is in its range, and where it may be for h >= 0 with the others as they are.
+
+    With up to four states, each one's trail hangs from its bar: the later, the higher.
+    """
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem)
         self._barriers = Barriers(problem)
         self._ranges = [self.range_of(i) for i in range(min(len(self.names), _MOST))]
-        self._pitch = min(74.0, (_BOTTOM - _TOP) / len(self._ranges))
+        self._pitch = min(_HIGHEST, (_BOTTOM - _TOP) / len(self._ranges))
 
     def draw(self, canvas: Canvas, moment: Moment) -> None:
         """Draw the bars."""
@@ -50,6 +56,23 @@ class BarsScene(Scene):
         if moment.violated is not None:
             canvas.cross((place(float(moment.violated[i])), top + 27), 5, VIOLATION)
         draw_point(canvas, (place(value), top + 27), warning_color(moment))
-        if self._pitch >= 60.0:
+        if self._pitch >= _WITH_ENDS:
             for end, side in ((low, 0.0), (high, 1.0)):
                 canvas.text(bound(end), (_LEFT + side * _WIDTH, top + 38), GREY, SMALL - 2, align=(side, 0.0))
+        if self._pitch >= _WITH_TRAIL:
+            self._draw_trail(canvas, moment, i, Axes((_LEFT, top + 56, _WIDTH, round(self._pitch) - 72), (low, high), self._times(moment)))
+
+    def _times(self, moment: Moment) -> Range:
+        now = float(moment.times[-1])
+        return now - self.problem.horizon, now
+
+    def _draw_trail(self, canvas: Canvas, moment: Moment, i: int, axes: Axes) -> None:
+        left, top, width, height = axes.box
+        canvas.fill(axes.box, PANEL)
+        for tick in ticks(*axes.x, most=10):
+            canvas.fill((round(axes.place(tick, 0.0)[0]), top, 1, height), LINE)
+        draw_trail(canvas, axes, moment.states[:, i], moment.times, moment.h)
+        if moment.violated is not None:
+            draw_violation(canvas, axes, (float(moment.violated[i]), moment.violated_at))
+        canvas.frame((left - 1, top - 1, width + 2, height + 2), LINE)
+        canvas.text(f"{self.problem.horizon:g} s ago", (left + 4, top + height - 1), GREY, SMALL - 2, align=(0.0, 1.0))

@@ -13,6 +13,7 @@ from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.history import Moment
 from safe_envs.rendering.safe_set import Barriers, barriers_in
+from safe_envs.rendering.scenes.ranges import first_range
 from safe_envs.rendering.style import EXECUTED, INFEASIBLE, INK, INTERVENING, PAPER, SKY, VIOLATION, Color, mix
 
 _MOST_POINTS = 1000
@@ -53,14 +54,14 @@ class Scene(ABC):
         return self.problem.states[self.index(name)].unit
 
     def range_of(self, i: int) -> Range:
-        """The workspace of a state; where that has no end, the range that is explored, or else one to begin with."""
+        """The workspace of a state; where that has no end, the range that is explored, or else one around the starts."""
         state = self.problem.states[i]
         if math.isfinite(state.low) and math.isfinite(state.high):
             return state.low, state.high
         try:
             return self.problem.exploration.region[i]
         except SystemDefinitionError:
-            return -1.0, 1.0
+            return first_range(self.problem, i)
 
     def window(self, i: int, j: int) -> tuple[Range, Range]:
         """The part of a plane of two states to look at: around the safe set if that is bounded in it, else the workspace."""

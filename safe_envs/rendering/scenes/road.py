@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
@@ -35,7 +36,6 @@ class Road(Scene):
         self._speed, self._gap = self.index(speed), self.index(gap)
         self._barriers = Barriers(problem)
         self._lead = self._other_speed()
-        self._charts: dict[Axes, Canvas] = {}
 
     def _other_speed(self) -> int | float | None:
         """The lead's speed: another state in the unit of the own one, or else the parameter v_f."""
@@ -108,9 +108,6 @@ class Road(Scene):
         times, gaps = moment.times[kept], moment.states[kept, self._gap]
         end = max(self.problem.horizon, float(times[-1]))
         axes = Axes(_CHART, (end - self.problem.horizon, end), (0.0, _reach(max(float(gaps.max()), float(required.max())))))
-        if axes not in self._charts:
-            furniture = self._charts[axes] = Canvas((600, 540), clear=True)
-            axes.furnish(furniture, "t [s]", label(self.names[self._gap], "m"))
         canvas.fill(_CHART, PAPER)
         canvas.within(_CHART)
         edge = axes.places(times, required)
@@ -119,7 +116,7 @@ class Road(Scene):
             canvas.shape([(edge[0, 0], top), *edge, (edge[-1, 0], top)], tint(1))
             canvas.shape([(edge[0, 0], bottom), *edge, (edge[-1, 0], bottom)], UNSAFE)
         canvas.within(None)
-        canvas.lay(self._charts[axes])
+        canvas.lay(_furniture(axes, label(self.names[self._gap], "m")))
         canvas.within(_CHART)
         canvas.path(edge, EDGE, 3)
         ahead = np.array([edge[-1], (_CHART[0] + _CHART[2], edge[-1, 1])])
@@ -132,6 +129,14 @@ class Road(Scene):
         canvas.within(_CHART)
         draw_point(canvas, axes.place(float(times[-1]), float(gaps[-1])), warning_color(moment))
         canvas.within(None)
+
+
+@lru_cache(maxsize=8)
+def _furniture(axes: Axes, y_label: str) -> Canvas:
+    """The grid of the chart, drawn once, of which few are kept: after the horizon each step has another one."""
+    drawn = Canvas((600, 540), clear=True)
+    axes.furnish(drawn, "t [s]", y_label)
+    return drawn
 
 
 def _reach(distance: float) -> float:

@@ -21,6 +21,8 @@ from safe_envs.rendering.scenes.plane import BOX, Plane
 from safe_envs.rendering.style import GOAL, GREY, INK, PAPER, SMALL, VIOLATION, mix
 
 _LENGTH = 15.0
+_MOVED = 2.0
+"""Pixels that an obstacle has to have moved for two outlines of it to be told apart."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class TopView(Scene):
     """The plane of x and y; a triangle points along theta.
 
     Vehicles are points, so that the triangle has a fixed size in pixels. Obstacles are where a barrier that is positive outside
-    a circle is negative: at their places now, with the way that they came.
+    a circle is negative: at their places now, with the way that they came, and after a violation where they were then.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -83,6 +85,7 @@ class TopView(Scene):
         axes = self._plane.background(canvas, moment)
         canvas.within(axes.box)
         self._draw_obstacles(canvas, axes, moment)
+        self._draw_hit(canvas, axes, moment)
         if self._goal is not None:
             self._draw_goal(canvas, axes, moment, self._goal)
         at = self._plane.trail(canvas, axes, moment)
@@ -113,6 +116,20 @@ class TopView(Scene):
             if size >= 14.0:
                 canvas.line(middle, (middle[0] + size, middle[1]), INK)
                 canvas.text(f"{obstacle.radius:g} m", (middle[0] + size / 2, middle[1] - 1), INK, SMALL - 2, align=(0.5, 1.0))
+
+
+    def _draw_hit(self, canvas: Canvas, axes: Axes, moment: Moment) -> None:
+        """Outline the obstacles that the vehicle was in at the first violation, where they were then; they may be elsewhere now."""
+        if moment.violated is None:
+            return
+        vehicle = moment.violated[[self.index("x"), self.index("y")]]
+        for obstacle in self._obstacles:
+            then, now = obstacle.middles(np.stack([moment.violated, moment.state]))
+            if math.dist(then, vehicle) > obstacle.radius or math.dist(then, now) * axes.scale[0] < _MOVED:
+                continue
+            at, size, color = axes.place(*then), obstacle.radius * axes.scale[0], mix(VIOLATION, PAPER, 0.6)
+            canvas.disk(at, size, None, color, 2)
+            canvas.text(f"at {moment.violated_at:.2f} s", (at[0], at[1] + size + 2), mix(color, INK, 0.6), SMALL, align=(0.5, 0.0))
 
 
 def draw_vehicle(canvas: Canvas, at: tuple[float, float], heading: float, moment: Moment) -> None:
