@@ -72,9 +72,11 @@ class _DriftingStreams(NoiseStreams):
 
     def next(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> np.ndarray:
         """See `NoiseStreams.next`; notes the density ratio."""
-        draws, added = super().next(rngs, stepping), self._env.drift()
-        self._env.log_ratio = -(draws * added).sum(axis=0) - 0.5 * (added * added).sum(axis=0)
-        return draws + added
+        # A state that overflows is found by the env, which says so better than a warning.
+        with np.errstate(all="ignore"):
+            draws, added = super().next(rngs, stepping), self._env.drift()
+            self._env.log_ratio = -(draws * added).sum(axis=0) - 0.5 * (added * added).sum(axis=0)
+            return draws + added
 
 
 MakeDrifting = Callable[[np.ndarray], Env]

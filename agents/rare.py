@@ -19,7 +19,7 @@ from agents.policy import Policy
 from agents.setting import Setting, Work
 from agents.splitting import LEAST, POWERS, Repetitions, Splitting
 from agents.statistics import log_normal_interval, rate_interval, require_confidence
-from safe_envs.errors import ConfigurationError, require_whole
+from safe_envs.errors import ConfigurationError, NumericalError, require_whole
 from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
 from wrappers import FilterSpec
@@ -197,10 +197,14 @@ def _by_drift(drifting: Drifting, problem: SafetyProblem, sizes: tuple[int, int]
     """The estimate by importance sampling, if there is one, and the control periods that it took."""
     if not any(Bridge(problem).reached):
         return None, 0
-    length, steps = drifting.choose(problem.steps * problem.dt)
-    if length is None:
-        return None, steps
-    estimates, more = drifting.estimate(length, *sizes)
+    try:
+        length, steps = drifting.choose(problem.steps * problem.dt)
+        if length is None:
+            return None, steps
+        estimates, more = drifting.estimate(length, *sizes)
+    except NumericalError:
+        # Pushed far out, where nothing else would take it, a system may leave the finite numbers.
+        return None, 0
     if not (estimates > 0.0).all():
         return None, steps + more
     return _estimate(f"drift of {length:.3g}/sqrt(s)", estimates, log_normal_interval(estimates, confidence)), steps + more

@@ -86,7 +86,8 @@ class Setting:
         """
         env = self.simulated.env(conditions, self._knowledge, self._objective, num_envs)
         env.reset(seed=0)
-        env.step(np.zeros(env.action_space.shape or (), dtype=np.float32))
+        space: Any = env.action_space
+        env.step(np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high))
         return env
 
     def drifting_env(self, conditions: Sequence[Condition], lengths: np.ndarray) -> Env:

@@ -15,7 +15,7 @@ from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, require
 BACKENDS = ("local", "dask", "ray")
 
 _MOST_LOSSES = 3
-"""How often cells are computed side by side before they are computed one by one, and how many may then be lost with none computed."""
+"""How often workers may end before cells are computed one by one, and how many cells may be lost by then with none computed."""
 
 _IDLE = 30
 """Seconds after which a process of this machine ends that has nothing to do, as when the one that started it was killed."""
@@ -61,8 +61,8 @@ class Place:
 def run(cells: Iterable[Cell], place: Place, keep: Callable[[Outcome], None]) -> None:
     """Compute cells, each once.
 
-    When a worker ends, what was under way is computed again. After several such losses the cells that are left are computed one
-    by one, so that one which ends its worker (as for want of memory) is found, and counted as failed.
+    When a worker ends, what was under way is computed again. After several such losses cells are computed one by one, until one that
+    ends its worker (as for want of memory) is found, which counts as failed; then the others go on side by side.
 
     Args:
         cells: what to compute. What comes out does not depend on their order.
@@ -84,24 +84,42 @@ def run(cells: Iterable[Cell], place: Place, keep: Callable[[Outcome], None]) ->
                 del missing[outcome.key]
                 any_computed = True
 
-    for _ in range(_MOST_LOSSES):
-        try:
-            take(list(missing.values()))
-        except _LossError:
-            continue
-        return
     lost = 0
-    for cell in list(missing.values()):
+    while missing:
         try:
-            take([cell])
-        except _LossError as error:
-            lost += 1
+            _persistently(lambda: take(list(missing.values())))
+        except _LossError:
+            cell, error = _first_lost(list(missing.values()), take)
+            lost += cell is not None
             if lost == _MOST_LOSSES and not any_computed:
                 raise WorkersLostError(
                     f"no cell could be computed, since the processes for it end; the last: {error}. Look for the reason, such as too "
                     "little memory or another installation on the workers, and start again"
                 ) from error
-            keep(Outcome(cell.key, None, None, f"the process that computed it ended: {error}", 0.0))
+            if cell is not None:
+                keep(Outcome(cell.key, None, None, f"the process that computed it ended: {error}", 0.0))
+                del missing[cell.key]
+
+
+def _persistently(take: Callable[[], None]) -> None:
+    """Do it again as long as a worker ends on the way; raise _LossError at the last loss."""
+    for attempt in range(1, _MOST_LOSSES + 1):
+        try:
+            return take()
+        except _LossError:
+            if attempt == _MOST_LOSSES:
+                raise
+    return None
+
+
+def _first_lost(cells: Sequence[Cell], take: Callable[[Sequence[Cell]], None]) -> tuple[Cell | None, _LossError | None]:
+    """Compute cells one by one up to the first whose worker ends: that, and how; nothing if none does."""
+    for cell in cells:
+        try:
+            take([cell])
+        except _LossError as error:
+            return cell, error
+    return None, None
 
 
 def _outcomes(cells: Sequence[Cell], place: Place) -> Generator[Outcome, None, None]:

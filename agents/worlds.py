@@ -130,7 +130,7 @@ class ForeignWorld:
         if name == "nominal" and self.spec.nominal is None:
             raise ConfigurationError("the filter spec has no nominal controller; give it one, or --policy zero, random or a .zip")
         if name in POLICIES:
-            return _OfModel(make_policy(name, self.problem), self.spec, self.problem)
+            return _OfModel(make_policy(name, self.problem), self.spec, self.problem, self._spaces[1])
         if len(policy_files(name)) > 1:
             raise ConfigurationError(f"{name} holds a policy for envs of this project; give a .zip of Stable-Baselines3 for {self.env_id}")
         return make_policy(name, self.problem, trust, self._spaces)
@@ -150,8 +150,8 @@ class ForeignWorld:
 class _OfModel(Policy):
     """A policy for the model's problem as one for the env: from its observations to its actions."""
 
-    def __init__(self, policy: Policy, spec: FilterSpec, problem: SafetyProblem) -> None:
-        self._policy, self._spec = policy, spec
+    def __init__(self, policy: Policy, spec: FilterSpec, problem: SafetyProblem, space: Any) -> None:
+        self._policy, self._spec, self._space = policy, spec, space
         self.deterministic = policy.deterministic
         self._center, self._half = (np.array(part) for part in center_and_half_width(problem))
 
@@ -163,8 +163,10 @@ class _OfModel(Policy):
         self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
     ) -> tuple[np.ndarray, Any]:
         """Choose actions of the env; see `Policy.predict`."""
-        actions, state = self._policy.predict(self._spec.state(np.asarray(observation)), state, episode_start, deterministic)
-        return self._spec.actions(self._center + self._half * actions), state
+        x = self._spec.state(observation, np.shape(observation)[:-1])
+        actions, state = self._policy.predict(x, state, episode_start, deterministic)
+        space = self._space
+        return np.clip(self._spec.actions(self._center + self._half * actions), space.low, space.high).astype(space.dtype), state
 
 
 def world_of(problem: SafetyProblem | str, options: Mapping[str, Any] | None, spec: FilterSpec | str | None) -> OwnWorld | ForeignWorld:

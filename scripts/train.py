@@ -122,7 +122,9 @@ def train(
     given = {"noise": noise, "plant": plant, "model": model, "barrier": barrier, "knowledge": knowledge if knowledge != "model" else None}
     given |= {"dt": dt, "substeps": substeps, "horizon": horizon, "box": box, "start": start}
     if finished:
-        stdout().print(f"The training in {out} was finished already: nothing was left to do.", highlight=False, markup=False, soft_wrap=True)
+        stdout().print(
+            f"The training in {out} was finished already: nothing was left to do.", highlight=False, markup=False, soft_wrap=True
+        )
     rows = json.loads((out / "evaluations.json").read_text())
     _report(["--system", system] if system else [training.env_id], out, training.filter or "none", rows, given)
     write_result(json_file, lambda: {"folder": str(out), "config": json.loads((out / "config.json").read_text()), "evaluations": rows})

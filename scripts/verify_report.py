@@ -127,7 +127,9 @@ def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
     elif found.beyond:
         lines.append("C reaches beyond the workspace: shares and shortfalls are of the part inside, where the episodes are")
     if found.undefined:
-        lines.append(f"a condition has no finite value on {_percent(found.undefined)} of {_searched(found)}; nothing can be met or missed there")
+        lines.append(
+            f"a condition has no finite value on {_percent(found.undefined)} of {_searched(found)}; nothing can be met or missed there"
+        )
     if found.kept is None:
         lines.append("the sets C_j = {b_j >= 0} have no state in common: nothing is kept")
     elif not found.formulas.first_order:

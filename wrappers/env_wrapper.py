@@ -65,6 +65,7 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         if inner.viewer is not None:
             inner.viewer.caption = text
         self._directly = _only_checks_between(env, inner)
+        self._tolerance = rounding(inner.problem)
         self._interventions = 0
         self._infeasible = 0
 
@@ -86,7 +87,7 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
             observation, reward, terminated, truncated, info = self._inner.step_physical(executed)
         else:
             observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(executed))
-            if any([abs(u - v) > 1e-12 + 1e-6 * abs(v) for u, v in zip(executed, self._inner.executed, strict=True)]):  # noqa: C419  (a list is faster here)
+            if any([abs(u - v) > t for u, v, t in zip(executed, self._inner.executed, self._tolerance, strict=True)]):  # noqa: C419  (a list is faster here)
                 raise changed_action(self, executed, self._inner.executed)
         differs = active and executed != nominal
         self._interventions += differs
@@ -114,12 +115,18 @@ def _readable(env: gym.Env[Any, Any]) -> SafeEnv | SafetyMonitor:
     while isinstance(layer, gym.Wrapper) and not isinstance(layer, SafetyMonitor):
         layer = layer.env
     if not isinstance(layer, SafeEnv | SafetyMonitor):
-        raise unreadable(layer)
+        raise unreadable(layer, vector=False)
     return layer
 
 
-def unreadable(env: object) -> ConfigurationError:
+def unreadable(env: Any, vector: bool) -> ConfigurationError:
     """The error of a filter over an env whose state it cannot read."""
+    if isinstance(env, gym.vector.VectorEnv) != vector:
+        batched = isinstance(env, gym.vector.VectorEnv)
+        kinds = ("SafetyFilterVectorWrapper", "a vector env") if batched else ("SafetyFilterWrapper", "a single env")
+        return ConfigurationError(f"{env} is {kinds[1]}; put {kinds[0]} over it")
+    if vector and any(isinstance(each.unwrapped, SafeEnv) for each in getattr(env, "envs", [])):
+        return ConfigurationError(f"{env} holds envs of this project one by one; make them by gym.make_vec, which is many times faster too")
     return ConfigurationError(
         f"{env} is not one of this project's envs, so that a filter cannot read its state; give model, barriers, state_fn: see FilterSpec"
     )
@@ -128,7 +135,7 @@ def unreadable(env: object) -> ConfigurationError:
 def require_foreign(env: object, ours: type[Any], view: Mapping[str, Any], knowledge: str) -> None:
     """Raise ConfigurationError where a filter is told how to see an env of this project, or to know what nobody knows."""
     if isinstance(env, ours):
-        raise ConfigurationError(f"{', '.join(view)} are for envs of somebody else; {env} has a model and barriers of its own")
+        raise ConfigurationError(f"{', '.join(view)}: only for envs of somebody else; {env} has a model and barriers of its own")
     if knowledge != "model":
         raise ConfigurationError(f"knowledge = {knowledge!r}: of an env of somebody else nothing is known but the model; use 'model'")
 
@@ -138,6 +145,11 @@ def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv | SafetyMonitor)
     while isinstance(env, (OrderEnforcing, PassiveEnvChecker)):
         env = env.env
     return env is inner
+
+
+def rounding(problem: SafetyProblem) -> list[float]:
+    """By how much each input may differ after it went through an env's numbers, float32 at worst."""
+    return [1e-6 * (high - low) for low, high in problem.box]
 
 
 def changed_action(wrapper: object, decided: Sequence[Any], executed: Sequence[Any]) -> ConfigurationError:

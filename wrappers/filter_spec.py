@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
@@ -13,14 +12,17 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.barrier import Barrier
-from safe_envs.calculus import relative_degree
-from safe_envs.custom import load_object
 from safe_envs.errors import ConfigurationError, InvalidInputError, nearest
+from safe_envs.mistakes import degree_of
+from safe_envs.places import load_object
 from safe_envs.problem import SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE, finite_number
 from safe_envs.statement import law_of, named_barriers, suitable
 
 Map = Callable[[np.ndarray], np.ndarray]
+
+_POINTS = 64
+"""At which an action map is tried."""
 
 
 class ActionMap(NamedTuple):
@@ -50,7 +52,8 @@ class FilterSpec:
     Attributes:
         model: of the env, continuous in time; nobody checks that the env obeys it.
         barriers: h, safe where h >= 0: an expression of the model's states or a `Barrier`, or several of them.
-        state_fn: from observations (..., k) to states (..., n), over any leading axes: write `observation[..., 0]`.
+        state_fn: from the observation that the wrapper gets, (..., k) mostly, to states (..., n), over any leading axes: write
+            `observation[..., 0]`.
         action_map: between the env's actions and the model's inputs; None where they are the same.
         filter: text of the filter where an evaluation names none, like "hocbf:p=2,8"; None for what suits the model.
         dt: control period in s; None for the env's own attribute `dt`.
@@ -81,7 +84,7 @@ class FilterSpec:
         if pair is not None and not (isinstance(pair, tuple) and len(pair) == 2 and all(map(callable, pair))):
             raise ConfigurationError(f"action_map = {pair!r}; give ActionMap(to_input, to_action), or ActionMap.scaled(factor)")
         for barrier in self.named:
-            relative_degree(self.model, barrier.expression)
+            degree_of(self.model, barrier.expression)
 
     @classmethod
     def of(cls, view: dict[str, Any]) -> FilterSpec:
@@ -116,21 +119,28 @@ class FilterSpec:
         """The barriers, each with a name."""
         return named_barriers(self.barriers)
 
-    def state(self, observation: np.ndarray) -> np.ndarray:
-        """The states (..., n) that observations (..., k) show.
+    def state(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
+        """The state (n,) that an observation shows, or the states (B, n) of a batch.
+
+        Args:
+            observation: of an env, or of a batch of them.
+            batch: its size (B,), if it is one.
 
         Raises:
-            InvalidInputError: `state_fn` returns another shape, or no finite numbers.
+            InvalidInputError: `state_fn` fails, or returns another shape or no finite numbers.
         """
-        x = np.asarray(self.state_fn(observation), dtype=np.float64)
-        shape = (*observation.shape[:-1], self.model.n)
+        shape = (*batch, self.model.n)
+        try:
+            x = np.array(self.state_fn(observation), dtype=np.float64)
+        except Exception as error:
+            raise InvalidInputError(f"state_fn failed at an observation: {type(error).__name__}: {error}") from error
         if x.shape != shape:
             raise InvalidInputError(
-                f"state_fn made {x.shape} of observations {observation.shape}; the model needs {shape}. Write it for any leading axes, "
+                f"state_fn made {x.shape} of observations {np.shape(observation)}; the model needs {shape}. Write it for any leading axes, "
                 "like np.stack([observation[..., 0], observation[..., 1]], axis=-1)"
             )
         if not np.isfinite(x).all():
-            raise InvalidInputError(f"state_fn made {x.tolist()} of {observation.tolist()}; a filter needs finite numbers")
+            raise InvalidInputError(f"state_fn made {x.tolist()} of {observation!r}; a filter needs finite numbers")
         return x
 
     def inputs(self, actions: np.ndarray) -> np.ndarray:
@@ -181,29 +191,37 @@ class FilterSpec:
 
     def _box(self, space: gym.Space[Any], name: str) -> list[tuple[float, float]]:
         m = self.model.m
-        if not isinstance(space, gym.spaces.Box) or space.shape != (m,) or not space.is_bounded():
-            raise ConfigurationError(f"the action space of {name} is {space}; a filter of {m} inputs needs a bounded Box of shape ({m},)")
-        ends = np.stack([space.low, space.high]).astype(np.float64)
-        images = self.inputs(_corners(ends))
-        if images.shape != (2**m, m):
-            raise ConfigurationError(f"to_input of the action map made {images.shape} of actions {(2**m, m)}; it is to keep the shape")
-        box = np.stack([images.min(axis=0), images.max(axis=0)])
-        back = self.actions(_corners(box))
-        tolerance = 1e-6 * (ends[1] - ends[0])
-        if (
-            not np.allclose(self.actions(images), _corners(ends), rtol=0, atol=tolerance.max())
-            or ((back < ends[0] - tolerance) | (back > ends[1] + tolerance)).any()
-        ):
+        if not isinstance(space, gym.spaces.Box) or space.shape != (m,) or not space.is_bounded() or space.dtype.kind != "f":
+            raise ConfigurationError(
+                f"the action space of {name} is {space}; a filter of {m} inputs needs a bounded Box of floats of ({m},)"
+            )
+        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        ends = self._mapped(np.stack([low, high]))
+        least, most = ends.min(axis=0), ends.max(axis=0)
+        rng = np.random.default_rng(0)
+        actions = rng.uniform(low, high, (_POINTS, m))
+        inputs = rng.uniform(least, most, (_POINTS, m))
+        width = most - least
+        there, back = self._mapped(actions), self.actions(inputs)
+        fits = (
+            np.allclose((self.actions(there) - actions) / (high - low), 0.0, atol=1e-6)
+            and (there >= least - 1e-6 * width).all()
+            and (there <= most + 1e-6 * width).all()
+            and (back >= low - 1e-6 * (high - low)).all()
+            and (back <= high + 1e-6 * (high - low)).all()
+        )
+        if not fits or not width.all():
             raise ConfigurationError(
                 f"the action map does not take the action space {space} to a box of inputs and back: to_action is to undo to_input, and "
                 "each action is to move one input alone"
             )
-        return [(float(low), float(high)) for low, high in box.T]
+        return list(zip(least.tolist(), most.tolist(), strict=True))
 
-
-def _corners(ends: np.ndarray) -> np.ndarray:
-    """Corners of a box, (2^m, m), from its ends (2, m)."""
-    return np.array(list(itertools.product(*ends.T)))
+    def _mapped(self, actions: np.ndarray) -> np.ndarray:
+        found = self.inputs(actions)
+        if found.shape != actions.shape:
+            raise ConfigurationError(f"to_input of the action map made {found.shape} of actions {actions.shape}; it is to keep the shape")
+        return found
 
 
 def _listed(laws: Any) -> tuple[Any, ...]:

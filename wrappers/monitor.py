@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,14 +11,19 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.codegen import Components, Flavour, compile_function, stacked
-from safe_envs.errors import InvalidInputError, NumericalError
+from safe_envs.errors import InvalidInputError, NumericalError, SystemDefinitionWarning
 from safe_envs.info import Info, safety_info
 from safe_envs.rendering.viewer import Viewer
 from wrappers.filter_spec import FilterSpec
 
+_CHANGE_SIGHT = (gym.ObservationWrapper, gym.wrappers.NormalizeObservation, gym.wrappers.FrameStackObservation)
+"""Wrappers that change observations."""
+
 
 class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.RecordConstructorArgs):
     """Adds cost, violation, barrier, h_min and episode_cost to `info`, by a model's barriers; actions go through unchanged.
+
+    Keys of the same names that the env reports itself are replaced.
 
     Args:
         env: any env with a box of actions.
@@ -36,6 +42,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         gym.utils.RecordConstructorArgs.__init__(self, spec=spec, _disable_deepcopy=True)
         gym.Wrapper.__init__(self, env)
         spec = FilterSpec.load(spec) if isinstance(spec, str) else spec
+        doubt_layers(env)
         self.problem = spec.problem(env.unwrapped, env.action_space, *named_and_limited(env))
         self._spec = spec
         self._barriers = barriers_of(spec, "floats")
@@ -102,7 +109,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         return picture if self.viewer is None else self.viewer.frames([np.asarray(picture)])[0]
 
     def _seen(self, observation: Any) -> Info:
-        self._x = tuple(self._spec.state(np.asarray(observation)).tolist())
+        self._x = tuple(self._spec.state(observation).tolist())
         try:
             barrier = self._barriers(*self._x)
         except (ArithmeticError, ValueError) as error:
@@ -115,6 +122,23 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         self._h_min = min(self._h_min, h)
         self._episode_cost += cost
         return safety_info(violation, cost, np.array(barrier, dtype=np.float64), self._h_min, self._episode_cost)
+
+
+def doubt_layers(env: gym.Env[Any, Any]) -> None:
+    """Warn of wrappers between a filter and its env that change what it sees or does."""
+    layer = env
+    while isinstance(layer, gym.Wrapper):
+        sees = isinstance(layer, _CHANGE_SIGHT) or layer.observation_space != layer.env.observation_space
+        acts = isinstance(layer, gym.ActionWrapper) or layer.action_space != layer.env.action_space
+        if sees or acts:
+            part = "state_fn" if sees else "action_map"
+            warnings.warn(
+                f"{type(layer).__name__} lies between the filter and the env and changes {'observations' if sees else 'actions'}: unless "
+                f"{part} undoes that, the filter keeps something else safe. Put wrappers around the filter",
+                SystemDefinitionWarning,
+                stacklevel=4,
+            )
+        layer = layer.env
 
 
 def named_and_limited(env: Any) -> tuple[str, int | None]:

@@ -15,7 +15,7 @@ from safe_envs.info import Info, safety_info, with_masks
 from safe_envs.rendering.viewer import Viewer
 from safe_envs.vector import VectorStep
 from wrappers.filter_spec import FilterSpec
-from wrappers.monitor import barrier_table, barriers_of, ends_of, named_and_limited
+from wrappers.monitor import barrier_table, barriers_of, doubt_layers, ends_of, named_and_limited
 
 
 class SafetyMonitorVector(gym.vector.VectorWrapper):
@@ -26,7 +26,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
     Args:
         env: any vector env with a box of actions, SyncVectorEnv and AsyncVectorEnv among them.
-        spec: how the states are seen, and what is safe.
+        spec: how the states are seen, and what is safe; or FILE.py:NAME of that.
 
     Attributes:
         problem: the model as a problem.
@@ -37,8 +37,11 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         ConfigurationError: the spec does not fit the env, or the env does not say how it resets.
     """
 
-    def __init__(self, env: gym.vector.VectorEnv, spec: FilterSpec) -> None:
+    def __init__(self, env: gym.vector.VectorEnv, spec: FilterSpec | str) -> None:
         super().__init__(env)
+        spec = FilterSpec.load(spec) if isinstance(spec, str) else spec
+        for layer in getattr(env.unwrapped, "envs", [])[:1]:
+            doubt_layers(layer)
         self.problem = spec.problem(_one_of(env), env.single_action_space, *named_and_limited(env))
         self._spec = spec
         try:
@@ -80,8 +83,9 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        anew = np.asarray((options or {}).get("reset_mask", self._everywhere), dtype=bool)
+        # Gymnasium's own vector envs take the mask out of the mapping that they are given.
+        anew = np.array((options or {}).get("reset_mask", self._everywhere), dtype=bool)
+        observation, info = self.env.reset(seed=seed, options=None if options is None else dict(options))
         self._forget(anew)
         seen = self._seen(observation, anew)
         if self.viewer is not None:
@@ -132,7 +136,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
     def _seen(self, observation: np.ndarray, counted: np.ndarray) -> Info:
         """Read the states; `counted` are the envs whose observations are new."""
-        self._x = _columns(self._spec.state(np.asarray(observation)))
+        self._x = _columns(self._spec.state(observation, (self.num_envs,)))
         barrier = barrier_table(self._barriers, self.problem.name, self._x)
         h = barrier.min(axis=1)
         violation = h < 0.0
@@ -155,4 +159,5 @@ def _one_of(env: gym.vector.VectorEnv) -> Any:
 
 
 def _columns(table: np.ndarray) -> Components:
-    return tuple(np.ascontiguousarray(table.T))
+    # A copy in any case: what a caller does to the observation must not reach the state.
+    return tuple(np.array(table.T, order="C"))

@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 from safe_envs.info import Info, filter_info, with_masks
 from safe_envs.vector import SafeVectorEnv, VectorStep
 from wrappers.conditions import Condition
-from wrappers.env_wrapper import build_filter, changed_action, require_foreign, rest_info, unreadable
+from wrappers.env_wrapper import build_filter, changed_action, require_foreign, rest_info, rounding, unreadable
 from wrappers.filter_spec import FilterSpec
 from wrappers.safety_filter import Decision
 from wrappers.vector_monitor import SafetyMonitorVector
@@ -48,6 +48,7 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         self._inner: Any = inner
         if inner.viewer is not None:
             inner.viewer.caption = text
+        self._tolerance = rounding(inner.problem)
         self._rest = rest_info(inner.problem)
         self._mode = env.metadata["autoreset_mode"]
         self._interventions = np.zeros(self.num_envs, dtype=np.int64)
@@ -84,8 +85,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             observation, reward, terminated, truncated, info = self._inner.step_physical(decision.action)
         else:
             observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(decision.action))
-            for u, v in zip(decision.action, self._inner.executed, strict=True):
-                if not np.allclose(u, v, rtol=1e-6, atol=1e-12):
+            for u, v, tolerance in zip(decision.action, self._inner.executed, self._tolerance, strict=True):
+                if not np.allclose(u, v, rtol=0.0, atol=tolerance):
                     raise changed_action(self, decision.action, self._inner.executed)
         added = self._decided(decision, active)
         ended = terminated | truncated
@@ -145,7 +146,7 @@ def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
     while isinstance(layer, gym.vector.VectorWrapper) and not isinstance(layer, SafetyMonitorVector):
         layer = layer.env
     if not isinstance(layer, SafeVectorEnv | SafetyMonitorVector):
-        raise unreadable(layer)
+        raise unreadable(layer, vector=True)
     return layer
 
 

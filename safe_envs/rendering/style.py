@@ -95,5 +95,5 @@ def number(value: float, scale: float = 0.0) -> str:
 
 
 def bound(value: float) -> str:
-    """A bound: a whole number as such, any other with three digits."""
-    return f"{value:.0f}".replace("-", "\u2212") if value == round(value) and abs(value) < 1000.0 else number(value)
+    """A bound: three digits without zeros behind the point; very small and large ones as `number` writes them."""
+    return f"{value:.3g}".replace("-", "\u2212") if value == 0.0 or 1e-3 <= abs(value) < 999.5 else number(value)

@@ -167,8 +167,8 @@ def test_a_cell_that_ends_every_worker_is_found(tmp_path: Path, document: Docume
     found = computed(document, tmp_path / "out", Place())
     ended = "the process that computed it ended: it went away"
     assert [row["error"] for row in found[:-1]] == [None] * 3 + [ended] * 3
-    # All that is left three times, and then one by one.
-    assert begun == [7, 4, 4, *[1] * 4]
+    # All that is left three times, and then one by one up to the first that is lost; and so on.
+    assert begun == [7, 4, 4, 1, *[3] * 3, 1, *[2] * 3, 1, 1]
 
 
 def test_workers_that_end_whatever_they_compute(tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch):

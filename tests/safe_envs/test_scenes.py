@@ -19,7 +19,7 @@ def test_the_disk_is_to_scale():
         env.reset(seed=0)
         frame = env.render()
         picture = Picture(env.problem)
-        axes = picture._scene._plane.background(picture._canvas, env._viewer._histories[0].moment)
+        axes = picture._scene._plane.background(picture._canvas, env.viewer._histories[0].moment)
         assert axes.scale[0] == pytest.approx(axes.scale[1])
         for angle in (0.3, 2.0, 4.0):
             x, y = axes.place(radius * np.cos(angle), radius * np.sin(angle))
@@ -35,7 +35,7 @@ def test_obstacles_and_goal_are_to_scale():
     env = SafeEnv(problem_of("safe_envs/DubinsObstacle-v0", radius=0.7), render_mode="rgb_array")
     env.reset(seed=0)
     frame = env.render()
-    scene = env._viewer._picture._scene
+    scene = env.viewer._picture._scene
     axes = next(iter(scene._plane._views))
     assert [circle.radius for circle in scene._obstacles] == pytest.approx([0.7])
     assert scene._goal.radius == pytest.approx(0.3)

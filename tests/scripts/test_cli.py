@@ -280,7 +280,7 @@ def test_plot_writes_a_picture(safe_envs_command, env_id, name, options):
 
 USER_ERRORS = (
     (["safe_envs/StochasticDubin-v0"], ["unknown env 'safe_envs/StochasticDubin-v0'", "did you mean 'safe_envs/StochasticDubins-v0'"]),
-    (["CartPole-v1"], ["not one of this project's envs", "safe_envs/DubinsDisk-v0"]),
+    (["CartPole-v1"], ["not one of this project's envs", "safe_envs/DubinsDisk-v0", "`safe-envs evaluate CartPole-v1 --filter-spec"]),
     (["CartPole-v1", "--noise", "1"], ["CartPole-v1"]),
     ([":x"], [":x"]),
     ([DUBINS, "--filter", "hocb"], ["unknown filter 'hocb'", "did you mean 'hocbf'"]),

@@ -157,3 +157,10 @@ def test_what_is_misspelt_has_a_suggestion(safe_envs_command, arguments, suggest
     status, out, err = safe_envs_command(*arguments)
     assert (status, out) == (2, "")
     assert suggestion in " ".join(err.split())
+
+
+def test_tables_on_a_pipe_have_no_trailing_blanks(safe_envs_command, monkeypatch):
+    monkeypatch.setattr("scripts.listing.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0"))
+    lines = safe_envs_command("list")[1].splitlines()
+    assert any("─" in line for line in lines)
+    assert [line for line in lines if line != line.rstrip()] == []

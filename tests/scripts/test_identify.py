@@ -15,6 +15,7 @@ from agents.problems import load_problem
 from scripts.identify import SETTINGS, read_settings, settings_of
 from scripts.identify_report import Function, Source, percent, unit_of
 from tests.scripts.conftest import strictly
+from tests.scripts.own_system import SYSTEM
 from wrappers.learning import METHODS, learner_of, load_learned
 from wrappers.learning.collect import collect
 from wrappers.learning.transitions import Transitions
@@ -288,3 +289,10 @@ def test_errors_of_a_function():
     assert Function("f", "", zero, np.ones(2)).relative is None
     assert Function("f", "", 1e-17 * np.ones(2), np.ones(2)).relative is None
     assert [percent(share) for share in (0.0, 1e-3, 0.2, 12.0)] == ["< 1e-06 %", "0.1 %", "20 %", "1200 %"]
+
+
+def test_an_unbounded_state_asks_for_a_range_or_a_workspace(safe_envs_command):
+    Path("own.py").write_text(SYSTEM)
+    status, _, err = safe_envs_command("identify", "--system", "own.py:problem", "--method", "bayesian", "--out", "learned.npz")
+    assert status == 2
+    assert "finite ranges, or the problem a workspace" in err

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 
 from tests.scripts.conftest import strictly
+from tests.scripts.own_system import SYSTEM
 
 DUBINS = "safe_envs/StochasticDubins-v0"
 QUICK = ("--n-timesteps", 512, "--num-envs", 4, "--eval-freq", 256, "--eval-episodes", 8, "--horizon", 0.5)
@@ -91,3 +93,26 @@ def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command
     status, _, err = safe_envs_command(*arguments, "--seed", 1)
     assert status == 2
     assert "give another --out" in err
+
+
+def test_a_system_without_a_workspace_is_trained_and_gone_on_with(safe_envs_command):
+    Path("own.py").write_text(SYSTEM)
+    given = ("--algo", "ppo", "--n-timesteps", 128, "--num-envs", 4, "--eval-episodes", 8, "--set", "n_steps=32", "--out", "run")
+    arguments = ("train", "--system", "own.py:problem", *given)
+    status, out, err = safe_envs_command(*arguments, "--eval-freq", 128)
+    assert (status, err) == (0, "")
+    assert "finished already" not in out
+    assert strictly("run/policy.json")["problem"]["observation"] == {"shape": [2], "low": ["-inf", "-inf"], "high": ["inf", "inf"]}
+    evaluated = ("--policy", "run", "--filter", "none", "--episodes", 8)
+    assert safe_envs_command("evaluate", "--system", "own.py:problem", *evaluated)[::2] == (0, "")
+    # A policy of other observations is refused as ever.
+    status, _, err = safe_envs_command("evaluate", "--system", "own.py:bounded", *evaluated)
+    assert status == 2
+    assert "was trained for another problem, with observation" in err
+    status, out, _ = safe_envs_command(*arguments, "--eval-freq", 128, "--resume")
+    assert status == 0
+    assert out.startswith("The training in run was finished already")
+    # The system is named before all that changes with it.
+    status, _, err = safe_envs_command("train", "--system", "own.py:bounded", *given, "--eval-freq", 64, "--resume")
+    assert status == 2
+    assert "has system = 'own.py:problem', not 'own.py:bounded'" in err

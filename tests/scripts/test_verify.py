@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from agents import verification
 from tests.scripts.conftest import strictly
+from tests.scripts.own_system import SYSTEM
 
 CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
 
@@ -54,6 +57,21 @@ def test_reports_without_a_simulation(verify, arguments, texts):
     assert "Measured" not in out
     for text in texts:
         assert text in out
+
+
+def test_of_a_set_that_is_cut_only_the_part_inside_is_told(verify):
+    Path("own.py").write_text(SYSTEM)
+    status, out, _ = verify("--system", "own.py:falling", "--filter", "scbf", "--no-simulate")
+    assert status == 0
+    assert out.count("chosen around the starts") == 1
+    (ranges,) = [line for line in out.splitlines() if "chosen around the starts" in line]
+    assert "x in [" in ranges
+    assert ", v in [" in ranges
+    assert "their workspace is unbounded" in ranges
+    assert "% of the part of C that is searched" in out
+    assert "  the part of C that is searched: " in out
+    assert "workspace:" not in out
+    assert "of the starts are in C and outside this intersection: nothing is promised from there" in out
 
 
 def test_json_holds_all_of_it(verify, tmp_path):

@@ -11,7 +11,14 @@ import sympy as sp
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from safe_envs import ConfigurationError, ControlAffineSDE, InvalidInputError, RelativeDegreeError
+from safe_envs import (
+    ConfigurationError,
+    ControlAffineSDE,
+    InvalidInputError,
+    RelativeDegreeError,
+    SystemDefinitionError,
+    SystemDefinitionWarning,
+)
 from wrappers import ActionMap, FilterSpec, SafetyFilterVectorWrapper, SafetyFilterWrapper, SafetyMonitor
 
 theta, rate, torque = sp.symbols("theta rate torque", real=True)
@@ -138,10 +145,63 @@ def test_a_batch_may_run_in_other_processes():
     assert infos["episode_interventions"].min() > 0
 
 
-def test_the_wrapper_may_stand_above_others():
-    env = SafetyFilterWrapper(gym.wrappers.TimeAwareObservation(gym.make("Pendulum-v1")), FILTER, **PENDULUM)
+@pytest.mark.parametrize(
+    ("wrap", "part"),
+    [
+        (gym.wrappers.TimeAwareObservation, "state_fn"),
+        (gym.wrappers.NormalizeObservation, "state_fn"),
+        (lambda env: gym.wrappers.RescaleAction(env, np.float32(-1), np.float32(1)), "action_map"),
+    ],
+)
+def test_wrappers_that_change_what_the_filter_sees_or_does_are_doubtful(wrap, part):
+    with pytest.warns(SystemDefinitionWarning, match=f"unless {part} undoes that"):
+        SafetyFilterWrapper(wrap(gym.make("Pendulum-v1")), FILTER, **PENDULUM)
+
+
+def test_wrappers_that_only_watch_may_lie_below():
+    env = SafetyFilterWrapper(gym.wrappers.RecordEpisodeStatistics(gym.make("Pendulum-v1")), FILTER, **PENDULUM)
     env.reset(seed=0)
     assert env.step([1.0])[4]["barrier"].shape == (1,)
+
+
+@pytest.mark.parametrize("kind", [gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv])
+def test_a_masked_reset_leaves_the_records_of_the_others(kind):
+    batch = SafetyFilterVectorWrapper(
+        kind([lambda: gym.make("Pendulum-v1")] * 3, autoreset_mode=AutoresetMode.DISABLED), FILTER, **PENDULUM, dt=0.05
+    )
+    observations, _ = batch.reset(seed=0)
+    for _ in range(20):
+        observations, *_, before = batch.step(spun(observations))
+    observations, after = batch.reset(options={"reset_mask": np.array([False, False, True])})
+    assert after["_cost"].tolist() == [False, False, True]
+    observations, *_, now = batch.step(spun(observations))
+    batch.close()
+    assert (now["h_min"][:2] <= before["h_min"][:2]).all()
+    assert now["h_min"][2] >= before["h_min"][2]
+    counts = now["episode_interventions"] - before["episode_interventions"]
+    assert (counts[:2] >= 0).all()
+    assert now["episode_interventions"][2] <= 1
+
+
+def test_what_a_caller_does_to_an_observation_does_not_reach_the_state():
+    view = {**CAR, "barriers": 5 - v, "state_fn": lambda o: o}
+    batch = SafetyFilterVectorWrapper(gym.make_vec("MountainCarContinuous-v0", 1, "sync"), "cbf", **view)
+    observations, _ = batch.reset(seed=0)
+    before = [float(c[0]) for c in batch.env.components]
+    observations -= 100
+    assert [float(c[0]) for c in batch.env.components] == before
+
+
+def test_rounding_of_actions_is_no_change():
+    offset = {"action_map": ActionMap.scaled(1.0, -1.4), "barriers": 100 - rate**2}
+    env = SafetyFilterWrapper(_Watched(SafetyMonitor(gym.make("Pendulum-v1"), FilterSpec(**{**PENDULUM, **offset}))), "cbf")
+    env.reset(seed=0)
+    for action in np.linspace(-2, 2, 40, dtype=np.float32):
+        env.step([action])
+
+
+class _Watched(gym.Wrapper):
+    """Does nothing."""
 
 
 @pytest.mark.parametrize(
@@ -154,6 +214,9 @@ def test_the_wrapper_may_stand_above_others():
         ({"action_map": 2.0}, ConfigurationError, "ActionMap.scaled"),
         ({"dt": None}, ConfigurationError, "give dt"),
         ({"barriers": sp.Integer(1)}, RelativeDegreeError, "no relative degree"),
+        ({"barriers": []}, SystemDefinitionError, "barriers is empty"),
+        ({"state_fn": lambda o: o["x"]}, InvalidInputError, "state_fn failed"),
+        ({"action_map": ActionMap(lambda a: a + 3 * np.sin(np.pi * a), lambda u: u)}, ConfigurationError, "to undo to_input"),
         ({"model": None}, ConfigurationError, "give a ControlAffineSDE"),
         ({"modell": None}, ConfigurationError, "did you mean 'model'"),
         ({"knowledge": "plant"}, ConfigurationError, "nothing is known but the model"),
@@ -173,6 +236,25 @@ def test_what_cannot_be_filtered_is_refused():
         SafetyFilterWrapper(gym.make("CartPole-v1"), FILTER, **PENDULUM, dt=0.02)
     with pytest.raises(ConfigurationError, match="has a model and barriers of its own"):
         SafetyFilterWrapper(gym.make("safe_envs/Pendulum-v0"), "scbf", **PENDULUM)
+
+
+def test_the_right_wrapper_is_named():
+    with pytest.raises(ConfigurationError, match="put SafetyFilterVectorWrapper over it"):
+        SafetyFilterWrapper(gym.make_vec("safe_envs/Scalar-v0", num_envs=2), "scbf")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ConfigurationError, match="make them by gym"):
+        SafetyFilterVectorWrapper(gym.vector.SyncVectorEnv([lambda: gym.make("safe_envs/Scalar-v0")]), "scbf")
+
+
+class _Whole(gym.Env):
+    """Takes whole numbers only."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (2,))
+    action_space = gym.spaces.Box(-5, 5, (1,), dtype=np.int64)
+
+
+def test_actions_that_would_be_truncated_are_refused():
+    with pytest.raises(ConfigurationError, match="Box of floats"):
+        SafetyFilterWrapper(_Whole(), "cbf", **CAR)
 
 
 def test_actions_that_are_no_numbers_are_refused():

@@ -33,7 +33,8 @@ class BarsScene(Scene):
         """Draw the bars."""
         more = len(self.names) - len(self._ranges)
         rest = f" (and {more} more)" if more else ""
-        canvas.text(f"States{rest}: tinted where each is safe while the others stay", (_LEFT, 18), INK, SMALL, bold=True)
+        below = "; below it, its trail" if self._pitch >= _WITH_TRAIL else ""
+        canvas.text(f"States{rest}: tinted where each is safe while the others stay{below}", (_LEFT, 18), INK, SMALL, bold=True)
         for i, usual in enumerate(self._ranges):
             self._draw_bar(canvas, moment, i, round(_TOP + i * self._pitch), *grown(usual, moment.states[:, i]))
 

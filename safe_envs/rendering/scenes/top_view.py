@@ -129,7 +129,10 @@ class TopView(Scene):
                 continue
             at, size, color = axes.place(*then), obstacle.radius * axes.scale[0], mix(VIOLATION, PAPER, 0.6)
             canvas.disk(at, size, None, color, 2)
-            canvas.text(f"at {moment.violated_at:.2f} s", (at[0], at[1] + size + 2), mix(color, INK, 0.6), SMALL, align=(0.5, 0.0))
+            # On the far side of the vehicle, whose trail and mark are on the near one.
+            up = vehicle[1] < then[1]
+            edge = at[1] - size - 2 if up else at[1] + size + 2
+            canvas.text(f"at {moment.violated_at:.2f} s", (at[0], edge), mix(color, INK, 0.6), SMALL, align=(0.5, float(up)))
 
 
 def draw_vehicle(canvas: Canvas, at: tuple[float, float], heading: float, moment: Moment) -> None:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from safe_envs.barrier import Barrier
 from safe_envs.calculus import derivatives, drift_derivative, generator, input_derivative
 from safe_envs.codegen import compile_function
 from safe_envs.errors import ConfigurationError, InvalidInputError
@@ -133,6 +134,15 @@ def test_every_barrier_has_its_generator():
     model = learn_generator(problem, points=30, repetitions=30)
     assert list(model.compare(problem, states_in(problem))) == ["M_1(h)", "M_1(inner)"]
     assert len(model.generators) == 2
+
+
+def test_noise_that_adds_nothing_to_a_barrier_is_learned_as_nothing():
+    scalar = problem_of("safe_envs/Scalar-v0")
+    (x,) = scalar.plant.states
+    model = learn_generator(replace(scalar, barriers=(Barrier(x),)), points=20, repetitions=20, way="network")
+    (generator_of_x,) = model.generators
+    assert not np.any(generator_of_x.arrays((np.linspace(-3.0, 3.0, 50),)))
+    assert set(model.record.errors.values()) == {0.0}
 
 
 @pytest.mark.parametrize("name", ["first_order", "recursion", "direct"])

@@ -171,6 +171,24 @@ def test_constant_columns_of_zeros_are_fine():
     assert trained.network.input_scale[2] == trained.network.output_scale[2] == 1.0
 
 
+@pytest.mark.parametrize("value", [0.0, -0.78, 1e-9])
+def test_a_target_that_is_constant_is_answered_by_the_constant(value):
+    x, y = data(60)
+    constant = value * (1.0 + 1e-15 * np.arange(60)[:, None] / 60)
+    trained = train(x, constant, hidden=(5,), epochs=3)
+    (found,) = trained.network.arrays(tuple(x.T))
+    np.testing.assert_allclose(found, value, rtol=1e-14, atol=0.0)
+    assert not np.any(trained.network.values_and_slopes_arrays(tuple(x.T), 0)[1])
+    assert (trained.epochs, trained.validation_loss) == (0, 0.0)
+    assert trained.heldout.max() <= 1e-14 * abs(value)
+    # Beside another one, which is learned as if it were not there.
+    both = train(x, np.hstack((y[:, :1], constant)), hidden=(5,), epochs=3)
+    first, second = both.network.arrays(tuple(x.T))
+    np.testing.assert_allclose(second, value, rtol=1e-14, atol=0.0)
+    assert np.std(first) > 0.0
+    assert both.epochs == 3
+
+
 def test_training_stops_when_the_validation_loss_does_not_fall():
     rng = np.random.default_rng(0)
     trained = train(rng.normal(size=(60, 2)), rng.normal(size=(60, 1)), hidden=(60, 30), epochs=2000, rate=1e-2)
