@@ -190,6 +190,8 @@ def evaluate(
             )
             for r, env in enumerate(envs[name])
         ]
+        for env in envs[name]:
+            env.close()
         speeds.append({**_speed(name, totals, time.perf_counter() - begun), "learning_seconds": seconds_of(filters_of[name])})
         found = pooled([each.row(confidence) for each in totals], confidence)
         rows.append(

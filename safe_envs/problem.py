@@ -245,12 +245,9 @@ class SafetyProblem:
         if noise is None:
             return {}
         if not self.noise:
-            fixed = (
-                ""
-                if self.plant.numeric(self.plant.diffusion).is_zero_matrix
-                else (": its diffusion holds numbers only; write it as a parameter, so that it can be changed")
-            )
-            raise ConfigurationError(f"{self.name} has no noise channels{fixed}")
+            still = self.plant.numeric(self.plant.diffusion).is_zero_matrix
+            advice = "" if still else ": its diffusion holds numbers only; write it as a parameter, so that it can be changed"
+            raise ConfigurationError(f"{self.name} has no noise channels{advice}")
         given = _numbers(noise)
         if given.shape not in ((1,), (len(self.noise),)) or not np.isfinite(given).all() or (given < 0).any():
             raise ConfigurationError(f"noise = {noise!r}; give one number >= 0, or {len(self.noise)} of them ({', '.join(self.noise)})")

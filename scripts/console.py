@@ -106,7 +106,8 @@ def stdout() -> Console:
     kind = _Tables if _Terminal.quiet else Console
     if sys.stdout.isatty():
         return kind(width=max(Console().width, _LEAST_WIDTH), quiet=_Terminal.silent)
-    return kind(width=_PIPE_WIDTH, quiet=_Terminal.silent, file=_Trimmed(sys.stdout))
+    trimmed: Any = _Trimmed(sys.stdout)
+    return kind(width=_PIPE_WIDTH, quiet=_Terminal.silent, file=trimmed)
 
 
 def require_result(path: Path | None) -> None:

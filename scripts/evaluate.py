@@ -84,6 +84,7 @@ def evaluate(
     particles: Annotated[int | None, typer.Option(help="With --rare, in place of --episodes: episodes of a repetition. [250]")] = None,
     repetitions: Annotated[int | None, typer.Option(help="With --rare: independent ones, which give the interval. [20]")] = None,
     num_envs: Annotated[int, typer.Option(help="Episodes side by side; it changes the speed, not the answer.")] = 1024,
+    jobs: Annotated[int, typer.Option(help="Processes; they change the speed, not the answer.")] = 1,
     json: Annotated[
         Path | None,
         typer.Option(
@@ -124,7 +125,7 @@ def evaluate(
     if rare:
         from scripts.rare_report import run_rare
 
-        refused = {"--filter-spec": filter_spec, "--refine": refine, "--plot": plot, "--repeats": repeats != 1}
+        refused = {"--filter-spec": filter_spec, "--refine": refine, "--plot": plot, "--repeats": repeats != 1, "--jobs": jobs != 1}
         run_rare(
             json,
             refused,
@@ -163,6 +164,7 @@ def evaluate(
             learned=learned or (),
             repeats=repeats,
             monitoring=monitoring,
+            jobs=jobs,
             progress=tell,
             record=plot is not None,
         )

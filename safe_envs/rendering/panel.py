@@ -163,8 +163,8 @@ class Panel:
         canvas.text("0", (left - 6, edge), GREY, SMALL, align=(1.0, 0.5))
         far = high if high >= -low else low
         canvas.text(number(far), (left - 6, axes.place(0.0, far)[1]), GREY, SMALL, align=(1.0, 0.5))
-        for tick in axes.x:
-            canvas.text(f"{tick:.3g} s", (axes.place(tick, 0.0)[0], top + height + 4), GREY, SMALL - 1, align=(float(tick == axes.x[1]), 0.0))
+        for time, side in zip(axes.x, (0.0, 1.0), strict=True):
+            canvas.text(f"{time:.3g} s", (left + side * width, top + height + 4), GREY, SMALL - 1, align=(side, 0.0))
         now = number(float(moment.h[-1]))
         right = canvas.text(f"least {number(moment.least)}", (_RIGHT, self._heading + 2), GREY, SMALL, align=(1.0, 0.0))
         canvas.text(f"now {now}", (_RIGHT - right - 14, self._heading + 2), INK, SMALL, bold=True, align=(1.0, 0.0))

@@ -210,6 +210,20 @@ def test_nothing_is_drawn_without_a_render_mode():
         assert env.render() is None
 
 
+def test_render_of_each_env_is_its_picture():
+    env = make_sb3_env(DUBINS, 3, "scbf", seed=1, render_mode="rgb_array")
+    env.reset()
+    pictures = env.env_method("render")
+    assert [picture.shape for picture in pictures] == [(540, 960, 3)] * 3
+    for ours, theirs in zip(pictures, env.get_images(), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+    (last,) = env.env_method("render", indices=2)
+    np.testing.assert_array_equal(last, pictures[2])
+    assert (last != pictures[0]).any()
+    with pytest.warns(UserWarning, match="without a render mode"):
+        assert make_sb3_env(DUBINS, 2).env_method("render") == [None, None]
+
+
 def test_video_recorder_gets_what_it_asks_for(monkeypatch, tmp_path):
     # The render mode, the frame rate in the metadata, and one picture of all envs, here from a stand-in for rendering.
     native = make_sb3_env(DUBINS, 2).env

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import sys
 from pathlib import Path
 
 import gymnasium as gym
@@ -12,7 +14,8 @@ from gymnasium.utils.env_checker import check_env
 
 import safe_envs
 from safe_envs import ConfigurationError, SafetyProblem, SystemDefinitionError, state_problem
-from safe_envs.custom import load_system
+from safe_envs.custom import Custom, load_system
+from safe_envs.places import load_object
 from safe_envs.systems import CUSTOM_ID
 
 STATEMENT = """
@@ -126,3 +129,67 @@ def test_what_cannot_be_registered_is_refused(given, my_id):
 def test_a_problem_itself_is_told_where_to_go(my_id):
     with pytest.raises(ConfigurationError, match=r"goes into SafeEnv\(problem\)"):
         safe_envs.register(my_id, stated_here())  # pyright: ignore[reportArgumentType]
+
+
+def test_the_arguments_of_the_env_itself_reach_it(tmp_path):
+    system = place(tmp_path)
+    env = Custom(system, max_episode_steps=3)
+    env.reset(seed=0)
+    assert [env.step([0.0])[3] for _ in range(3)] == [False, False, True]
+    envs = gym.make_vec(CUSTOM_ID, num_envs=1, system=system, autoreset_mode="SameStep", horizon=0.1)
+    envs.reset(seed=0)
+    assert "final_info" not in envs.step([[0.0]])[4]
+    assert "final_info" in envs.step([[0.0]])[4]
+
+
+def test_a_file_leaves_nothing_behind(tmp_path):
+    before = list(sys.path)
+    for text in (STATEMENT, "import nowhere"):
+        with contextlib.suppress(ConfigurationError):
+            load_system(place(tmp_path, statement=text))
+    assert sys.path == before
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        ("1 / 0", "in line 2: ZeroDivisionError"),
+        ("raise SystemExit(0)", "SystemExit"),
+        ("from beside_it import EDGE; return EDGE", "returned float"),
+    ],
+)
+def test_what_goes_wrong_in_the_function_is_explained(tmp_path, body, says):
+    (tmp_path / "beside_it.py").write_text("EDGE = 1.5")
+    (tmp_path / "own.py").write_text(f"def problem():\n    {body}\n")
+    with pytest.raises(ConfigurationError, match=says):
+        load_system(f"{tmp_path / 'own.py'}:problem")()
+
+
+def test_a_missing_argument_is_named(tmp_path):
+    (tmp_path / "own.py").write_text("def problem(*, radius): pass")
+    with pytest.raises(ConfigurationError, match="'radius'; give its arguments by --barrier"):
+        gym.make(CUSTOM_ID, system=f"{tmp_path / 'own.py'}:problem")
+
+
+def test_neighbours_of_one_name_in_two_folders_are_told_apart(tmp_path):
+    found = []
+    for number in (1, 2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        (folder / "same_name.py").write_text(f"EDGE = {number}")
+        (folder / "own.py").write_text("from same_name import EDGE")
+        found.append(load_object(f"{folder / 'own.py'}:EDGE"))
+    assert found == [1, 2]
+
+
+def test_an_error_of_ours_has_the_line_of_the_file(tmp_path):
+    (tmp_path / "own.py").write_text("import sympy as sp\nfrom safe_envs import Barrier\nBarrier('x')")
+    with pytest.raises(SystemDefinitionError, match=r"own.py in line 3: a barrier is a text"):
+        load_system(f"{tmp_path / 'own.py'}:problem")
+
+
+def test_ids_of_others_are_not_replaced(tmp_path, my_id):
+    with pytest.raises(ConfigurationError, match="is taken"):
+        safe_envs.register("Pendulum-v1", place(tmp_path))
+    for edge in ("1.0", "2.0"):
+        safe_envs.register(my_id, place(tmp_path, statement=STATEMENT.replace("edge: float = 1.0", f"edge: float = {edge}")))

@@ -194,3 +194,31 @@ def test_a_missing_parameter_and_a_symbol_of_other_assumptions_are_told_apart():
         ControlAffineSDE((x,), (u,), [k * x], [1], [0])
     with pytest.raises(SystemDefinitionError, match="x has other assumptions there"):
         ControlAffineSDE((x,), (u,), [sp.Symbol("x")], [1], [0])
+
+
+def test_what_is_given_is_what_the_problem_has():
+    model = SYSTEM.with_parameters(k=1.5)
+    noise_in_drift = ControlAffineSDE((x, v), (u,), [v, sigma], [0, 1], [0, k * sigma], {k: 2.0, sigma: 0.1})
+    problem = stated(model=model, units={x: "m", u: "N"}, reward=3 - v, filter="scbf", gains=(3.0, 4.0))
+    assert problem.model == model
+    assert [s.unit for s in (*problem.states, *problem.inputs)] == ["m", "", "N"]
+    assert (problem.reward, problem.filter, problem.gains) == (3 - v, "scbf", (3.0, 4.0))
+    assert stated(noise_in_drift).noise == ("k",)
+
+
+def test_a_mistake_in_the_model_alone_is_found():
+    system = ControlAffineSDE((x, v), (u,), [v, 0], [0, 1 / k], [0, 0], {k: 1.0})
+    with pytest.raises(ConfigurationError, match="division by 0"):
+        stated(system, model=system.with_parameters(k=0.0))
+
+
+def test_gains_of_each_barrier_are_its_own():
+    with pytest.raises(SystemDefinitionError, match="gains of h_2"):
+        stated(barriers=[1 - x**2, 2 - v], gains=((1.0, 1.0), (1.0, 1.0)))
+
+
+def test_boxes_without_zero_and_several_inputs_are_weighed_rightly():
+    # Only u near 9 or above keeps the state: |u| alone would say that the box holds twice what is needed.
+    drift = ControlAffineSDE.from_rate((x,), (u, w), [u + w - 4000])
+    with pytest.warns(SystemDefinitionWarning, match="the inputs make up 10"):
+        state_problem(drift, x + 1, box=[(-30.0, 4.0), (-30.0, 6.0)], start=[0.0], dt=0.01, horizon=1.0, nominal=[0, 0])

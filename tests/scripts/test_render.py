@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import sys
 
 import imageio_ffmpeg
@@ -8,11 +9,16 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
+from agents.policy import make_policy
+from safe_envs import SafeEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.rendering import style
 from scripts.cli import app
-from scripts.film import steps_a_frame
-from scripts.render import split_filters
+from scripts.doctor import packages
+from scripts.film import steps_a_frame, write_film
+from scripts.render import frames_of, split_filters
+from tests.conftest import problem_of
+from wrappers import SafetyFilterWrapper
 
 
 def render(*arguments: str):
@@ -91,9 +97,112 @@ def test_films_run_in_real_time(tmp_path):
     assert [steps_a_frame(out[s], 0.05, 6000) for s in out] == [1, 10]
 
 
+@pytest.mark.parametrize("seconds", [0.02, 0.025, 0.0333, 0.1])
+def test_animations_run_in_real_time(tmp_path, seconds):
+    out = tmp_path / "run.gif"
+    frames = (np.full((6, 6, 3), 40 * k, dtype=np.uint8) for k in range(7))
+    assert write_film(out, frames, seconds) == 7
+    with Image.open(out) as image:
+        lengths = []
+        for k in range(image.n_frames):
+            image.seek(k)
+            lengths.append(image.info["duration"])
+    ends = np.cumsum(lengths)
+    assert len(ends) == 7
+    assert np.abs(ends - 1000 * seconds * np.arange(1, 8)).max() <= 5.0 + 1e-6
+
+
+def straightforward(env_id: str, seed: int, filter_name: str | None = None, knowledge: str = "model", **options):
+    """What an env of the seed does under the random policy: the least h, and where and when it ended and was unsafe first."""
+    problem = problem_of(env_id, **options)
+    env = SafeEnv(problem) if filter_name is None else SafetyFilterWrapper(SafeEnv(problem), filter_name, knowledge)
+    actor = make_policy("random", problem, False)
+    actor.begin(range(1), seed)
+    observation, info = env.reset(seed=seed)
+    violated, steps, state, ended = 0.0 if info["cost"] else None, 0, None, False
+    while not ended:
+        actions, state = actor.predict(observation[None], state, np.array([steps == 0]), deterministic=True)
+        observation, _, terminated, truncated, info = env.step(actions[0])
+        steps += 1
+        ended = terminated or truncated or steps >= problem.steps
+        violated = steps * problem.dt if violated is None and info["cost"] else violated
+    return {"violated_at": violated, "h_min": info["h_min"], "seconds": steps * problem.dt}
+
+
+def episodes(tmp_path, *arguments: str) -> list[dict]:
+    """The random policy's episodes, from the JSON of a still."""
+    found = tmp_path / "found.json"
+    result = render(*arguments, "--policy", "random", "--out", str(tmp_path / "end.png"), "--json", str(found))
+    assert result.exit_code == 0, result.output
+    return json.loads(found.read_text())["episodes"]
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_episodes_are_those_of_the_seed(tmp_path, seed):
+    (found,) = episodes(
+        tmp_path, "safe_envs/Scalar-v0", "--filter", "none", "--noise", "1", "--horizon", "0.5", "--start", "0", "--seed", str(seed)
+    )
+    expected = straightforward("safe_envs/Scalar-v0", seed, noise=1.0, horizon=0.5, start=[0.0])
+    assert {key: found[key] for key in expected} == pytest.approx(expected)
+    assert expected["h_min"] < 0.999, "the actions have no part in it"
+
+
+def test_the_first_violation_is_at_its_step(tmp_path):
+    (found,) = episodes(tmp_path, "safe_envs/Scalar-v0", "--filter", "none", "--start", "0.9", "--noise", "2", "--horizon", "0.5")
+    expected = straightforward("safe_envs/Scalar-v0", 0, start=[0.9], noise=2.0, horizon=0.5)
+    assert expected["violated_at"] > 0.01
+    assert found["violated_at"] == pytest.approx(expected["violated_at"])
+    (found,) = episodes(tmp_path, "safe_envs/Scalar-v0", "--filter", "none", "--start", "1.5", "--horizon", "0.05")
+    assert found["violated_at"] == 0.0
+
+
+def test_filters_know_what_they_are_told(tmp_path):
+    arguments = ("safe_envs/DubinsDisk-v0", "--filter", "hocbf:p=2,8", "--horizon", "1.5", "--start", "0,0.1,0")
+    found = {k: episodes(tmp_path, *arguments, "--knowledge", k)[0]["h_min"] for k in ("model", "plant")}
+    for knowledge, h_min in found.items():
+        expected = straightforward("safe_envs/DubinsDisk-v0", 0, "hocbf:p=2,8", knowledge, horizon=1.5, start=[0.0, 0.1, 0.0])
+        assert h_min == pytest.approx(expected["h_min"])
+    assert found["model"] != found["plant"]
+
+
+def test_each_episode_has_a_policy_of_its_own(tmp_path):
+    arguments = ("safe_envs/Scalar-v0", "--noise", "1", "--horizon", "0.3", "--seed", "2")
+    both = episodes(tmp_path, *arguments, "--compare", "none,scbf")
+    assert both == [episodes(tmp_path, *arguments, "--filter", name)[0] for name in ("none", "scbf")]
+
+
+class Counted:
+    """Stands in for a run of so many steps, with the step as its picture."""
+
+    def __init__(self, steps: int) -> None:
+        self.k, self._steps = 0, steps
+
+    @property
+    def ended(self) -> bool:
+        return self.k == self._steps
+
+    def step(self) -> None:
+        self.k += not self.ended
+
+    def frame(self) -> np.ndarray:
+        return np.full((1, 1, 3), self.k)
+
+
+@pytest.mark.parametrize(("every", "expected"), [(1, [0, 1, 2, 3, 4, 5]), (2, [0, 2, 4, 5]), (5, [0, 5]), (9, [0, 5])])
+def test_a_film_has_the_start_and_the_end(every, expected):
+    told = []
+    frames = list(frames_of([Counted(5), Counted(3)], every, 5, told.append))
+    assert [frame[0, 0, 0] for frame in frames] == expected
+    assert [frame[0, 1, 0] for frame in frames] == [min(k, 3) for k in expected]
+    assert told == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (("--out", "run.gif", "--json", "run.gif"), "--json run.gif would overwrite the file of --out run.gif"),
+        (("--out", "run.png", "--compare", "none,foo"), "unknown filter 'foo'"),
+        (("--out", "run.png", "--compare", "none, scfb:alpha=1,szcbf"), "unknown filter 'scfb'; did you mean 'scbf'"),
         (("--out", "run.avi"), "ends in '.avi'"),
         (("--out", "missing/run.png"), "does not exist"),
         (("--out", "run.png", "--filter", "scfb"), "did you mean 'scbf'"),
@@ -116,5 +225,24 @@ def test_missing_moviepy_says_what_to_install(tmp_path, monkeypatch):
     for name in [name for name in sys.modules if name.split(".")[0] == "moviepy"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "moviepy", None)
-    result = render("safe_envs/Scalar-v0", "--out", str(tmp_path / "run.mp4"))
+    # Before any work: what else is wrong comes up later.
+    result = render("safe_envs/Scalar-v0", "--policy", "nominall", "--out", str(tmp_path / "run.mp4"))
     assert 'pip install "safe-envs[render]"' in str(result.exception)
+
+
+def test_missing_pygame_is_said_before_any_work(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    result = render("safe_envs/Scalar-v0", "--policy", "nominall", "--out", str(tmp_path / "run.png"))
+    assert 'drawing needs pygame-ce: pip install "safe-envs[render]"' in str(result.exception)
+    # The doctor reads the metadata, which have pygame-ce.
+    assert next(check for check in packages() if check.name == "pygame-ce").ok
+
+
+def test_the_doctor_finds_the_other_pygame(monkeypatch):
+    import pygame
+
+    monkeypatch.delattr(pygame.draw, "aacircle")
+    (check,) = (check for check in packages() if check.name == "pygame-ce")
+    assert check.ok is False
+    assert "what is imported is pygame" in check.found
+    assert check.advice.startswith("pip uninstall pygame pygame-ce")

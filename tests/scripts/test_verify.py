@@ -70,7 +70,7 @@ def test_of_a_set_that_is_cut_only_the_part_inside_is_told(verify):
     assert "their workspace is unbounded" in ranges
     assert "% of the part of C that is searched" in out
     assert "  the part of C that is searched: " in out
-    assert "workspace:" not in out
+    assert "where the episodes are" not in out
     assert "of the starts are in C and outside this intersection: nothing is promised from there" in out
 
 

@@ -117,7 +117,6 @@ class TopView(Scene):
                 canvas.line(middle, (middle[0] + size, middle[1]), INK)
                 canvas.text(f"{obstacle.radius:g} m", (middle[0] + size / 2, middle[1] - 1), INK, SMALL - 2, align=(0.5, 1.0))
 
-
     def _draw_hit(self, canvas: Canvas, axes: Axes, moment: Moment) -> None:
         """Outline the obstacles that the vehicle was in at the first violation, where they were then; they may be elsewhere now."""
         if moment.violated is None:
