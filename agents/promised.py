@@ -107,7 +107,8 @@ def _outside_of(conditions: Sequence[Condition], problem: SafetyProblem, knowled
     def outside(x: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
             values = stacked(chain(*np.ascontiguousarray(x.T)), len(x))
-        return (values[:, : len(rows)] > 0.0).all(axis=1) & (values[:, len(rows) :] <= 0.0).any(axis=1)
+        safe, left = (values[:, : len(rows)] > 0.0).all(axis=1), (values[:, len(rows) :] <= 0.0).any(axis=1)
+        return np.logical_and(safe, left)
 
     return outside
 
