@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -180,7 +181,8 @@ def run_episodes(
     return totals_of(readable(env).problem, play(env, policy, range(episodes), seed, progress, recorder, bridge), on_start)
 
 
-class Played(NamedTuple):
+@dataclass(frozen=True)
+class Played:
     """A wave that was simulated.
 
     Attributes:

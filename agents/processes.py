@@ -48,11 +48,8 @@ def play_in_processes(
     parts = [range(first, min(first + size, episodes)) for first in range(0, episodes, size)]
     send = delayed(_played)
     try:
-        for part, waves in zip(
-            parts,
-            Parallel(n_jobs=jobs, return_as="generator")(send(setting, conditions, part, seed, num_envs, bridge) for part in parts),
-            strict=True,
-        ):
+        found: Any = Parallel(n_jobs=jobs, return_as="generator")(send(setting, conditions, part, seed, num_envs, bridge) for part in parts)
+        for part, waves in zip(parts, found, strict=True):
             yield from waves
             if progress:
                 progress(part.stop)
