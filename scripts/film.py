@@ -13,7 +13,6 @@ import numpy as np
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import require_writable, write_atomically
-from safe_envs.rendering.viewer import require_pygame
 
 SUFFIXES = (".mp4", ".gif", ".png")
 """What can be written."""
@@ -33,6 +32,8 @@ def require_film(path: Path) -> None:
     if path.suffix.lower() not in SUFFIXES:
         raise ConfigurationError(f"--out {path} ends in {path.suffix!r}; give a file that ends in {', '.join(SUFFIXES)}")
     require_writable(path)
+    from safe_envs.rendering.viewer import require_pygame
+
     require_pygame()
     if path.suffix.lower() == ".mp4":
         _video_writer()

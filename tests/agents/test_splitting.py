@@ -86,11 +86,11 @@ def test_cruise_control_under_its_filter_has_the_gaussian_law():
 def test_interval_covers():
     problem = brownian(0.05, 1.0, 0.0, 0.25)
     exact = walk_passage(1.0, 20, 0.0, 0.25 * math.sqrt(0.05))
-    rows = [row_of(problem, seed=seed, particles=100, repetitions=8) for seed in range(14)]
+    rows = [row_of(problem, seed=seed, particles=100, repetitions=8) for seed in range(9)]
     held = sum(row["ci_low"] < exact < row["ci_high"] for row in rows)
-    # 11 of 14 or less has a probability of .03 if 95 % are held.
-    assert held >= 12
-    assert np.mean([row["probability"] for row in rows]) == pytest.approx(exact, rel=0.15)
+    # 6 of 9 or less has a probability of .008 if 95 % are held.
+    assert held >= 7
+    assert np.mean([row["probability"] for row in rows]) == pytest.approx(exact, rel=0.2)
 
 
 @pytest.mark.parametrize(("policy", "monitoring"), [("nominal", "discrete"), ("random", "discrete"), ("nominal", "continuous")])

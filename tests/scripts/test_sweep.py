@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 import os
 import re
 import signal
@@ -106,7 +107,9 @@ def test_mistakes_in_a_report(safe_envs_command, spec: Path, tmp_path: Path):
 def test_ctrl_c_keeps_what_is_done_and_leaves_no_process(spec: Path, tmp_path: Path):
     spec.write_text(SPEC.replace("seed: [0, 1]", f"seed: {list(range(1000))}"))
     words = [sys.executable, "-m", "scripts.sweep", str(spec), "--out", str(tmp_path / "out"), "--jobs", "2"]
-    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    # A shell that runs the tests in the background has its processes ignore the signal.
+    heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heed)
     try:
         cells = tmp_path / "out" / "cells"
         while process.poll() is None and not (cells.exists() and len(list(cells.glob("[!.]*.parquet"))) >= 3):
