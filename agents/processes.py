@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from pickle import PicklingError
 from typing import Any
+
+import cloudpickle
 
 from agents.bridge import Bridge
 from agents.episodes import Played, Progress, play
@@ -46,17 +47,25 @@ def play_in_processes(
 
     size = max(1, math.ceil(episodes / (jobs * _PARTS)))
     parts = [range(first, min(first + size, episodes)) for first in range(0, episodes, size)]
-    send = delayed(_played)
+    sent = _sent(setting, conditions, jobs)
+    found: Any = Parallel(n_jobs=jobs, return_as="generator")(delayed(_played)(sent, part, seed, num_envs, bridge) for part in parts)
+    for part, waves in zip(parts, found, strict=True):
+        yield from waves
+        if progress:
+            progress(part.stop)
+
+
+def _sent(setting: Setting, conditions: Sequence[Condition], jobs: int) -> bytes:
     try:
-        found: Any = Parallel(n_jobs=jobs, return_as="generator")(send(setting, conditions, part, seed, num_envs, bridge) for part in parts)
-        for part, waves in zip(parts, found, strict=True):
-            yield from waves
-            if progress:
-                progress(part.stop)
-    except (PicklingError, AttributeError, TypeError) as error:
+        return cloudpickle.dumps((setting, conditions))
+    except Exception as error:  # Whatever an object of the user's raises where it is not made for this.
         raise ConfigurationError(f"jobs = {jobs}: what is evaluated cannot be sent to another process ({error}); use jobs=1") from error
 
 
-def _played(setting: Setting, conditions: Sequence[Condition], part: range, seed: int, num_envs: int, bridge: bool) -> list[Any]:
+def _played(sent: bytes, part: range, seed: int, num_envs: int, bridge: bool) -> list[Played]:
+    setting, conditions = cloudpickle.loads(sent)
     env = setting.env(conditions, min(num_envs, len(part)))
-    return list(play(env, setting.actor, part, seed, bridge=Bridge(setting.problem) if bridge else None))
+    try:
+        return list(play(env, setting.actor, part, seed, bridge=Bridge(setting.problem) if bridge else None))
+    finally:
+        env.close()

@@ -53,9 +53,9 @@ class Place:
         if (self.address is None) != (self.backend == "local"):
             wrong = "needs the address of its cluster" if self.address is None else "takes no address; name dask or ray as the backend"
             raise ConfigurationError(f"backend {self.backend} {wrong}")
-        for package, extra in (("joblib", "sweep"), ({"dask": "distributed"}.get(self.backend, self.backend), self.backend)):
-            if extra != "local" and find_spec(package) is None:
-                raise ConfigurationError(f'{package} is not installed; install it with pip install "safe-envs[{extra}]"')
+        package = {"local": "joblib", "dask": "distributed", "ray": "ray"}[self.backend]
+        if find_spec(package) is None:
+            raise ConfigurationError(f'{package} is not installed; install it with pip install "safe-envs[{self.backend}]"')
 
 
 def run(cells: Iterable[Cell], place: Place, keep: Callable[[Outcome], None]) -> None:

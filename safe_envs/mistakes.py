@@ -16,6 +16,7 @@ from safe_envs.codegen import Components, compile_function, stacked
 from safe_envs.errors import SystemDefinitionError, SystemDefinitionWarning
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
+from safe_envs.simulation import proposed_starts
 
 _STARTS = 256
 _FEW = 0.05
@@ -70,15 +71,7 @@ def degree_of(system: ControlAffineSDE, h: sp.Expr) -> int:
     Raises:
         RelativeDegreeError: no input reaches h.
     """
-    noisy = any(entry != 0 for entry in system.numeric(system.diffusion))
-    return relative_degree(system, h, generator if noisy else drift_derivative)
-
-
-def _starts(problem: SafetyProblem) -> Components:
-    """States drawn from the problem's start, whether or not they meet its condition: components of shape (256,)."""
-    start = problem.starts[problem.start]
-    uniforms = np.random.default_rng(0).random((len(start.uniforms), _STARTS))
-    return tuple(stacked(compile_function(start.uniforms, start.state, "arrays")(*uniforms), _STARTS).T.copy())
+    return relative_degree(system, h, generator if system.noisy else drift_derivative)
 
 
 def _values(symbols: Sequence[sp.Symbol], expressions: Sequence[Any], x: Components) -> np.ndarray:
@@ -108,7 +101,7 @@ def _safe_starts(problem: SafetyProblem) -> Components:
     Raises:
         SystemDefinitionError: there are none.
     """
-    x, states = _starts(problem), problem.plant.states
+    x, states = tuple(proposed_starts(problem, _STARTS).T.copy()), problem.plant.states
     within = np.ones(_STARTS, dtype=bool)
     for state, values in zip(problem.states, x, strict=True):
         inside = (values >= state.low) & (values <= state.high)

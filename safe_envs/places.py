@@ -14,6 +14,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import cloudpickle
+
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
 
 
@@ -84,10 +86,13 @@ def _loaded(path: Path, _changed: int) -> ModuleType:
     if spec is None or spec.loader is None:
         raise ConfigurationError(f"{path} cannot be read as Python")
     module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    # Another process does not have this module: what is sent there takes its functions along.
+    cloudpickle.register_pickle_by_value(module)
     try:
         with _running(path, str(path)):
             spec.loader.exec_module(module)
     except SafeEnvsError:
+        cloudpickle.unregister_pickle_by_value(module)
         del sys.modules[name]
         raise
     return module

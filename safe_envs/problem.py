@@ -245,8 +245,7 @@ class SafetyProblem:
         if noise is None:
             return {}
         if not self.noise:
-            still = self.plant.numeric(self.plant.diffusion).is_zero_matrix
-            advice = "" if still else ": its diffusion holds numbers only; write it as a parameter, so that it can be changed"
+            advice = ": its diffusion holds numbers only; write it as a parameter, so that it can be changed" if self.plant.noisy else ""
             raise ConfigurationError(f"{self.name} has no noise channels{advice}")
         given = _numbers(noise)
         if given.shape not in ((1,), (len(self.noise),)) or not np.isfinite(given).all() or (given < 0).any():

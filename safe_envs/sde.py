@@ -172,6 +172,11 @@ class ControlAffineSDE:
         """Number of inputs."""
         return len(self.inputs)
 
+    @property
+    def noisy(self) -> bool:
+        """Whether the diffusion is not zero, for the parameters as they are."""
+        return any(entry != 0 for entry in self.numeric(self.diffusion))
+
     def with_parameters(self, **values: float) -> ControlAffineSDE:
         """Return the same system with other parameter values.
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.codegen import Components, Flavour, compile_function
+from safe_envs.codegen import Components, Flavour, compile_function, stacked
 from safe_envs.errors import ConfigurationError
 from safe_envs.integrate import Integrator
 from safe_envs.problem import TIME, SafetyProblem
@@ -77,6 +77,13 @@ class Simulation:
     def draw_starts(self, rngs: Sequence[np.random.Generator]) -> np.ndarray:
         """Draw an initial state from each generator; shape (n, len(rngs))."""
         return np.array([self.draw_start(rng) for rng in rngs], dtype=float).T.copy()
+
+
+def proposed_starts(problem: SafetyProblem, count: int) -> np.ndarray:
+    """Some states of a problem's start, whether or not they meet its condition: always the same, shape (count, n)."""
+    start = problem.starts[problem.start]
+    uniforms = np.random.default_rng(0).random((len(start.uniforms), count))
+    return stacked(compile_function(start.uniforms, start.state, "arrays")(*uniforms), count)
 
 
 class NoiseStream:

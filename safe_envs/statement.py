@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
@@ -15,7 +16,7 @@ from safe_envs.mistakes import degree_of, require_sound
 from safe_envs.problem import SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE, finite_number
 
-_UNBOUNDED = (-sp.oo, sp.oo)
+_UNBOUNDED = (-math.inf, math.inf)
 
 _STATED = ("name", "plant", "model", "barriers", "states", "inputs", "reward", "nominal", "starts", "start", "dt", "horizon")
 """Attributes of a problem that are made of the arguments."""
@@ -112,12 +113,11 @@ def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str,
         RelativeDegreeError: no input reaches a barrier.
     """
     elsewhere = system.drift.free_symbols | system.input_matrix.free_symbols
-    noisy = any(entry != 0 for entry in system.numeric(system.diffusion))
     degrees = [degree_of(system, b.expression) for b in barriers]
     return {
         "noise": tuple(p.name for p in system.parameters if p in system.diffusion.free_symbols - elsewhere),
         "gains": tuple((1.0,) * degree for degree in degrees) if len(set(degrees)) > 1 else (1.0,) * degrees[0],
-        "filter": "szcbf" if noisy else "hocbf",
+        "filter": "szcbf" if system.noisy else "hocbf",
         "plane": tuple(s.name for s in system.states) if system.n == 2 else None,
     }
 

@@ -108,8 +108,7 @@ def describe_plant(problem: SafetyProblem) -> str:
     model = {p.name: value for p, value in problem.model.parameters.items()}
     noise = ", ".join(f"{name} = {plant[name]:g}" for name in problem.noise)
     differing = [f"{name} = {plant[name]:g} (model {model[name]:g})" for name in plant if plant[name] != model[name]]
-    still = problem.plant.numeric(problem.plant.diffusion).is_zero_matrix
-    told = f"noise {noise}" if any(plant[name] for name in problem.noise) else "no noise" if still else "fixed noise"
+    told = f"noise {noise}" if any(plant[name] for name in problem.noise) else "fixed noise" if problem.plant.noisy else "no noise"
     mismatch = f"plant {', '.join(differing)}" if differing else "model = plant"
     return f"{told}, {mismatch}"
 

@@ -69,8 +69,7 @@ class Formulas:
     @property
     def noisy(self) -> bool:
         """Whether the plant has noise."""
-        plant = self.problem.plant
-        return not plant.numeric(plant.diffusion).is_zero_matrix
+        return self.problem.plant.noisy
 
     @property
     def certain(self) -> bool:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from agents import evaluate
@@ -29,6 +31,25 @@ class _Stuck(Policy):
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         return observation[:, :1] * 0.0, state
+
+
+def test_functions_of_a_file_go_along(tmp_path):
+    place = tmp_path / "mine.py"
+    place.write_text((Path(__file__).parents[2] / "examples" / "pendulum_v1.py").read_text())
+    arguments = {"filters": ["hocbf"], "episodes": 4, "bounds": False, "spec": f"{place}:spec"}
+    assert evaluate("Pendulum-v1", jobs=2, **arguments).rows == evaluate("Pendulum-v1", **arguments).rows
+
+
+class _Failing(Policy):
+    """Fails in its own code, which is no question of processes."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        raise TypeError("of the policy's own")
+
+
+def test_an_error_of_a_policy_stays_what_it_is():
+    with pytest.raises(TypeError, match="of the policy's own"):
+        evaluate("Scalar-v0", _Failing(), filters=["none"], episodes=4, jobs=2)
 
 
 def test_what_cannot_be_sent_is_explained():

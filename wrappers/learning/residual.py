@@ -200,7 +200,7 @@ def learn_residual(
     require_whole("states", states, LEAST_ROWS)
     widths = hidden_widths(hidden)
     _require_label_dt(label_dt, problem.dt)
-    if step is None and any(entry != 0 for entry in problem.plant.numeric(problem.plant.diffusion)):
+    if step is None and problem.plant.noisy:
         raise ConfigurationError(
             f"the plant of {problem.name} is noisy, and the derivatives of a noisy path do not exist; learn with noise=0, or use "
             "ddscbf or bayesian-scbf, which are for noise"

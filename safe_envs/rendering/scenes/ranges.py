@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from safe_envs.codegen import compile_function, stacked
 from safe_envs.problem import SafetyProblem
 from safe_envs.rendering.axes import Range, nice_step
 from safe_envs.rendering.safe_set import Barriers
+from safe_envs.simulation import proposed_starts
 
 _DRAWN = 64
 _HALF_POWERS = range(-16, 27)
@@ -25,7 +23,7 @@ def first_range(problem: SafetyProblem, i: int) -> Range:
         problem: whose starts and barriers are looked at.
         i: index of the state.
     """
-    starts = _starts(problem)
+    starts = proposed_starts(problem, _DRAWN)
     low, high, middle = float(starts[:, i].min()), float(starts[:, i].max()), starts.mean(axis=0)
     barriers = Barriers(problem)
     for power in _HALF_POWERS:
@@ -34,13 +32,6 @@ def first_range(problem: SafetyProblem, i: int) -> Range:
         if any(ends[0] < edge < ends[1] for safe in barriers.intervals(middle, i, *ends) for edge in safe):
             return _rounded(low - _SPARE * reach, high + _SPARE * reach)
     return _rounded(low - 1.0, high + 1.0)
-
-
-def _starts(problem: SafetyProblem) -> np.ndarray:
-    """Some starts, whether or not the distribution's condition holds there, shape (k, n)."""
-    start = problem.starts[problem.start]
-    uniforms = np.random.default_rng(0).random((len(start.uniforms), _DRAWN))
-    return stacked(compile_function(start.uniforms, start.state, "arrays")(*uniforms), _DRAWN)
 
 
 def _rounded(low: float, high: float) -> Range:
