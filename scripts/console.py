@@ -8,7 +8,7 @@ import io
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any, NoReturn, TextIO
@@ -94,11 +94,15 @@ def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
         with quietly(quiet, silent=STDOUT in (arguments.get("json"), arguments.get("json_file"))):
             command(**arguments)
 
-    signature = inspect.signature(command, eval_str=True)
     option = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Quiet)
-    wrapped.__signature__ = signature.replace(parameters=[*signature.parameters.values(), option])  # pyright: ignore[reportAttributeAccessIssue]
-    wrapped.__annotations__ = {**command.__annotations__, "quiet": Quiet}
-    return wrapped
+    return with_signature(wrapped, [*inspect.signature(command, eval_str=True).parameters.values(), option])
+
+
+def with_signature(function: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
+    """Let a function have these parameters for typer, which asks its signature and its annotations; returns it."""
+    function.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
+    function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return function
 
 
 def stdout() -> Console:

@@ -11,6 +11,7 @@ import typer
 from safe_envs.errors import ConfigurationError
 from scripts import completion, options
 from scripts.console import progress_bar, stdout, write_result
+from scripts.env_options import EnvOptions, with_env
 
 LEARNED_PARAMETERS = (
     "learned-hocbf:p=..:level=.95:eps=.. (quantile of the held-out errors that is the margin, or the margin itself), ddscbf:margin=0, "
@@ -19,9 +20,9 @@ LEARNED_PARAMETERS = (
 )
 
 
+@with_env
 def evaluate(
-    env_id: options.EnvId = None,
-    system: options.System = None,
+    env: EnvOptions,
     filter_spec: Annotated[
         str | None,
         typer.Option(
@@ -51,20 +52,11 @@ def evaluate(
     trust: options.Trust = False,
     episodes: Annotated[int, typer.Option(help="Episodes for each filter.")] = 1000,
     seed: options.Seed = 0,
-    noise: options.Noise = None,
-    plant: options.Plant = None,
-    model: options.Model = None,
-    barrier: options.BarrierArguments = None,
     knowledge: options.Knowledge = "model",
     objective: Annotated[
         str,
         typer.Option(metavar="nearest|clf", help="Of the filters: the action nearest to the policy's, or the joint program with the goal."),
     ] = "nearest",
-    dt: options.Dt = None,
-    substeps: options.Substeps = None,
-    horizon: options.Horizon = None,
-    box: options.Box = None,
-    start: options.StartAt = None,
     learned: Annotated[
         list[Path] | None,
         typer.Option("--learned", metavar="FILE", help="What `safe-envs identify` wrote, for the learned filters. Repeatable."),
@@ -105,22 +97,9 @@ def evaluate(
     With --rare the probability of a violation is printed instead, with its interval and what plain Monte Carlo would need.
     """
     from agents import evaluation, refinement
-    from agents.problems import which_env
     from scripts.table import print_evaluation, print_refinement
 
-    options.require_outputs(json, plot, inputs=options.inputs_of(policy, filters or (), learned or ()))
-    arguments = options.of_env(
-        system=system,
-        noise=noise,
-        plant=plant,
-        model=model,
-        barrier=barrier,
-        dt=dt,
-        substeps=substeps,
-        horizon=horizon,
-        box=box,
-        start=start,
-    )
+    options.require_outputs(json, plot, inputs=options.inputs_of(env.system, policy, filters or (), learned or (), filter_spec))
     names = list(dict.fromkeys(filters)) if filters else None
     if rare:
         from scripts.rare_report import run_rare
@@ -129,11 +108,11 @@ def evaluate(
         run_rare(
             json,
             refused,
-            which_env(env_id, system),
+            env.full_id,
             policy,
             filters=names,
             trust=trust,
-            options=arguments,
+            options=env.arguments,
             particles=particles,
             repetitions=repetitions,
             seed=seed,
@@ -149,12 +128,12 @@ def evaluate(
     run_all: Callable[..., Any] = refinement.refine if refine else evaluation.evaluate
     with progress_bar("Evaluating") as tell:
         answer = run_all(
-            env_id if filter_spec and env_id and not system else which_env(env_id, system),
+            env.env_id if filter_spec and env.env_id and not env.system else env.full_id,
             policy,
             filters=names,
             spec=filter_spec,
             trust=trust,
-            options=arguments,
+            options=env.arguments,
             episodes=episodes,
             seed=seed,
             num_envs=num_envs,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
-import shlex
 import typing
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -15,6 +15,7 @@ import typer
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from scripts import completion, options
 from scripts.console import progress_bar, stdout, write_result
+from scripts.env_options import EnvOptions, with_env
 
 _NOT_SETTINGS = ("problem", "data", "seed", "step", "progress")
 _OF_COLLECTING = ("starts", "steps", "points", "repetitions")
@@ -33,6 +34,7 @@ SETTINGS = {
 _SETTINGS_HELP = "\n\n".join(("Setting of the method, repeatable; with the defaults:", *(f"{m}: {text}." for m, text in SETTINGS.items())))
 
 
+@functools.partial(with_env, without=("horizon", "start"))
 def identify(
     method: Annotated[
         str,
@@ -43,8 +45,7 @@ def identify(
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="Where what was learned goes: an npz, without pickle.")],
-    env_id: options.EnvId = None,
-    system: options.System = None,
+    env: EnvOptions,
     data: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Learn from these, an npz of Transitions.save, instead of collecting data."),
@@ -53,13 +54,6 @@ def identify(
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help=_SETTINGS_HELP),
     ] = None,
-    noise: options.Noise = None,
-    plant: options.Plant = None,
-    model: options.Model = None,
-    barrier: options.BarrierArguments = None,
-    dt: options.Dt = None,
-    substeps: options.Substeps = None,
-    box: options.Box = None,
     seed: options.Seed = 0,
     json: Annotated[
         Path | None,
@@ -73,49 +67,38 @@ def identify(
     refused. The truth, with which the estimates are compared at states drawn anew from where the problem is explored, is that of
     the plant, with its --noise.
     """
-    from agents.problems import load_problem, title_of, which_env
+    from agents.problems import load_problem, title_of
     from scripts.identify_report import Identification, Source, compare, document, print_report
     from wrappers.learning import learner_of
     from wrappers.learning.identifiability import IdentifiabilityWarning
 
     require_whole("seed", seed, 0)
-    options.require_outputs(json, plot, out=out, inputs=[] if data is None else [("--data", data)])
-    arguments = options.of_env(
-        system=system, noise=noise, plant=plant, model=model, barrier=barrier, dt=dt, substeps=substeps, horizon=None, box=box, start=None
-    )
+    inputs = [*options.inputs_of(env.system), *([] if data is None else [("--data", data)])]
+    options.require_outputs(json, plot, out=out, inputs=inputs)
+    arguments = env.arguments
     learner = learner_of(method)
     chosen = read_settings(method, learner, settings or ())
     source: dict[str, Any] = {}
     if data is not None:
-        _refuse_collecting(chosen, {"--dt": dt, "--substeps": substeps, "--box": box})
+        _refuse_collecting(chosen, env)
         source = {"data": _load_data(method, learner, data)}
-    known = which_env(env_id, system)
-    problem = load_problem(known, arguments)
+    problem = load_problem(env.full_id, arguments)
     with progress_bar("Learning") as tell, warnings.catch_warnings():
         # They are in the record, and printed with the results.
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         learned = learner(problem, seed=seed, progress=tell, **source, **chosen)
     learned.save(out)
-    of_env = {
-        "--noise": noise,
-        "--plant": plant,
-        "--model": model,
-        "--barrier": barrier,
-        "--dt": dt,
-        "--substeps": substeps,
-        "--box": box,
-    }
     found = Identification(
-        env_id=known,
-        title=title_of(known, arguments),
+        env_id=env.full_id,
+        title=title_of(env.full_id, arguments),
         problem=problem,
         learned=learned,
         functions=compare(learned, problem, seed),
-        options={name: value for name, value in arguments.items() if value is not None},
+        options=arguments,
         seed=seed,
         source=None if data is None else Source.of(data, source["data"]),
         out=out,
-        use=_use(["--system", system] if system else [known], method, out, of_env),
+        use=env.evaluate_command("--filter", _filter_of(method), "--learned", str(out)),
     )
     print_report(stdout(), found)
     write_result(json, lambda: document(found))
@@ -133,7 +116,7 @@ def read_settings(method: str, learner: Callable[..., Any], texts: Sequence[str]
     """
     allowed = settings_of(learner)
     hints = typing.get_type_hints(learner)
-    found = options.parameters("--set", texts, words=True) or {}
+    found = options.parameters("--set", texts, words=True)
     for name, value in found.items():
         if name not in allowed:
             raise ConfigurationError(f"--set {name}={value}: {method} has no setting {name!r}; {nearest(name, allowed)}")
@@ -146,11 +129,10 @@ def settings_of(learner: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     return {name: found for name, found in inspect.signature(learner).parameters.items() if name not in _NOT_SETTINGS}
 
 
-def _refuse_collecting(settings: Mapping[str, Any], given: Mapping[str, Any]) -> None:
+def _refuse_collecting(settings: Mapping[str, Any], env: EnvOptions) -> None:
     """Raise ConfigurationError if a setting or an option only says how data are collected."""
-    idle = [f"--set {name}" for name in _OF_COLLECTING if name in settings] + [
-        option for option, value in given.items() if value is not None
-    ]
+    idle = [f"--set {name}" for name in _OF_COLLECTING if name in settings]
+    idle += [f"--{name}" for name in ("dt", "substeps", "box") if name in env.changes]
     if idle:
         raise ConfigurationError(f"{', '.join(idle)}: not allowed with --data, since nothing is collected then; leave it out")
 
@@ -194,16 +176,12 @@ def _load_data(method: str, learner: Callable[..., Any], path: Path) -> Any:
     return Transitions.load(path)
 
 
-def _use(env: Sequence[str], method: str, out: Path, of_env: Mapping[str, Any]) -> str:
-    """A command that puts what was learned to use on the same problem."""
+def _filter_of(method: str) -> str:
+    """The name of the filter that uses what a method learns."""
     from wrappers.conditions import LEARNED
 
     (name,) = [condition.name for condition in LEARNED.values() if condition.method == method]
-    words = ["safe-envs", "evaluate", *env, "--filter", name, "--learned", str(out)]
-    for option, given in of_env.items():
-        for value in given if isinstance(given, list) else [given]:
-            words += [] if value is None else [option, str(value)]
-    return shlex.join(words)
+    return name
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The options that say which env is meant, and from their text to the arguments of `gym.make`."""
+"""Options of several commands, and from the text of options to arguments."""
 
 from __future__ import annotations
 
@@ -11,70 +11,14 @@ import typer
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import require_writable
-from scripts import completion
 from scripts.console import STDOUT
 
-EnvId = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="[ENV_ID]", help="Registered id; `safe-envs list` shows all.", show_default=False, autocompletion=completion.env_ids
-    ),
-]
-System = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE.py:NAME", help="In place of ENV_ID: a SafetyProblem of your own or a function that returns one. Runs the file."
-    ),
-]
-Noise = Annotated[
-    str | None, typer.Option(metavar="X", help="Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.")
-]
-Plant = Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter of the simulated system. Repeatable.")]
-Model = Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter that the designer believes. Repeatable.")]
-BarrierArguments = Annotated[list[str] | None, typer.Option(metavar="K=V", help="Argument of the barrier. Repeatable.")]
 Knowledge = Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")]
-Dt = Annotated[float | None, typer.Option(help="Control period in s.")]
-Substeps = Annotated[int | None, typer.Option(help="Integration steps in a control period.")]
-Horizon = Annotated[float | None, typer.Option(help="Length of an episode in s.")]
-Box = Annotated[list[str] | None, typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each.")]
-StartAt = Annotated[str | None, typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution.")]
 Trust = Annotated[
     bool, typer.Option("--trust", help="Load the .zip of --policy. That runs code that it contains: only for files whose source you trust.")
 ]
 Seed = Annotated[int, typer.Option(help="Seed of all randomness.")]
 FORMATS = ".png, .pdf, .svg, or another format of matplotlib."
-
-
-def of_env(
-    *,
-    system: str | None,
-    noise: str | None,
-    plant: Sequence[str] | None,
-    model: Sequence[str] | None,
-    barrier: Sequence[str] | None,
-    dt: float | None,
-    substeps: int | None,
-    horizon: float | None,
-    box: Sequence[str] | None,
-    start: str | None,
-) -> dict[str, Any]:
-    """The arguments of `gym.make` that the options of the same names stand for.
-
-    Raises:
-        ConfigurationError: a text cannot be read.
-    """
-    return {
-        **({} if system is None else {"system": system}),
-        "noise": read_noise(noise),
-        "plant": parameters("--plant", plant or ()),
-        "model": parameters("--model", model or ()),
-        "barrier": parameters("--barrier", barrier or (), words=True),
-        "dt": dt,
-        "substeps": substeps,
-        "horizon": horizon,
-        "box": read_box(box or ()),
-        "start": read_start(start),
-    }
 
 
 def numbers(option: str, text: str) -> list[float]:
@@ -116,10 +60,17 @@ def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = 
         require_format(plot)
 
 
-def inputs_of(policy: str, filters: Iterable[str], learned: Iterable[Path] = ()) -> Iterator[tuple[str, Path]]:
-    """Options and the files that a simulation may read: of a policy, of filters with file=FILE, and of --learned."""
+def inputs_of(
+    system: str | None, policy: str = "nominal", filters: Iterable[str] = (), learned: Iterable[Path] = (), filter_spec: str | None = None
+) -> Iterator[tuple[str, Path]]:
+    """Options and the files that a command may read: of FILE.py:NAME, of a policy, of --learned, and of filters with file=FILE."""
     from agents.policy import policy_files
 
+    for option, place in (("--system", system), ("--filter-spec", filter_spec)):
+        source = (place or "").rpartition(":")[0]
+        # Anything else is the name of a module.
+        if source.endswith(".py"):
+            yield option, Path(source)
     for path in policy_files(policy):
         yield "--policy", path
     for path in learned:
@@ -131,18 +82,14 @@ def inputs_of(policy: str, filters: Iterable[str], learned: Iterable[Path] = ())
             yield from (("--filter", Path("+".join(parts[: i + 1]))) for i in range(len(parts)))
 
 
-def read_noise(text: str | None) -> float | list[float] | None:
+def read_noise(text: str) -> float | list[float]:
     """Read --noise: one number for all channels, or one for each."""
-    if text is None:
-        return None
     levels = numbers("--noise", text)
     return levels[0] if len(levels) == 1 else levels
 
 
-def read_start(text: str | None) -> str | list[float] | None:
+def read_start(text: str) -> str | list[float]:
     """Read --start: a state, or else the name of a distribution."""
-    if text is None:
-        return None
     try:
         return numbers("--start", text)
     except ConfigurationError:
@@ -151,7 +98,7 @@ def read_start(text: str | None) -> str | list[float] | None:
         return text
 
 
-def read_box(texts: Sequence[str]) -> list[float] | list[list[float]] | None:
+def read_box(texts: Sequence[str]) -> list[float] | list[list[float]]:
     """Read --box LO,HI: one for all inputs, or one for each.
 
     Raises:
@@ -161,12 +108,10 @@ def read_box(texts: Sequence[str]) -> list[float] | list[list[float]] | None:
     for text, pair in zip(texts, pairs, strict=True):
         if len(pair) != 2:
             raise ConfigurationError(f"--box {text!r} has {len(pair)} numbers; give LO,HI")
-    if len(pairs) == 1:
-        return pairs[0]
-    return pairs or None
+    return pairs[0] if len(pairs) == 1 else pairs
 
 
-def parameters(option: str, texts: Sequence[str], words: bool = False) -> dict[str, Any] | None:
+def parameters(option: str, texts: Sequence[str], words: bool = False) -> dict[str, Any]:
     """Read NAME=VALUE entries.
 
     Args:
@@ -184,7 +129,7 @@ def parameters(option: str, texts: Sequence[str], words: bool = False) -> dict[s
             problem = "comes twice" if name in found else "is not of this form"
             raise ConfigurationError(f"{option} {text!r} {problem}; give NAME=VALUE, once for each parameter")
         found[name] = _value(option, text, value, words)
-    return found or None
+    return found
 
 
 def _value(option: str, text: str, value: str, words: bool) -> float | str:

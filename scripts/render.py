@@ -13,6 +13,7 @@ import typer
 from safe_envs.errors import ConfigurationError
 from scripts import options
 from scripts.console import Json, progress_bar, stdout, write_result
+from scripts.env_options import EnvOptions, with_env
 from scripts.film import require_film, steps_a_frame, write_film
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from wrappers import Condition
 
 
+@with_env
 def render(
     out: Annotated[
         Path,
@@ -28,8 +30,7 @@ def render(
             "--out", metavar="FILE", help="A .mp4 or .gif of the whole episode in real time, or a .png of its end.", show_default=False
         ),
     ],
-    env_id: options.EnvId = None,
-    system: options.System = None,
+    env: EnvOptions,
     filter_name: Annotated[
         str | None,
         typer.Option("--filter", metavar="NAME", help="As for evaluate: none, scbf, hocbf:p=2,8, ... By default the env's own."),
@@ -51,16 +52,7 @@ def render(
     ] = "nominal",
     trust: options.Trust = False,
     seed: options.Seed = 0,
-    noise: options.Noise = None,
-    plant: options.Plant = None,
-    model: options.Model = None,
-    barrier: options.BarrierArguments = None,
     knowledge: options.Knowledge = "model",
-    dt: options.Dt = None,
-    substeps: options.Substeps = None,
-    horizon: options.Horizon = None,
-    box: options.Box = None,
-    start: options.StartAt = None,
     learned: Annotated[
         list[Path] | None,
         typer.Option("--learned", metavar="FILE", help="What `safe-envs identify` wrote, for the learned filters. Repeatable."),
@@ -72,26 +64,14 @@ def render(
     The episode is that of an env which is reset with the seed. Filters that rest on something learned learn it first, unless
     --learned gives it.
     """
-    from agents.problems import load_problem, which_env
+    from agents.problems import load_problem
 
     if filter_name is not None and compare is not None:
         raise ConfigurationError(f"--filter {filter_name} and --compare {compare} are both there; give one of them")
     require_film(out)
     names = None if filter_name is None and compare is None else [filter_name] if filter_name is not None else split_filters(compare or "")
-    options.require_outputs(json_file, None, out=out, inputs=options.inputs_of(policy, names or (), learned or ()))
-    arguments = options.of_env(
-        system=system,
-        noise=noise,
-        plant=plant,
-        model=model,
-        barrier=barrier,
-        dt=dt,
-        substeps=substeps,
-        horizon=horizon,
-        box=box,
-        start=start,
-    )
-    problem = load_problem(which_env(env_id, system), arguments)
+    options.require_outputs(json_file, None, out=out, inputs=options.inputs_of(env.system, policy, names or (), learned or ()))
+    problem = load_problem(env.full_id, env.arguments)
     with progress_bar("Drawing") as tell:
         runs = make_runs(problem, names or [problem.filter], policy, trust=trust, seed=seed, knowledge=knowledge, learned=learned or ())
         every = problem.steps if out.suffix.lower() == ".png" else steps_a_frame(out, problem.dt, problem.steps)

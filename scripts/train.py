@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import shlex
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,14 +13,15 @@ from rich.table import Table
 
 from safe_envs.errors import ConfigurationError
 from scripts import completion, options
-from scripts.console import Json, progress_bar, require_result, stdout, write_result
+from scripts.console import Json, progress_bar, stdout, write_result
+from scripts.env_options import EnvOptions, with_env
 
 
+@with_env
 def train(
     algo: Annotated[str, typer.Option(metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="New folder for the policy, its evaluations and the checkpoint.")],
-    env_id: options.EnvId = None,
-    system: options.System = None,
+    env: EnvOptions,
     filters: Annotated[
         list[str] | None,
         typer.Option(
@@ -48,16 +47,7 @@ def train(
     intervention_penalty: Annotated[
         float, typer.Option(metavar="X", help="Taken from the reward for each unit by which the filter moves the action.")
     ] = 0.0,
-    noise: options.Noise = None,
-    plant: options.Plant = None,
-    model: options.Model = None,
-    barrier: options.BarrierArguments = None,
     knowledge: options.Knowledge = "model",
-    dt: options.Dt = None,
-    substeps: options.Substeps = None,
-    horizon: options.Horizon = None,
-    box: options.Box = None,
-    start: options.StartAt = None,
     eval_freq: Annotated[
         int | None, typer.Option(help="Steps between evaluations and checkpoints; by default a tenth of the training.")
     ] = None,
@@ -76,30 +66,17 @@ def train(
     infeasible steps in the training so far. The folder is what `safe-envs evaluate --policy DIR` reads.
     """
     from agents.policy import DESCRIPTION
-    from agents.problems import which_env
     from agents.trainer import train as train_agent
     from agents.training import Training
 
-    require_result(json_file)
+    options.require_outputs(json_file, None, inputs=options.inputs_of(env.system, filters=filters or ()))
     if len(filters or []) > 1:
         raise ConfigurationError(f"--filter was given {len(filters or [])} times; a training has one filter in the loop")
-    arguments = options.of_env(
-        system=system,
-        noise=noise,
-        plant=plant,
-        model=model,
-        barrier=barrier,
-        dt=dt,
-        substeps=substeps,
-        horizon=horizon,
-        box=box,
-        start=start,
-    )
     training = Training.of(
-        which_env(env_id, system),
+        env.full_id,
         algo,
         filter=filters[0] if filters else None,
-        options=arguments,
+        options=env.arguments,
         knowledge=knowledge,
         n_timesteps=n_timesteps,
         num_envs=num_envs,
@@ -119,14 +96,15 @@ def train(
         except KeyboardInterrupt:
             print(f"Stopped. The same command with --resume goes on after the last checkpoint in {out}.", file=sys.stderr)
             raise
-    given = {"noise": noise, "plant": plant, "model": model, "barrier": barrier, "knowledge": knowledge if knowledge != "model" else None}
-    given |= {"dt": dt, "substeps": substeps, "horizon": horizon, "box": box, "start": start}
     if finished:
         stdout().print(
             f"The training in {out} was finished already: nothing was left to do.", highlight=False, markup=False, soft_wrap=True
         )
     rows = json.loads((out / "evaluations.json").read_text())
-    _report(["--system", system] if system else [training.env_id], out, training.filter or "none", rows, given)
+    _report(training.filter or "none", rows)
+    known = [f"--knowledge={knowledge}"] if knowledge != "model" else []
+    command = env.evaluate_command("--policy", str(out), "--filter", training.filter or "none", *known)
+    stdout().print(f"\nTo evaluate the policy: {command}", highlight=False, markup=False)
     write_result(json_file, lambda: {"folder": str(out), "config": json.loads((out / "config.json").read_text()), "evaluations": rows})
 
 
@@ -154,7 +132,7 @@ def _number(value: Any) -> Any:
         return value
 
 
-def _report(env: list[str], out: Path, filter_name: str, rows: list[dict[str, Any]], given: Mapping[str, Any]) -> None:
+def _report(filter_name: str, rows: list[dict[str, Any]]) -> None:
     """Print how safe and how good the agent was in each evaluation."""
     console = stdout()
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
@@ -165,10 +143,6 @@ def _report(env: list[str], out: Path, filter_name: str, rows: list[dict[str, An
         table.add_row(f"{row['timesteps']:,}", rate, f"{row['return_mean']:.4g}", f"{row['training']['violations']:.0f}")
     console.print(f"Evaluations with the filter {filter_name}:", highlight=False, markup=False)
     console.print(table)
-    command = ["safe-envs", "evaluate", *env, "--policy", str(out), "--filter", filter_name]
-    for name, values in given.items():
-        command += [f"--{name}={value}" for value in (values if isinstance(values, list) else [values]) if value is not None]
-    console.print(f"\nTo evaluate the policy: {shlex.join(command)}", highlight=False, markup=False)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,11 +11,12 @@ import typer
 from safe_envs.errors import require_whole
 from scripts import completion, options
 from scripts.console import progress_bar, stdout, write_result
+from scripts.env_options import EnvOptions, with_env
 
 
+@with_env
 def verify(
-    env_id: options.EnvId = None,
-    system: options.System = None,
+    env: EnvOptions,
     filter_name: Annotated[
         str | None,
         typer.Option(
@@ -24,16 +26,7 @@ def verify(
             help="As for evaluate: scbf, hocbf:p=2,8, ... By default the env's own.",
         ),
     ] = None,
-    noise: options.Noise = None,
-    plant: options.Plant = None,
-    model: options.Model = None,
-    barrier: options.BarrierArguments = None,
     knowledge: options.Knowledge = "model",
-    dt: options.Dt = None,
-    substeps: options.Substeps = None,
-    horizon: options.Horizon = None,
-    box: options.Box = None,
-    start: options.StartAt = None,
     policy: Annotated[
         str,
         typer.Option(metavar="NAME|FOLDER|FILE", autocompletion=completion.policies, help="Who acts in the simulation, as for evaluate."),
@@ -55,7 +48,7 @@ def verify(
     conditions, and the suprema on which the bounds rest. Nothing of this depends on the policy; the simulation does.
     """
     from agents.policy import make_policy
-    from agents.problems import load_problem, title_of, which_env
+    from agents.problems import load_problem, title_of
     from agents.verification import measure, starts_of
     from scripts.verify_report import document, print_report
     from wrappers import parse_conditions
@@ -63,22 +56,12 @@ def verify(
     from wrappers.verify import verify as find
 
     require_whole("episodes", episodes, 1)
-    options.require_outputs(json, plot, inputs=options.inputs_of(policy, [filter_name or ""]))
-    arguments = options.of_env(
-        system=system,
-        noise=noise,
-        plant=plant,
-        model=model,
-        barrier=barrier,
-        dt=dt,
-        substeps=substeps,
-        horizon=horizon,
-        box=box,
-        start=start,
-    )
-    known = which_env(env_id, system)
+    options.require_outputs(json, plot, inputs=options.inputs_of(env.system, policy, [filter_name or ""]))
+    known, arguments = env.full_id, env.arguments
     title = title_of(known, arguments)
-    problem = load_problem(known, arguments)
+    asked = load_problem(known, arguments)
+    # The bounds are of the horizon that is simulated: a whole number of periods.
+    problem = replace(asked, horizon=asked.steps * asked.dt)
     actor = make_policy(policy, problem, trust)  # An unknown one is to show before the search, and without a simulation too.
     found = find(problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed)
     starts = starts_of(problem, seed)
@@ -88,12 +71,7 @@ def verify(
         with progress_bar("Simulating") as tell:
             measurements = measure(found, actor, episodes=episodes, seed=seed, progress=tell)
     print_report(stdout(), title, found, starts, bounds, policy, measurements)
-    config = {
-        "env_id": known,
-        "options": {k: v for k, v in arguments.items() if v is not None},
-        "policy": policy,
-        "seed": seed,
-    }
+    config = {"env_id": known, "options": arguments, "policy": policy, "seed": seed}
     write_result(json, lambda: document(config, found, bounds, measurements))
     if plot is not None:
         from scripts.verify_figure import draw

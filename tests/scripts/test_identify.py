@@ -135,7 +135,7 @@ def test_what_is_said_of_data_from_elsewhere():
 
 
 def test_what_is_proposed_keeps_the_options_of_the_env(identify):
-    given = ["--noise", "0.1", "--plant", "sigma_1=0.3", "--dt", "0.02"]
+    given = ["--noise=0.1", "--plant=sigma_1=0.3", "--dt=0.02"]
     status, out, _ = identify(*BAYESIAN, *given, "--out", "my file.npz")
     assert status == 0
     expected = ["safe-envs", "evaluate", "safe_envs/CubicSDEDisk-v0", "--filter", "bayesian-scbf", "--learned", "my file.npz", *given]

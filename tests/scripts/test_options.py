@@ -10,10 +10,6 @@ from safe_envs import ConfigurationError
 from scripts import options
 
 
-def test_what_is_not_given_stays_none():
-    assert options.read_noise(None) is options.read_start(None) is options.read_box([]) is options.parameters("--plant", []) is None
-
-
 def test_texts_become_numbers():
     assert options.read_noise("0.2") == 0.2
     assert options.read_noise("0.1,.2,0") == [0.1, 0.2, 0.0]
@@ -59,7 +55,9 @@ def test_outputs_are_files_of_their_own(tmp_path):
 
 def test_the_files_that_a_simulation_reads():
     filters = ["scbf", "ddscbf:file=a+b.npz:margin=1+cbf:alpha=1", "bayesian-scbf:file=c.npz+cbf"]
-    found = list(options.inputs_of("ppo.zip", filters, [Path("d.npz")]))
+    found = list(options.inputs_of("my.py:problem", "ppo.zip", filters, [Path("d.npz")], "here/spec.py:view"))
     assert {("--policy", Path("ppo.zip")), ("--learned", Path("d.npz"))} < set(found)
+    assert {("--system", Path("my.py")), ("--filter-spec", Path("here/spec.py"))} < set(found)
     assert {Path("a+b.npz"), Path("c.npz")} <= {path for option, path in found if option == "--filter"}
-    assert not list(options.inputs_of("nominal", ["none", "hocbf:p=1,2"]))
+    assert not list(options.inputs_of(None, "nominal", ["none", "hocbf:p=1,2"]))
+    assert not list(options.inputs_of("my.module:problem", filter_spec="my.module:view"))
