@@ -66,7 +66,7 @@ class Bridge:
         return stacked(self._h(*x), len(x[0]))
 
     def lowest(self, x: Components, before: np.ndarray, after: np.ndarray, draws: np.ndarray) -> np.ndarray:
-        """Draw the smallest barrier of each episode during a control period, its ends included.
+        """Draw the smallest value of each barrier during a control period, its ends included.
 
         Args:
             x: components of the states at the beginning of the period, each of shape (B,).
@@ -75,14 +75,19 @@ class Bridge:
             draws: standard exponentials, shape (B, k).
 
         Returns:
-            Shape (B,).
+            Shape (B, k).
         """
         ends = np.minimum(before, after)
         if any(self.reached):
             reach = np.sqrt((after - before) ** 2 + stacked(self._rates(*x), len(ends)) * draws)
             # Rounding must not lift the minimum above an end.
             ends = np.minimum(ends, 0.5 * (before + after - reach))
-        return ends[:, 0] if ends.shape[1] == 1 else ends.min(axis=1)
+        return ends
+
+
+def smallest(barriers: np.ndarray) -> np.ndarray:
+    """The smallest of the barriers of each episode: shape (B,) for (B, k)."""
+    return barriers[:, 0] if barriers.shape[1] == 1 else barriers.min(axis=1)
 
 
 def bridge_notes(problem: SafetyProblem) -> list[str]:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from agents.bridge import Bridge
-from agents.episodes import Env
+from agents.bridge import Bridge, smallest
+from agents.episodes import Env, Progress
 from agents.policy import Policy
 from safe_envs.calculus import gradient
 from safe_envs.codegen import compile_function, stacked
@@ -20,24 +20,22 @@ from safe_envs.simulation import NoiseStreams
 from safe_envs.vector import SafeVectorEnv
 from wrappers.vector_wrapper import readable
 
-STRENGTHS = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 11.0, 16.0, 23.0, 32.0)
-"""Drifts that are tried, in standard deviations of the noise over an episode."""
-
-_PILOTS = 200
-_FEWEST_HITS = 20
+_STRONGEST = 64.0
+"""The strongest drift that is thought of, in standard deviations of the noise over an episode."""
 
 
 class DriftingEnv(SafeVectorEnv):
-    """`SafeVectorEnv` with dW + theta dt in place of dW, where theta has a given length and points to where h falls fastest.
+    """`SafeVectorEnv` with dW - c e dt in place of dW, where e = sigma' grad h/|sigma' grad h| is the way on which h rises fastest.
 
-    Of several barriers the smallest counts. The drift of a control period is that of its beginning, -c sigma' grad h/|sigma' grad h|.
+    Of several barriers the smallest counts. Where no noise reaches it, e = 0. The e of a control period is that of its beginning.
 
     Args:
         problem: what to simulate.
-        lengths: c of each env, in 1/sqrt(s), shape (num_envs,).
+        lengths: c of each env, in 1/sqrt(s), shape (num_envs,); 0 for the noise as it is.
 
     Attributes:
-        log_ratio: for the last period, the logarithm of the density of its noise over the density with the drift, shape (num_envs,).
+        climbed: of each episode the integrals of e'dW, where W is what drives the system, and of e'e dt; shape (num_envs, 2). They
+            say the density of the noise so far over that with a drift: see `log_ratio`.
     """
 
     def __init__(self, problem: SafetyProblem, lengths: np.ndarray) -> None:
@@ -49,18 +47,42 @@ class DriftingEnv(SafeVectorEnv):
         self._slopes = compile_function(plant.states, [row[0, j] for row in rows for j in live], "arrays")
         self._barriers = compile_function(plant.states, [plant.numeric(barrier.expression) for barrier in problem.barriers], "arrays")
         self._shape = (len(rows), len(live), len(lengths))
-        self._lengths = lengths * math.sqrt(problem.dt / problem.substeps)
-        self.log_ratio = np.zeros(len(lengths))
+        self._lengths = lengths
+        self.climbed = np.zeros((len(lengths), 2))
         self._noise = _DriftingStreams(self, self._simulation.integrator.channels)
 
-    def drift(self) -> np.ndarray:
-        """What is added to the draws of the coming period, shape (channels, num_envs)."""
+    def way(self) -> np.ndarray:
+        """The vector e of the coming period, shape (channels of the noise, num_envs)."""
         slopes = stacked(self._slopes(*self.components), self.num_envs).T.reshape(self._shape)
-        barriers = stacked(self._barriers(*self.components), self.num_envs)
-        nearest = slopes[barriers.argmin(axis=1), :, np.arange(self.num_envs)].T
-        steepness = np.sqrt((nearest * nearest).sum(axis=0))
-        added = np.where(steepness > 0.0, -self._lengths * nearest / np.where(steepness > 0.0, steepness, 1.0), 0.0)
-        return np.tile(added, (self.problem.substeps, 1))
+        if len(slopes) == 1:
+            steepest = slopes[0]
+        else:
+            barriers = stacked(self._barriers(*self.components), self.num_envs)
+            steepest = slopes[barriers.argmin(axis=1), :, np.arange(self.num_envs)].T
+        steepness = np.sqrt((steepest * steepest).sum(axis=0))
+        return np.where(steepness > 0.0, steepest / np.where(steepness > 0.0, steepness, 1.0), 0.0)
+
+    def drifted(self, draws: np.ndarray) -> np.ndarray:
+        """The draws of a period with the drift in them, substep by substep; notes how far they climb."""
+        root = math.sqrt(self.problem.dt / self.problem.substeps)
+        way = np.tile(self.way(), (self.problem.substeps, 1))
+        moved = draws - self._lengths * root * way
+        self.climbed[:, 0] += root * (way * moved).sum(axis=0)
+        self.climbed[:, 1] += root**2 * (way * way).sum(axis=0)
+        return moved
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """See `SafeVectorEnv.snapshot`."""
+        return {**super().snapshot(), "climbed": self.climbed.copy()}
+
+    def restore(self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None) -> None:
+        """See `SafeVectorEnv.restore`."""
+        super().restore(snapshot, seed)
+        self.climbed = np.array(snapshot["climbed"])
+
+    def _restart(self, envs: np.ndarray) -> None:
+        super()._restart(envs)
+        self.climbed[envs] = 0.0
 
 
 class _DriftingStreams(NoiseStreams):
@@ -71,12 +93,50 @@ class _DriftingStreams(NoiseStreams):
         self._env = env
 
     def next(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> np.ndarray:
-        """See `NoiseStreams.next`; notes the density ratio."""
+        """See `NoiseStreams.next`."""
         # A state that overflows is found by the env, which says so better than a warning.
         with np.errstate(all="ignore"):
-            draws, added = super().next(rngs, stepping), self._env.drift()
-            self._env.log_ratio = -(draws * added).sum(axis=0) - 0.5 * (added * added).sum(axis=0)
-            return draws + added
+            return self._env.drifted(super().next(rngs, stepping))
+
+
+def log_ratio(climbed: np.ndarray, lengths: Any) -> np.ndarray:
+    """Logarithm of the density of episodes' noise as it is over that with a drift, by Girsanov: c int e'dW + c^2/2 int e'e dt.
+
+    Args:
+        climbed: of the episodes, as in `DriftingEnv`, shape (..., 2).
+        lengths: c of each, or one for all.
+    """
+    return lengths * climbed[..., 0] + 0.5 * lengths**2 * climbed[..., 1]
+
+
+def best_length(climbed: np.ndarray, shares: np.ndarray, horizon: float) -> tuple[float, float]:
+    """The drift whose weights differ least, judged by episodes that end in a violation, however these were found.
+
+    With the weight w of an episode the second moment under the drift is E[w; violation] without it. So episodes that the drift would
+    hardly ever show, since they violate on another way, count with their large weights.
+
+    Args:
+        climbed: of episodes that violate, as in `DriftingEnv`, shape (B, 2).
+        shares: of the probability for which each stands, shape (B,).
+        horizon: of an episode, in s.
+
+    Returns:
+        The length c in 1/sqrt(s), and the deviation of what one episode with it says, relative to the probability.
+
+    Source: S. Asmussen and P. Glynn, Stochastic Simulation, Springer 2007, Ch. V and VI.
+    """
+    from scipy.optimize import minimize_scalar
+    from scipy.special import logsumexp
+
+    probability = math.fsum(shares)
+
+    def log_second_moment(length: float) -> float:
+        found: Any = logsumexp(log_ratio(climbed, length), b=shares / probability)
+        return float(found) - math.log(probability)
+
+    # A sum of exponentials of convex functions: there is one minimum.
+    found: Any = minimize_scalar(log_second_moment, bounds=(0.0, _STRONGEST / math.sqrt(horizon)), method="bounded")
+    return float(found.x), math.sqrt(max(math.exp(min(found.fun, 700.0)) - 1.0, 0.0))
 
 
 MakeDrifting = Callable[[np.ndarray], Env]
@@ -103,37 +163,27 @@ class Drifting:
     num_envs: int
     bridge: Bridge | None = None
 
-    def choose(self, horizon: float) -> tuple[float | None, int]:
-        """Find the length of the drift with the smallest relative deviation, in a few episodes with each.
-
-        Args:
-            horizon: of an episode, in s.
-
-        Returns:
-            The length in 1/sqrt(s), None if no drift leads to violations, and the control periods that were simulated.
-        """
-        lengths = np.array(STRENGTHS) / math.sqrt(horizon)
-        weights, steps = self._weights(np.repeat(lengths, _PILOTS), (0, 3))
-        deviations = [_deviation(part) for part in np.split(weights, len(lengths))]
-        best = int(np.argmin(deviations))
-        return (float(lengths[best]) if math.isfinite(deviations[best]) else None), steps
-
-    def estimate(self, length: float, episodes: int, repetitions: int) -> tuple[np.ndarray, int]:
+    def estimate(self, length: float, episodes: int, repetitions: int, progress: Progress | None = None) -> tuple[np.ndarray, int]:
         """Estimate the probability.
 
         Args:
             length: of the drift, in 1/sqrt(s).
             episodes: of a repetition.
             repetitions: R.
+            progress: told the part that is done.
 
         Returns:
             Unbiased estimates, shape (R,), and the control periods that were simulated.
         """
-        lengths = np.full(episodes * repetitions, length)
-        batches = range(0, len(lengths), self.num_envs)
-        parts = [self._weights(lengths[first : first + self.num_envs], (1, 3, first)) for first in batches]
-        weights = np.concatenate([weights for weights, _ in parts])
-        return weights.reshape(repetitions, episodes).mean(axis=1), sum(steps for _, steps in parts)
+        count = episodes * repetitions
+        weights, steps = np.zeros(count), 0
+        for first in range(0, count, self.num_envs):
+            some = slice(first, min(first + self.num_envs, count))
+            weights[some], taken = self._weights(np.full(some.stop - first, length), (1, 3, first))
+            steps += taken
+            if progress:
+                progress(some.stop / count)
+        return weights.reshape(repetitions, episodes).mean(axis=1), steps
 
     def _weights(self, lengths: np.ndarray, spawn_key: tuple[int, ...]) -> tuple[np.ndarray, int]:
         """Density ratio of each episode's noise up to its violation, 0 without one; and the control periods."""
@@ -144,24 +194,19 @@ class Drifting:
         observation, info = env.reset(seed=seed.generate_state(len(lengths), np.uint64).tolist())
         if isinstance(self.policy, Policy):
             self.policy.begin(range(len(lengths)), int(generator.integers(2**63)))
-        hit = info["barrier"].min(axis=1) <= 0.0
-        alive, total, steps = ~hit, np.zeros(len(lengths)), 0
+        hit = smallest(info["barrier"]) <= 0.0
+        alive, weights, steps = ~hit, hit.astype(np.float64), 0
         with threadpool_limits(1, "blas"):
             while alive.any():
                 x, before = world.components, info["barrier"]
                 actions, _ = self.policy.predict(observation, None, np.zeros(len(lengths), dtype=bool), deterministic=True)
                 observation, _, terminated, truncated, info = env.step(actions)
-                total += np.where(alive, world.log_ratio, 0.0)
                 steps += int(np.count_nonzero(alive))
                 after = info["barrier"]
-                lowest = after.min(axis=1)
+                lowest = after
                 if self.bridge is not None:
                     lowest = self.bridge.lowest(x, before, after, generator.standard_exponential(after.shape))
-                hit |= alive & (lowest <= 0.0)
+                hit = alive & (smallest(lowest) <= 0.0)
+                weights[hit] = np.exp(log_ratio(world.climbed[hit], lengths[hit]))
                 alive &= ~hit & ~(terminated | truncated)
-        return np.where(hit, np.exp(total), 0.0), steps
-
-
-def _deviation(weights: np.ndarray) -> float:
-    """Relative deviation; infinite with so few violations that it means nothing."""
-    return float(np.std(weights) / np.mean(weights)) if np.count_nonzero(weights) >= _FEWEST_HITS else math.inf
+        return weights, steps

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from agents.bridge import Bridge, Exponentials
+from agents.bridge import Bridge, Exponentials, smallest
 from agents.comparison import Flags
 from agents.policy import Policy
 from agents.statistics import FirstValues, RunningSum, SafetyCurve, rate_interval, share
@@ -241,7 +241,7 @@ class _Watch:
         """Smallest h of the period that led to states, shape (B,)."""
         found = self._bridge.lowest(self._x, self._barriers, barriers, self._draws.next())
         self._x, self._barriers = x, barriers
-        return found
+        return smallest(found)
 
 
 def _play(
@@ -258,7 +258,7 @@ def _play(
     world = readable(env)
     steps = world.problem.steps
     observation, info = started
-    h = _smallest(info["barrier"])
+    h = smallest(info["barrier"])
     wave = Wave(len(h), count, h)
     if recorder:
         recorder.note(0, first, wave.alive, h, world.components)
@@ -266,7 +266,7 @@ def _play(
     for k in range(1, steps + 1):
         actions, state = policy.predict(observation, state, start, deterministic=True)
         observation, reward, terminated, truncated, info = env.step(actions)
-        h = _smallest(info["barrier"])
+        h = smallest(info["barrier"])
         lowest = h if watch is None else watch.lowest(world.components, info["barrier"])
         wave.add(lowest, _executed(world, actions, info), reward, info)
         if recorder:
@@ -280,10 +280,6 @@ def _play(
     if progress:
         progress(first + count)
     return wave
-
-
-def _smallest(barriers: np.ndarray) -> np.ndarray:
-    return barriers[:, 0] if barriers.shape[1] == 1 else barriers.min(axis=1)
 
 
 def _executed(world: SafeVectorEnv | SafetyMonitorVector, actions: np.ndarray, info: Info) -> Components:

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from agents.bridge import Bridge
+from agents.bridge import Bridge, smallest
+from agents.drifting import MakeDrifting
 from agents.episodes import Env
 from agents.policy import Policy
 from safe_envs.errors import ConfigurationError
-from safe_envs.vector import SafeVectorEnv
 from wrappers.vector_wrapper import readable
-
-MakeEnv = Callable[[int], Env]
-"""An env with so many episodes side by side, for a filter."""
 
 _FIRST_ROOM = 64
 _FEWEST_ENVS = 64
@@ -37,6 +33,11 @@ class Records:
         self._ended = np.zeros((_FIRST_ROOM, paths), dtype=bool)
         self._state = np.zeros((_FIRST_ROOM, paths, states))
         self._observation = np.zeros((_FIRST_ROOM, paths, features), dtype=np.float32)
+        self._climbed = np.zeros((_FIRST_ROOM, paths, 2))
+
+    @property
+    def _kept(self) -> tuple[np.ndarray, ...]:
+        return self._height, self._time, self._ended, self._state, self._observation, self._climbed
 
     def clear(self, paths: np.ndarray) -> None:
         """Forget the records of some paths."""
@@ -44,11 +45,16 @@ class Records:
         self._height[:, paths] = -np.inf
 
     def add(self, paths: np.ndarray, *entries: np.ndarray) -> None:
-        """Note a record of each of some paths: height, control instant, whether the episode ended there, state, observation."""
+        """Note a record of each of some paths.
+
+        Args:
+            paths: which.
+            *entries: height, control instant, whether the episode ended there, state, observation, and `DriftingEnv.climbed`.
+        """
         rows = self._count[paths]
         if rows.size and int(rows.max()) == len(self._height):
             self._grow()
-        for kept, values in zip((self._height, self._time, self._ended, self._state, self._observation), entries, strict=True):
+        for kept, values in zip(self._kept, entries, strict=True):
             kept[rows, paths] = values
         self._count[paths] += 1
 
@@ -56,15 +62,15 @@ class Records:
         """The first records of paths below levels, one for each, in the order of the arguments of `add`."""
         # Records fall along the first axis, and what was not filled is lower than all.
         rows = (self._height[:, paths] >= levels).sum(axis=0)
-        return tuple(kept[rows, paths] for kept in (self._height, self._time, self._ended, self._state, self._observation))
+        return tuple(kept[rows, paths] for kept in self._kept)
 
-    def last_times(self, paths: np.ndarray) -> np.ndarray:
-        """Control instants of the last records of paths."""
-        return self._time[self._count[paths] - 1, paths]
+    def last(self, paths: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The last records of paths, in the order of the arguments of `add`."""
+        return tuple(kept[self._count[paths] - 1, paths] for kept in self._kept)
 
     def _grow(self) -> None:
         room = len(self._height)
-        for name in ("_height", "_time", "_ended", "_state", "_observation"):
+        for name in ("_height", "_time", "_ended", "_state", "_observation", "_climbed"):
             old = getattr(self, name)
             fill = np.full((room, *old.shape[1:]), -np.inf if name == "_height" else 0, dtype=old.dtype)
             setattr(self, name, np.concatenate([old, fill]))
@@ -74,13 +80,14 @@ class Particles:
     """Paths of a policy in an env, up to their first violations.
 
     The height of a path at control instant k of K is its smallest h since the last one, times (1 - k/(K + 1))^-p: for p = 0 that is
-    h, and for p = 1/2 it is h against what a Brownian motion may do in the time that is left. It is 0 or less at a violation.
+    h, and for p = 1/2 it is h against what a Brownian motion may do in the time that is left. It is 0 or less at a violation. Of
+    several barriers, which may have units of their own, each is divided by its mean at the starts.
 
     Noise is drawn by the envs, whose generators are seeded once and run on, so that paths that were taken up again get fresh
     noise. What comes of it depends on the seed, and on the number of paths and of envs.
 
     Args:
-        make: an env with next-step autoreset and so many episodes side by side.
+        make: envs for the paths, made without a drift.
         policy: anything with Stable-Baselines3's `predict`, without memory.
         powers: p of each path.
         seed: of all randomness.
@@ -93,7 +100,7 @@ class Particles:
     """
 
     def __init__(
-        self, make: MakeEnv, policy: Any, powers: np.ndarray, seed: np.random.SeedSequence, num_envs: int, bridge: Bridge | None = None
+        self, make: MakeDrifting, policy: Any, powers: np.ndarray, seed: np.random.SeedSequence, num_envs: int, bridge: Bridge | None = None
     ) -> None:
         self.lowest = np.full(len(powers), np.inf)
         self.steps = 0
@@ -101,8 +108,9 @@ class Particles:
         self._envs: dict[int, Env] = {}
         self._largest = min(num_envs, len(powers))
         self._seed, self._generator = seed, np.random.default_rng(seed.spawn(1)[0])
-        world = _own(self._env(self._largest))
+        world: Any = readable(self._env(self._largest))
         self._horizon = world.problem.steps
+        self._units = np.ones(len(world.problem.barriers))
         kinds, self._kind = np.unique(powers, return_inverse=True)
         left = 1.0 - np.arange(self._horizon + 1) / (self._horizon + 1)
         self._weights = left[:, None] ** -kinds
@@ -115,15 +123,24 @@ class Particles:
             some = paths[first : first + self._largest]
             env = self._env(len(some))
             observation, info = env.reset()
-            world, count = _own(env), len(some)
-            h = info["barrier"].min(axis=1)[:count]
+            world: Any = readable(env)
+            count = len(some)
+            if first == 0 and len(self._units) > 1:
+                at_start = info["barrier"].mean(axis=0)
+                self._units = np.where(at_start > 0.0, at_start, 1.0)
+            h = smallest(info["barrier"][:count] / self._units)
+            begun = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool), world.state[:count], observation[:count]
             # At the start the weight is 1.
-            begun = (h, np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool), world.state[:count], observation[:count])
+            begun = (h, *begun, world.climbed[:count])
             self._play(env, some, observation, begun)
 
     def h_at_lowest(self, paths: np.ndarray) -> np.ndarray:
-        """The h of paths where their heights were smallest, shape as given."""
-        return self.lowest[paths] / self._weights[self._records.last_times(paths), self._kind[paths]]
+        """The h of paths where their heights were smallest, of several barriers relative to the starts; shape as given."""
+        return self.lowest[paths] / self._weights[self._records.last(paths)[1], self._kind[paths]]
+
+    def climbed(self, paths: np.ndarray) -> np.ndarray:
+        """`DriftingEnv.climbed` of paths where their heights were smallest, shape (B, 2)."""
+        return self._records.last(paths)[5]
 
     def branch(self, paths: np.ndarray, parents: np.ndarray, levels: np.ndarray) -> None:
         """Replace paths by what goes on from where others of the same p first fell below levels.
@@ -144,7 +161,7 @@ class Particles:
     def _resume(self, paths: np.ndarray, entries: tuple[np.ndarray, ...]) -> None:
         env: Any = self._env(len(paths))
         snapshot = env.snapshot()
-        for name, values in (("state", entries[3]), ("steps", entries[1])):
+        for name, values in (("state", entries[3]), ("steps", entries[1]), ("climbed", entries[5])):
             snapshot[name][:] = values[0]
             snapshot[name][: len(paths)] = values
         snapshot["ended"][:] = False
@@ -155,7 +172,8 @@ class Particles:
 
     def _play(self, env: Env, paths: np.ndarray, observation: np.ndarray, entries: tuple[np.ndarray, ...]) -> None:
         """Simulate paths, in the first rows of an env, from entries of `Records.add` until they end or violate."""
-        count, world, records, kind = len(paths), _own(env), self._records, self._kind[paths]
+        world: Any = readable(env)
+        count, records, kind = len(paths), self._records, self._kind[paths]
         lowest, time, ended = entries[0].copy(), entries[1].copy(), entries[2]
         records.add(paths, *entries)
         alive = (lowest > 0.0) & ~ended
@@ -166,7 +184,7 @@ class Particles:
             x = world.components
             observation, _, terminated, truncated, info = env.step(self._act(observation))
             time += 1
-            h = self._smallest(x, barriers, info["barrier"])[:count]
+            h = smallest(self._lowest(x, barriers, info["barrier"])[:count] / self._units)
             height = h * self._weights[np.minimum(time, self._horizon), kind]
             barriers = info["barrier"]
             self.steps += int(np.count_nonzero(alive))
@@ -175,7 +193,7 @@ class Particles:
             if fell.size:
                 lowest[fell] = height[fell]
                 state = np.stack([component[fell] for component in world.components], axis=-1)
-                records.add(paths[fell], height[fell], time[fell], ended[fell], state, observation[fell])
+                records.add(paths[fell], height[fell], time[fell], ended[fell], state, observation[fell], world.climbed[fell])
             alive &= (lowest > 0.0) & ~ended
         self.lowest[paths] = lowest
 
@@ -185,9 +203,9 @@ class Particles:
             raise ConfigurationError("the policy has a memory, which splitting cannot take up again; estimate with plain episodes")
         return actions
 
-    def _smallest(self, x: Any, before: np.ndarray | None, after: np.ndarray) -> np.ndarray:
+    def _lowest(self, x: Any, before: np.ndarray | None, after: np.ndarray) -> np.ndarray:
         if self._bridge is None or before is None:
-            return after[:, 0] if after.shape[1] == 1 else after.min(axis=1)
+            return after
         return self._bridge.lowest(x, before, after, self._generator.standard_exponential(after.shape))
 
     def _env(self, count: int) -> Env:
@@ -196,18 +214,6 @@ class Particles:
         while size // 2 >= max(count, _FEWEST_ENVS):
             size //= 2
         if size not in self._envs:
-            env = self._envs[size] = self._make(size)
+            env = self._envs[size] = self._make(np.zeros(size))
             env.reset(seed=self._seed.spawn(1)[0].generate_state(size, np.uint64).tolist())
         return self._envs[size]
-
-
-def _own(env: Env) -> SafeVectorEnv:
-    """The layer of an env that holds the states.
-
-    Raises:
-        ConfigurationError: it is of somebody else, who cannot put it back to where it was.
-    """
-    world = readable(env)
-    if not isinstance(world, SafeVectorEnv):
-        raise ConfigurationError("an env of somebody else cannot be put back to where it was: estimate its safety with plain episodes")
-    return world

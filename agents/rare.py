@@ -6,30 +6,34 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from agents.bridge import Bridge, require_monitoring
-from agents.drifting import Drifting
+from agents.drifting import Drifting, best_length
 from agents.episodes import Progress, Row
 from agents.evaluation import package_versions
 from agents.policy import Policy
 from agents.setting import Setting, Work
 from agents.splitting import LEAST, POWERS, Repetitions, Splitting
 from agents.statistics import log_normal_interval, rate_interval, require_confidence
-from safe_envs.errors import ConfigurationError, NumericalError, require_whole
+from safe_envs.errors import NumericalError, require_whole
 from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
-from wrappers import FilterSpec
 from wrappers.learning import LearnedModel
 
 PARTICLES = 250
 REPETITIONS = 20
 
-_ROUGH = 1.5
+_BETTER = 2.0
+"""How many times smaller the relative error of the drift has to be."""
+
+_ROUGH = 1.0
 _FEWEST_PARTICLES = 20
+_FEWEST_REPETITIONS = 10
 
 
 @dataclass(frozen=True)
@@ -67,15 +71,14 @@ def estimate_rare(
     knowledge: str = "model",
     objective: str = "nearest",
     confidence: float = 0.95,
-    spec: FilterSpec | str | None = None,
     learned: Sequence[LearnedModel | Path | str] = (),
     monitoring: str = "discrete",
     progress: Progress | None = None,
 ) -> RareEvaluation:
     """Estimate the probability of a violation under each filter by splitting on h; see `agents.splitting.Splitting`.
 
-    Where the noise reaches h directly, importance sampling tries too, see `agents.drifting.Drifting`. Its estimate is taken if its
-    relative error is less than half of splitting's and the two intervals overlap; splitting's is the check on it then.
+    The paths that violate, as splitting found them, say what importance sampling by a drift could do, see
+    `agents.drifting.best_length`. If that is less than half of splitting's relative error, it is tried; see `verdict`.
 
     An episode is safe as in `agents.evaluation.evaluate`. The intervals are those of independent repetitions; see
     `agents.statistics.log_normal_interval`. Where splitting cannot work a row has the reason in place of numbers.
@@ -87,13 +90,12 @@ def estimate_rare(
         trust: as for `evaluate`.
         options: as for `evaluate`.
         particles: episodes of a repetition.
-        repetitions: independent ones, at least 5.
+        repetitions: independent ones, at least 10.
         seed: of all randomness.
         num_envs: the most episodes side by side; another number is another draw of the same estimate.
         knowledge: as for `evaluate`.
         objective: as for `evaluate`.
         confidence: of all intervals, between 0 and 1.
-        spec: refused.
         learned: as for `evaluate`; what is missing is learned once.
         monitoring: as for `evaluate`.
         progress: told the part of the work that is done, from 0 to 1.
@@ -103,12 +105,14 @@ def estimate_rare(
         RelativeDegreeError: a condition does not suit a barrier.
         NumericalError: a simulation or a condition left the finite numbers.
     """
-    for name, value, least in (("particles", particles, _FEWEST_PARTICLES), ("repetitions", repetitions, 5), ("num_envs", num_envs, 1)):
+    for name, value, least in (
+        ("particles", particles, _FEWEST_PARTICLES),
+        ("repetitions", repetitions, _FEWEST_REPETITIONS),
+        ("num_envs", num_envs, 1),
+    ):
         require_whole(name, value, least)
     require_confidence(confidence)
     require_monitoring(monitoring)
-    if spec is not None:
-        raise ConfigurationError("an env of somebody else cannot be put back to where it was: estimate its safety with plain episodes")
     setting = Setting(
         problem,
         policy,
@@ -122,18 +126,17 @@ def estimate_rare(
         learned=learned,
         repeats=1,
     )
-    work = Work(progress, len(setting.learning.missing()) + 2 * len(setting.names))
+    work = Work(progress, len(setting.learning.missing()) + 3 * len(setting.names))
     setting.learn(work.part)
     bridge = Bridge(setting.problem) if monitoring == "continuous" else None
     frozen, sizes = _is_frozen(setting), (particles, repetitions)
     rows, speeds = [], []
     for name in setting.names:
         begun = time.perf_counter()
-        conditions = setting.filters[name][0]
-        splitting = Splitting(lambda size, c=conditions: setting.env(c, size), setting.actor, seed, num_envs, bridge)
-        drifting = Drifting(lambda lengths, c=conditions: setting.drifting_env(c, lengths), setting.actor, seed, num_envs, bridge)
+        make = partial(setting.drifting_env, setting.filters[name][0])
+        how = (make, setting.actor, seed, num_envs, bridge)
         row = {"filter": name, "policy": setting.config()["policy"]["name"]}
-        row |= _none(frozen) if frozen else _row(splitting, drifting, setting.problem, sizes, confidence, work)
+        row |= _none(frozen) if frozen else _row(Splitting(*how), Drifting(*how), setting.problem, sizes, confidence, work)
         seconds = time.perf_counter() - begun
         speeds.append({"filter": name, "seconds": seconds, "steps_per_second": row["steps"] / seconds})
         rows.append(row)
@@ -161,23 +164,18 @@ def _row(splitting: Splitting, drifting: Drifting, problem: SafetyProblem, sizes
     particles, repetitions = sizes
     power, pilot_steps = splitting.choose(particles, work.part())
     found = splitting.estimate(power, particles, repetitions, work.part())
+    last_part = work.part()
     low, high = rate_interval(found.first, found.paths, confidence)
     plain = {"episodes": found.paths, "violations": found.first, "ci_low": low, "ci_high": high}
     rest = {"levels": float(found.levels.mean()), "steps": found.steps + pilot_steps, "plain": plain}
     if found.given_up:
-        return _none(_why_none(found, particles)) | rest
-    # Without a level they are plain episodes, and nothing else.
-    interval = log_normal_interval(found.estimates, confidence) if found.levels.any() else (low, high)
-    answer = _estimate("splitting on h" if power == POWERS[0] else "splitting on h/sqrt(T - t)", found.estimates, interval)
-    check, drift_steps = None, 0
-    if found.levels.any():
-        check, drift_steps = _by_drift(drifting, problem, sizes, confidence)
-    doubt = _doubt(found, interval, (low, high))
-    if check is not None and 2.0 * check["relative_error"] < answer["relative_error"]:
-        if check["ci_low"] <= answer["ci_high"] and answer["ci_low"] <= check["ci_high"]:
-            answer, check, doubt = check, answer, None
-        else:
-            doubt = f"importance sampling says {check['probability']:.2g} [{check['ci_low']:.2g}, {check['ci_high']:.2g}]"
+        return _none(_why_none(found, particles, problem, plain)) | rest
+    split = _estimate("splitting on h" if power == POWERS[0] else "splitting on h/sqrt(T - t)", found.estimates, confidence)
+    if not found.levels.any():
+        # They were plain episodes, and nothing else.
+        split |= {"ci_low": low, "ci_high": high}
+    drift, drift_steps = _by_drift(drifting, problem, found, split["relative_error"], sizes, confidence, last_part)
+    answer, check, doubt = verdict(split, drift, plain)
     p, error = answer["probability"], answer["relative_error"]
     needed = (1.0 - p) / (p * error**2) if error else None
     return {
@@ -193,31 +191,66 @@ def _row(splitting: Splitting, drifting: Drifting, problem: SafetyProblem, sizes
     }
 
 
-def _by_drift(drifting: Drifting, problem: SafetyProblem, sizes: tuple[int, int], confidence: float) -> tuple[Row | None, int]:
-    """The estimate by importance sampling, if there is one, and the control periods that it took."""
-    if not any(Bridge(problem).reached):
+def _by_drift(
+    drifting: Drifting,
+    problem: SafetyProblem,
+    found: Repetitions,
+    to_beat: float,
+    sizes: tuple[int, int],
+    confidence: float,
+    progress: Progress | None,
+) -> tuple[Row | None, int]:
+    """The estimate by importance sampling, if it promises to be much better, and the control periods that it took."""
+    length, deviation = best_length(found.climbed, found.shares, problem.steps * problem.dt)
+    if not _BETTER * deviation / math.sqrt(math.prod(sizes)) < to_beat:
         return None, 0
     try:
-        length, steps = drifting.choose(problem.steps * problem.dt)
-        if length is None:
-            return None, steps
-        estimates, more = drifting.estimate(length, *sizes)
+        estimates, steps = drifting.estimate(length, *sizes, progress)
     except NumericalError:
         # Pushed far out, where nothing else would take it, a system may leave the finite numbers.
         return None, 0
-    if not (estimates > 0.0).all():
-        return None, steps + more
-    return _estimate(f"drift of {length:.3g}/sqrt(s)", estimates, log_normal_interval(estimates, confidence)), steps + more
+    return (_estimate(f"drift of {length:.3g}/sqrt(s)", estimates, confidence) if (estimates > 0.0).all() else None), steps
 
 
-def _estimate(method: str, estimates: np.ndarray, interval: tuple[float, float]) -> Row:
+def verdict(split: Row, drift: Row | None, plain: Row) -> tuple[Row, Row | None, str | None]:
+    """Which of two estimates is the answer, which the check on it, and what speaks against the answer, if anything.
+
+    The drift's is the answer if its relative error is less than half of splitting's and their intervals overlap.
+
+    Args:
+        split: estimate by splitting.
+        drift: by importance sampling, if there is one.
+        plain: number of episodes and of violations among them, and the interval, of plain episodes.
+    """
+    agree = drift is None or _overlap(split, drift)
+    if drift is not None and agree and _BETTER * drift["relative_error"] < split["relative_error"]:
+        answer, check = drift, split
+    else:
+        answer, check = split, drift
+    if check is not None and not agree:
+        told = f"[{check['ci_low']:.2g}, {check['ci_high']:.2g}]"
+        return answer, check, f"importance sampling says {check['probability']:.2g} {told}: take more particles"
+    if not _overlap(answer, plain):
+        seen = f"{plain['violations']} violations among {plain['episodes']} contradict it"
+        return answer, check, f"its first episodes are plain ones, and {seen}: take more particles"
+    if float(np.std(np.log(answer["estimates"]))) > _ROUGH:
+        return answer, check, "its repetitions differ by large factors, so that the interval is rough: take more particles"
+    return answer, check, None
+
+
+def _overlap(one: Row, other: Row) -> bool:
+    return one["ci_low"] <= other["ci_high"] and other["ci_low"] <= one["ci_high"]
+
+
+def _estimate(method: str, estimates: np.ndarray, confidence: float) -> Row:
+    low, high = log_normal_interval(estimates, confidence)
     p = math.fsum(estimates) / len(estimates)
     error = float(np.std(estimates, ddof=1)) / math.sqrt(len(estimates)) / p
     return {
         "method": method,
         "probability": p,
-        "ci_low": interval[0],
-        "ci_high": min(interval[1], 1.0),
+        "ci_low": low,
+        "ci_high": min(high, 1.0),
         "relative_error": error,
         "estimates": estimates.tolist(),
     }
@@ -230,24 +263,21 @@ def _none(reason: str) -> Row:
     return {"status": "none", "reason": reason, "estimates": [], **dict.fromkeys(names), **nothing}
 
 
-def _why_none(found: Repetitions, particles: int) -> str:
+def _why_none(found: Repetitions, particles: int, problem: SafetyProblem, plain: Row) -> str:
     repetitions = len(found.estimates)
+    h = "h" if len(problem.barriers) == 1 else "h/h(start)"
     if found.stuck:
-        return (
+        reason = (
             f"in {len(found.stuck)} of {repetitions} repetitions all {particles} particles stood at one level and none came below "
-            f"h = {min(found.stuck):.3g}. There h may be flat, jump or never fall, or those that come lower are too few: more particles "
+            f"{h} = {min(found.stuck):.3g}. There h may be flat, jump or never fall, or those that come lower are too few: more particles "
             "or a smaller dt may help"
         )
-    return (
-        f"in {len(found.endless)} of {repetitions} repetitions the probability to come below h = {min(found.endless):.3g} is less than "
-        f"{LEAST:g} already; h = 0 may never be reached"
-    )
-
-
-def _doubt(found: Repetitions, interval: tuple[float, float], plain: tuple[float, float]) -> str | None:
-    """What speaks against an estimate, if anything."""
-    if interval[1] < plain[0] or plain[1] < interval[0]:
-        return f"its first episodes are plain ones, and {found.first} violations among {found.paths} contradict it: take more particles"
-    if float(np.std(np.log(found.estimates))) > _ROUGH:
-        return "its repetitions differ by large factors, so that the interval is rough: take more particles"
-    return None
+    else:
+        reason = (
+            f"in {len(found.endless)} of {repetitions} repetitions the probability to come below {h} = {min(found.endless):.3g} is less "
+            f"than {LEAST:g} already; h = 0 may never be reached"
+        )
+    if not plain["violations"]:
+        return reason
+    seen = f"{plain['violations']} of the {plain['episodes']} plain episodes at its beginning violated"
+    return f"{reason}. But {seen}, which says [{plain['ci_low']:.3g}, {plain['ci_high']:.3g}]"

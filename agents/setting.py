@@ -91,7 +91,7 @@ class Setting:
         return env
 
     def drifting_env(self, conditions: Sequence[Condition], lengths: np.ndarray) -> Env:
-        """A batch of envs of this project's whose noise drifts, behind the filter of conditions; see `DriftingEnv`."""
+        """A batch of envs of this project's whose noise may drift, behind the filter of conditions; see `DriftingEnv`."""
         env = DriftingEnv(self.problem, lengths)
         return SafetyFilterVectorWrapper(env, conditions, self._knowledge, self._objective) if conditions else env
 

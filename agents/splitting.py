@@ -10,7 +10,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from agents.bridge import Bridge
-from agents.particles import MakeEnv, Particles
+from agents.drifting import MakeDrifting
+from agents.particles import Particles
 
 KILLED = 0.75
 """Share of a repetition's paths that are killed at a level, at least."""
@@ -24,7 +25,6 @@ POWERS = (0.0, 0.5)
 _PILOTS = 10
 _FEWEST_PARTICLES = 50
 _OFTEN = 0.1
-_PILOT_WORK = 0.3
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,8 @@ class Repetitions:
         length: their mean length, up to a violation, in control periods.
         stuck: for each repetition all of whose paths stood at one level, h there.
         endless: for each one that fell below `LEAST`, h of its last level.
+        climbed: of the paths that violate, as in `agents.drifting.DriftingEnv`, shape (V, 2).
+        shares: of the probability for which each of them stands, shape (V,).
     """
 
     estimates: np.ndarray
@@ -50,6 +52,8 @@ class Repetitions:
     length: float
     stuck: tuple[float, ...]
     endless: tuple[float, ...]
+    climbed: np.ndarray
+    shares: np.ndarray
 
     @property
     def given_up(self) -> int:
@@ -68,7 +72,7 @@ class Splitting:
     any score; both count for the spread alone.
 
     Attributes:
-        make: an env with next-step autoreset and so many episodes side by side.
+        make: a filtered env, which is made without a drift.
         policy: anything with Stable-Baselines3's `predict`, without memory.
         seed: of all randomness.
         num_envs: the most episodes side by side.
@@ -79,7 +83,7 @@ class Splitting:
         splitting algorithms, Annals of Applied Probability 26 (2016) 3559-3601.
     """
 
-    make: MakeEnv
+    make: MakeDrifting
     policy: Any
     seed: int
     num_envs: int
@@ -128,6 +132,7 @@ class Splitting:
             length,
             tuple(run.stuck),
             tuple(run.endless),
+            *run.violating(),
         )
 
 
@@ -168,6 +173,12 @@ class _Run:
                 if progress:
                     progress(1.0 - float(levels.mean()) / highest)
                 self.paths.branch(killed, parents, levels)
+
+    def violating(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the paths that violate, how far they climbed, and the part of the estimated probability for which each stands."""
+        violate = self.paths.lowest.reshape(len(self.estimates), self._particles) <= 0.0
+        each = self.estimates / (np.maximum(violate.sum(axis=1), 1) * len(self.estimates))
+        return self.paths.climbed(np.flatnonzero(violate)), np.repeat(each, violate.sum(axis=1))
 
     def _next_level(self, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Whom to kill, whom to continue in their place and from which level; None if the repetition is at its end."""

@@ -50,7 +50,7 @@ def evaluate(
         ),
     ] = "nominal",
     trust: options.Trust = False,
-    episodes: Annotated[int, typer.Option(help="Episodes for each filter.")] = 1000,
+    episodes: Annotated[int | None, typer.Option(help="Episodes for each filter. [1000]")] = None,
     seed: options.Seed = 0,
     knowledge: options.Knowledge = "model",
     objective: Annotated[
@@ -75,7 +75,7 @@ def evaluate(
     ] = False,
     particles: Annotated[int | None, typer.Option(help="With --rare, in place of --episodes: episodes of a repetition. [250]")] = None,
     repetitions: Annotated[int | None, typer.Option(help="With --rare: independent ones, which give the interval. [20]")] = None,
-    num_envs: Annotated[int, typer.Option(help="Episodes side by side; it changes the speed, not the answer.")] = 1024,
+    num_envs: Annotated[int | None, typer.Option(help="Episodes side by side; it changes the speed, not the answer. [1024]")] = None,
     jobs: Annotated[int, typer.Option(help="Processes; they change the speed, not the answer.")] = 1,
     json: Annotated[
         Path | None,
@@ -105,6 +105,7 @@ def evaluate(
         from scripts.rare_report import run_rare
 
         refused = {"--filter-spec": filter_spec, "--refine": refine, "--plot": plot, "--repeats": repeats != 1, "--jobs": jobs != 1}
+        refused |= {"--episodes": episodes is not None, "--num-envs": num_envs is not None}
         run_rare(
             json,
             refused,
@@ -134,9 +135,7 @@ def evaluate(
             spec=filter_spec,
             trust=trust,
             options=env.arguments,
-            episodes=episodes,
             seed=seed,
-            num_envs=num_envs,
             knowledge=knowledge,
             objective=objective,
             confidence=confidence,
@@ -146,6 +145,7 @@ def evaluate(
             jobs=jobs,
             progress=tell,
             record=plot is not None,
+            **{name: value for name, value in (("episodes", episodes), ("num_envs", num_envs)) if value is not None},
         )
     given = answer.evaluations[0] if refine else answer
     print_evaluation(stdout(), given)

@@ -69,6 +69,12 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
     console.print()
     console.print(table)
     console.print()
+    reasons = Table.grid()
+    for row in answer.rows:
+        if row["reason"]:
+            reasons.add_row(Text(f"Splitting cannot work here for {row['filter']}: {row['reason']}.", overflow="fold"))
+    if reasons.row_count:
+        console.print(reasons)
     for note in _notes(answer):
         console.print(note, soft_wrap=True, highlight=False, markup=False)
 
@@ -104,8 +110,7 @@ def _probability(row: Row) -> str:
 
 
 def _notes(answer: RareEvaluation) -> list[str]:
-    notes = [f"Splitting cannot work here for {row['filter']}: {row['reason']}." for row in answer.rows if row["reason"]]
-    notes += [f"Note: doubt the estimate of {row['filter']}: {row['doubt']}." for row in answer.rows if row["doubt"]]
+    notes = [f"Note: doubt the estimate of {row['filter']}: {row['doubt']}." for row in answer.rows if row["doubt"]]
     if answer.config["monitoring"] == "continuous":
         notes += [f"Note: {note}" for note in bridge_notes(answer.problem)]
     return notes

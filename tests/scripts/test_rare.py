@@ -9,13 +9,13 @@ import pytest
 from tests.scripts.conftest import strictly
 
 ACC = ("evaluate", "safe_envs/ACC-v0", "--filter", "scbf", "--start=10,10,40", "--horizon", "6", "--dt", "0.1")
-FEW = ("--particles", "60", "--repetitions", "8")
+FEW = ("--particles", "50", "--repetitions", "10")
 
 
 def test_acceptance_in_small(safe_envs_command):
     status, out, err = safe_envs_command(*ACC, "--rare", *FEW, "--json", "rare.json")
     assert (status, err) == (0, "")
-    assert "rare violations, 8 repetitions of 60 particles" in out
+    assert "rare violations, 10 repetitions of 50 particles" in out
     assert "P(violation) [95 % interval]" in out
     (row,) = strictly("rare.json")["rows"]
     # h_0 = 22 m is 5 deviations of the Gaussian law away: 2 Phi(-h_0/(tau sigma sqrt(T))), and a little less at control instants.
@@ -29,10 +29,11 @@ def test_reason_in_place_of_a_number(safe_envs_command):
     status, out, _ = safe_envs_command("evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--rare", *FEW, "--json", "-")
     assert status == 0
     assert '"probability": null' in out
-    status, out, _ = safe_envs_command("evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--rare", *FEW)
-    assert status == 0
-    assert "none, see below" in out
-    assert "Splitting cannot work here for hocbf: nothing is random after the start" in out
+    for quiet in ((), ("--quiet",)):
+        status, out, _ = safe_envs_command("evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--rare", *FEW, *quiet)
+        assert status == 0
+        assert "none, see below" in out
+        assert "Splitting cannot work here for hocbf: nothing is random after the start" in out
 
 
 def test_continuous_monitoring_is_told_in_the_heading(safe_envs_command):
@@ -50,6 +51,7 @@ def test_continuous_monitoring_is_told_in_the_heading(safe_envs_command):
     [
         (("--rare", "--refine"), "--rare does not go with --refine"),
         (("--rare", "--plot", "a.png", "--repeats", "2"), "--rare does not go with --plot, --repeats"),
+        (("--rare", "--episodes", "1000", "--num-envs", "64"), "--rare does not go with --episodes, --num-envs"),
         (("--particles", "100"), "are of --rare"),
         (("--rare", "--particles", "3"), "particles = 3"),
         (("--monitoring", "often"), "monitoring = 'often'"),
