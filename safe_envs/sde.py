@@ -24,7 +24,8 @@ def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.Immuta
     if matrix.rows != rows or (columns is not None and matrix.cols != columns):
         wanted = f"{rows} x {'any' if columns is None else columns}"
         raise SystemDefinitionError(f"{name} has shape {matrix.rows} x {matrix.cols}; the states and inputs need {wanted}")
-    return matrix
+    # To sympy 0.0 is not 0, and a channel of such entries would count as noise.
+    return sp.ImmutableMatrix(matrix.applyfunc(lambda entry: sp.Integer(0) if entry.is_Float and entry.is_zero else entry))
 
 
 def finite_number(name: str, value: Any) -> float:

@@ -10,6 +10,7 @@ import sympy as sp
 
 from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError
 from safe_envs.codegen import compile_function
+from safe_envs.integrate import Integrator
 
 x, y, u, k = sp.symbols("x y u k", real=True)
 
@@ -55,6 +56,14 @@ def test_parameters_are_finite_numbers(value):
         scalar(parameters={k: value})
     with pytest.raises(ConfigurationError, match="parameter k"):
         scalar().with_parameters(k=value)
+
+
+def test_a_diffusion_of_zeros_is_no_noise_however_they_are_written():
+    x, u, sigma = sp.symbols("x u sigma", real=True)
+    for entry, parameters, noisy in ((0, {}, False), (0.0, {}, False), (sigma, {sigma: 0.0}, False), (sigma, {sigma: 0.1}, True)):
+        system = ControlAffineSDE(states=(x,), inputs=(u,), drift=[0], input_matrix=[1], diffusion=[[entry, 0.0]], parameters=parameters)
+        assert system.noisy == noisy
+        assert Integrator(system, 0.1, 1, "floats").channels == noisy
 
 
 def test_with_parameters_returns_another_system_and_knows_its_names():
