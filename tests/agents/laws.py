@@ -42,6 +42,19 @@ def walk_passage(distance: float, steps: int, mean: float, deviation: float) -> 
     return _passage(grid, kernel, norm.cdf(0.0, grid - mean, deviation), distance, steps)
 
 
+def survival(start, steps, factor, deviation):
+    """P(h_1 > 0, ..., h_N > 0) of h_(k+1) = factor h_k + deviation N(0, 1), by quadrature over each step."""
+    top, spacing = start + 8 * deviation * math.sqrt(steps), deviation / 8
+    grid = np.arange(spacing / 2, top, spacing)
+    kernel = spacing * norm.pdf(grid[None, :], factor * grid[:, None], deviation)
+    beyond = norm.sf(top, factor * grid, deviation)
+    probability = np.ones(len(grid))
+    for _ in range(steps - 1):
+        probability = kernel @ probability + beyond
+    last = norm.pdf(grid, factor * start, deviation)
+    return float(spacing * last @ probability + norm.sf(top, factor * start, deviation))
+
+
 def martingale_passage(start: float, steps: int, dt: float) -> float:
     """P(|x| reaches 1 at one of the Euler steps of dx = -x/2 dt + x dW, the system of thesis Prop. 4.2.8 under its SCBF).
 

@@ -11,7 +11,7 @@ from agents import evaluate, load_problem
 from agents.refinement import TOLERANCE, refine, verdict
 from agents.statistics import paired_difference_interval
 from safe_envs import ConfigurationError
-from tests.agents.test_evaluation import survival
+from tests.agents.laws import survival
 
 SCALAR = {"start": [0.5], "noise": 0.8, "box": [-100.0, 100.0]}
 

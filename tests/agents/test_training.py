@@ -26,7 +26,13 @@ DUBINS = "safe_envs/StochasticDubins-v0"
 SMALL = {"num_envs": 4, "eval_episodes": 8, "options": {"horizon": 0.5}}
 
 
-def training(algorithm="ppo", steps=768, every=256, **changes):
+# Three evaluations; sac learns at every step, which takes long.
+LENGTHS = {"ppo": (768, 256), "sac": (384, 128)}
+
+
+def training(algorithm="ppo", steps=None, every=None, **changes):
+    length = LENGTHS.get(algorithm, LENGTHS["ppo"])
+    steps, every = steps or length[0], every or length[1]
     settings = {"learning_starts": 100} if algorithm in ("sac", "td3") else {}
     given = {"filter": "scbf", "n_timesteps": steps, "eval_freq": every, **SMALL, **changes}
     given["settings"] = settings | given.get("settings", {})
@@ -64,7 +70,7 @@ def test_the_folder_holds_all_that_is_needed(finished):
     assert config["training"]["env_id"] == DUBINS
     assert "stable-baselines3" in config["versions"]
     rows = evaluations(folder)
-    assert rows[-1]["timesteps"] >= 768
+    assert rows[-1]["timesteps"] >= LENGTHS[algorithm][0]
     assert all(row["ci_low"] <= row["safety_rate"] <= row["ci_high"] for row in rows)
     assert {row["filter"] for row in rows} == {"scbf"}
 
@@ -107,7 +113,7 @@ def test_a_training_that_was_interrupted_goes_on_as_if_it_had_not_been(finished,
 
     with pytest.raises(KeyboardInterrupt):
         train(training(algorithm), interrupted, tell=stop)
-    assert evaluations(interrupted)[-1]["timesteps"] < 768
+    assert evaluations(interrupted)[-1]["timesteps"] < LENGTHS[algorithm][0]
     with pytest.raises(ConfigurationError, match="not finished"):
         evaluate(DUBINS, str(interrupted), ["none"], episodes=1)
     evaluate(DUBINS, str(interrupted / "best"), ["none"], episodes=1)

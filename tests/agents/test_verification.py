@@ -36,12 +36,12 @@ def short(monkeypatch):
 
 def test_the_product_bound_of_the_stochastic_dubins_is_contradicted(monkeypatch):
     monkeypatch.setattr(verification, "_MULTIPLES", (1,))
-    monkeypatch.setattr(verification, "_LONG_MULTIPLES", (50,))
+    monkeypatch.setattr(verification, "_LONG_MULTIPLES", (30,))
     # With the default noise of .2 it takes four times as long.
     _, at_best = measured("safe_envs/StochasticDubins-v0", episodes=60, noise=0.4)
     assert at_best.state is not None
     first, last = at_best.horizons
-    assert (first.time, last.time) == (5.0, 250.0)
+    assert (first.time, last.time) == (5.0, 150.0)
     assert first.contradicted == ()
     (product,) = [b for b in last.bounds if "product" in b.name]
     # Radially inwards at the distance rho: b_0 = r^2 - rho^2 and b_1 = 2 v rho - 2 sigma^2, with r = 3 and v = 2.

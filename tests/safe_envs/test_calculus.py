@@ -36,6 +36,17 @@ def moved(x, direction, step):
     return [a + step * d for a, d in zip(x, direction, strict=True)]
 
 
+def levels_of(problem, system):
+    """For each barrier, and each time that the generator is applied up to its degree: phi, its Lie derivatives and A phi."""
+    for barrier in problem.barriers:
+        phi = barrier.expression
+        for _ in range(relative_degree(system, phi, generator)):
+            generated = generator(system, phi)
+            exact = [drift_derivative(system, phi), *input_derivative(system, phi)]
+            yield in_fifty_digits(system, phi), [in_fifty_digits(system, e) for e in exact], in_fifty_digits(system, generated)
+            phi = generated
+
+
 @pytest.mark.parametrize("side", ["plant", "model"])
 def test_derivatives_equal_finite_differences(env_id, side):
     problem = problem_of(env_id, noise=0.3)
@@ -43,21 +54,17 @@ def test_derivatives_equal_finite_differences(env_id, side):
     step = mpmath.mpf("1e-12")
     with mpmath.workdps(60):
         f, g, sigma = (in_fifty_digits(system, m) for m in (system.drift, system.input_matrix, system.diffusion))
-        for x, barrier in itertools.product(states_near_starts(problem), problem.barriers):
+        for level, x in itertools.product(levels_of(problem, system), states_near_starts(problem)):
             columns = [[f(x)[i] for i in range(system.n)]]
             columns += [[g(x)[i, j] for i in range(system.n)] for j in range(system.m)]
             noises = [[sigma(x)[i, j] for i in range(system.n)] for j in range(system.diffusion.cols)]
-            phi = barrier.expression
-            for _ in range(relative_degree(system, phi, generator)):
-                at = in_fifty_digits(system, phi)
-                slopes = [(at(moved(x, d, step)) - at(moved(x, d, -step))) / (2 * step) for d in columns]
-                curvature = sum((at(moved(x, s, step)) - 2 * at(x) + at(moved(x, s, -step))) / step**2 for s in noises)
-                exact = [drift_derivative(system, phi), *input_derivative(system, phi)]
-                for slope, expression in zip(slopes, exact, strict=True):
-                    assert abs(slope - in_fifty_digits(system, expression)(x)) < mpmath.mpf("1e-9") * (1 + abs(slope))
-                a_phi = slopes[0] + curvature / 2
-                assert abs(a_phi - in_fifty_digits(system, generator(system, phi))(x)) < mpmath.mpf("1e-9") * (1 + abs(a_phi))
-                phi = generator(system, phi)
+            at, exact, generated = level
+            slopes = [(at(moved(x, d, step)) - at(moved(x, d, -step))) / (2 * step) for d in columns]
+            curvature = sum((at(moved(x, s, step)) - 2 * at(x) + at(moved(x, s, -step))) / step**2 for s in noises)
+            for slope, derivative in zip(slopes, exact, strict=True):
+                assert abs(slope - derivative(x)) < mpmath.mpf("1e-9") * (1 + abs(slope))
+            a_phi = slopes[0] + curvature / 2
+            assert abs(a_phi - generated(x)) < mpmath.mpf("1e-9") * (1 + abs(a_phi))
 
 
 def test_relative_degrees_of_the_registered_systems(env_id):

@@ -8,7 +8,7 @@ from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, SafeEnv, Sa
 from safe_envs.problem import Feature, Start, Variable
 from safe_envs.rendering import style
 from tests.conftest import problem_of
-from tests.safe_envs.test_rendering import SCENE, shown, stepped
+from tests.safe_envs.drawn import SCENE, shown, stepped
 
 
 def test_the_disk_is_to_scale():

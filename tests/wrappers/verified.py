@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import sympy as sp
 
 from safe_envs.barrier import Barrier
@@ -55,6 +57,16 @@ def made_bound(problem, text="scbf"):
 
 
 def findings(env_id, text=None, knowledge="model", **options):
+    """What is found of a registered id; with its defaults once for all tests."""
+    return _found_anew(env_id, text, knowledge, options) if options else _found_once(env_id, text, knowledge)
+
+
+@cache
+def _found_once(env_id, text, knowledge):
+    return _found_anew(env_id, text, knowledge, {})
+
+
+def _found_anew(env_id, text, knowledge, options):
     problem = problem_of(env_id, **options)
     return verify(problem, parse_conditions(text or problem.filter, problem), knowledge)
 

@@ -1,0 +1,250 @@
+"""`safe-envs evaluate` as a person types it: its table, its JSON and its picture."""
+
+from __future__ import annotations
+
+import io
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from agents import evaluate
+from scripts.table import print_evaluation
+from tests.scripts.conftest import strictly
+
+DUBINS = "safe_envs/StochasticDubins-v0"
+QUICK = ("--episodes", "8", "--horizon", "0.3")
+ROW_KEYS = [
+    "filter",
+    "policy",
+    "episodes",
+    "safe",
+    "safety_rate",
+    "ci_low",
+    "ci_high",
+    "min_h_median",
+    "min_h_p05",
+    "violations",
+    "intervention_rate",
+    "infeasible_rate",
+    "effort_mean",
+    "return_mean",
+    "curve",
+    "bound",
+    "bound_note",
+    "certificate",
+    "outside_rate",
+    "learning",
+]
+
+
+def test_json_has_the_documented_keys(safe_envs_command):
+    status, _, err = safe_envs_command("evaluate", DUBINS, "--filter", "none", "--filter", "hocbf:p=1,2", *QUICK, "--json", "out.json")
+    assert (status, err) == (0, "")
+    document = strictly("out.json")
+    assert list(document) == ["config", "versions", "rows", "comparisons", "timing"]
+    assert [list(row) for row in document["rows"]] == [ROW_KEYS, ROW_KEYS]
+    assert [row["filter"] for row in document["rows"]] == ["none", "hocbf:p=1,2"]
+    assert {row["policy"] for row in document["rows"]} == {"nominal"}
+    for row in document["rows"]:
+        assert row["episodes"] == 8 == row["safe"] + row["violations"]
+        assert 0 <= row["ci_low"] <= row["safety_rate"] <= row["ci_high"] <= 1
+        assert row["min_h_p05"] <= row["min_h_median"]
+        assert list(row["curve"]) == ["time", "safe", "rate", "ci_low", "ci_high"]
+        assert {len(column) for column in row["curve"].values()} == {7}
+    (comparison,) = document["comparisons"]
+    assert list(comparison) == [
+        *("first", "second", "both", "only_first", "only_second", "neither"),
+        *("difference", "ci_low", "ci_high", "mcnemar_p"),
+    ]
+    assert {"safe-envs", "python", "numpy", "gymnasium"} <= set(document["versions"])
+    assert document["timing"]["num_envs"] == 1024
+    assert [row["filter"] for row in document["timing"]["rows"]] == ["none", "hocbf:p=1,2"]
+    assert [p.name for p in Path().iterdir()] == ["out.json"]
+
+
+def test_json_is_strict_where_no_step_counts(safe_envs_command):
+    status, out, _ = safe_envs_command("evaluate", "Scalar-v0", "--start", "1.0", "--noise", "0", *QUICK, "--json", "out.json")
+    assert status == 0
+    assert "Note: nothing is random here" in out
+    for row in strictly("out.json")["rows"]:
+        assert row["safe"] == 0
+        assert row["effort_mean"] is row["intervention_rate"] is row["infeasible_rate"] is None
+
+
+def test_all_but_timing_is_the_same_for_every_num_envs(safe_envs_command):
+    documents = []
+    for num_envs in (1000, 1, 7):
+        status, _, _ = safe_envs_command(
+            "evaluate", DUBINS, "--policy", "random", *QUICK, "--seed", 4, "--num-envs", num_envs, "--json", f"{num_envs}.json"
+        )
+        assert status == 0
+        documents.append(strictly(f"{num_envs}.json"))
+        assert documents[-1].pop("timing")["num_envs"] == num_envs
+    assert json.dumps(documents[0]) == json.dumps(documents[1]) == json.dumps(documents[2])
+
+
+def test_every_option_reaches_the_evaluation(safe_envs_command):
+    status, out, _ = safe_envs_command(
+        *("evaluate", "StochasticDubins-v0", "--filter", "hocbf", "--policy", "zero", "--episodes", "6", "--seed", "5"),
+        *("--noise", ".1,.3", "--plant", "v=1.5", "--model", "v=1.7", "--barrier", "radius=2.5", "--knowledge", "plant"),
+        *("--dt", ".02", "--substeps", "2", "--horizon", ".4", "--box", "-3,4", "--start", "-0.5,0,1", "--num-envs", "4"),
+        *("--confidence", ".9"),
+        *("--json", "out.json"),
+    )
+    assert status == 0
+    options = {
+        "noise": [0.1, 0.3],
+        "plant": {"v": 1.5},
+        "model": {"v": 1.7},
+        "barrier": {"radius": 2.5},
+        "dt": 0.02,
+        "substeps": 2,
+        "horizon": 0.4,
+        "box": [-3.0, 4.0],
+        "start": [-0.5, 0.0, 1.0],
+    }
+    wanted = evaluate(DUBINS, "zero", ["hocbf"], options=options, episodes=6, seed=5, knowledge="plant", confidence=0.9)
+    document = strictly("out.json")
+    assert document["rows"] == wanted.rows
+    assert document["config"] == json.loads(json.dumps(wanted.config))
+    for text in (DUBINS, "policy zero", "6 episodes", "seed 5", "v = 1.5 (model 1.7)", "sigma_1 = 0.1, sigma_2 = 0.3", "dt = 0.02 s"):
+        assert text in out
+    assert "filters know the plant" in out
+    assert "safe [90 % interval]" in out
+
+
+def test_boxes_for_each_input_and_named_starts(safe_envs_command):
+    boxes = [argument for high in (4e4, 5e4, 6e4, 7e4) for argument in ("--box", f"0,{high}")]
+    status, *_ = safe_envs_command(
+        "evaluate", "Quadrotor-v0", *boxes, "--start", "thesis", "--horizon", ".2", "--episodes", 2, "--json", "out.json"
+    )
+    assert status == 0
+    problem = strictly("out.json")["config"]["problem"]
+    assert problem["box"] == [[0.0, 4e4], [0.0, 5e4], [0.0, 6e4], [0.0, 7e4]]
+    assert problem["start"] == "thesis"
+
+
+def test_table_shows_the_rows(safe_envs_command):
+    _, out, _ = safe_envs_command("evaluate", DUBINS, "--episodes", 40, "--horizon", 2, "--filter", "none", "--filter", "scbf")
+    answer = evaluate(DUBINS, filters=["none", "scbf"], options={"horizon": 2.0}, episodes=40)
+    lines = {line.split()[0]: line for line in out.splitlines() if line and line.split()[0] in ("none", "scbf")}
+    assert list(lines) == ["none", "scbf"]
+    for row in answer.rows:
+        line = lines[row["filter"]]
+        for shown in (
+            f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]",
+            f"{row['min_h_median']:.3g}",
+            f" {row['violations']} ",
+            f"{row['effort_mean']:.3g}",
+            f"{row['return_mean']:.4g}",
+        ):
+            assert shown in line
+    assert f"{100 * answer.rows[1]['intervention_rate']:.1f} %" in lines["scbf"]
+    assert "Note: nothing is random" not in out
+
+
+def test_filters_are_compared_under_the_table(safe_envs_command):
+    filters = [argument for name in ("none", "hocbf", "scbf", "hocbf:p=1,1") for argument in ("--filter", name)]
+    _, out, _ = safe_envs_command("evaluate", DUBINS, *filters, "--episodes", 200, "--noise", 0.4, "--json", "out.json")
+    shown = out.partition("Difference of the safety rates on the same episodes [95 % interval]:\n")[2].partition("\n\n")[0].splitlines()
+    comparisons = [c for c in strictly("out.json")["comparisons"] if "none" not in (c["first"], c["second"])]
+    assert len(shown) == len(comparisons) == 3
+    for line, c in zip(shown, comparisons, strict=True):
+        assert f"{c['first']} - {c['second']}: {100 * c['difference']:+.1f} points " in line
+        assert f"[{100 * c['ci_low']:.1f}, {100 * c['ci_high']:.1f}], McNemar p " in line
+        assert line.endswith(f"(safe with one only: {c['first']} {c['only_first']}, {c['second']} {c['only_second']})")
+    assert shown[0].lstrip().startswith("scbf - hocbf: +")
+    assert "McNemar p < 1e-10" in shown[0]
+    assert "Difference" not in safe_envs_command("evaluate", DUBINS, *QUICK)[1]
+
+
+def test_all_safe_shows_the_exact_interval(safe_envs_command):
+    _, out, _ = safe_envs_command("evaluate", "ACC-v0", "--filter", "scbf", "--episodes", "100", "--horizon", "0.2")
+    # Clopper and Pearson's, .025^(1/100) = 96.38 %; Wilson's would begin at 96.3 %.
+    assert "100.0 % [96.4, 100.0]" in out
+
+
+def test_refinement_says_which_rates_have_converged(safe_envs_command):
+    arguments = ("evaluate", "ACC-v0", "--filter", "none", "--filter", "scbf", "--episodes", "200", "--horizon", "0.2")
+    status, out, err = safe_envs_command(*arguments, "--refine", "--confidence", ".9", "--json", "out.json", "--plot", "out.svg")
+    assert (status, err) == (0, "")
+    plain, _, refined = out.partition("Refinement: safe [90 % interval]")
+    assert "safe [90 % interval]" in plain
+    for text in ("dt = 0.05 s", "dt = 0.025 s", "dt = 0.0125 s", "noise that is not coupled", "no further than 3 points"):
+        assert text in refined
+    row = strictly("out.json")["refinement"]["rows"][1]
+    rates = [f"100.0 % [{100 * low:.1f}, 100.0]" for low in row["ci_low"]]
+    (line,) = [line for line in refined.splitlines() if line.startswith("scbf")]
+    assert line.split() == ["scbf", *" ".join(rates).split()]
+    assert f"scbf: converged, +0.0 points [{100 * row['change_low']:.1f}, {100 * row['change_high']:.1f}]" in refined
+    few = safe_envs_command(*arguments, "--episodes", "10", "--refine")[1]
+    assert "  scbf: not resolved, +0.0 points [-27.8, 27.8]: more episodes are needed" in few
+    coarse = ("--dt", ".4", "--horizon", "1.6", "--start", ".5", "--noise", ".8", "--episodes", "2000")
+    changing = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", *coarse, "--refine")[1]
+    assert "  none: still changing by -" in changing
+    picture = Path("out.svg").read_text()
+    assert "dt = 0.05 s" in picture
+    assert "90 % band" in picture
+
+
+def test_bounds_are_shown_where_there_are_any():
+    answer = evaluate(DUBINS, filters=["none", "hocbf", "scbf"], options={"horizon": 0.2}, episodes=5)
+
+    def printed(*changes):
+        console = Console(width=200, file=io.StringIO())
+        rows = [{**row, **change} for row, change in zip(answer.rows, changes, strict=True)]
+        print_evaluation(console, replace(answer, rows=rows))
+        return console.file.getvalue()
+
+    bounded = printed({}, {"bound": None, "bound_note": "it ignores the noise"}, {"bound": 0.492, "bound_note": ""})
+    lines = {line.split()[0]: line for line in bounded.splitlines() if line.startswith(("none", "hocbf", "scbf"))}
+    assert "≥ 49.2 %" in lines["scbf"]
+    assert "] none " in " ".join(lines["hocbf"].split())
+    assert "] - " in " ".join(lines["none"].split())
+    assert "Note: no proved bound for hocbf: it ignores the noise\n" in bounded
+    assert bounded.count("no proved bound") == 1
+    below = printed({}, {}, {"bound": 0.999, "ci_high": 0.98})
+    assert "the rate of scbf lies below its proved bound" in below
+    assert "lies below" not in bounded
+
+
+def test_the_plants_mass_saves_the_quadrotor(safe_envs_command):
+    for knowledge in ("model", "plant"):
+        arguments = ("--filter", "none", "--filter", "hocbf", "--episodes", "12", "--knowledge", knowledge, "--json", f"{knowledge}.json")
+        assert safe_envs_command("evaluate", "safe_envs/QuadrotorAltitude-v0", *arguments)[0] == 0
+    bare, model = strictly("model.json")["rows"]
+    again, plant = strictly("plant.json")["rows"]
+    assert bare == again
+    assert bare["violations"] == model["violations"] == 12
+    assert bare["min_h_median"] < model["min_h_median"] < 0
+    assert plant["violations"] == 0
+    assert plant["min_h_p05"] > 0
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name", "options"),
+    [
+        (DUBINS, "a.png", ()),
+        (DUBINS, "a.SVG", ("--policy", "random", "--filter", "none", "--filter", "hocbf", "--filter", "scbf")),
+        ("DubinsObstacle-v0", "a.png", ()),
+        ("Quadrotor-v0", "a.pdf", ()),
+        ("ACC-v0", "a.png", ()),
+        ("Scalar-v0", "a.jpg", ()),
+        # h is the same number throughout: there is no range to draw.
+        ("Scalar-v0", "flat.png", ("--noise", "0", "--start", "1")),
+    ],
+)
+def test_plot_writes_a_picture(safe_envs_command, env_id, name, options):
+    status, _, err = safe_envs_command("evaluate", env_id, *QUICK, "--plot", name, *options)
+    assert (status, err) == (0, "")
+    starts = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF", ".jpg": b"\xff\xd8"}
+    content = Path(name).read_bytes()
+    assert content.startswith(starts[Path(name).suffix.lower()])
+    assert len(content) > 5000
+    if name == "a.SVG":
+        for text in (b"barrier h", b"safe so far", b"pointwise 95 % band", b"none: ", b"hocbf: ", b"scbf: ", b"unsafe"):
+            assert text in content
+    assert [p.name for p in Path().iterdir()] == [name]
