@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 import cloudpickle
@@ -11,7 +12,7 @@ import cloudpickle
 from agents.bridge import Bridge
 from agents.episodes import Played, Progress, play
 from agents.setting import Setting
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, WorkersLostError
 from wrappers import Condition
 
 _PARTS = 4
@@ -42,6 +43,7 @@ def play_in_processes(
 
     Raises:
         ConfigurationError: something cannot be sent to a process, a policy of one's own mostly.
+        WorkersLostError: a process was ended from outside.
     """
     from joblib import Parallel, delayed
 
@@ -49,10 +51,16 @@ def play_in_processes(
     parts = [range(first, min(first + size, episodes)) for first in range(0, episodes, size)]
     sent = _sent(setting, conditions, jobs)
     found: Any = Parallel(n_jobs=jobs, return_as="generator")(delayed(_played)(sent, part, seed, num_envs, bridge) for part in parts)
-    for part, waves in zip(parts, found, strict=True):
-        yield from waves
-        if progress:
-            progress(part.stop)
+    try:
+        for part, waves in zip(parts, found, strict=True):
+            yield from waves
+            if progress:
+                progress(part.stop)
+    except BrokenProcessPool as error:
+        raise WorkersLostError(
+            f"jobs = {jobs}: a process that simulated episodes was ended from outside, as for want of memory; use fewer jobs or a smaller "
+            "num_envs"
+        ) from error
 
 
 def _sent(setting: Setting, conditions: Sequence[Condition], jobs: int) -> bytes:

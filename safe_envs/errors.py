@@ -36,6 +36,10 @@ class NumericalError(SafeEnvsError, ArithmeticError):
     """A formula has no finite value at a state."""
 
 
+class WorkersLostError(SafeEnvsError, RuntimeError):
+    """Processes end before they have computed what they were given."""
+
+
 def nearest(name: str, allowed: Iterable[str]) -> str:
     """Return a phrase that lists the allowed names, the nearest one to `name` first."""
     names = list(allowed)

@@ -39,6 +39,7 @@ _ID = "safe_envs/StochasticDubins-v0"
 _LIMITS = "safe_envs/QuadrotorLimits-v0"
 _BATCHES = (1, 32, 1024, 10_000)
 _NUM_ENVS = 1024
+_FUSED = "hand-fused loop"
 _ROUNDS = 15
 _SECONDS_PER_ROUND = 0.08
 _LEARNED: dict[str, tuple[str, str, dict[str, Any]]] = {
@@ -92,13 +93,13 @@ def measure() -> Figures:
     """Return microseconds for each state, and the ratios that matter."""
     learned, seconds = _learn()
     cases = {**_filter_calls(), **_several_rows(), **_learned_calls(learned), **_scalar_steps(), **_vector_steps()}
-    times = _times({**cases, "hand-fused loop": _fused_loop()})
+    times = _times({**cases, _FUSED: _fused_loop()})
     return {
         **times,
         "filtered / bare env.step": times["env.step, filtered"] / times["env.step, bare"],
         "vector env, bare, million steps a second": 1.0 / times["vector env, bare"],
         "vector env, filtered, million steps a second": 1.0 / times["vector env, filtered"],
-        "speed of the filtered vector env / fused loop": times["hand-fused loop"] / times["vector env, filtered"],
+        "speed of the filtered vector env / fused loop": times[_FUSED] / times["vector env, filtered"],
         **seconds,
         **_vec_envs(),
     }
@@ -260,7 +261,7 @@ def read_figures(path: Path) -> Figures:
         found = json.loads(path.read_text())
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"--compare {path} cannot be read: {error}; give what `safe-envs benchmark --json FILE` wrote") from error
-    if not isinstance(found, dict) or not all(isinstance(value, int | float) for value in found.values()):
+    if not isinstance(found, dict) or _FUSED not in found or not all(isinstance(value, int | float) for value in found.values()):
         raise ConfigurationError(f"--compare {path} holds no figures; give what `safe-envs benchmark --json FILE` wrote")
     return found
 

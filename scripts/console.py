@@ -7,7 +7,9 @@ import inspect
 import io
 import json
 import re
+import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -139,7 +141,8 @@ def write_result(path: Path | None, document: Callable[[], Any]) -> None:
 def run(command: Callable[[], object]) -> None:
     """Run a command; an error of the user's making ends it with a message and the exit status 2."""
     try:
-        command()
+        with _terminable():
+            command()
     except SafeEnvsError as error:
         _fail(str(error))
     except (MemoryError, RuntimeError, ValueError) as error:
@@ -154,6 +157,23 @@ def run(command: Callable[[], object]) -> None:
         if not isinstance(error, Error):
             raise
         _fail(str(error))
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let a request to terminate, as job managers send it, end like Ctrl-C: with the processes that were started."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: Any) -> NoReturn:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _fail(message: str) -> NoReturn:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from pathlib import Path
 
 import pytest
 
 from agents import evaluate
 from agents.policy import Policy
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, WorkersLostError
 
 
 def test_the_answer_does_not_depend_on_the_number_of_processes():
@@ -50,6 +52,23 @@ class _Failing(Policy):
 def test_an_error_of_a_policy_stays_what_it_is():
     with pytest.raises(TypeError, match="of the policy's own"):
         evaluate("Scalar-v0", _Failing(), filters=["none"], episodes=4, jobs=2)
+
+
+class _Ending(Policy):
+    """Ends its process, as the operating system does when memory runs out."""
+
+    def __init__(self) -> None:
+        self.parent = os.getpid()
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        if os.getpid() != self.parent:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return observation[:, :1] * 0.0, state
+
+
+def test_a_lost_process_is_told():
+    with pytest.raises(WorkersLostError, match="ended from outside"):
+        evaluate("Scalar-v0", _Ending(), filters=["none"], episodes=4, jobs=2)
 
 
 def test_what_cannot_be_sent_is_explained():

@@ -54,7 +54,7 @@ def test_command_prints_and_writes_the_figures(monkeypatch, tmp_path, capsys):
 
 def test_earlier_figures_stand_beside_with_their_ratio(monkeypatch, tmp_path, capsys):
     earlier = tmp_path / "earlier.json"
-    earlier.write_text('{"filter call, 1 state": 4.0}')
+    earlier.write_text('{"filter call, 1 state": 4.0, "hand-fused loop": 0.1}')
     monkeypatch.setattr(benchmark, "measure", lambda: {"filter call, 1 state": 5.0, "new": 0.5})
     benchmark.benchmark(compare=earlier)
     lines = {line.rsplit("  ")[0].strip(): line.split()[-3:] for line in capsys.readouterr().out.splitlines() if line.strip()}
@@ -62,7 +62,7 @@ def test_earlier_figures_stand_beside_with_their_ratio(monkeypatch, tmp_path, ca
     assert rows == [["5", "4", "1.25"], ["0.5", "-", "-"]]
 
 
-@pytest.mark.parametrize("text", ["[1]", '{"a": "b"}', "no json", None])
+@pytest.mark.parametrize("text", ["[1]", '{"a": 1}', '{"hand-fused loop": "b"}', "no json", None])
 def test_what_holds_no_earlier_figures_is_refused(tmp_path, text):
     if text is not None:
         (tmp_path / "earlier.json").write_text(text)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import runpy
+import signal
 import sys
 from pathlib import Path
 
@@ -49,6 +51,12 @@ def test_sizes_beyond_the_memory_end_with_status_2(capsys, error):
 def test_faults_of_the_program_are_not_hidden(error):
     with pytest.raises(type(error)):
         run(failing(error))
+
+
+def test_a_request_to_terminate_is_like_ctrl_c():
+    with pytest.raises(KeyboardInterrupt):
+        run(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
 def test_errors_of_gymnasium_are_of_the_users_making(capsys):
