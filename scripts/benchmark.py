@@ -100,6 +100,7 @@ def measure() -> Figures:
         "vector env, bare, million steps a second": 1.0 / times["vector env, bare"],
         "vector env, filtered, million steps a second": 1.0 / times["vector env, filtered"],
         "speed of the filtered vector env / fused loop": times[_FUSED] / times["vector env, filtered"],
+        **_page_faults(cases["vector env, filtered"]),
         **seconds,
         **_vec_envs(),
     }
@@ -225,6 +226,22 @@ def _vector_steps() -> dict[str, Case]:
         calls = 10 * (env.unwrapped.problem.steps + 1)  # pyright: ignore[reportAttributeAccessIssue]
         cases[f"vector env, {name}"] = Case(lambda env=env: env.step(actions), _NUM_ENVS, calls=calls)
     return cases
+
+
+def _page_faults(case: Case) -> Figures:
+    """How often a step makes the system find new memory, once all is warm; nothing where the system does not count it."""
+    try:
+        import resource
+    except ImportError:  # Not on Windows.
+        return {}
+    steps = case.calls or 1
+    faults = []
+    for _ in range(2):
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(steps):
+            case.call()
+        faults.append(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+    return {"page faults a step of the filtered vector env": faults[-1] / steps}
 
 
 def _fused_loop() -> Case:

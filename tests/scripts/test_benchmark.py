@@ -81,3 +81,12 @@ def test_the_fused_loop_does_the_work_of_the_filter():
     np.testing.assert_allclose(turned, result.action[:, 0], rtol=1e-9, atol=1e-9)
     assert result.active.any()
     assert not result.active.all()
+
+
+def test_page_faults_are_those_of_fresh_memory():
+    kept = np.zeros(1 << 20)
+    (reused,) = benchmark._page_faults(benchmark.Case(lambda: kept.fill(1.0), calls=50)).values()
+    (fresh,) = benchmark._page_faults(benchmark.Case(lambda: np.ones(1 << 22), calls=5)).values()
+    assert reused < 1
+    # 32 MiB at a time, in pages of at most 2 MiB.
+    assert fresh >= 8
