@@ -57,6 +57,8 @@ def test_ratios_undo_a_drift_of_several_channels():
     push = np.array(diffusion) @ np.array([0.3, 0.6]) / math.hypot(0.3, 0.6) * 1.5
     assert env.state.mean(axis=0) == pytest.approx(push * time, abs=0.01)
     assert env.climbed[:, 1] == pytest.approx(time)
+    env.reset()
+    assert not env.climbed.any()
 
 
 def test_best_drift_of_a_walk_goes_straight_to_the_level():

@@ -38,22 +38,22 @@ def test_paths_go_on_from_where_others_fell_below_a_level():
     problem = brownian(0.05, 1.0, 0.0, 0.3)
     policy = Watching(problem)
     paths = particles_of(problem, policy, 64)
-    killed, parent = np.arange(1, 64), int(np.argmin(paths.lowest))
-    killed = killed[killed != parent]
-    level = 0.5 * (1.0 + paths.lowest[parent])
+    order = np.argsort(paths.lowest)
+    killed, parents = order[2:], np.resize(order[:2], 62)
+    levels = 0.5 * (1.0 + paths.lowest[parents])
     policy.seen.clear()
     ends = []
     for _ in range(2):
-        paths.branch(killed, np.full(killed.size, parent), np.full(killed.size, level))
-        assert (paths.lowest[killed] < level).all()
+        paths.branch(killed, parents, levels)
+        assert (paths.lowest[killed] < levels).all()
         ends.append(paths.lowest[killed].copy())
     # The policy sees the state of each row, and the noise is fresh each time.
     rows = slice(0, killed.size)
     for observation, x in policy.seen:
         assert observation[rows] == pytest.approx(x[rows], abs=1e-6)
     first = policy.seen[0][1][rows]
-    assert (first == first[0]).all()
-    assert 1 - first[0] < level
+    assert len(np.unique(first)) == 2
+    assert (1 - first < levels.max()).all()
     for end in ends:
         assert len(np.unique(end)) > killed.size / 2
     assert (ends[0] != ends[1]).mean() > 0.5
