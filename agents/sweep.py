@@ -4,37 +4,24 @@ from __future__ import annotations
 
 import itertools
 import json
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from agents.evaluation import BARE
-from agents.policy import make_policy, policy_files
+from agents.policy import make_policy
 from agents.problems import load_problem
-from agents.sweep_cell import ENV_OPTIONS, PARAMETERS, Cell, checksum, versions
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, require_whole
-from wrappers import require_readable
+from agents.sweep_cell import Cell, checksum, versions
+from agents.sweep_files import absolute, read_by, with_imported
+from agents.sweep_settings import Settings, complete, sections, text_of
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
+from wrappers import LEARNED, SafetyFilter, require_readable
 
-_SECTIONS = ("fixed", "grid", "cells")
-_DEFAULTS: dict[str, Any] = {
-    "policy": "nominal",
-    "knowledge": "model",
-    "objective": "nearest",
-    "seed": 0,
-    "episodes": 1000,
-    "bounds": False,
-}
-_NAMES = ("env", "filter", *ENV_OPTIONS, *_DEFAULTS)
-_WORDS = ("env", "system", "filter", "policy", "knowledge", "objective")
 _NO_PART = ("seed", "episodes", "bounds")
 """Settings that change neither the problem nor the filter nor the policy."""
-_GROUPS = tuple(f"{group}.NAME" for group in PARAMETERS)
-_FILE = re.compile("(?<=file=)[^:+]+")
-_MOST_CELLS = 1_000_000
 
-Settings = dict[str, Any]
+_MOST_CELLS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -80,10 +67,7 @@ def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Swe
     Raises:
         ConfigurationError: a section or a setting is not allowed.
     """
-    sections = _mapping(document, what, _SECTIONS)
-    fixed = _settings(sections.get("fixed"), f"{what}: fixed")
-    grid = _grid(sections.get("grid"), f"{what}: grid")
-    given = _listed(sections.get("cells"), f"{what}: cells")
+    fixed, grid, given = sections(document, what)
     for name in (*grid, *itertools.chain.from_iterable(given)):
         if name in fixed:
             raise ConfigurationError(f"{what}: {name} is fixed, and has other values too; give it once")
@@ -96,19 +80,14 @@ def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Swe
     chosen += given
     if not chosen:
         chosen = [{}]
-    complete = [_complete({**fixed, **each}, what) for each in chosen]
-    cells = {cell.key: cell for cell in _cells(complete, trust)}
+    once = {_equal(settings): settings for settings in (complete({**fixed, **each}, what) for each in chosen)}
+    cells = {cell.key: cell for cell in _cells(once.values(), trust)}
     return Sweep(tuple(cells.values()), tuple(_swept([cell.settings for cell in cells.values()])))
 
 
 def describe(cell: Cell, names: Iterable[str]) -> str:
     """A cell in a few words: the settings of these names."""
     return ", ".join(f"{name} = {text_of(cell.settings[name])}" for name in names if name in cell.settings)
-
-
-def text_of(value: Any) -> str:
-    """The value of a setting as text."""
-    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _document(path: Path) -> Any:
@@ -122,116 +101,24 @@ def _document(path: Path) -> Any:
         raise ConfigurationError(f"{path} is no YAML: {error}") from error
 
 
-def _mapping(given: Any, what: str, allowed: Sequence[str] | None) -> dict[str, Any]:
-    if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
-        form = "NAME: VALUE entries" if allowed is None else f"the sections {', '.join(allowed)}"
-        raise ConfigurationError(f"{what} is {json.dumps(given, default=str)[:80]}; give {form}")
-    for name in given:
-        if allowed is not None and name not in allowed:
-            raise ConfigurationError(f"{what} has the section {name!r}; {nearest(name, allowed)}")
-    return dict(given)
+def _equal(settings: Settings) -> str:
+    """The same for settings that differ in 1 and 1.0 of a barrier only, and so are of the same episodes."""
+
+    def one_form(value: Any) -> Any:
+        return json.loads(json.dumps(value), parse_int=float)
+
+    return json.dumps({name: one_form(value) if name.startswith("barrier.") else value for name, value in settings.items()})
 
 
-def _settings(given: Any, what: str) -> Settings:
-    settings = _mapping({} if given is None else given, what, None)
-    for name in settings:
-        _require_known(name, what)
-    return {name: _value(name, value, what) for name, value in settings.items()}
-
-
-def _grid(given: Any, what: str) -> dict[str, list[Any]]:
-    lists = _mapping({} if given is None else given, what, None)
-    for name, values in lists.items():
-        _require_known(name, what)
-        if not isinstance(values, list) or not values:
-            raise ConfigurationError(f"{what}: {name} = {text_of(values)}; give a list of values, or put it under fixed")
-    return {name: [_value(name, value, what) for value in values] for name, values in lists.items()}
-
-
-def _listed(given: Any, what: str) -> list[Settings]:
-    if given is None:
-        return []
-    if not isinstance(given, list) or not given:
-        raise ConfigurationError(f"{what} is {text_of(given)}; give a list, each entry with settings")
-    return [_settings(each, f"{what}, entry {i}") for i, each in enumerate(given, 1)]
-
-
-def _require_known(name: str, what: str) -> None:
-    group, dot, parameter = name.partition(".")
-    if not (name in _NAMES or (group in PARAMETERS and dot and parameter)):
-        hint = f"; give its parameters as {name}.NAME" if name in PARAMETERS else f"; {nearest(name, (*_NAMES, *_GROUPS))}"
-        raise ConfigurationError(f"{what} has the setting {name!r}{hint}")
-
-
-def _value(name: str, value: Any, what: str) -> Any:
-    """A value of the kind that its setting takes; YAML reads 1e-3 as a word."""
-    if name in _WORDS:
-        if not isinstance(value, str):
-            raise ConfigurationError(f"{what}: {name} = {text_of(value)}; give a text")
-        return value
-    if name == "bounds":
-        if not isinstance(value, bool):
-            raise ConfigurationError(f"{what}: bounds = {text_of(value)}; give true or false")
-        return value
-    if name in ("seed", "episodes", "substeps"):
-        require_whole(f"{what}: {name}", value, 0 if name == "seed" else 1)
-        return value
-    if isinstance(value, list):
-        return [_value(name, entry, what) for entry in value]
-    if isinstance(value, str):
-        try:
-            return float(value)
-        except ValueError:
-            if name == "start" or name.startswith("barrier."):
-                return value
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        raise ConfigurationError(f"{what}: {name} = {json.dumps(value, default=str)}; give a number")
-    return value
-
-
-def _complete(settings: Settings, what: str) -> Settings:
-    """The settings of a cell, in one order, with what is the same for every env where it was left open."""
-    if ("env" in settings) == ("system" in settings):
-        raise ConfigurationError(f"{what}: a cell needs env: ENV_ID or system: FILE.py:NAME, one of the two")
-    if "filter" not in settings:
-        raise ConfigurationError(f"{what}: a cell has no filter; name one, or {BARE} for the bare env")
-    given = {**_DEFAULTS, **settings}
-    return {name: given[name] for name in sorted(given, key=lambda name: (name not in _NAMES, _rank(name), name))}
-
-
-def _rank(name: str) -> int:
-    return _NAMES.index(name) if name in _NAMES else PARAMETERS.index(name.partition(".")[0])
-
-
-def _cells(complete: Iterable[Settings], trust: bool) -> Iterable[Cell]:
-    digests: dict[str, str] = {}
-    for settings in complete:
-        absolute = _absolute(settings)
-        paths = [str(path) for path in _paths(absolute)]
-        for path in paths:
+def _cells(found: Iterable[Settings], trust: bool) -> Iterable[Cell]:
+    digests: dict[Path, dict[str, str]] = {}
+    for given in found:
+        settings, files = absolute(given), {}
+        for path in read_by(settings):
             if path not in digests:
-                digests[path] = checksum(Path(path))
-        yield Cell(absolute, {path: digests[path] for path in paths}, versions(), trust)
-
-
-def _absolute(settings: Settings) -> Settings:
-    """The settings with paths that mean the same in every process."""
-    found = {**settings, "filter": _FILE.sub(lambda match: str(Path(match.group()).resolve()), settings["filter"])}
-    if policy_files(settings["policy"]) and Path(settings["policy"]).exists():
-        found["policy"] = str(Path(settings["policy"]).resolve())
-    file, colon, name = settings.get("system", "").rpartition(":")
-    if colon and file.endswith(".py"):
-        found["system"] = f"{Path(file).resolve()}:{name}"
-    return found
-
-
-def _paths(settings: Settings) -> Iterable[Path]:
-    """The files that a cell reads. A policy that is not there is an unknown name, which `make_policy` says better."""
-    file, _, _ = settings.get("system", "").rpartition(":")
-    if file.endswith(".py"):
-        yield Path(file)
-    yield from (Path(match) for match in _FILE.findall(settings["filter"]))
-    yield from (path for path in policy_files(settings["policy"]) if path.exists())
+                digests[path] = {str(each): checksum(each) for each in with_imported(path)}
+            files |= digests[path]
+        yield Cell(settings, files, versions(), trust)
 
 
 def _swept(settings: Sequence[Mapping[str, Any]]) -> Iterable[str]:
@@ -251,21 +138,26 @@ def _check(sweep: Sweep) -> None:
     for cell in sweep.cells:
         place = (cell.settings.get("env"), cell.settings.get("system"))
         looked_at = {name: value for name, value in cell.settings.items() if name not in _NO_PART}
-        parts = {json.dumps([name, value, place if name in ("filter", "policy") else None]) for name, value in looked_at.items()}
-        if parts <= seen:
+        parts = {name: json.dumps([name, value, place if name in ("filter", "policy") else None]) for name, value in looked_at.items()}
+        new = {name for name, part in parts.items() if part not in seen}
+        if not new:
             continue
-        seen |= parts
+        seen |= set(parts.values())
         try:
-            _check_cell(cell)
+            _check_cell(cell, "filter" in new)
         except SafeEnvsError as error:
             raise type(error)(f"cell {describe(cell, sweep.swept) or 1}: {error}") from error
 
 
-def _check_cell(cell: Cell) -> None:
+def _check_cell(cell: Cell, derive: bool) -> None:
+    settings = cell.settings
     for name, allowed in (("knowledge", ("model", "plant")), ("objective", ("nearest", "clf"))):
-        if cell.settings[name] not in allowed:
-            raise ConfigurationError(f"{name} = {cell.settings[name]!r}; {nearest(cell.settings[name], allowed)}")
+        if settings[name] not in allowed:
+            raise ConfigurationError(f"{name} = {settings[name]!r}; {nearest(settings[name], allowed)}")
     problem = load_problem(cell.env_id, cell.options)
-    if cell.settings["filter"] != BARE:
-        require_readable(cell.settings["filter"], problem)
-    make_policy(cell.settings["policy"], problem, cell.trust)
+    if settings["filter"] != BARE:
+        require_readable(settings["filter"], problem)
+        rests_on_learned = any(part.split(":")[0] in LEARNED for part in settings["filter"].split("+"))
+        if derive and not rests_on_learned:
+            SafetyFilter.for_problem(problem, settings["filter"], settings["knowledge"], settings["objective"])
+    make_policy(settings["policy"], problem, cell.trust)

@@ -6,6 +6,7 @@ import hashlib
 import json
 import threading
 import time
+import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -24,6 +25,9 @@ ENV_OPTIONS = ("system", "noise", "dt", "substeps", "horizon", "box", "start")
 """Settings that are arguments of `gym.make`."""
 
 _PACKAGES = ("safe_envs", "wrappers", "agents")
+_FRAMES = 3
+"""How many lines of code an unexpected error is told with."""
+
 _ONE_AT_A_TIME = threading.Lock()
 """A Dask worker may have several threads, but neither SymPy nor the limits of threadpoolctl are made for that."""
 
@@ -101,8 +105,15 @@ def compute(cell: Cell) -> Outcome:
     except SafeEnvsError as error:
         return Outcome(cell.key, None, None, str(error), time.perf_counter() - began)
     except Exception as error:
-        return Outcome(cell.key, None, None, f"{type(error).__name__}: {error}", time.perf_counter() - began)
+        return Outcome(cell.key, None, None, f"{type(error).__name__}: {error}{_where(error)}", time.perf_counter() - began)
     return Outcome(cell.key, row, config, None, time.perf_counter() - began)
+
+
+def _where(error: Exception) -> str:
+    """The last lines of code that led to an error, with as much of their files' paths as is the same on all machines."""
+    frames = traceback.extract_tb(error.__traceback__)[-_FRAMES:]
+    places = [f"{'/'.join(Path(frame.filename).parts[-2:])}:{frame.lineno} in {frame.name}" for frame in frames]
+    return f" (at {', from '.join(reversed(places))})"
 
 
 def _evaluated(cell: Cell) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents.sweep import Sweep, text_of
+from agents.sweep import Sweep
 from agents.sweep_cell import Cell, Outcome
+from agents.sweep_settings import text_of
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import write_atomically, write_json
 
@@ -21,6 +24,9 @@ INDEX = "sweep.json"
 """Name of the file with the order of the cells and the names of the swept settings."""
 
 _CELLS = "cells"
+_STALE = 3600.0
+"""Age in seconds at which a temporary file is left over: to write one takes no second."""
+
 _COUNTS = ("safe", "violations")
 _STATISTICS = (
     "safety_rate",
@@ -42,7 +48,7 @@ class Store:
 
     Args:
         folder: made if it is not there.
-        sweep: whose cells are kept in it. Those of another sweep in the same folder stay, and are not read.
+        sweep: whose cells are kept in it. Those of another sweep in the same folder stay, and are read until one of this is there.
 
     Raises:
         ConfigurationError: the folder cannot be made or written, or pyarrow is not installed.
@@ -55,25 +61,41 @@ class Store:
             (folder / _CELLS).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigurationError(f"{folder} cannot be made: {error.strerror}; give another folder") from error
-        self._finished = {key for key in self._cells if _is_finished(_file_of(folder, key))}
-        index = {"cells": list(self._cells), "swept": sweep.swept}
-        self._write(folder / INDEX, lambda: write_json(folder / INDEX, index))
+        _remove_stale(folder)
+        there = {key for key in self._cells if _file_of(folder, key).is_file()}
+        self._finished = {key for key in there if _is_finished(_file_of(folder, key))}
+        self._failed = there - self._finished
+        self._index = {"cells": list(self._cells), "swept": list(sweep.swept)}
+        # The results of another sweep, as of another version of the code, can be read until there is one of this.
+        self._is_indexed = bool(there) or not _has_index(folder)
+        if self._is_indexed:
+            self._write_index()
 
     @property
     def missing(self) -> list[Cell]:
-        """Cells that are not there yet, or failed."""
-        return [cell for key, cell in self._cells.items() if key not in self._finished]
+        """Cells that are not there yet, and after them those that failed."""
+        missing = [cell for key, cell in self._cells.items() if key not in self._finished]
+        return sorted(missing, key=lambda cell: cell.key in self._failed)
 
     def keep(self, outcome: Outcome) -> None:
-        """Write an outcome.
+        """Write an outcome, unless it failed and another run has the result.
 
         Raises:
             ConfigurationError: it cannot be written, as on a full disk.
         """
         path = _file_of(self._folder, outcome.key)
-        self._write(path, lambda: write_atomically(path, lambda part: _write_table(part, self._cells[outcome.key], outcome)))
-        if outcome.error is None:
+        if not self._is_indexed:
+            self._write_index()
+        if outcome.error is None or not _is_finished(path):
+            self._write(path, lambda: write_atomically(path, lambda part: _write_table(part, self._cells[outcome.key], outcome)))
+            (self._finished if outcome.error is None else self._failed).add(outcome.key)
+        else:
             self._finished.add(outcome.key)
+
+    def _write_index(self) -> None:
+        path = self._folder / INDEX
+        self._write(path, lambda: write_json(path, self._index))
+        self._is_indexed = True
 
     def _write(self, path: Path, write: Any) -> None:
         try:
@@ -89,9 +111,9 @@ class Store:
 def read(folder: Path | str) -> pa.Table:
     """The cells of a sweep that are there, in the order of its file.
 
-    Columns: `key`; each setting that some cell has, null where another one leaves it to the env; counts and statistics as in the
-    rows of `agents.evaluation.evaluate`; `error`, null for cells that did not fail; `seconds`, the only one that depends on the
-    machine; and as JSON the whole row, its configuration, the versions and the checksums of files.
+    Columns: `key`; each setting that is swept or that some cell has, null where another one leaves it to the env; counts and
+    statistics as in the rows of `agents.evaluation.evaluate`; `error`, null for cells that did not fail; `seconds`, the only one that
+    depends on the machine; and as JSON the whole row, its configuration, the versions and the checksums of files.
 
     Raises:
         ConfigurationError: the folder holds no sweep, a file in it cannot be read, or pyarrow is not installed.
@@ -101,15 +123,17 @@ def read(folder: Path | str) -> pa.Table:
     import pyarrow.parquet as pq
 
     folder = Path(folder)
-    paths = [path for key in read_index(folder)["cells"] if (path := _file_of(folder, key)).is_file()]
+    index = read_index(folder)
+    paths = [path for key in index["cells"] if (path := _file_of(folder, key)).is_file()]
     if not paths:
         return _schema().empty_table()
     try:
-        kept = pa.concat_tables([pq.ParquetFile(path).read() for path in paths])
-    except (OSError, pa.ArrowException) as error:
+        kept = pa.concat_tables([pq.ParquetFile(path).read().select(_schema().names) for path in paths])
+        settings = [json.loads(text) for text in kept["settings"].to_pylist()]
+    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
         raise ConfigurationError(f"a file in {folder / _CELLS} cannot be read ({error}); remove it and start the sweep again") from error
-    settings = [json.loads(text) for text in kept["settings"].to_pylist()]
-    names = dict.fromkeys(name for each in settings for name in each)
+    # A swept setting may be one of cells only that are not there yet.
+    names = dict.fromkeys([*(name for each in settings for name in each), *index["swept"]])
     columns = {"key": kept["key"], **{name: _column([each.get(name) for each in settings]) for name in names}}
     return pa.table(columns | {name: kept[name] for name in kept.column_names if name not in ("key", "settings")})
 
@@ -121,9 +145,29 @@ def read_index(folder: Path) -> dict[str, Any]:
         ConfigurationError: the folder holds no sweep.
     """
     try:
-        return json.loads((folder / INDEX).read_text())
+        index = json.loads((folder / INDEX).read_text())
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"{folder} holds no sweep: it has no {INDEX}; give the folder of `safe-envs sweep ... --out`") from error
+    texts = [index.get(name) if isinstance(index, dict) else None for name in ("cells", "swept")]
+    if not all(isinstance(each, list) and all(isinstance(text, str) for text in each) for each in texts):
+        raise ConfigurationError(f"{folder / INDEX} is not as `safe-envs sweep` writes it; run the sweep again, which writes it anew")
+    return index
+
+
+def _has_index(folder: Path) -> bool:
+    try:
+        read_index(folder)
+    except ConfigurationError:
+        return False
+    return True
+
+
+def _remove_stale(folder: Path) -> None:
+    """Remove what was being written when a run was killed: nothing that is young, which another run may be writing."""
+    for path in (*folder.glob(f".{Path(INDEX).stem}.*"), *(folder / _CELLS).glob(".*.parquet")):
+        with suppress(OSError):
+            if time.time() - path.stat().st_mtime > _STALE:
+                path.unlink()
 
 
 def _require_pyarrow() -> None:
@@ -141,7 +185,7 @@ def _is_finished(path: Path) -> bool:
 
     try:
         return pq.ParquetFile(path).read(columns=["error"])["error"][0].as_py() is None
-    except (OSError, pa.ArrowException):
+    except (OSError, pa.ArrowException, KeyError, IndexError):
         return False
 
 

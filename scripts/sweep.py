@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -74,7 +71,7 @@ def _document(found: Sweep, failures: Sequence[Outcome], counts: dict[str, int])
 
 
 def _compute(store: Store, place: Place, out: Path) -> list[Outcome]:
-    """Compute what is missing; return the outcomes that failed."""
+    """Compute what is missing; return the outcomes that failed, and that no other run has computed meanwhile."""
     from agents.sweep_run import run
 
     missing, failures, done = store.missing, [], 0
@@ -89,29 +86,12 @@ def _compute(store: Store, place: Place, out: Path) -> list[Outcome]:
             tell(done / len(missing))
 
         try:
-            with _stoppable():
-                run(missing, place, keep)
+            run(missing, place, keep, lambda text: print(text, file=sys.stderr, flush=True))
         except KeyboardInterrupt:
             print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
             raise
-    return failures
-
-
-@contextmanager
-def _stoppable() -> Iterator[None]:
-    """Let a request to terminate, as job managers send it, end like Ctrl-C: with the processes that were started."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(*_: Any) -> None:
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    left = {cell.key for cell in store.missing}
+    return [outcome for outcome in failures if outcome.key in left]
 
 
 def _told(found: Sweep, failures: Sequence[Outcome]) -> str:

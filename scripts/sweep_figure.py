@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from agents.evaluation import BARE
-from agents.statistics import rate_interval
+from agents.statistics import rate_interval, repeated_interval
 from safe_envs.files import write_atomically
 from scripts.figure import COLORS, STYLE, add_legend
 
@@ -152,13 +152,24 @@ def _at(rows: Iterable[Row], name: str | None, value: Any) -> list[Row]:
 
 
 def _rate(rows: Sequence[Row]) -> Rate | None:
-    """The rate of cells that differ in their seeds only, whose episodes are independent; None without any."""
+    """The rate of cells that differ in their seeds only, whose episodes are independent; None without any.
+
+    Where each seed learned anew what its filter rests on, its episodes have that in common, and the interval is over both.
+    """
     if not rows:
         return None
     if len(rows) == 1:
         return rows[0]["safety_rate"], rows[0]["ci_low"], rows[0]["ci_high"]
     safe, episodes = sum(row["safe"] for row in rows), sum(row["episodes"] for row in rows)
-    return safe / episodes, *rate_interval(safe, episodes)
+    of_episodes = rate_interval(safe, episodes)
+    if len({_learned(row) for row in rows}) == 1:
+        return safe / episodes, *of_episodes
+    return safe / episodes, *repeated_interval([row["safety_rate"] for row in rows], of_episodes, 0.95, (0.0, 1.0))
+
+
+def _learned(row: Row) -> tuple[str, ...]:
+    """Checksums of the models on which the filter of a cell rests; none for one that learned nothing."""
+    return tuple((json.loads(row["row"])["learning"] or {}).get("sha256", ()))
 
 
 def _values(rows: Sequence[Row], name: str) -> list[Any]:

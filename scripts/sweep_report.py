@@ -35,7 +35,7 @@ def sweep_report(
     """Draw the safety rates of a sweep with 95 % bands, and list its worst cells, those that failed and how many are missing.
 
     Every combination of the settings that are neither across nor lines has a panel. Seeds are put together: their episodes are
-    independent.
+    independent. Where each seed learned its filter anew, the band is over what was learned too.
     """
     from agents.sweep_store import read, read_index
     from scripts.sweep_figure import Layout, draw

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +11,7 @@ import pytest
 
 from agents.sweep import describe, read_sweep, sweep_of
 from agents.sweep_cell import Cell, compute
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, RelativeDegreeError
 
 SMALL: dict[str, Any] = {"env": "Scalar-v0", "filter": "scbf", "episodes": 20, "horizon": 0.2}
 
@@ -33,6 +36,12 @@ def test_lists_multiply_and_single_cells_follow():
 def test_equal_cells_are_one():
     assert len(sweep_of({"fixed": SMALL, "grid": {"noise": [0.1, 0.1]}, "cells": [{"noise": 0.1}]}).cells) == 1
     assert len(sweep_of({"fixed": SMALL}).cells) == 1
+    equal = {"noise": [1, 1.0, "1e0"], "start": [[0, 0.5], [-0.0, 0.5]], "barrier.limit": [1, 1.0], "seed": [2**53, 2**53 + 1]}
+    found = sweep_of({"fixed": SMALL, "grid": equal, "cells": [{"noise": 1.0, "seed": 2**53, "barrier.limit": 1.0, "start": [0, 0.5]}]})
+    assert found.swept == ("seed",)
+    assert len(found.cells) == 2
+    (one,) = sweep_of({"fixed": {**SMALL, "noise": 1}}).cells
+    assert one.key == sweep_of({"fixed": {**SMALL, "env": "safe_envs/Scalar-v0", "noise": 1.0}}).cells[0].key
 
 
 @pytest.mark.parametrize(
@@ -50,6 +59,13 @@ def test_equal_cells_are_one():
         ({"fixed": {**SMALL, "episodes": 0}}, "give a whole number from 1"),
         ({"fixed": {**SMALL, "bounds": 1}}, "give true or false"),
         ({"fixed": {**SMALL, "policy": 3}}, "policy = 3; give a text"),
+        ({"fixed": SMALL, "grid": {"seed": date(2026, 1, 1)}}, 'seed = "2026-01-01"; give a list of values'),
+        ({"fixed": SMALL, "cells": date(2026, 1, 1)}, "give a list, each entry with settings"),
+        ({"fixed": {date(2026, 1, 1): 1}}, "give NAME: VALUE entries"),
+        ({"fixed": {**SMALL, "env": True}}, "env = true; give a text"),
+        ({"fixed": SMALL, "grid": {"noise": [None]}}, "noise = null; give a number"),
+        ({"fixed": SMALL, "grid": {"noise": [math.nan]}}, "noise = nan; give a finite number"),
+        ({"fixed": {"filter": "scbf", "system": "mine:problem"}}, "system = mine:problem; give FILE.py:NAME"),
         ({"fixed": {"env": "Scalar-v0"}}, "has no filter"),
         ({"fixed": {"filter": "scbf"}}, "one of the two"),
         ({"fixed": SMALL, "grid": {f"plant.p{k}": list(range(100)) for k in range(4)}}, "the most are"),
@@ -70,12 +86,14 @@ def test_mistakes_in_the_form_are_said(document: Any, message: str):
         ("plant.sigma: [.1, 0]\n  plant.sgma: [1]", "sgma"),
         ("knowledge: [model, plnt]", "did you mean 'plant'"),
         ("filter: [scbf, 'ddscbf:file=there-is-none.npz']", "there-is-none.npz cannot be read"),
+        # Each env goes with one of the filters, and each filter with one of the envs.
+        ("filter: [scbf, srcbf]\n  env: [Scalar-v0, StochasticDubins-v0]", "cell .*StochasticDubins-v0, filter = srcbf: .*degree 2"),
     ],
 )
 def test_mistakes_in_a_value_are_found_before_the_first_cell(tmp_path: Path, grid: str, message: str):
-    kept = [f"  {name}: {value}" for name, value in SMALL.items() if not grid.startswith(name)]
+    kept = [f"  {name}: {value}" for name, value in SMALL.items() if f"{name}: [" not in grid]
     path = written(tmp_path, "\n".join(["fixed:", *kept, "grid:", f"  {grid}"]))
-    with pytest.raises(ConfigurationError, match=message):
+    with pytest.raises((ConfigurationError, RelativeDegreeError), match=message):
         read_sweep(path)
 
 
@@ -115,4 +133,5 @@ def test_a_worker_with_other_versions_or_files_computes_nothing(tmp_path: Path):
 
 def test_an_error_of_any_kind_is_the_outcome_of_its_cell():
     outcome = compute(Cell({"env": "Scalar-v0"}))
-    assert (outcome.row, outcome.error) == (None, "KeyError: 'policy'")
+    assert outcome.row is None
+    assert re.fullmatch(r"KeyError: 'policy' \(at agents/sweep_cell\.py:\d+ in _evaluated, from .*:\d+ in compute\)", str(outcome.error))

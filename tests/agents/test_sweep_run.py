@@ -11,21 +11,20 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from agents import sweep_run
+from agents import sweep_clusters, sweep_run
 from agents.sweep import sweep_of
-from agents.sweep_cell import Cell, Outcome, compute
-from agents.sweep_run import Place, WorkersLostError, run
+from agents.sweep_run import Place, run
 from agents.sweep_store import Store, read
 from safe_envs.errors import ConfigurationError
 
-# With "ends", the first process that simulates it is killed, in the middle of the cell.
+# With "ends", the first process that simulates it is killed, in the middle of the cell; with "kills", every one but that of the tests.
 SYSTEM = """
 import os, signal
 from pathlib import Path
@@ -35,8 +34,9 @@ def problem(kind="plain"):
     marker = Path(__file__).with_suffix(".ended")
     if kind == "fails":
         raise OSError("no such thing")
-    if kind == "ends" and not marker.exists():
+    if kind == "kills" or (kind == "ends" and not marker.exists()):
         marker.touch()
+        assert os.environ["SPARED"] != str(os.getpid())
         os.kill(os.getpid(), signal.SIGKILL)
     return load_problem("Scalar-v0", {"horizon": 0.2})
 """
@@ -45,10 +45,12 @@ def problem(kind="plain"):
 DRIVER = """
 import json, os, signal, sys
 from pathlib import Path
+from agents import sweep_clusters
 from agents.sweep import sweep_of
 from agents.sweep_run import Place, run
 from agents.sweep_store import Store
 
+sweep_clusters._RETRIES = 1
 spec, out, backend, address, jobs, last = sys.argv[1:]
 store = Store(Path(out), sweep_of(json.loads(Path(spec).read_text())))
 left = int(last)
@@ -70,10 +72,16 @@ Document = dict[str, Any]
 
 
 @pytest.fixture
-def document(tmp_path: Path) -> Document:
+def document(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Document:
+    monkeypatch.setenv("SPARED", str(os.getpid()))
     (tmp_path / "system.py").write_text(SYSTEM)
     fixed = {"system": f"{tmp_path / 'system.py'}:problem", "filter": "scbf", "episodes": 20}
     return {"fixed": fixed, "grid": {"noise": [0.1, 0.3], "seed": [0, 1, 2]}, "cells": [{"barrier.kind": "fails"}]}
+
+
+def killing(document: Document) -> Document:
+    """A cell that ends every process that computes it."""
+    return {"fixed": {**document["fixed"], "barrier.kind": "kills"}}
 
 
 def with_end(document: Document) -> Document:
@@ -135,6 +143,22 @@ def wait_for(process: subprocess.Popen[bytes], log: Path, path: Path, text: str)
     raise RuntimeError(f"{path} has no {text!r}: {log.read_text()}")
 
 
+@contextmanager
+def limited() -> Iterator[None]:
+    """What would wait for an answer that never comes ends, by what is no error that a sweep could take for one of its workers."""
+
+    def stop(*_: Any) -> None:
+        pytest.fail(f"no answer in {LONG} s")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(LONG)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
 def free_port() -> int:
     """A port that the system chooses, for what does not ask it itself."""
     with socket.socket() as found:
@@ -144,42 +168,16 @@ def free_port() -> int:
 
 def test_a_killed_worker_and_a_failing_cell_cost_no_other(tmp_path: Path, document: Document):
     document = with_end(document)
+    # By itself, too, it has a process of its own.
+    single = {"fixed": {**document["fixed"], "barrier.kind": "ends"}}
+    assert [row["error"] for row in computed(single, tmp_path / "single", Place(jobs=2))] == [None]
+    (tmp_path / "system.ended").unlink()
     found = computed(document, tmp_path / "two", Place(jobs=2))
     assert (tmp_path / "system.ended").exists()
     *errors, last = [row["error"] for row in found]
     assert errors == [None] * 12
     assert "no such thing" in last
     assert found == local_answer(document, tmp_path / "one")
-
-
-def test_a_cell_that_ends_every_worker_is_found(tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch):
-    # Three in a row, too: others have shown that the workers are sound.
-    begun: list[int] = []
-
-    def outcomes(cells: Sequence[Cell], place: Place) -> Iterator[Outcome]:
-        begun.append(len(cells))
-        for cell in cells:
-            if cell.settings.get("noise") == 0.3:
-                raise sweep_run._LossError("it went away")
-            yield compute(cell)
-
-    monkeypatch.setattr(sweep_run, "_outcomes", outcomes)
-    found = computed(document, tmp_path / "out", Place())
-    ended = "the process that computed it ended: it went away"
-    assert [row["error"] for row in found[:-1]] == [None] * 3 + [ended] * 3
-    # All that is left three times, and then one by one up to the first that is lost; and so on.
-    assert begun == [7, 4, 4, 1, *[3] * 3, 1, *[2] * 3, 1, 1]
-
-
-def test_workers_that_end_whatever_they_compute(tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch):
-    def outcomes(cells: Sequence[Cell], place: Place) -> Iterator[Outcome]:
-        raise sweep_run._LossError("they went away")
-        yield
-
-    monkeypatch.setattr(sweep_run, "_outcomes", outcomes)
-    store = Store(tmp_path / "out", sweep_of(document))
-    with pytest.raises(WorkersLostError, match=r"no cell could be computed, .* the last: they went away"):
-        run(store.missing, Place(), store.keep)
 
 
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, document: Document):
@@ -195,19 +193,25 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, document: Document):
     assert rows(folder) == local_answer(document, tmp_path / "one")
 
 
-def test_dask_with_a_killed_worker(tmp_path: Path, document: Document):
+def test_dask_with_a_killed_worker_and_with_none(tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch):
     document = with_end(document)
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
     file, log = tmp_path / "scheduler.json", tmp_path / "log"
     common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
     scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", *common]
     worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1", "--no-nanny", *common]
     with started(scheduler, log=log) as (process,):
-        address = json.loads(wait_for(process, log, file, "\n}"))["address"]
-        with started(worker, worker, log=tmp_path / "log-of-workers") as workers:
-            ended = driver(document, tmp_path / "dask", Place("dask", address))
-            assert ended.returncode == 0, ended.stderr
-            assert sorted(process.poll() is None for process in workers) == [False, True]
-    assert rows(tmp_path / "dask") == local_answer(document, tmp_path / "one")
+        place = Place("dask", json.loads(wait_for(process, log, file, "\n}"))["address"])
+        with started(worker, worker, worker, log=tmp_path / "log-of-workers") as workers, limited():
+            found = computed(document, tmp_path / "dask", place)
+            assert sorted(process.poll() is None for process in workers) == [False, True, True]
+            # Among others, and by itself.
+            (killed,) = computed(killing(document), tmp_path / "killed", place)
+            assert killed["error"].startswith("the process that computed it ended: KilledWorker")
+        monkeypatch.setattr(sweep_clusters, "_PATIENCE", 1)
+        with pytest.raises(ConfigurationError, match="has no workers"):
+            computed(killing(document), tmp_path / "killed", place)
+    assert found == local_answer(document, tmp_path / "one")
 
 
 @pytest.fixture
@@ -234,10 +238,13 @@ def test_ray_with_a_killed_worker(tmp_path: Path, document: Document, ray_folder
     with started([sys.executable, "-m", "ray.scripts.scripts", "start", *where, *size], log=log) as (process,):
         wait_for(process, log, log, "Ray runtime started")
         address = wait_for(process, log, ray_folder / "ray" / "ray_current_cluster", ":").strip()
-        ended = driver(document, tmp_path / "ray", Place("ray", address))
+        both = {**document, "cells": [*document["cells"], {"barrier.kind": "kills"}]}
+        ended = driver(both, tmp_path / "ray", Place("ray", address))
         assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "system.ended").exists()
-    assert rows(tmp_path / "ray") == local_answer(document, tmp_path / "one")
+    *others, killed = rows(tmp_path / "ray")
+    assert killed["error"].startswith("the process that computed it ended: ")
+    assert others == local_answer(document, tmp_path / "one")
 
 
 @pytest.mark.parametrize(
@@ -261,9 +268,9 @@ def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_an_address_where_nobody_listens(monkeypatch: pytest.MonkeyPatch):
-    from agents import sweep_clusters
-
     monkeypatch.setattr(sweep_clusters, "_PATIENCE", 1)
-    for settings, port in ((sweep_clusters.dask_settings, "tcp://127.0.0.1:9"), (sweep_clusters.ray_settings, "127.0.0.1:9")):
-        with pytest.raises(ConfigurationError, match=f"answers at {port}"), settings(port):
-            pass
+    dask, ray = "tcp://127.0.0.1:9", "127.0.0.1:9"
+    with pytest.raises(ConfigurationError, match=f"answers at {dask}"), sweep_clusters.dask_settings(dask, print):
+        pass
+    with pytest.raises(ConfigurationError, match=f"answers at {ray}"), sweep_clusters.ray_settings(ray):
+        pass

@@ -2,6 +2,10 @@ from __future__ import annotations
 
 import errno
 import json
+import os
+import shutil
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +53,49 @@ def test_a_failed_cell_is_told_and_tried_again(tmp_path: Path, sweep: Sweep, out
     store = Store(tmp_path, sweep)
     store.keep(Outcome(sweep.cells[0].key, None, None, "it broke", 0.1))
     assert read(tmp_path)["error"].to_pylist() == ["it broke"]
-    assert Store(tmp_path, sweep).missing == list(sweep.cells)
+    # Those that failed come last, so that they keep no other from being computed.
+    assert Store(tmp_path, sweep).missing == [*sweep.cells[1:], sweep.cells[0]]
     store.keep(outcomes[0])
     assert read(tmp_path)["error"].to_pylist() == [None]
+
+
+def test_a_failure_replaces_no_result_of_another_run(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+    store, other = Store(tmp_path, sweep), Store(tmp_path, sweep)
+    other.keep(outcomes[0])
+    store.keep(Outcome(sweep.cells[0].key, None, None, "it broke", 0.1))
+    assert read(tmp_path)["error"].to_pylist() == [None]
+    assert store.missing == list(sweep.cells[1:])
+
+
+def test_settings_of_cells_that_are_not_there_have_columns(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+    Store(tmp_path, sweep).keep(outcomes[0])
+    assert read(tmp_path).select(["noise", "start"]).to_pylist() == [{"noise": 0.1, "start": None}]
+
+
+def test_the_results_of_another_sweep_are_read_until_there_is_one_of_this(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+    first = Store(tmp_path, sweep)
+    for outcome in outcomes:
+        first.keep(outcome)
+    # As after an update of the code: nothing of it has been computed yet.
+    newer = Sweep(tuple(replace(cell, versions={**cell.versions, "source": "newer"}) for cell in sweep.cells), sweep.swept)
+    store = Store(tmp_path, newer)
+    assert store.missing == list(newer.cells)
+    assert len(read(tmp_path)) == 4
+    store.keep(replace(outcomes[0], key=newer.cells[0].key))
+    assert read(tmp_path)["key"].to_pylist() == [newer.cells[0].key]
+
+
+def test_what_was_being_written_when_a_run_was_killed_is_removed(tmp_path: Path, sweep: Sweep):
+    Store(tmp_path, sweep)
+    old, young = tmp_path / "cells" / ".abc.x1.parquet", tmp_path / "cells" / ".abc.x2.parquet"
+    of_index = tmp_path / ".sweep.x1.json"
+    for path in (old, young, of_index):
+        path.touch()
+    before = time.time() - 7200
+    for path in (old, of_index):
+        os.utime(path, (before, before))
+    Store(tmp_path, sweep)
+    assert [path.exists() for path in (old, young, of_index)] == [False, True, False]
 
 
 def test_cells_of_another_sweep_stay_and_are_not_read(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
@@ -87,15 +131,26 @@ def test_a_broken_file_is_computed_again(tmp_path: Path, sweep: Sweep, outcomes:
     store = Store(tmp_path, sweep)
     store.keep(outcomes[0])
     (file,) = (tmp_path / "cells").iterdir()
+    kept = shutil.copy(file, tmp_path / "kept.parquet")
     file.write_bytes(file.read_bytes()[:100])
     with pytest.raises(ConfigurationError, match="remove it and start the sweep again"):
         read(tmp_path)
-    assert Store(tmp_path, sweep).missing == list(sweep.cells)
+    assert sweep.cells[0] in Store(tmp_path, sweep).missing
+    # Whole, but with nothing in it, or with something else.
+    for table in (pq.read_table(kept).slice(0, 0), pq.read_table(kept).select(["key"])):
+        pq.write_table(table, file)
+        assert sweep.cells[0] in Store(tmp_path, sweep).missing
+    with pytest.raises(ConfigurationError, match="remove it and start the sweep again"):
+        read(tmp_path)
 
 
 def test_folders_that_cannot_be(tmp_path: Path, sweep: Sweep):
     with pytest.raises(ConfigurationError, match="holds no sweep"):
         read(tmp_path)
+    for text in ("{}", "[]", '{"cells": 1, "swept": []}'):
+        (tmp_path / "sweep.json").write_text(text)
+        with pytest.raises(ConfigurationError, match="is not as `safe-envs sweep` writes it"):
+            read(tmp_path)
     (tmp_path / "file").touch()
     with pytest.raises(ConfigurationError, match="cannot be made"):
         Store(tmp_path / "file", sweep)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+import json
 import os
 import re
 import signal
@@ -73,10 +74,13 @@ grid: {barrier.first: [0, 1], barrier.second: [0, 1], seed: [0, 1]}
         assert (document["cells"], document["done"], len(document["failed"])) == (8, 6, 2)
         assert document["failed"][1]["settings"]["seed"] == 1
     (tmp_path / "done" / "cells" / f"{read(tmp_path / 'done')['key'][0]}.parquet").unlink()
+    # No cell that is there has this one.
+    index = json.loads((tmp_path / "done" / "sweep.json").read_text())
+    (tmp_path / "done" / "sweep.json").write_text(json.dumps({**index, "swept": [*index["swept"], "dt"]}))
     status, out, _ = safe_envs_command("sweep-report", "done", "--plot", "rates.svg")
     assert status == 0
     assert "5 of 8 cells are done, 2 failed, 1 are missing." in out
-    assert re.search(r"\nFailed:\n  seed = 0, barrier\.first = 1, barrier\.second = 1: .*division by zero\n", out)
+    assert re.search(r"\nFailed:\n  seed = 0, barrier\.first = 1, barrier\.second = 1, dt = -: .*division by zero\n", out)
     assert "barrier.first" in (tmp_path / "rates.svg").read_text()
 
 
@@ -104,9 +108,10 @@ def test_mistakes_in_a_report(safe_envs_command, spec: Path, tmp_path: Path):
     assert "unknown format" in err
 
 
-def test_ctrl_c_keeps_what_is_done_and_leaves_no_process(spec: Path, tmp_path: Path):
+@pytest.mark.parametrize(("jobs", "number"), [("2", signal.SIGINT), ("1", signal.SIGTERM)])
+def test_a_stop_keeps_what_is_done_and_leaves_no_process(spec: Path, tmp_path: Path, jobs: str, number: signal.Signals):
     spec.write_text(SPEC.replace("seed: [0, 1]", f"seed: {list(range(1000))}"))
-    words = [sys.executable, "-m", "scripts.sweep", str(spec), "--out", str(tmp_path / "out"), "--jobs", "2"]
+    words = [sys.executable, "-m", "scripts.sweep", str(spec), "--out", str(tmp_path / "out"), "--jobs", jobs]
     # A shell that runs the tests in the background has its processes ignore the signal.
     heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heed)
@@ -114,8 +119,8 @@ def test_ctrl_c_keeps_what_is_done_and_leaves_no_process(spec: Path, tmp_path: P
         cells = tmp_path / "out" / "cells"
         while process.poll() is None and not (cells.exists() and len(list(cells.glob("[!.]*.parquet"))) >= 3):
             time.sleep(0.05)
-        # As a terminal sends it: to all of them.
-        os.killpg(process.pid, signal.SIGINT)
+        # As a terminal and a job manager send it: to all of them.
+        os.killpg(process.pid, number)
         _, err = process.communicate(timeout=240)
         assert "Stopped. The same command goes on" in err
         assert process.returncode not in (0, 2)

@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 import itertools
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from agents.statistics import rate_interval
+from agents.statistics import rate_interval, repeated_interval
 from scripts import sweep_figure
 from scripts.sweep_figure import Layout, _rate, draw
 
@@ -19,7 +20,8 @@ def rows_of(**values: Any) -> list[dict[str, Any]]:
     rows = [dict(zip(names, each, strict=True)) for each in itertools.product(*values.values())]
     for k, row in enumerate(rows):
         low, high = rate_interval(k % 20, 20)
-        row |= {"safe": k % 20, "episodes": 20, "safety_rate": (k % 20) / 20, "ci_low": low, "ci_high": high, "config": '{"title": "mine"}'}
+        row |= {"safe": k % 20, "episodes": 20, "safety_rate": (k % 20) / 20, "ci_low": low, "ci_high": high}
+        row |= {"config": '{"title": "mine"}', "row": '{"learning": null}'}
     return rows
 
 
@@ -49,6 +51,22 @@ def test_episodes_of_several_seeds_are_put_together():
     assert _rate([]) is None
     assert _rate(ROWS[:1]) == (ROWS[0]["safety_rate"], ROWS[0]["ci_low"], ROWS[0]["ci_high"])
     assert _rate(ROWS[1:4]) == (6 / 60, *rate_interval(6, 60))
+
+
+def test_the_band_of_seeds_that_learned_anew_is_over_what_they_learned_too():
+    rows = [{**row, "row": json.dumps({"learning": {"sha256": [str(k)]}})} for k, row in enumerate(ROWS[1:4])]
+    rate, low, high = _rate(rows) or (0.0, 0.0, 0.0)
+    assert (rate, low, high) == (6 / 60, *repeated_interval([1 / 20, 2 / 20, 3 / 20], rate_interval(6, 60), 0.95, (0.0, 1.0)))
+    # As of a file, which is the same for all of them.
+    same = [{**row, "row": rows[0]["row"]} for row in rows]
+    assert _rate(same) == (6 / 60, *rate_interval(6, 60))
+
+
+def test_what_no_cell_has_yet_is_drawn_as_the_envs_own(tmp_path: Path):
+    rows = [{**row, "start": None} for row in rows_of(noise=[0.1, 0.2])]
+    layout = Layout.of(rows, ("noise", "start"))
+    assert layout == Layout("noise", "start", ())
+    assert draw(rows, layout, tmp_path / "rates.svg") == 0
 
 
 @pytest.mark.parametrize(
