@@ -13,6 +13,7 @@ from agents.evaluation import BARE
 from agents.policy import make_policy
 from agents.problems import load_problem
 from agents.sweep_cell import Cell, checksum, versions
+from agents.sweep_document import document_in
 from agents.sweep_files import absolute, read_by, with_imported
 from agents.sweep_settings import Settings, complete, sections, text_of
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
@@ -20,6 +21,9 @@ from wrappers import LEARNED, SafetyFilter, require_readable
 
 _NO_PART = ("seed", "episodes", "bounds")
 """Settings that change neither the problem nor the filter nor the policy."""
+
+_BESIDE = {"filter": ("env", "system", "knowledge", "objective"), "policy": ("env", "system")}
+"""With what else a setting has to suit."""
 
 _MOST_CELLS = 1_000_000
 
@@ -51,8 +55,8 @@ def read_sweep(path: Path, trust: bool = False) -> Sweep:
         ConfigurationError: the file cannot be read, or a section, setting, id, filter, policy or value is not allowed.
         RelativeDegreeError: a filter does not suit a barrier.
     """
-    sweep = sweep_of(_document(path), trust, what=str(path))
-    _check(sweep)
+    sweep = sweep_of(document_in(path), trust, what=str(path))
+    _check(sweep, str(path))
     return sweep
 
 
@@ -90,17 +94,6 @@ def describe(cell: Cell, names: Iterable[str]) -> str:
     return ", ".join(f"{name} = {text_of(cell.settings[name])}" for name in names if name in cell.settings)
 
 
-def _document(path: Path) -> Any:
-    import yaml
-
-    try:
-        return yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise ConfigurationError(f"{path} cannot be read: {error.strerror}; name a YAML file that says what to sweep") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path} is no YAML: {error}") from error
-
-
 def _equal(settings: Settings) -> str:
     """The same for settings that differ in 1 and 1.0 of a barrier only, and so are of the same episodes."""
 
@@ -126,8 +119,8 @@ def _swept(settings: Sequence[Mapping[str, Any]]) -> Iterable[str]:
     return (name for name in names if len({json.dumps(each.get(name)) for each in settings}) > 1)
 
 
-def _check(sweep: Sweep) -> None:
-    """Make the problem, the filter and the policy of every cell that has a value, or a pair with the env, that none before it had.
+def _check(sweep: Sweep, what: str) -> None:
+    """Make the problem, the filter and the policy of every cell that has a value, or one with its env, that none before it had.
 
     Others would repeat it, and to make the problem of a large system takes a second.
 
@@ -136,9 +129,9 @@ def _check(sweep: Sweep) -> None:
     """
     seen: set[str] = set()
     for cell in sweep.cells:
-        place = (cell.settings.get("env"), cell.settings.get("system"))
+        beside = {name: [cell.settings.get(other) for other in others] for name, others in _BESIDE.items()}
         looked_at = {name: value for name, value in cell.settings.items() if name not in _NO_PART}
-        parts = {name: json.dumps([name, value, place if name in ("filter", "policy") else None]) for name, value in looked_at.items()}
+        parts = {name: json.dumps([name, value, beside.get(name)]) for name, value in looked_at.items()}
         new = {name for name, part in parts.items() if part not in seen}
         if not new:
             continue
@@ -146,7 +139,8 @@ def _check(sweep: Sweep) -> None:
         try:
             _check_cell(cell, "filter" in new)
         except SafeEnvsError as error:
-            raise type(error)(f"cell {describe(cell, sweep.swept) or 1}: {error}") from error
+            where = describe(cell, sweep.swept)
+            raise type(error)(f"{what}{', cell ' * bool(where)}{where}: {error}") from error
 
 
 def _check_cell(cell: Cell, derive: bool) -> None:

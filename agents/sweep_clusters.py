@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import socket
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -82,6 +83,7 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
                 callback(error)
 
     try:
+        _require_listener(re.sub("^(tcp|tls|ucx)://", "", address))
         client = Client(address, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"no Dask scheduler answers at {address} ({error}); start one by: dask scheduler") from error

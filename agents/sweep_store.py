@@ -50,6 +50,9 @@ class Store:
         folder: made if it is not there.
         sweep: whose cells are kept in it. Those of another sweep in the same folder stay, and are read until one of this is there.
 
+    Attributes:
+        hidden: number of cells of another sweep, such as one with another grid or another version of the code.
+
     Raises:
         ConfigurationError: the folder cannot be made or written, or pyarrow is not installed.
     """
@@ -67,7 +70,9 @@ class Store:
         self._failed = there - self._finished
         self._index = {"cells": list(self._cells), "swept": list(sweep.swept)}
         # The results of another sweep, as of another version of the code, can be read until there is one of this.
-        self._is_indexed = bool(there) or not _has_index(folder)
+        before = _keys_before(folder)
+        self.hidden = sum(_file_of(folder, key).is_file() for key in before if key not in self._cells)
+        self._is_indexed = bool(there) or not before
         if self._is_indexed:
             self._write_index()
 
@@ -154,12 +159,11 @@ def read_index(folder: Path) -> dict[str, Any]:
     return index
 
 
-def _has_index(folder: Path) -> bool:
+def _keys_before(folder: Path) -> list[str]:
     try:
-        read_index(folder)
+        return read_index(folder)["cells"]
     except ConfigurationError:
-        return False
-    return True
+        return []
 
 
 def _remove_stale(folder: Path) -> None:

@@ -56,6 +56,9 @@ def sweep(
     done = len(found.cells) - len(store.missing)
     kept = f", of which {before} were there before" if before else ""
     stdout().print(f"{done} of {len(found.cells)} cells are in {out}{kept}.", highlight=False, markup=False, soft_wrap=True)
+    if store.hidden:
+        hidden = f"{store.hidden} cells of another grid or version are in {out} too, where no report reads them now"
+        stdout().print(f"Note: {hidden}; give each sweep a folder of its own.", highlight=False, markup=False, soft_wrap=True)
     counts = {"cells": len(found.cells), "done": done, "before": before}
     write_result(json, lambda: _document(found, failures, counts))
     if failures:

@@ -46,7 +46,8 @@ def sweep_report(
     swept = index["swept"]
     for option, name in (("--x", x), ("--lines", lines)):
         if name is not None and name not in swept:
-            raise ConfigurationError(f"{option} {name}: it was not swept; {nearest(name, swept)}")
+            advice = nearest(name, swept) if swept else "all settings were fixed, so that there is nothing to draw over"
+            raise ConfigurationError(f"{option} {name}: it was not swept; {advice}")
     if x is not None and x == lines:
         raise ConfigurationError(f"--x and --lines are both {x}; name two settings")
     done = [row for row in rows if row["error"] is None]
@@ -57,7 +58,9 @@ def sweep_report(
         told = f"The picture: {path}" + (
             f" (without {hidden} of its panels, which are too many; sweep less, or choose --x and --lines)" * bool(hidden)
         )
-        stdout().print(f"\n{told}", highlight=False, markup=False, soft_wrap=True)
+    else:
+        told = "There is no picture, since no cell is done."
+    stdout().print(f"\n{told}", highlight=False, markup=False, soft_wrap=True)
     write_result(json, lambda: _document(index, rows, worst))
 
 

@@ -86,6 +86,7 @@ def test_mistakes_in_the_form_are_said(document: Any, message: str):
         ("plant.sigma: [.1, 0]\n  plant.sgma: [1]", "sgma"),
         ("knowledge: [model, plnt]", "did you mean 'plant'"),
         ("filter: [scbf, 'ddscbf:file=there-is-none.npz']", "there-is-none.npz cannot be read"),
+        ("filter: [none, scbf]\n  env: [StochasticDubins-v0]\n  objective: [nearest, clf]", "= clf: .*no control Lyapunov function"),
         # Each env goes with one of the filters, and each filter with one of the envs.
         ("filter: [scbf, srcbf]\n  env: [Scalar-v0, StochasticDubins-v0]", "cell .*StochasticDubins-v0, filter = srcbf: .*degree 2"),
     ],
@@ -97,7 +98,16 @@ def test_mistakes_in_a_value_are_found_before_the_first_cell(tmp_path: Path, gri
         read_sweep(path)
 
 
-@pytest.mark.parametrize(("text", "message"), [("a: [", "is no YAML"), (None, "cannot be read")])
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: [", "is no YAML"),
+        (None, "cannot be read"),
+        ("fixed: {seed: 1}\ngrid: {seed: [1]}\nfixed: {}", "'fixed' is given twice"),
+        ("grid:\n  filter: [none]\n  filter: [scbf]", r"(?s)'filter' is given twice.*line 3"),
+        *((f"grid: {{seed: [{text}]}}", f"{text} is no plain number") for text in ("010", "1:30", "1_000", "0x10")),
+    ],
+)
 def test_files_that_are_none(tmp_path: Path, text: str | None, message: str):
     path = tmp_path / "sweep.yaml" if text is None else written(tmp_path, text)
     with pytest.raises(ConfigurationError, match=message):

@@ -103,6 +103,15 @@ def test_a_scheduler_that_has_lost_its_workers(monkeypatch: pytest.MonkeyPatch):
     assert "has had no workers for" in str(error)
 
 
+@pytest.mark.parametrize("address", ["foo", "", "http://127.0.0.1:8786", "tcp://127.0.0.1"])
+def test_addresses_of_dask_that_cannot_be_tried(address: str):
+    with (
+        pytest.raises(ConfigurationError, match=rf"answers at {address} \(this is not of the form HOST:PORT\)"),
+        sweep_clusters.dask_settings(address, print),
+    ):
+        pass
+
+
 @pytest.mark.parametrize("address", ["auto", "ray://127.0.0.1:10001", "127.0.0.1", ":6379"])
 def test_addresses_of_ray_that_cannot_be_tried(address: str):
     with (

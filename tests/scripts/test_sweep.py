@@ -50,6 +50,12 @@ def test_a_sweep_its_second_run_and_its_report(safe_envs_command, spec: Path, tm
     assert status == 0
     assert "12 of 12 cells are done, 0 failed, 0 are missing." in out
     assert (tmp_path / "done" / "report.png").stat().st_size > 10_000
+    spec.write_text(SPEC.replace("[0, 1]", "[0]"))
+    status, out, _ = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)
+    assert (status, out.splitlines()[0]) == (0, "4 of 4 cells are in done, of which 4 were there before.")
+    assert out.splitlines()[1].startswith("Note: 8 cells of another grid or version are in done too")
+    spec.write_text(SPEC.replace("[0, 1]", "[0, 1, 2]"))
+    assert safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)[0] == 0
     report = strictly(tmp_path / "report.json")
     rates = sorted(read(tmp_path / "done")["safety_rate"].to_pylist())
     assert [row["safety_rate"] for row in report["worst"]] == rates[:2]
@@ -88,7 +94,7 @@ def test_mistakes_end_before_anything_is_made(safe_envs_command, spec: Path, tmp
     spec.write_text(SPEC.replace("scbf", "scfb"))
     status, _, err = safe_envs_command("sweep", spec, "--out", "done")
     assert status == 2
-    assert "cell filter = scfb, noise = 0.1, seed = 0: unknown filter 'scfb'; did you mean 'scbf'" in err
+    assert "sweep.yaml, cell filter = scfb, noise = 0.1, seed = 0: unknown filter 'scfb'; did you mean 'scbf'" in err
     status, _, err = safe_envs_command("sweep", spec, "--out", "done", "--backend", "dask", "--address", "tcp://127.0.0.1:1", "--jobs", 2)
     assert status == 2
     assert "--jobs 2 is of this machine" in err
