@@ -128,7 +128,12 @@ class Canvas:
             points = points[_apart(points)]
         # Wide lines of the library have gaps at their corners: a brush of thin ones has none.
         for offset in _BRUSHES[min(width, 3)]:
-            pygame.draw.aalines(self.surface, color, False, (points + offset).tolist())
+            through = (points + offset).tolist()
+            # Of two points the library's `aalines` looks at a third, so that its picture is a matter of chance.
+            if len(through) == 2:
+                pygame.draw.aaline(self.surface, color, *through)
+            else:
+                pygame.draw.aalines(self.surface, color, False, through)
 
     def dashes(self, points: np.ndarray, color: Color, width: int = 1, period: float = 12.0) -> None:
         """Draw a dashed line through points, shape (k, 2)."""

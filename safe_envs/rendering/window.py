@@ -46,6 +46,8 @@ class Window:
             self._show(surface)
         except pygame.error:
             # Gymnasium's own envs quit the display when they close, and with it all windows.
+            if not pygame.display.get_init():
+                _forget_all()
             self._window = self._opened()
             self._show(surface)
 
@@ -61,3 +63,12 @@ class Window:
         _OPEN.discard(self)
         if not _OPEN and pygame.display.get_init() and pygame.display.get_surface() is None:
             pygame.display.quit()
+
+
+def _forget_all() -> None:
+    """Let go of windows that ended with the display.
+
+    SDL gives a new window the address of one of them: an old one that is let go of only then would end the new one.
+    """
+    for each in _OPEN:
+        each._window.destroy()
