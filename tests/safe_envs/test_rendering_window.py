@@ -75,6 +75,20 @@ def test_each_env_has_a_window_of_its_own():
 
 
 @pytest.mark.usefixtures("no_display")
+def test_windows_that_ended_do_not_end_new_ones():
+    import pygame
+
+    envs = [stepped(gym.make(DUBINS, render_mode="human", dt=0.001), 1) for _ in range(3)]
+    for _ in range(120):
+        # SDL likes to give a new window the address of one that ended.
+        pygame.quit()
+        for env in envs:
+            env.step(np.zeros(1, dtype=np.float32))
+    for env in envs:
+        env.close()
+
+
+@pytest.mark.usefixtures("no_display")
 def test_a_window_leaves_the_display_to_others():
     import pygame
 
