@@ -64,6 +64,8 @@ class DriftingEnv(SafeVectorEnv):
 
     def drifted(self, draws: np.ndarray) -> np.ndarray:
         """The draws of a period with the drift in them, substep by substep; notes how far they climb."""
+        if not draws.size:
+            return draws
         root = math.sqrt(self.problem.dt / self.problem.substeps)
         way = np.tile(self.way(), (self.problem.substeps, 1))
         moved = draws - self._lengths * root * way

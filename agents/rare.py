@@ -129,7 +129,7 @@ def estimate_rare(
     work = Work(progress, len(setting.learning.missing()) + 3 * len(setting.names))
     setting.learn(work.part)
     bridge = Bridge(setting.problem) if monitoring == "continuous" else None
-    frozen, sizes = _is_frozen(setting), (particles, repetitions)
+    frozen, sizes = _why_frozen(setting), (particles, repetitions)
     rows, speeds = [], []
     for name in setting.names:
         begun = time.perf_counter()
@@ -151,7 +151,7 @@ def estimate_rare(
     return RareEvaluation(setting.problem, config, rows, {"num_envs": num_envs, "rows": speeds})
 
 
-def _is_frozen(setting: Setting) -> str:
+def _why_frozen(setting: Setting) -> str:
     """Why copies of an episode would all be the same, if so."""
     world, actor = setting.problem, setting.actor
     random = not actor.deterministic if isinstance(actor, Policy) else False

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from agents import NominalController
+from agents import NominalController, evaluate
 from agents.bridge import Bridge
 from agents.drifting import Drifting, DriftingEnv, best_length, log_ratio
 from agents.rare import estimate_rare, verdict
@@ -91,6 +91,16 @@ def test_two_ways_to_fail_in_different_units_are_both_found():
     (row,) = estimate_rare(problem, filters=["none"], particles=400).rows
     assert row["method"].startswith("splitting")
     assert row["ci_low"] < exact < row["ci_high"]
+
+
+def test_without_noise_chance_may_come_from_the_policy():
+    arguments = {"filters": ["none"], "options": {"horizon": 3.0, "start": [0.0, 0.0, 0.0], "barrier": {"radius": 2.35}}}
+    (found,) = estimate_rare("DubinsDisk-v0", "random", particles=50, repetitions=10, **arguments).rows
+    (plain,) = evaluate("DubinsDisk-v0", "random", episodes=2000, bounds=False, **arguments).rows
+    assert found["method"].startswith("splitting")
+    assert found["check"] is None
+    assert found["ci_low"] < 1 - plain["ci_low"]
+    assert found["ci_high"] > 1 - plain["ci_high"]
 
 
 def row(p, width, error, spread=0.1):
