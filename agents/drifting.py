@@ -42,7 +42,7 @@ class DriftingEnv(SafeVectorEnv):
         super().__init__(problem, len(lengths))
         plant = problem.plant
         diffusion = plant.numeric(plant.diffusion)
-        live = [j for j in range(diffusion.cols) if any(entry != 0 for entry in diffusion[:, j])]
+        live = plant.noise_channels
         rows = [plant.numeric(gradient(plant, barrier.expression)) * diffusion for barrier in problem.barriers]
         self._slopes = compile_function(plant.states, [row[0, j] for row in rows for j in live], "arrays")
         self._barriers = compile_function(plant.states, [plant.numeric(barrier.expression) for barrier in problem.barriers], "arrays")

@@ -31,7 +31,7 @@ class Promised:
     """
 
     def __init__(self, conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str, why_not: str | None = None) -> None:
-        self._horizon = problem.steps * problem.dt
+        self._horizon = problem.duration
         self._certified = any(isinstance(c, BayesianSCBF) and c.simultaneous is not None for c in conditions)
         self._found: ProvedBound | Certificate | None = None
         self._why_none: str | None = why_not if conditions else "there is no filter"

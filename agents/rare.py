@@ -201,7 +201,7 @@ def _by_drift(
     progress: Progress | None,
 ) -> tuple[Row | None, int]:
     """The estimate by importance sampling, if it promises to be much better, and the control periods that it took."""
-    length, deviation = best_length(found.climbed, found.shares, problem.steps * problem.dt)
+    length, deviation = best_length(found.climbed, found.shares, problem.duration)
     if not _BETTER * deviation / math.sqrt(math.prod(sizes)) < to_beat:
         return None, 0
     try:

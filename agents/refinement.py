@@ -90,7 +90,7 @@ def _share(progress: Progress | None, i: int) -> Progress | None:
 
 def _divided(problem: SafetyProblem, divisor: int) -> SafetyProblem:
     # With the whole number of periods as the horizon all three end at the same time.
-    return replace(problem, dt=problem.dt / divisor, horizon=problem.steps * problem.dt)
+    return replace(problem, dt=problem.dt / divisor, horizon=problem.duration)
 
 
 def _row(name: str, evaluations: tuple[Evaluation, ...]) -> Row:

@@ -147,7 +147,7 @@ def ray_settings(address: str) -> Iterator[dict[str, Any]]:
 
 
 def _require_listener(address: str) -> None:
-    """Raise OSError unless something listens at HOST:PORT, ValueError for an address of another form; Ray itself would try for minutes."""
+    """Raise OSError unless something listens at HOST:PORT, ValueError for another form; the clusters' own clients try for long."""
     host, _, port = address.rpartition(":")
     if not (host and port.isdecimal() and "/" not in host):
         raise ValueError("this is not of the form HOST:PORT")

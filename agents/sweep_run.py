@@ -11,7 +11,7 @@ from typing import Any, cast
 
 from agents.sweep_cell import Cell, Outcome, compute
 from agents.sweep_clusters import TaskLostError, dask_settings, ray_settings
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, require_whole
+from safe_envs.errors import ConfigurationError, SafeEnvsError, WorkersLostError, nearest, require_whole
 
 BACKENDS = ("local", "dask", "ray")
 
@@ -23,10 +23,6 @@ _MOST_TRIED = 5
 
 _IDLE = 30
 """Seconds after which a process of this machine ends that has nothing to do, as when the one that started it was killed."""
-
-
-class WorkersLostError(SafeEnvsError, RuntimeError):
-    """Processes that are to compute cells end before they have computed any."""
 
 
 class _LossError(Exception):
@@ -65,8 +61,8 @@ class Place:
         if (self.address is None) != (self.backend == "local"):
             wrong = "needs the address of its cluster" if self.address is None else "takes no address; name dask or ray as the backend"
             raise ConfigurationError(f"backend {self.backend} {wrong}")
-        package = {"local": "joblib", "dask": "distributed", "ray": "ray"}[self.backend]
-        if find_spec(package) is None:
+        package = {"dask": "distributed", "ray": "ray"}.get(self.backend)
+        if package is not None and find_spec(package) is None:
             raise ConfigurationError(f'{package} is not installed; install it with pip install "safe-envs[{self.backend}]"')
 
 

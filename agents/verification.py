@@ -117,14 +117,14 @@ def _measure(
     verification: Verification, name: str, world: SafetyProblem, policy: Any, episodes: int, seed: int, progress: Progress | None
 ) -> Measurement:
     formulas, starts = verification.formulas, starts_of(world, seed)
-    lasting = formulas.noisy and any(b.forever and b.value for b in promise(verification, starts, world.horizon))
+    lasting = formulas.noisy and any(b.forever and b.value for b in promise(verification, starts, world.duration))
     runs = _runs(world, lasting, episodes)
     horizons: list[Horizon] = []
     repeats = False
     done, whole = 0, sum(run[-1] for run in runs)
     for run in runs:
         answer = evaluate(
-            replace(world, horizon=run[-1] * world.horizon),
+            replace(world, horizon=run[-1] * world.duration),
             policy,
             [spec_of(formulas.conditions)],
             episodes=episodes,
@@ -133,7 +133,7 @@ def _measure(
             bounds=False,
             progress=None if progress is None else _part_of(progress, done / whole, run[-1] / whole),
         )
-        horizons += [_horizon(verification, answer, k * world.horizon, starts) for k in run]
+        horizons += [_horizon(verification, answer, k * world.duration, starts) for k in run]
         repeats, done = answer.repeats, done + run[-1]
     return Measurement(name, starts[0] if len(starts) == 1 else None, episodes, repeats, tuple(horizons))
 

@@ -63,7 +63,7 @@ class Integrator:
 def _compiled(system: ControlAffineSDE, h: float, flavour: Flavour) -> tuple[int, Callable[..., Components]]:
     """The number of noise channels, and the state after a step of h in s with them, or the rate of the state without any."""
     diffusion = system.numeric(system.diffusion)
-    live = [j for j in range(diffusion.cols) if any(e != 0 for e in diffusion[:, j])]
+    live = list(system.noise_channels)
     rate = system.numeric(system.drift + system.input_matrix * sp.Matrix(system.inputs))
     if not live:
         return 0, compile_function((*system.states, *system.inputs), tuple(rate), flavour)

@@ -189,6 +189,11 @@ class SafetyProblem:
         return round(self.horizon / self.dt)
 
     @property
+    def duration(self) -> float:
+        """Length of an episode in s as it is simulated: the whole number of control periods that is nearest to the horizon."""
+        return self.steps * self.dt
+
+    @property
     def outside(self) -> sp.Expr:
         """Positive where the state has left the workspace; -1 if the workspace is unbounded."""
         return _excess(tuple((s.symbol, s.low, s.high) for s in self.states))

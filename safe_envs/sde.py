@@ -174,9 +174,15 @@ class ControlAffineSDE:
         return len(self.inputs)
 
     @property
+    def noise_channels(self) -> tuple[int, ...]:
+        """The columns of the diffusion that are not zero, for the parameters as they are."""
+        diffusion = self.numeric(self.diffusion)
+        return tuple(j for j in range(diffusion.cols) if any(entry != 0 for entry in diffusion[:, j]))
+
+    @property
     def noisy(self) -> bool:
-        """Whether the diffusion is not zero, for the parameters as they are."""
-        return any(entry != 0 for entry in self.numeric(self.diffusion))
+        """Whether there is any noise, for the parameters as they are."""
+        return bool(self.noise_channels)
 
     def with_parameters(self, **values: float) -> ControlAffineSDE:
         """Return the same system with other parameter values.

@@ -98,8 +98,7 @@ def describe_system(problem: SafetyProblem) -> str:
 
 
 def _timing(problem: SafetyProblem) -> str:
-    # The horizon that is simulated: a whole number of periods.
-    return f"dt = {problem.dt:g} s, horizon {problem.steps * problem.dt:g} s"
+    return f"dt = {problem.dt:g} s, horizon {problem.duration:g} s"
 
 
 def describe_plant(problem: SafetyProblem) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -59,13 +58,11 @@ def verify(
     options.require_outputs(json, plot, inputs=options.inputs_of(env.system, policy, [filter_name or ""]))
     known, arguments = env.full_id, env.arguments
     title = title_of(known, arguments)
-    asked = load_problem(known, arguments)
-    # The bounds are of the horizon that is simulated: a whole number of periods.
-    problem = replace(asked, horizon=asked.steps * asked.dt)
+    problem = load_problem(known, arguments)
     actor = make_policy(policy, problem, trust)  # An unknown one is to show before the search, and without a simulation too.
     found = find(problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed)
     starts = starts_of(problem, seed)
-    bounds = promise(found, starts, problem.horizon)
+    bounds = promise(found, starts, problem.duration)
     measurements = []
     if simulate:
         with progress_bar("Simulating") as tell:

@@ -70,7 +70,7 @@ def document(config: dict[str, Any], found: Verification, bounds: Sequence[Bound
                 **config,
                 "filter": spec_of(formulas.conditions),
                 "knowledge": formulas.knowledge,
-                "horizon": formulas.problem.horizon,
+                "horizon": formulas.problem.duration,
             },
             "states": [s.symbol.name for s in formulas.problem.states],
             "drawn": found.drawn,
@@ -190,7 +190,7 @@ def _describe_part(found: Verification, part: Part) -> str:
 def _print_bounds(console: Console, found: Verification, starts: np.ndarray, bounds: Sequence[Bound]) -> None:
     problem = found.formulas.problem
     where = f"at {_state(problem, starts[0])}" if len(starts) == 1 else f"on average over {len(starts)} starts {problem.start!r}"
-    console.print(f"\n[bold]Bounds on the probability of no violation[/] {escape(where)}, T = {problem.horizon:g} s", highlight=False)
+    console.print(f"\n[bold]Bounds on the probability of no violation[/] {escape(where)}, T = {problem.duration:g} s", highlight=False)
     table = _table()
     for name in ("", "bound", "P >=", "status with the c and m found", "why"):
         table.add_column(name, justify="right" if name == "P >=" else "left", no_wrap=name in ("", "P >="))

@@ -85,9 +85,9 @@ class Panel:
         time = float(moment.times[-1])
         canvas.text(f"t = {time:.2f} s", (_LEFT, 68), INK, NORMAL)
         if not self._endless:
-            canvas.text(f"of {self._problem.horizon:g} s", (_RIGHT, 68), GREY, NORMAL, align=(1.0, 0.0))
+            canvas.text(f"of {self._problem.duration:g} s", (_RIGHT, 68), GREY, NORMAL, align=(1.0, 0.0))
             canvas.fill((_LEFT, 91, _WIDTH, 3), LINE)
-            canvas.fill((_LEFT, 91, _WIDTH * min(time / self._problem.horizon, 1.0), 3), GREY)
+            canvas.fill((_LEFT, 91, _WIDTH * min(time / self._problem.duration, 1.0), 3), GREY)
         self._status(canvas, moment)
         self._actions(canvas, moment)
         self._chart(canvas, moment)

@@ -136,7 +136,7 @@ def _no_bound(sample: Sample) -> list[str]:
     if sample.quick:
         return notes
     found = verify(problem, (SCBF(),), samples=1024)
-    reason = promise(found, np.array([FIXED]), problem.horizon)[0].reason
+    reason = promise(found, np.array([FIXED]), problem.duration)[0].reason
     return [*notes, f"{reason}; no input in the box meets the condition on {100 * found.safe.infeasible:.0f} % of C within the workspace"]
 
 

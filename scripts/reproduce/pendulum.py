@@ -304,7 +304,7 @@ def _bounds(near: dict[str, Any], first: Lesson, sample: Sample) -> list[str]:
     notes = [f"{said}the condition at the origin, where it is missed by {top.slack[0]:.2g}; there its h/sup h is not proved"]
     if sample.quick:
         return notes
-    bound = promise(verify(problem, (SCBF(),)), starts_of(problem), problem.horizon)[0]
+    bound = promise(verify(problem, (SCBF(),)), starts_of(problem), problem.duration)[0]
     value = "none" if bound.value is None else f"{100 * bound.value:.1f} %"
     return [*notes, f"SCBF knows the noise and needs no margin: {bound.name} = {value} ({bound.status}); measured: see SCBF"]
 

@@ -10,8 +10,8 @@ import pytest
 
 from agents import sweep_clusters, sweep_run
 from agents.sweep_cell import Cell, Outcome
-from agents.sweep_run import Place, WorkersLostError, run
-from safe_envs.errors import ConfigurationError
+from agents.sweep_run import Place, run
+from safe_envs.errors import ConfigurationError, WorkersLostError
 
 CELLS = [Cell({"number": k}) for k in range(8)]
 NUMBERS = {cell.key: cell.settings["number"] for cell in CELLS}
