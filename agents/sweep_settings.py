@@ -80,7 +80,8 @@ def _mapping(given: Any, what: str, allowed: Sequence[str] | None) -> dict[str, 
         raise ConfigurationError(f"{what} is {text_of(given)[:80]}; give {form}")
     for name in given:
         if allowed is not None and name not in allowed:
-            raise ConfigurationError(f"{what} has the section {name!r}; {nearest(name, allowed)}")
+            hint = "a setting goes under fixed, a list of its values under grid" if _is_known(name) else nearest(name, allowed)
+            raise ConfigurationError(f"{what} has the section {name!r}; {hint}")
     return dict(given)
 
 
@@ -108,9 +109,13 @@ def _listed(given: Any, what: str) -> list[Settings]:
     return [_settings(each, f"{what}, entry {i}") for i, each in enumerate(given, 1)]
 
 
-def _require_known(name: str, what: str) -> None:
+def _is_known(name: str) -> bool:
     group, dot, parameter = name.partition(".")
-    if not (name in _NAMES or (group in PARAMETERS and dot and parameter)):
+    return name in _NAMES or (group in PARAMETERS and bool(dot and parameter))
+
+
+def _require_known(name: str, what: str) -> None:
+    if not _is_known(name):
         hint = f"; give its parameters as {name}.NAME" if name in PARAMETERS else f"; {nearest(name, (*_NAMES, *_GROUPS))}"
         raise ConfigurationError(f"{what} has the setting {name!r}{hint}")
 

@@ -15,7 +15,7 @@ from scripts.console import STDOUT
 
 Knowledge = Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")]
 Trust = Annotated[
-    bool, typer.Option("--trust", help="Load the .zip of --policy. That runs code that it contains: only for files whose source you trust.")
+    bool, typer.Option("--trust", help="Load a policy that is a .zip. That runs code in it: only for files whose source you trust.")
 ]
 Seed = Annotated[int, typer.Option(help="Seed of all randomness.")]
 FORMATS = ".png, .pdf, .svg, or another format of matplotlib."

@@ -48,6 +48,7 @@ def test_equal_cells_are_one():
     ("document", "message"),
     [
         ([1], "give the sections fixed, grid, cells"),
+        ({"env": "Scalar-v0", "grid": {"filter": ["none"]}}, "a setting goes under fixed, a list of its values under grid"),
         ({"gird": {}}, "did you mean 'grid'"),
         ({"fixed": {"nosie": 0.1}}, "did you mean 'noise'"),
         ({"fixed": {"plant": 1}}, "give its parameters as plant.NAME"),
