@@ -16,6 +16,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.files import write_json
 from scripts import completion
 from scripts.console import Json, progress_bar, require_result, stdout, write_result
+from scripts.rates import percent_in
 
 _RESULTS = "results.json"
 _QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 50}
@@ -125,7 +126,7 @@ def _document(known: dict[str, Any], rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _rate(row: Row) -> str:
-    return f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]"
+    return percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
 
 
 def _time(row: Row) -> str:

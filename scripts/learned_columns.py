@@ -8,6 +8,7 @@ from typing import Any
 from agents.episodes import Row
 from safe_envs.calculus import input_derivative, vanishes
 from safe_envs.problem import SafetyProblem
+from scripts.rates import percent
 
 Cell = Callable[[Row, Mapping[str, Any]], str]
 """From a row, and what was timed of it, to a text."""
@@ -81,11 +82,11 @@ def _seconds(_: Row, speed: Mapping[str, Any]) -> str:
 
 def _worst(row: Row, _: Mapping[str, Any]) -> str:
     learning = row["learning"]
-    return f"{100 * min(learning['rates']):.1f} %" if learning and learning["repeats"] > 1 else _NONE
+    return percent(min(learning["rates"])) if learning and learning["repeats"] > 1 else _NONE
 
 
 def _certificate(row: Row, _: Mapping[str, Any]) -> str:
     certificate = row["certificate"]
     if certificate is None:
         return _NONE
-    return "none" if certificate["probability"] is None else f"≥ {100 * certificate['probability']:.1f} %"
+    return "none" if certificate["probability"] is None else f"≥ {percent(certificate['probability'])}"

@@ -10,6 +10,7 @@ import typer
 from safe_envs.errors import ConfigurationError, nearest
 from scripts import options
 from scripts.console import Json, stdout, write_result
+from scripts.rates import percent, percent_in
 
 _PICTURE = "report.png"
 _SHOWN = 10
@@ -86,7 +87,7 @@ def _print(index: dict[str, Any], rows: list[Row], worst: int) -> None:
     for title in (*names, "safe [95 % interval]", "min h 5 %", "violations", "intervened", "infeasible", "return"):
         table.add_column(title, no_wrap=True, justify="left" if title in names else "right")
     for row in _worst(rows, worst):
-        rates = ["-" if row["filter"] == BARE else _percent(row[name]) for name in ("intervention_rate", "infeasible_rate")]
+        rates = ["-" if row["filter"] == BARE else percent(row[name]) for name in ("intervention_rate", "infeasible_rate")]
         cells = [f"{row['min_h_p05']:.3g}", str(row["violations"]), *rates, f"{row['return_mean']:.4g}"]
         table.add_row(*[Text(_value(row[name])) for name in names], _rate(row), *cells)
     if table.row_count:
@@ -122,11 +123,7 @@ def _value(value: Any) -> str:
 
 
 def _rate(row: Row) -> str:
-    return f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]"
-
-
-def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100 * share:.1f} %"
+    return percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
 
 
 if __name__ == "__main__":

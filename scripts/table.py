@@ -14,6 +14,7 @@ from agents.evaluation import BARE, Evaluation
 from agents.refinement import TOLERANCE, Refinement
 from safe_envs.problem import SafetyProblem
 from scripts.learned_columns import learned_columns, learned_notes
+from scripts.rates import percent, percent_in
 
 _COLUMNS = (
     "min h\nmedian",
@@ -62,7 +63,7 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
     table = _table(*[f"dt = {dt:g} s" for dt in refinement.periods])
     for row in refinement.rows:
         rates = zip(row["safety_rate"], row["ci_low"], row["ci_high"], strict=True)
-        table.add_row(Text(row["filter"]), *[_rate(*rate) for rate in rates])
+        table.add_row(Text(row["filter"]), *[percent_in(*rate) for rate in rates])
     _print_table(console, table)
     if refinement.evaluations[0].repeats:
         _say(console, "Nothing is random here: what changes with the period, changes for sure.")
@@ -189,13 +190,13 @@ def _cells(row: Row, speed: float) -> list[str]:
     filtered = row["filter"] != BARE
     return [
         row["filter"],
-        _rate(row["safety_rate"], row["ci_low"], row["ci_high"]),
+        percent_in(row["safety_rate"], row["ci_low"], row["ci_high"]),
         _bound(row),
         f"{row['min_h_median']:.3g}",
         f"{row['min_h_p05']:.3g}",
         str(row["violations"]),
-        _percent(row["intervention_rate"]) if filtered else "-",
-        _percent(row["infeasible_rate"]) if filtered else "-",
+        percent(row["intervention_rate"]) if filtered else "-",
+        percent(row["infeasible_rate"]) if filtered else "-",
         "-" if row["effort_mean"] is None else f"{row['effort_mean']:.3g}",
         f"{row['return_mean']:.4g}",
         _thousands(speed),
@@ -205,19 +206,11 @@ def _cells(row: Row, speed: float) -> list[str]:
 def _bound(row: Row) -> str:
     if row["filter"] == BARE:
         return "-"
-    return "none" if row["bound"] is None else f"≥ {_percent(row['bound'])}"
-
-
-def _rate(rate: float, low: float, high: float) -> str:
-    return f"{_percent(rate)} [{100 * low:.1f}, {100 * high:.1f}]"
+    return "none" if row["bound"] is None else f"≥ {percent(row['bound'])}"
 
 
 def _points(difference: float, low: float, high: float) -> str:
     return f"{100 * difference:+.1f} points [{100 * low:.1f}, {100 * high:.1f}]"
-
-
-def _percent(rate: float | None) -> str:
-    return "-" if rate is None else f"{100 * rate:.1f} %"
 
 
 def _thousands(number: float) -> str:

@@ -15,6 +15,7 @@ from safe_envs.errors import ConfigurationError
 from scripts import completion, options
 from scripts.console import Json, progress_bar, stdout, write_result
 from scripts.env_options import EnvOptions, with_env
+from scripts.rates import percent_in
 
 
 @with_env
@@ -139,7 +140,7 @@ def _report(filter_name: str, rows: list[dict[str, Any]]) -> None:
     for title in ("steps", "safe [95 % interval]", "return", "violations in training"):
         table.add_column(title, justify="right")
     for row in rows:
-        rate = f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]"
+        rate = percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
         table.add_row(f"{row['timesteps']:,}", rate, f"{row['return_mean']:.4g}", f"{row['training']['violations']:.0f}")
     console.print(f"Evaluations with the filter {filter_name}:", highlight=False, markup=False)
     console.print(table)

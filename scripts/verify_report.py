@@ -15,6 +15,7 @@ from rich.text import Text
 
 from agents.verification import Horizon, Measurement
 from safe_envs.problem import SafetyProblem
+from scripts.rates import percent, percent_in
 from scripts.table import describe_system
 from wrappers import spec_of
 from wrappers.promise import Bound
@@ -213,8 +214,7 @@ def _print_measurement(console: Console, problem: SafetyProblem, policy: str, fo
     for name in ("T", "no violation [95 % interval]", *[f"bound {numbers.setdefault(n, str(len(numbers) + 1))}" for n in names]):
         table.add_column(name, justify="right", no_wrap=True)
     for horizon in found.horizons:
-        interval = f"[{100 * horizon.ci_low:.1f}, {100 * horizon.ci_high:.1f}]"
-        table.add_row(f"{horizon.time:g} s", escape(f"{_percent(horizon.rate)} {interval}"), *_marked(horizon, names))
+        table.add_row(f"{horizon.time:g} s", escape(percent_in(horizon.rate, horizon.ci_low, horizon.ci_high)), *_marked(horizon, names))
     console.print(table)
     if found.repeats:
         _say(console, "Nothing is random here: all episodes are one and the same.")
@@ -260,6 +260,4 @@ def _number(value: float) -> str:
 
 def _percent(share: float | None) -> str:
     """A share with two digits below 1 %, so that a small one is not read as none."""
-    if share is None:
-        return "-"
-    return f"{100 * share:.1f} %" if share == 0.0 or share >= 0.01 else f"{100 * share:.2g} %"
+    return percent(share) if share is None or share == 0.0 or share >= 0.01 else f"{100 * share:.2g} %"

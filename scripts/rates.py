@@ -1,0 +1,24 @@
+"""Rates as text."""
+
+from __future__ import annotations
+
+_MOST_DIGITS = 9
+
+
+def percent(rate: float | None) -> str:
+    """A rate in per cent; "-" for None."""
+    return "-" if rate is None else f"{_percents(rate)[0]} %"
+
+
+def percent_in(rate: float, low: float, high: float) -> str:
+    """A rate with its interval, in per cent."""
+    rate_text, low_text, high_text = _percents(rate, low, high)
+    return f"{rate_text} % [{low_text}, {high_text}]"
+
+
+def _percents(*rates: float) -> list[str]:
+    """With one digit, or as many more as it takes to tell each from 0 and from 1 that is neither."""
+    # What rounding has left of 0 and 1 is the same.
+    open_ended = [rate for rate in rates if 1e-12 < rate < 1.0 - 1e-12]
+    digits = next((d for d in range(1, _MOST_DIGITS) if all(0.0 < round(100 * rate, d) < 100.0 for rate in open_ended)), _MOST_DIGITS)
+    return [f"{100 * rate:.{digits}f}" for rate in rates]
