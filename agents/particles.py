@@ -97,13 +97,16 @@ class Particles:
     Attributes:
         lowest: smallest height of each path, shape (paths,).
         steps: control periods that were simulated.
+        outside: how many paths start where h <= 0.
+        kept_length: mean length of the paths from the starts that do not violate, in control periods; None without any.
     """
 
     def __init__(
         self, make: MakeDrifting, policy: Any, powers: np.ndarray, seed: np.random.SeedSequence, num_envs: int, bridge: Bridge | None = None
     ) -> None:
         self.lowest = np.full(len(powers), np.inf)
-        self.steps = 0
+        self.steps = self.outside = 0
+        self.kept_length: float | None = None
         self._make, self._policy, self._bridge = make, policy, bridge
         self._envs: dict[int, Env] = {}
         self._largest = min(num_envs, len(powers))
@@ -119,6 +122,7 @@ class Particles:
     def begin(self) -> None:
         """Simulate all paths from their starts."""
         paths = np.arange(len(self.lowest))
+        lengths = np.zeros(len(paths), dtype=np.int64)
         for first in range(0, len(paths), self._largest):
             some = paths[first : first + self._largest]
             env = self._env(len(some))
@@ -132,7 +136,10 @@ class Particles:
             begun = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool), world.state[:count], observation[:count]
             # At the start the weight is 1.
             begun = (h, *begun, world.climbed[:count])
-            self._play(env, some, observation, begun)
+            self.outside += int(np.count_nonzero(h <= 0.0))
+            lengths[some] = self._play(env, some, observation, begun)
+        kept = lengths[self.lowest > 0.0]
+        self.kept_length = float(kept.mean()) if kept.size else None
 
     def h_at_lowest(self, paths: np.ndarray) -> np.ndarray:
         """The h of paths where their heights were smallest, of several barriers relative to the starts; shape as given."""
@@ -170,11 +177,12 @@ class Particles:
         observation[: len(paths)] = entries[4]
         self._play(env, paths, observation, entries)
 
-    def _play(self, env: Env, paths: np.ndarray, observation: np.ndarray, entries: tuple[np.ndarray, ...]) -> None:
-        """Simulate paths, in the first rows of an env, from entries of `Records.add` until they end or violate."""
+    def _play(self, env: Env, paths: np.ndarray, observation: np.ndarray, entries: tuple[np.ndarray, ...]) -> np.ndarray:
+        """Simulate paths, in the first rows of an env, from entries of `Records.add` until they end or violate; return when."""
         world: Any = readable(env)
         count, records, kind = len(paths), self._records, self._kind[paths]
         lowest, time, ended = entries[0].copy(), entries[1].copy(), entries[2]
+        ends = time.copy()
         records.add(paths, *entries)
         alive = (lowest > 0.0) & ~ended
         barriers = None if self._bridge is None else self._bridge.barriers(world.components)
@@ -184,6 +192,7 @@ class Particles:
             x = world.components
             observation, _, terminated, truncated, info = env.step(self._act(observation))
             time += 1
+            ends[alive] = time[alive]
             h = smallest(self._lowest(x, barriers, info["barrier"])[:count] / self._units)
             height = h * self._weights[np.minimum(time, self._horizon), kind]
             barriers = info["barrier"]
@@ -196,6 +205,7 @@ class Particles:
                 records.add(paths[fell], height[fell], time[fell], ended[fell], state, observation[fell], world.climbed[fell])
             alive &= (lowest > 0.0) & ~ended
         self.lowest[paths] = lowest
+        return ends
 
     def _act(self, observation: np.ndarray) -> np.ndarray:
         actions, memory = self._policy.predict(observation, None, np.zeros(len(observation), dtype=bool), deterministic=True)

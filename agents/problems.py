@@ -53,8 +53,8 @@ def require_ours(env_id: str) -> None:
     creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
     if not (isinstance(creator, type) and issubclass(creator, SafeEnv)):
         raise ConfigurationError(
-            f"{env_id} is not one of this project's envs; {nearest(env_id, ENV_IDS)}. A filter goes over any env of Gymnasium's: "
-            f"`safe-envs evaluate {env_id} --filter-spec FILE.py:NAME`"
+            f"{env_id} is not one of this project's envs. `safe-envs evaluate {env_id} --filter-spec FILE.py:NAME` puts a filter over any "
+            f"env of Gymnasium's. For an env of this project: {nearest(env_id, ENV_IDS)}"
         )
 
 

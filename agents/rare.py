@@ -166,14 +166,14 @@ def _row(splitting: Splitting, drifting: Drifting, problem: SafetyProblem, sizes
     found = splitting.estimate(power, particles, repetitions, work.part())
     last_part = work.part()
     low, high = rate_interval(found.first, found.paths, confidence)
-    plain = {"episodes": found.paths, "violations": found.first, "ci_low": low, "ci_high": high}
+    seen = {"violations": found.first, "ci_low": low, "ci_high": high, "outside": found.outside, "kept_length": found.kept_length}
+    plain = {"episodes": found.paths, **seen}
     rest = {"levels": float(found.levels.mean()), "steps": found.steps + pilot_steps, "plain": plain}
     if found.given_up:
         return _none(_why_none(found, particles, problem, plain)) | rest
     split = _estimate("splitting on h" if power == POWERS[0] else "splitting on h/sqrt(T - t)", found.estimates, confidence)
     if not found.levels.any():
-        # They were plain episodes, and nothing else.
-        split |= {"ci_low": low, "ci_high": high}
+        split |= {"method": "plain episodes", "ci_low": low, "ci_high": high}
     drift, drift_steps = _by_drift(drifting, problem, found, split["relative_error"], sizes, confidence, last_part)
     answer, check, doubt = verdict(split, drift, plain)
     p, error = answer["probability"], answer["relative_error"]

@@ -37,6 +37,8 @@ class Repetitions:
         steps: control periods that were simulated in all.
         first: violations among the paths of the beginning, which are plain episodes.
         paths: how many these are.
+        outside: how many of them start where h <= 0.
+        kept_length: mean length of those that do not violate, in control periods; None without any.
         length: their mean length, up to a violation, in control periods.
         stuck: for each repetition all of whose paths stood at one level, h there.
         endless: for each one that fell below `LEAST`, h of its last level.
@@ -49,6 +51,8 @@ class Repetitions:
     steps: int
     first: int
     paths: int
+    outside: int
+    kept_length: float | None
     length: float
     stuck: tuple[float, ...]
     endless: tuple[float, ...]
@@ -129,6 +133,8 @@ class Splitting:
             run.paths.steps,
             run.first,
             run.paths.lowest.size,
+            run.paths.outside,
+            run.paths.kept_length,
             length,
             tuple(run.stuck),
             tuple(run.endless),

@@ -16,15 +16,14 @@ from agents.episodes import Row
 from agents.rare import RareEvaluation, estimate_rare
 from safe_envs.errors import ConfigurationError
 from scripts.console import progress_bar, stdout, write_result
-from scripts.table import describe_system
+from scripts.table import describe_system, early_end, unsafe_starts
 
 _COLUMNS = (
     "method",
     "levels",
-    "by the other method",
     "simulated\nsteps",
-    "plain Monte Carlo\nwould need",
-    "seen in the first\nepisodes",
+    "plain episodes\nneeded",
+    "violations in\nplain episodes",
     "steps/s",
 )
 _WIDEST = 1000
@@ -70,9 +69,9 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
     console.print(table)
     console.print()
     reasons = Table.grid()
-    for row in answer.rows:
-        if row["reason"]:
-            reasons.add_row(Text(f"Splitting cannot work here for {row['filter']}: {row['reason']}.", overflow="fold"))
+    for reason in dict.fromkeys(row["reason"] for row in answer.rows if row["reason"]):
+        names = ", ".join(row["filter"] for row in answer.rows if row["reason"] == reason)
+        reasons.add_row(Text(f"Splitting cannot work here for {names}: {reason}.", overflow="fold"))
     if reasons.row_count:
         console.print(reasons)
     for note in _notes(answer):
@@ -97,9 +96,8 @@ def _cells(row: Row, speed: float) -> list[str]:
         "none, see below" if p is None else _probability(row),
         row["method"] or "-",
         f"{row['levels']:.1f}" if row["steps"] else "-",
-        _probability(row["check"]) if row["check"] else "-",
         _large(row["steps"]) if row["steps"] else "-",
-        f"{_large(needed)} episodes, {_large(row['plain_steps_needed'])} steps" if needed else "-",
+        _large(needed) if needed else "-",
         f"{plain['violations']} of {plain['episodes']}" if plain else "-",
         _large(speed) if row["steps"] else "-",
     ]
@@ -110,10 +108,20 @@ def _probability(row: Row) -> str:
 
 
 def _notes(answer: RareEvaluation) -> list[str]:
-    notes = [f"Note: doubt the estimate of {row['filter']}: {row['doubt']}." for row in answer.rows if row["doubt"]]
+    rows, steps = answer.rows, answer.problem.steps
+    notes = [f"doubt the estimate of {row['filter']}: {row['doubt']}." for row in rows if row["doubt"]]
+    notes += [f"the check on {row['filter']}, by {row['check']['method']}, is {_probability(row['check'])}" for row in rows if row["check"]]
+    plain = [row["plain"] for row in rows if row["plain"]]
+    if plain:
+        notes += unsafe_starts(plain[0]["outside"] / plain[0]["episodes"])
+    notes += [
+        early_end(row["filter"], "mean episode without a violation", length, steps)
+        for row in rows
+        if row["plain"] and (length := row["plain"]["kept_length"]) is not None and length < 0.99 * steps
+    ]
     if answer.config["monitoring"] == "continuous":
-        notes += [f"Note: {note}" for note in bridge_notes(answer.problem)]
-    return notes
+        notes += bridge_notes(answer.problem)
+    return [f"Note: {note}" for note in notes]
 
 
 def _large(number: float) -> str:

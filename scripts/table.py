@@ -152,7 +152,9 @@ def _describe(comparison: Comparison) -> str:
 def _notes(evaluation: Evaluation) -> list[str]:
     """What has to be known to read the table."""
     steps, episodes = evaluation.problem.steps, evaluation.config["episodes"]
-    notes = [
+    curve = evaluation.rows[0]["curve"]
+    notes = unsafe_starts(1.0 - curve["rate"][0])
+    notes += [
         f"no proved bound for {row['filter']}: {row['bound_note']}"
         for row in evaluation.rows
         if row["filter"] != BARE and row["bound"] is None and row["learning"] is None
@@ -171,8 +173,7 @@ def _notes(evaluation: Evaluation) -> list[str]:
         if row["bound"] is not None and row["ci_high"] < row["bound"]
     ]
     notes += [
-        f"with {row['filter']} the mean episode ends after {speed['steps'] / episodes:.1f} of {steps} steps, at the goal or "
-        "outside the workspace; its safety is that of the instants until then."
+        early_end(row["filter"], "mean episode", speed["steps"] / episodes, steps)
         for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True)
         if speed["steps"] < 0.99 * steps * episodes
     ]
@@ -184,6 +185,22 @@ def _notes(evaluation: Evaluation) -> list[str]:
             "one and the same: the interval says nothing."
         )
     return notes
+
+
+def unsafe_starts(share: float) -> list[str]:
+    """A note on episodes that start where h <= 0, if there are some."""
+    if share == 0.0:
+        return []
+    some = "all episodes start" if share == 1.0 else f"{percent(share)} of the episodes start"
+    return [f"{some} where h <= 0: they count as violated whatever a filter does"]
+
+
+def early_end(name: str, which: str, length: float, steps: int) -> str:
+    """A note on episodes that do not last as long as they might."""
+    return (
+        f"with {name} the {which} ends after {length:.1f} of {steps} steps, at the goal or outside the workspace; its safety is that of "
+        "the instants until then."
+    )
 
 
 def _cells(row: Row, speed: float) -> list[str]:

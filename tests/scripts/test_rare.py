@@ -36,6 +36,39 @@ def test_reason_in_place_of_a_number(safe_envs_command):
         assert "Splitting cannot work here for hocbf: nothing is random after the start" in out
 
 
+def test_filters_with_the_same_reason_share_a_line(safe_envs_command):
+    arguments = ("evaluate", "Scalar-v0", "--noise", "0", "--filter", "none", "--filter", "scbf", "--rare", *FEW)
+    out = safe_envs_command(*arguments)[1]
+    assert out.count("Splitting cannot work here for") == 1
+    assert "for none, scbf: nothing is random" in out
+
+
+def test_starts_outside_the_safe_set_are_told(safe_envs_command):
+    arguments = ("evaluate", "Scalar-v0", "--filter", "scbf", "--start", "2", "--horizon", "0.2", "--json", "out.json")
+    told = "all episodes start where h <= 0: they count as violated whatever a filter does"
+    assert told in safe_envs_command(*arguments, "--episodes", "20")[1]
+    assert told in safe_envs_command(*arguments, "--rare", *FEW)[1]
+    (row,) = strictly("out.json")["rows"]
+    assert (row["method"], row["plain"]["outside"], row["plain"]["kept_length"]) == ("plain episodes", 500, None)
+    assert "h <= 0" not in safe_envs_command(*arguments[:4], "--horizon", "0.2", "--episodes", "20")[1]
+
+
+def test_rare_violations_of_episodes_that_end_early_are_told(safe_envs_command):
+    arguments = ("evaluate", "Scalar-v0", "--policy", "random", "--filter", "scbf", "--rare", *FEW, "--json", "out.json")
+    out = safe_envs_command(*arguments)[1]
+    (row,) = strictly("out.json")["rows"]
+    assert 0 < row["plain"]["kept_length"] < 450
+    assert f"the mean episode without a violation ends after {row['plain']['kept_length']:.1f} of 500 steps" in out
+
+
+def test_the_other_method_is_a_check_below(safe_envs_command):
+    out = safe_envs_command(*ACC, "--rare", *FEW, "--json", "rare.json")[1]
+    (row,) = strictly("rare.json")["rows"]
+    check = row["check"]
+    assert f"the check on scbf, by {check['method']}, is {check['probability']:.3g} [{check['ci_low']:.3g}" in out
+    assert max(map(len, out.splitlines()[3:7])) < 140
+
+
 def test_continuous_monitoring_is_told_in_the_heading(safe_envs_command):
     arguments = ("evaluate", "Scalar-v0", "--filter", "none", "--episodes", "20", "--horizon", "0.2")
     assert "monitored" not in safe_envs_command(*arguments)[1]
