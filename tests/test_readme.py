@@ -16,7 +16,7 @@ README = (ROOT / "README.md").read_text()
 
 def test_examples_run_and_print_what_is_shown():
     examples = re.findall(r"```python\n(.*?)```(?:\n\n```\n(.*?)```)?", README, re.DOTALL)
-    assert sum(bool(shown) for _, shown in examples) == 2
+    assert sum(bool(shown) for _, shown in examples) == 3
     for code, shown in examples:
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             exec(code, {})
