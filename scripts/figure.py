@@ -17,6 +17,7 @@ from safe_envs.codegen import compile_function
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
+from scripts.rates import percent
 from scripts.table import describe_system
 
 # Okabe and Ito's palette, which the colour-blind can tell apart; the bare env is always the same warm colour.
@@ -103,9 +104,9 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
         h = h[np.isfinite(h).mean(axis=1) >= 0.5]
         time = np.arange(len(h)) * evaluation.problem.dt
         low, median, high = np.nanquantile(h, (0.05, 0.5, 0.95), axis=1)
-        axes.fill_between(time, low, high, color=colors[name], alpha=0.12, linewidth=0)
+        axes.fill_between(time, low, high, color=colors[name], alpha=0.09, linewidth=0)
         axes.plot(time, np.stack([low, high], axis=1), color=colors[name], linewidth=0.6, alpha=0.6)
-        axes.plot(time, median, color=colors[name], linewidth=2.2, label=f"{name}: {100 * row['safety_rate']:.1f} % safe")
+        axes.plot(time, median, color=colors[name], linewidth=2.2, label=f"{name}: {percent(row['safety_rate'])} safe")
         lowest, highest, last = min(lowest, low.min()), max(highest, high.max()), max(last, time[-1])
     # Far below 0 it does not matter how far: what is seen of the filters shall not shrink for that.
     bottom = max(lowest, -highest) if highest > 0.0 else lowest
@@ -153,7 +154,7 @@ def _draw_plane(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> N
     axes.contourf(horizontal, vertical, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35, zorder=0)
     axes.contour(horizontal, vertical, h, levels=[0.0], colors="black", linewidths=1.2, zorder=1)
     labels = [f"{names[i]} ({units[i]})" if units[i] else names[i] for i in (across, up)]
-    axes.set(xlabel=labels[0], ylabel=labels[1], title=f"Safe set{_when(problem)} and {len(starts)} episodes")
+    axes.set(xlabel=labels[0], ylabel=labels[1], title=f"Safe set{_when(problem)} and {len(starts)} episodes, dots at their starts")
 
 
 def _when(problem: SafetyProblem) -> str:
