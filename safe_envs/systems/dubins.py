@@ -191,7 +191,7 @@ class DubinsDisk(SystemEnv):
     by us.
 
     ## Nominal controller
-    Turns towards a course that leads onto that circle and around it. The thesis uses 0 here.
+    Turns towards a course that leads onto that circle and around it.
 
     ## Start
     `feasible`: uniform in the disk and in heading, kept where b_1 > 0 for the plant's default speed and the default gains, since

@@ -79,17 +79,19 @@ class Number:
 
 @dataclass(frozen=True)
 class Claim:
-    """A sentence of the thesis as a check of ours.
+    """A sentence as a computed check.
 
     Attributes:
         sentence: in our words.
         holds: computed.
         evidence: the numbers by which.
+        printed: whether the thesis says it. A check of ours is shown, and counts for no verdict.
     """
 
     sentence: str
     holds: bool
     evidence: str
+    printed: bool = True
 
 
 @dataclass(frozen=True)
@@ -141,10 +143,9 @@ class Artefact:
         name: "table-4.1", "figure-3.2a", "example-4.2.2".
         title: what it shows, in our words.
         compute: does the work, with the project's public API only.
-        setting: how, in one place.
+        setting: how, by what is simulated.
         chosen: what the print leaves open, and what we take.
         corrections: errors of the print that are not in ours, with the thesis' equation.
-        orderings: pairs of numbers' names, the first of which is printed as the larger one.
         argument: why the print cannot be reproduced, for a verdict that says so.
         draw: fills an empty figure from the outcome; None for a table.
         size: of the figure, in inches.
@@ -153,10 +154,9 @@ class Artefact:
     name: str
     title: str
     compute: Callable[[Sample], Outcome]
-    setting: tuple[str, ...]
+    setting: Callable[[Sample], tuple[str, ...]]
     chosen: tuple[str, ...] = ()
     corrections: tuple[str, ...] = ()
-    orderings: tuple[tuple[str, str], ...] = ()
     argument: str = ""
     draw: Callable[[Figure, Outcome], None] | None = None
     size: tuple[float, float] = (7.0, 4.2)

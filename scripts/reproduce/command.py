@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
 from multiprocessing import get_context
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, WorkersLostError, nearest
 from scripts import completion, options
 from scripts.console import Json, progress_bar, require_result, stdout, write_result
 
@@ -41,13 +42,14 @@ def reproduce(
 ) -> None:
     """Compute the tables and figures of the thesis, and hold them against the print.
 
-    Each gets a picture (PNG and SVG) or a table, a JSON file with all numbers, and a verdict from a fixed list by stated rules.
+    Each gets a picture (PNG and SVG) or a table, a JSON file with all numbers, and, but for a quick run, a verdict from a fixed list by
+    stated rules.
     DIR/index.html is one page with all that is in DIR by the same options, DIR/index.md the same as Markdown. What is computed is
     kept by its configuration and the version of the code: a run that was stopped goes on.
     """
     from scripts.reproduce.artefact import Sample
     from scripts.reproduce.page import write_page
-    from scripts.reproduce.store import read
+    from scripts.reproduce.store import read, require_same_sample
 
     require_result(json_file)
     sample = Sample(episodes, seed, quick)
@@ -56,13 +58,14 @@ def reproduce(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigurationError(f"--out {out} cannot be made: {error.strerror}; give another folder") from error
+    require_same_sample(out, _chosen([_ALL]), sample)
     missing = [artefact for artefact in chosen if read(out, artefact, sample) is None]
     with progress_bar(f"{len(missing)} of {len(chosen)} to do") as tell:
         failures = _compute(missing, sample, out, jobs, tell or (lambda _: None))
     found = [(artefact, *answer) for artefact in _chosen([_ALL]) if (answer := read(out, artefact, sample)) is not None]
     write_page(out, found, sample)
     reported = [entry for entry in found if entry[0] in chosen]
-    _report(reported, out)
+    _report(reported, sample, out)
     write_result(json_file, lambda: _document(reported, sample))
     if failures:
         raise ConfigurationError("; ".join(f"{name} failed: {error}" for name, error in failures.items()))
@@ -81,34 +84,79 @@ def _chosen(names: Sequence[str]) -> list[Artefact]:
 def _compute(missing: Sequence[Artefact], sample: Sample, out: Path, jobs: int, tell: Callable[[float], None]) -> dict[str, str]:
     """Compute and keep what is missing; return the errors of those that failed, which stop no others."""
     failures: dict[str, str] = {}
-    with _pool(min(jobs, len(missing))) as pool:
-        left: dict[Any, str] = {pool.submit(compute_one, artefact.name, sample, out): artefact.name for artefact in missing}
-        try:
-            while left:
-                for future in wait(left, return_when=FIRST_COMPLETED).done:
-                    name, error = left.pop(future), future.exception()
-                    if error is not None:
-                        failures[name] = f"{type(error).__name__}: {error}"
-                    tell(1 - len(left) / len(missing))
-        except KeyboardInterrupt:
-            pool.shutdown(wait=False, cancel_futures=True)
-            print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
-            raise
+    names = [artefact.name for artefact in missing]
+    ended = _one_by_one(names, sample, out) if min(jobs, len(names)) < 2 else _in_processes(names, sample, out, jobs)
+    try:
+        for done, (name, error) in enumerate(ended, 1):
+            if error is not None:
+                failures[name] = f"{type(error).__name__}: {error}"
+            tell(done / len(names))
+    except KeyboardInterrupt:
+        print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
+        raise
     return failures
 
 
-def _pool(jobs: int) -> Executor:
-    """Processes; for a single job a thread of this one, which starts at once."""
+Ended = Iterator[tuple[str, BaseException | None]]
+"""Names of artefacts as they end, with their errors."""
+
+
+def _one_by_one(names: Sequence[str], sample: Sample, out: Path) -> Ended:
+    for name in names:
+        try:
+            compute_one(name, sample, out)
+        except Exception as error:
+            yield name, error
+        else:
+            yield name, None
+
+
+def _in_processes(names: Sequence[str], sample: Sample, out: Path, jobs: int) -> Ended:
+    """By a pool; what was lost with a process of it is computed again, each in a process of its own."""
+    lost = []
+    for name, error in _pooled(names, sample, out, min(jobs, len(names))):
+        if isinstance(error, BrokenProcessPool):
+            lost.append(name)
+        else:
+            yield name, error
+    for name in lost:
+        for _, error in _pooled([name], sample, out, 1):
+            ended = isinstance(error, BrokenProcessPool)
+            yield name, WorkersLostError("its process was ended from outside, as for want of memory; use fewer jobs") if ended else error
+
+
+def _pooled(names: Sequence[str], sample: Sample, out: Path, jobs: int) -> Ended:
+    from scripts.reproduce.store import source_checksum
+
     # Not by fork: torch's threads do not survive it.
-    return ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) if jobs > 1 else ThreadPoolExecutor(1)
+    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
+    try:
+        left: dict[Any, str] = {pool.submit(compute_one, name, sample, out, source_checksum()): name for name in names}
+        for future in as_completed(left):
+            yield left[future], future.exception()
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
-def compute_one(name: str, sample: Sample, out: Path) -> None:
-    """Compute an artefact and keep it; what a process of the pool does."""
+def compute_one(name: str, sample: Sample, out: Path, source: str | None = None) -> None:
+    """Compute an artefact and keep it; what a process of the pool does.
+
+    Args:
+        name: of the artefact.
+        sample: how much is simulated.
+        out: folder of the results.
+        source: checksum of the code of the process that asks for it, if that is another one.
+
+    Raises:
+        ConfigurationError: the code has changed since then.
+    """
     import torch
 
-    from scripts.reproduce.store import keep
+    from scripts.reproduce.store import keep, source_checksum
 
+    # Before the code that computes is read, since results are kept by this checksum.
+    if source not in (None, source_checksum()):
+        raise ConfigurationError("the code changed during the run; start it again")
     torch.set_num_threads(1)
     (artefact,) = _chosen([name])
     began = time.perf_counter()
@@ -122,13 +170,13 @@ def _document(found: Sequence[tuple[Artefact, Any, float]], sample: Sample) -> d
 
     rows = []
     for artefact, outcome, seconds in found:
-        judgement = judge(artefact, outcome)
+        judgement = judge(artefact, outcome, sample)
         verdict = {"verdict": judgement.verdict.value, "reasons": list(judgement.reasons)}
         rows.append({"name": artefact.name, **verdict, "seconds": seconds, "outcome": outcome.document()})
     return {"sample": asdict(sample), "artefacts": rows}
 
 
-def _report(found: Sequence[tuple[Artefact, Any, float]], out: Path) -> None:
+def _report(found: Sequence[tuple[Artefact, Any, float]], sample: Sample, out: Path) -> None:
     from rich.box import SIMPLE_HEAD
     from rich.table import Table
 
@@ -138,7 +186,7 @@ def _report(found: Sequence[tuple[Artefact, Any, float]], out: Path) -> None:
     for title in ("artefact", "verdict", "because"):
         table.add_column(title, no_wrap=title != "because")
     for artefact, outcome, _ in found:
-        judgement = judge(artefact, outcome)
+        judgement = judge(artefact, outcome, sample)
         table.add_row(artefact.name, judgement.text, "; ".join(judgement.reasons))
     console = stdout()
     console.print(table)

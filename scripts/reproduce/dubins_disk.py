@@ -6,161 +6,145 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import sympy as sp
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from agents.problems import load_problem
-from safe_envs.calculus import derivatives, drift_derivative, input_derivative
-from safe_envs.codegen import compile_function, stacked
 from safe_envs.problem import SafetyProblem
-from safe_envs.sde import ControlAffineSDE
 from scripts.figure import COLORS, QUIET, UNSAFE, add_legend
 from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
-from scripts.reproduce.learned_runs import CORRECTED, LEARNING, Run, over_learnings, residuals, runs, seeds, settings, thinned
+from scripts.reproduce.learned_runs import CORRECTED, Run, learning, over_learnings, parameters, residuals, runs, seeds, thinned
+from scripts.reproduce.printed_differences import printed_residuals
 from wrappers import HOCBF
-from wrappers.learning.base import Record
-from wrappers.learning.collect import collect_paths, draw_states
-from wrappers.learning.files import Signature
-from wrappers.learning.residual import LearnedResidual, ResidualModel
-from wrappers.learning.training import train
+from wrappers.learning.residual import ResidualModel
 
 DISK = "DubinsDisk-v0"
 RATES = (0.5, 1.0, 5.0)  # p_1 = p_2, 1/s
 PRINTED_START, VALID_START = (0.9, 0.1, 0.0), (0.0, 0.1, 0.0)  # m, m, rad
 SHOWN = 400  # control instants in the picture
 WIDE, NARROW = (-20.0, 20.0), (-math.pi, math.pi)  # turn rate, rad/s
+SAFE_COUNT = f"safe trajectories of {len(RATES)}, in the worst learning"
+_NOMINAL = [f"hocbf:p={p},{p}" for p in RATES]
+_LEARNED = [f"learned-{text}" for text in _NOMINAL]
+_NO_MARGIN = [f"{text}:eps=0" for text in _LEARNED]
+
+Learnings = Sequence[Sequence[Run]]  # one run for each gain, for each learning
+
+
+def disk(sample: Sample) -> SafetyProblem:
+    """The problem, as long as the sample lets it be."""
+    world = load_problem(DISK)
+    return world.configured(horizon=world.dt * sample.work(world.steps))
 
 
 def compute_disk(sample: Sample) -> Outcome:
     """Trajectories of the disk for each gain, from both starts."""
-    models = residuals(DISK, sample)
-    world = load_problem(DISK)
-    world = world.configured(horizon=world.dt * sample.work(world.steps))
-    nominal, learned, bare = ([f"{kind}:p={p},{p}{end}" for p in RATES] for kind, end in (("hocbf", ""), ("learned-hocbf", ""), _NO_MARGIN))
+    world, models = disk(sample), residuals(DISK, sample)
     at = {start: world.configured(start=start, box=WIDE) for start in (PRINTED_START, VALID_START)}
-    ours = {start: [runs(problem, learned, model, "zero") for model in models] for start, problem in at.items()}
-    believed = runs(at[VALID_START], nominal, policy="zero")
-    exact = {start: runs(problem, nominal, policy="zero", knowledge="plant") for start, problem in at.items()}
-    narrow = {start: runs(world.configured(start=start, box=NARROW), learned, models[0], "zero") for start in at}
-    without = runs(at[PRINTED_START], bare, models[0], "zero")
-    estimated = [printed_residuals(load_problem(DISK), sample, seed) for seed in seeds(sample)]
-    by_print = [runs(at[PRINTED_START], bare, model, "zero") for model, _ in estimated]
-    printed, valid = ([min(each) for each in zip(*_smallest(ours[start]), strict=True)] for start in at)
+    found = {start: trajectories(problem, models) for start, problem in at.items()}
+    believed = runs(at[VALID_START], _NOMINAL, policy="zero")
+    exact = {start: runs(problem, _NOMINAL, policy="zero", knowledge="plant") for start, problem in at.items()}
+    estimates, shares = zip(*(printed_residuals(load_problem(DISK), sample, seed) for seed in seeds(sample)), strict=True)
+    by_print = trajectories(at[PRINTED_START], estimates, _NO_MARGIN)
     return Outcome(
-        numbers=_disk_numbers(ours[PRINTED_START], printed=3),
-        elsewhere={
-            f"start {VALID_START}": Outcome(_disk_numbers(ours[VALID_START], printed=3)),
-            f"start {VALID_START}, |omega| <= pi": Outcome(_disk_numbers([narrow[VALID_START]], printed=3)),
-            "|omega| <= pi": Outcome(_disk_numbers([narrow[PRINTED_START]], printed=3)),
-            "without the margin of Eq. (3.20)": Outcome(_disk_numbers([without], printed=3)),
-        },
-        as_printed=_disk_numbers(by_print),
-        claims=[
-            Claim(
-                f"All trajectories from {PRINTED_START} stay safe under the learned derivatives",
-                min(printed) > 0,
-                f"smallest h over the learnings: {_by_rate(printed)}",
-            ),
-            Claim(
-                f"From {VALID_START}, a start that the theory covers, all stay safe under the learned derivatives, none under the nominal",
-                min(valid) > 0 > max(run.smallest for run in believed),
-                f"smallest h, learned: {_by_rate(valid)}; nominal: {_by_rate([run.smallest for run in believed])}",
-            ),
-        ],
-        data={
-            "curves": [
-                {"panel": panel, "kind": kind, "p": p, "x": thinned(run.states[:SHOWN, 0]), "y": thinned(run.states[:SHOWN, 1])}
-                for panel, kind, found in (
-                    (0, "learned", ours[PRINTED_START][0]),
-                    (1, "learned", by_print[0]),
-                    (2, "learned", ours[VALID_START][0]),
-                    (2, "nominal", believed),
-                )
-                for p, run in zip(RATES, found, strict=True)
-            ],
-            "starts": [PRINTED_START, PRINTED_START, VALID_START],
-            "radius": 1.0,
-        },
+        numbers=disk_numbers(found[PRINTED_START], printed=len(RATES)),
+        claims=[all_safe(found[PRINTED_START]), theory_holds(found[VALID_START], believed)],
+        elsewhere=_elsewhere(at, models, found[VALID_START]),
+        as_printed=disk_numbers(by_print),
+        data=_pictures(found[PRINTED_START][0], by_print[0], found[VALID_START][0], believed),
         notes=[
             *(outside(world, start) for start in at),
-            f"with exact derivatives from {PRINTED_START} the smallest h is {_by_rate([run.smallest for run in exact[PRINTED_START]])}, "
-            f"from {VALID_START} it is {_by_rate([run.smallest for run in exact[VALID_START]])}",
+            *(f"with exact derivatives from {start} the smallest h is {_by_rate(_smallest(each))}" for start, each in exact.items()),
             binding(world),
-            f"the differences of Eq. (3.28) give {estimated[0][1]:.2g} of the input's gain (median), so that the filter turns more than "
-            f"the condition asks for: without a margin, as printed, {min(map(_safe, by_print))} of {len(RATES)} runs from "
-            f"{PRINTED_START} are safe in the worst learning",
+            _by_printed_differences(shares, by_print),
         ],
     )
 
 
-def printed_residuals(problem: SafetyProblem, sample: Sample, seed: int) -> tuple[ResidualModel, float]:
-    """What is learned from the differences of Eq. (3.28) over control periods, and the median share of the input's gain in them.
-
-    The backward period is driven straight on, the forward one under either of two inputs.
-    """
-    dt, count, epochs = problem.dt, *settings(sample)
-    before = draw_states(problem, count, np.random.default_rng(seed))
-
-    def stepped(states: np.ndarray, omega: float) -> np.ndarray:
-        return collect_paths(problem, states, np.full((count, 1), omega), 1, dt)[:, 1]
-
-    x = stepped(before, 0.0)
-    first, second = problem.exploration.inputs[0][0], problem.exploration.inputs[-1][0]
-    h_before, h, *h_after = (_barrier(problem, states) for states in (before, x, stepped(x, first), stepped(x, second)))
-    known, true = (_lie_derivatives(system, problem, x) for system in (problem.model, problem.plant))
-    excess = [(after + h_before - 2 * h) / dt**2 - known[2] - known[3] * u for after, u in zip(h_after, (first, second), strict=True)]
-    gain = (excess[1] - excess[0]) / (second - first)
-    targets = np.stack([(h - h_before) / dt - known[1], excess[0] - gain * first, gain], axis=1)
-    coordinates = problem.exploration.coordinates
-    inputs = stacked(compile_function(problem.plant.states, coordinates, "arrays")(*np.ascontiguousarray(x.T)), count)
-    trained = train(inputs, targets, epochs=epochs, seed=seed)
-    part = LearnedResidual(problem.plant.states, coordinates, 2, trained.network, trained.heldout)
-    record = Record(3 * count, 3 * count * dt, 0.0, seed)
-    return ResidualModel(Signature.of(problem), record, (part,)), float(np.median((gain + known[3]) / true[3]))
+def trajectories(problem: SafetyProblem, models: Sequence[ResidualModel], filters: Sequence[str] = _LEARNED) -> list[list[Run]]:
+    """A run for each gain with each learning, the nominal control being 0."""
+    return [runs(problem, filters, model, "zero") for model in models]
 
 
-def _barrier(problem: SafetyProblem, states: np.ndarray) -> np.ndarray:
-    return compile_function(problem.plant.states, [problem.barriers[0].expression], "arrays")(*np.ascontiguousarray(states.T))[0]
+def _elsewhere(at: dict[tuple[float, ...], SafetyProblem], models: Sequence[ResidualModel], valid: Learnings) -> dict[str, Outcome]:
+    """What comes out with another start, with another box of the input, and without a margin."""
+    narrow = {start: trajectories(problem.configured(box=NARROW), models) for start, problem in at.items()}
+    found = {
+        f"start {VALID_START}": valid,
+        f"start {VALID_START}, |omega| <= pi rad/s": narrow[VALID_START],
+        "|omega| <= pi rad/s": narrow[PRINTED_START],
+        "without the margin of Eq. (3.20)": trajectories(at[PRINTED_START], models, _NO_MARGIN),
+    }
+    return {name: Outcome(disk_numbers(each, printed=len(RATES)), [all_safe(each)]) for name, each in found.items()}
 
 
-def _lie_derivatives(system: ControlAffineSDE, problem: SafetyProblem, states: np.ndarray) -> np.ndarray:
-    """h, L_f h, L_f^2 h and L_g L_f h at states, shape (4, B)."""
-    along = derivatives(system, problem.barriers[0].expression, 2, drift_derivative)
-    expressions = [system.numeric(e) for e in (*along, *input_derivative(system, along[1]))]
-    return stacked(compile_function(system.states, expressions, "arrays")(*np.ascontiguousarray(states.T)), len(states)).T
+def disk_numbers(found: Learnings, printed: float | None = None) -> list[Number]:
+    """How many are safe, a fact without an interval, which is all of them only if it is so in every learning; and the smallest h."""
+    each = zip(RATES, zip(*map(_smallest, found), strict=True), strict=True)
+    return [
+        Number(SAFE_COUNT, float(min(_counts(found))), printed=printed),
+        *(over_learnings(f"smallest h, p = {p:g}", h, "m^2") for p, h in each),
+    ]
 
 
-_NO_MARGIN = ("learned-hocbf", ":eps=0")
+def all_safe(found: Learnings) -> Claim:
+    """The text about the figure."""
+    return Claim(
+        "All trajectories stay safe under the learned derivatives",
+        min(worst(found)) > 0,
+        f"safe in each learning: {', '.join(map(str, _counts(found)))} of {len(RATES)}; smallest h over all: {_by_rate(worst(found))}",
+    )
 
 
-def _smallest(found: Sequence[Sequence[Run]]) -> list[list[float]]:
-    return [[run.smallest for run in each] for each in found]
+def theory_holds(found: Learnings, believed: Sequence[Run]) -> Claim:
+    """What the theory has to say, where it says something."""
+    return Claim(
+        f"From {VALID_START}, a start that the theory covers, all stay safe under the learned derivatives, none under the nominal",
+        min(worst(found)) > 0 > max(_smallest(believed)),
+        f"smallest h over the learnings: {_by_rate(worst(found))}; nominal: {_by_rate(_smallest(believed))}",
+        printed=False,
+    )
 
 
-def _safe(each: Sequence[Run]) -> int:
-    return sum(run.smallest > 0 for run in each)
+def worst(found: Learnings) -> list[float]:
+    """The smallest h of each gain over all learnings."""
+    return [min(each) for each in zip(*map(_smallest, found), strict=True)]
+
+
+def _smallest(each: Sequence[Run]) -> list[float]:
+    return [run.smallest for run in each]
+
+
+def _counts(found: Learnings) -> list[int]:
+    return [sum(run.smallest > 0 for run in each) for each in found]
 
 
 def _by_rate(values: Sequence[float]) -> str:
     return ", ".join(f"{value:.3g} (p = {p:g})" for p, value in zip(RATES, values, strict=True))
 
 
-def _disk_numbers(found: Sequence[Sequence[Run]], printed: float | None = None) -> list[Number]:
-    """Number of safe trajectories and smallest h of each gain, for each learning; of one alone without an interval."""
-    values = _smallest(found)
-    safe = [float(_safe(each)) for each in found]
-    if len(values) == 1:
-        # One trajectory is a fact: the count is exact.
-        rest = [Number(f"smallest h, p = {p:g}", h, unit="m^2") for p, h in zip(RATES, values[0], strict=True)]
-        return [Number("safe trajectories of 3", safe[0], safe[0], safe[0], printed), *rest]
-    each = zip(RATES, zip(*values, strict=True), strict=True)
-    return [
-        over_learnings("safe trajectories of 3", safe, "", printed),
-        *(over_learnings(f"smallest h, p = {p:g}", h, "m^2") for p, h in each),
-    ]
+def _by_printed_differences(shares: Sequence[float], found: Learnings) -> str:
+    return (
+        f"the differences of Eq. (3.28) give at most {max(shares):.2g} of the input's gain (median over states), so that the filter turns "
+        f"about {1 / max(shares):.2g} times as much as the condition asks for: without a margin, as printed, {min(_counts(found))} of "
+        f"{len(RATES)} runs from {PRINTED_START} are safe in the worst learning"
+    )
+
+
+def _pictures(printed: Sequence[Run], by_print: Sequence[Run], valid: Sequence[Run], believed: Sequence[Run]) -> dict[str, Any]:
+    """The curves of the three panels."""
+    shown = ((0, "learned", printed), (1, "learned", by_print), (2, "learned", valid), (2, "nominal", believed))
+    return {
+        "curves": [
+            {"panel": panel, "kind": kind, "p": p, "x": thinned(run.states[:SHOWN, 0]), "y": thinned(run.states[:SHOWN, 1])}
+            for panel, kind, found in shown
+            for p, run in zip(RATES, found, strict=True)
+        ],
+        "starts": [PRINTED_START, PRINTED_START, VALID_START],
+        "radius": 1.0,
+    }
 
 
 def chain_at(problem: SafetyProblem, p: float, start: Sequence[float]) -> tuple[float, float, float]:
@@ -226,25 +210,36 @@ def draw_disk(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, [*handles, Line2D([], [], color=QUIET, linewidth=0.8, linestyle="--", label="nominal")])
 
 
+def setting(sample: Sample) -> tuple[str, ...]:
+    """How it is simulated."""
+    world = disk(sample)
+    speeds = [parameters(system)["v"] for system in (world.plant, world.model)]
+    return (
+        f"{DISK}: plant {speeds[0]:g} m/s, model {speeds[1]:g} m/s, dt {world.dt:g} s, {world.horizon:g} s; p_1 = p_2 = "
+        f"{', '.join(f'{p:g}' for p in RATES)} 1/s; start {PRINTED_START}, and {VALID_START} beside it",
+        learning(sample),
+        "safe: h > 0 at every control instant",
+        f"the picture shows the first learning, up to {min(SHOWN * world.dt, world.horizon):g} s",
+    )
+
+
 FIGURE = Artefact(
     name="figure-3.1",
     title="Dubins vehicle in the unit disk under learned derivatives of the HOCBF",
     compute=compute_disk,
     draw=draw_disk,
-    setting=(
-        f"{DISK}: plant .8 m/s, model .5 m/s, dt .05 s, 50 s; p_1 = p_2 = .5, 1 and 5 1/s; starts {PRINTED_START} and {VALID_START}",
-        LEARNING,
-        "the picture shows the first 20 s",
-    ),
+    setting=setting,
     chosen=(
         "nominal control 0",
-        "|omega| <= 20 rad/s, the box |omega| <= pi beside it",
-        "network inputs x, y, cos(theta), sin(theta)",
+        f"|omega| <= {WIDE[1]:g} rad/s, and |omega| <= pi rad/s beside it",
+        "layers of 100 and 30 nodes, which the print gives for the quadrotor",
         "for Eq. (3.28) as printed: differences over the control period, the backward one driven straight on, no margin",
     ),
     corrections=(
         f"Sec. 3.5.1: the start {PRINTED_START} is outside C_2 for all three gains, where no safety follows; {VALID_START} is shown too",
         "Sec. 3.5.1: the relative degree is not 2 where the heading is radial; the row is infeasible there unless b_2 >= 0",
+        "Sec. 3.5.1: a network with 3 inputs; here 4, x, y, cos(theta) and sin(theta), for theta leaves the range that was learned as the "
+        "vehicle turns on",
         *CORRECTED,
     ),
     argument="With exact derivatives, too, a run from the printed start leaves the set: see the closed form in the notes.",

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import sympy as sp
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.special import stdtrit
 
 from agents.statistics import repeated_interval
 from safe_envs.problem import SafetyProblem
@@ -20,6 +23,7 @@ from wrappers.learning.estimators import rates
 from wrappers.learning.identifiability import IdentifiabilityWarning
 from wrappers.learning.posterior import Posterior
 from wrappers.learning.regression import sigma_map, sigma_samples
+from wrappers.learning.transitions import Transitions
 
 STARTS, STEPS, DEGREE = 10, 100, 3
 """Of the data for the drift: trajectories, states of each, degree of the features."""
@@ -31,8 +35,14 @@ AT_REST = ((0.0,),)
 """Inputs of the data for f alone, and of those for sigma."""
 
 NOISE_STARTS, NOISE_STEPS, DRAWS = 100, 300, 10_000
-_LEVELS = (0.025, 0.975)
+PRIOR_OF_SIGMA = (1.0, 1.0)
+"""alpha and beta of Sec. 6.3.1."""
+
+CONFIDENCE = 0.95
 _BINS = 50
+
+ONE_MORE = "an interval holds one more identification with 95 %, if logarithms are normal: a printed number is of one"
+"""What the intervals of `predicted` are."""
 
 FIT_ERRATA = (
     "Sec. 6.2.2: the noise of the data has the variance sigma^2/(K dt), with u1 and u2 besides, not sigma^2/K",
@@ -45,14 +55,16 @@ SIGMA_ERRATA = (
 )
 
 
-def identified(
-    problem: SafetyProblem, repetitions: int, seed: int, prior: float, *, starts: int = STARTS, steps: int = STEPS, inputs: Any = None
-) -> Posterior:
+def identified(problem: SafetyProblem, repetitions: int, seed: int, prior: float, *, inputs: Any = None) -> Posterior:
     """Learn f, g and sigma from trajectories, by default under inputs of both signs."""
+    return identified_from(problem, collect(problem, STARTS, repetitions, inputs, steps=STEPS, seed=seed), prior)
+
+
+def identified_from(problem: SafetyProblem, data: Transitions, prior: float) -> Posterior:
+    """Learn f, g and sigma from data."""
     with warnings.catch_warnings():
         # What data at a single input do not tell is meant.
         warnings.simplefilter("ignore", IdentifiabilityWarning)
-        data = collect(problem, starts, repetitions, inputs, steps=steps, seed=seed)
         return identify(problem, data=data, degree=DEGREE, prior=prior)
 
 
@@ -74,21 +86,43 @@ def noise_level(problem: SafetyProblem, name: str) -> float:
 
 
 def seeds(sample: Sample, full: int) -> range:
-    """Seeds of identifications, others for each seed of the sample; at least two."""
-    count = max(2, full // 10) if sample.quick else full
+    """Seeds of identifications, others for each seed of the sample; a quick sample has a tenth, and three if there are as many."""
+    count = max(2, min(full, 3), full // 10) if sample.quick else full
     return range(1000 * sample.seed, 1000 * sample.seed + count)
 
 
-def spread(name: str, values: Any, printed: float | None = None, unit: str = "") -> Number:
-    """The median over identifications, and what holds 95 % of them: a printed number is of a single one."""
-    low, high = np.quantile(values, _LEVELS).tolist()
-    return Number(name, float(np.median(values)), low, high, printed, unit=unit)
+def one_more(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
+    """The 95 % prediction interval of one more value, where they are normal: mean +- t s sqrt(1 + 1/n)."""
+    mean = float(np.mean(values))
+    half = float(stdtrit(len(values) - 1, 0.5 + CONFIDENCE / 2) * np.std(values, ddof=1)) * math.sqrt(1 + 1 / len(values))
+    return mean - half, mean + half
+
+
+def predicted(name: str, values: Any, printed: float | None = None, unit: str = "") -> Number:
+    """The geometric mean of a positive quantity over identifications, and the 95 % prediction interval of one more.
+
+    Its logarithm is taken for normal. A printed number is of a single identification: it is one more.
+    """
+    logarithms = np.log(values)
+    low, high = one_more(logarithms)
+    return Number(name, float(np.exp(logarithms.mean())), math.exp(low), math.exp(high), printed, unit=unit)
+
+
+def credible(name: str, draws: np.ndarray, unit: str) -> Number:
+    """The median of many draws from a posterior, and what holds 95 % of it."""
+    low, high = np.quantile(draws, _ends(CONFIDENCE)).tolist()
+    return Number(name, float(np.median(draws)), low, high, unit=unit)
+
+
+def _ends(content: float) -> tuple[float, float]:
+    """Levels between which there is so much of a distribution."""
+    return (1 - content) / 2, (1 + content) / 2
 
 
 def averaged(name: str, values: Any, unit: str = "") -> Number:
-    """The mean over identifications, with Student's interval."""
+    """The mean of a positive quantity over identifications, with Student's interval of that mean."""
     mean = float(np.mean(values))
-    low, high = repeated_interval(list(map(float, values)), (mean, mean), 0.95, (0.0, float("inf")))
+    low, high = repeated_interval(list(map(float, values)), (mean, mean), CONFIDENCE, (0.0, float("inf")))
     return Number(name, mean, low, high, unit=unit)
 
 
@@ -96,34 +130,52 @@ def noise_levels(problem: SafetyProblem, sample: Sample, prior: float, unit: tup
     """Sample the posterior of sigma from the residuals of fresh trajectories, with the identified f and g known."""
     first, second, *_ = seeds(sample, 2)
     learned = identified(problem, REPETITIONS[-1], first, prior)
-    starts, steps = sample.work(NOISE_STARTS), NOISE_STEPS
-    data = collect(problem, starts, 1, AT_REST, steps=steps, seed=second)
+    data = collect(problem, sample.work(NOISE_STARTS), 1, AT_REST, steps=NOISE_STEPS, seed=second)
     left = data.successors[:, 0] - data.x - rates(learned.system, data) * problem.dt
     squares, count = (left**2).sum(axis=0), len(left)
     rng = np.random.default_rng([sample.seed, 63])
     true = [noise_level(problem, name) for name in ("sigma_1", "sigma_2")]
-    numbers, printed, shown, apart, sharp = [], [], {"truth": true}, [], []
+    numbers, printed, every, shown = [], [], [], {"truth": true}
     for i, (s, at) in enumerate(zip(squares.tolist(), unit, strict=True), start=1):
-        draws = sigma_samples(s / problem.dt, count, 1.0, 1.0, DRAWS, rng)
+        draws = sigma_samples(s / problem.dt, count, *PRIOR_OF_SIGMA, DRAWS, rng)
         # The print: no dt, and one factor less.
-        wrong = sigma_samples(s, count - 1, 1.0, 1.0, DRAWS, rng)
-        numbers.append(spread(f"sigma_{i}", draws, unit=at))
-        printed.append(spread(f"sigma_{i}", wrong, unit=at))
-        apart.append(abs(draws.mean() - true[i - 1]) / draws.std())
-        sharp.append(draws.std() / draws.mean())
+        wrong = sigma_samples(s, count - 1, *PRIOR_OF_SIGMA, DRAWS, rng)
+        numbers.append(credible(f"sigma_{i}", draws, at))
+        printed.append(credible(f"sigma_{i}", wrong, at))
+        every.append(draws)
         counts, edges = np.histogram(draws, bins=_BINS)
         shown |= {f"counts {i}": counts.tolist(), f"edges {i}": edges.tolist()}
-    mode = sigma_map(squares / problem.dt, np.full(len(squares), count))
-    evidence = [
-        f"sigma_{i} {n.ours:.4f} [{n.low:.4f}, {n.high:.4f}], most probable {m:.4f}, true {t:g}, {a:.1f} standard deviations apart"
-        for i, (n, m, t, a) in enumerate(zip(numbers, mode, true, apart, strict=True), start=1)
+    modes = sigma_map(squares / problem.dt, np.full(len(squares), count), *PRIOR_OF_SIGMA).tolist()
+    sharp = np.mean([draws.std() / draws.mean() for draws in every])
+    notes = [
+        f"Most probable: {', '.join(f'sigma_{i} = {mode:.4f}' for i, mode in enumerate(modes, start=1))}. Relative standard deviation "
+        f"{100 * sharp:.2f} %; by the law sqrt(1/(2 N)) {100 / np.sqrt(2 * count):.2f} % with N = {count} residuals.",
     ]
-    claim = Claim("The posteriors of sigma_1 and sigma_2 gather at the true values.", bool(max(apart) < 3.0), "; ".join(evidence))
-    note = (
-        f"Relative standard deviation {100 * np.mean(sharp):.2f} %; by the law sqrt(1/(2 N)) {100 / np.sqrt(2 * count):.2f} % with "
-        f"N = {count} residuals."
+    return Outcome(numbers=numbers, claims=[gathered(every, true)], as_printed=printed, data=shown, notes=notes)
+
+
+def gathered(every: Sequence[np.ndarray], true: Sequence[float]) -> Claim:
+    """That posteriors are around the true values: together in 95 % of all cases, so that each interval holds a little more."""
+    levels = _ends(1 - (1 - CONFIDENCE) / len(every))
+    found = [tuple(np.quantile(draws, levels).tolist()) for draws in every]
+    content = f"{100 * (levels[1] - levels[0]):g} %"
+    return Claim(
+        "The posteriors of sigma_1 and sigma_2 are around the true values.",
+        all(low <= level <= high for (low, high), level in zip(found, true, strict=True)),
+        "; ".join(
+            f"{content} of that of sigma_{i} in [{low:.4f}, {high:.4f}], true {level:g}"
+            for i, ((low, high), level) in enumerate(zip(found, true, strict=True), start=1)
+        ),
     )
-    return Outcome(numbers=numbers, claims=[claim], as_printed=printed, data=shown, notes=[note])
+
+
+def noise_setting(sample: Sample, rest: str) -> tuple[str, ...]:
+    """How `noise_levels` goes."""
+    return (
+        f"{sample.work(NOISE_STARTS)} trajectories of {NOISE_STEPS} steps of .01 s, {DRAWS} draws, {rest}; alpha = beta = 1 in the prior "
+        "of sigma",
+        "an interval holds 95 % of the posterior",
+    )
 
 
 def draw_levels(figure: Figure, outcome: Outcome) -> None:

@@ -15,6 +15,7 @@ from agents.problems import load_problem
 from agents.repeats import pooled
 from agents.statistics import repeated_interval
 from safe_envs.problem import SafetyProblem
+from safe_envs.sde import ControlAffineSDE
 from scripts.figure import COLORS
 from scripts.reproduce.artefact import Number, Sample
 from wrappers.learning.residual import ResidualModel, learn_residual
@@ -22,15 +23,16 @@ from wrappers.learning.residual import ResidualModel, learn_residual
 LEARNINGS, QUICK_LEARNINGS = 3, 2  # repetitions of the learning, from other seeds
 STATES, LEAST_STATES = 2000, 400  # to learn from; with fewer than 127 the held-out errors have no 95 % quantile
 EPOCHS, LEAST_EPOCHS = 500, 80  # with fewer the margin is so wide that no input meets the row
+LABEL_STEP = 1e-3  # of the differences that are learned from, s
 EPISODES = 1000  # from starts around the printed one
 
-LEARNING = (
-    f"{LEARNINGS} learnings from {STATES} states each, network 100-30 ReLU, Adam, up to {EPOCHS} epochs, learned margin at the 95 % level"
-)
 CORRECTED = (
-    "Eq. (3.28), Alg. 1: the central second difference gives half of the input's gain; forward differences under one held input here",
-    "Eq. (3.26) forgets the margin of Eq. (3.20), and the box of the input; both are here",
-    "Sec. 3.4.2: the loss lacks its square, and the update has the wrong sign",
+    "Eq. (3.28), Alg. 1: the central second difference over control periods gives half of the input's gain; here forward differences "
+    f"over steps of {LABEL_STEP:g} s under one held input",
+    "Sec. 3.4.1, Alg. 1: states along trajectories; here drawn uniformly where it is safe, which covers the region evenly",
+    "Eq. (3.26) forgets the margin of Eq. (3.20), and the box of the input; both are here, the margin with an error of its own for each "
+    "residual, and |u| in place of its largest value",
+    "Sec. 3.4.2: the loss lacks its square, and the update has the wrong sign; here Adam, stopped by the loss at states kept apart",
 )
 
 LEARNED_COLOR, TRUE_COLOR, PRINTED_COLOR, NOMINAL_COLOR = COLORS[:4]
@@ -75,12 +77,26 @@ def seeds(sample: Sample) -> list[int]:
     return np.random.SeedSequence(sample.seed).generate_state(QUICK_LEARNINGS if sample.quick else LEARNINGS).tolist()
 
 
+def learning(sample: Sample) -> str:
+    """How it is learned."""
+    states, epochs = settings(sample)
+    return (
+        f"{len(seeds(sample))} learnings from {states} states each, network 100-30 ReLU, Adam, up to {epochs} epochs, margin of the "
+        "held-out errors at the 95 % level"
+    )
+
+
+def parameters(system: ControlAffineSDE) -> dict[str, float]:
+    """Parameters of a system by their names."""
+    return {symbol.name: value for symbol, value in system.parameters.items()}
+
+
 @lru_cache(maxsize=8)
 def residuals(env_id: str, sample: Sample, **model: float) -> tuple[ResidualModel, ...]:
     """What is learned of a problem, anew for each repetition; remembered, for two figures show the same."""
     problem = load_problem(env_id, {"model": model or None})
     states, epochs = settings(sample)
-    return tuple(learn_residual(problem, states=states, epochs=epochs, seed=seed) for seed in seeds(sample))
+    return tuple(learn_residual(problem, states=states, label_dt=LABEL_STEP, epochs=epochs, seed=seed) for seed in seeds(sample))
 
 
 def runs(
@@ -100,11 +116,11 @@ def cut(states: np.ndarray, h: np.ndarray) -> Run:
     return Run(states[present], h[present])
 
 
-def over_learnings(name: str, values: Sequence[float], unit: str, printed: float | None = None) -> Number:
-    """Mean of a quantity, with its interval over the repetitions of the learning."""
+def over_learnings(name: str, values: Sequence[float], unit: str, least: float = -math.inf) -> Number:
+    """Mean of a quantity that is not printed and at least so much, with its interval over the repetitions of the learning."""
     mean = math.fsum(values) / len(values)
-    low, high = repeated_interval(values, (mean, mean), 0.95, (-math.inf, math.inf))
-    return Number(name, mean, low, high, printed, unit=unit)
+    low, high = repeated_interval(values, (mean, mean), 0.95, (least, math.inf))
+    return Number(name, mean, low, high, unit=unit)
 
 
 def rates_around(problem: SafetyProblem, sample: Sample, models: Sequence[ResidualModel], gains: str) -> list[Number]:
@@ -116,14 +132,9 @@ def rates_around(problem: SafetyProblem, sample: Sample, models: Sequence[Residu
 
     nominal, true = row(f"hocbf:p={gains}"), row(f"hocbf:p={gains}", knowledge="plant")
     learned = pooled([row(f"learned-hocbf:p={gains}", learned=(model,)) for model in models], 0.95)
+    rate, low, high = (100 * learned[key] for key in ("safety_rate", "ci_low", "ci_high"))
     return [
-        Number(
-            "safe around the start, learned",
-            100 * learned["safety_rate"],
-            100 * learned["ci_low"],
-            100 * learned["ci_high"],
-            unit="%",
-        ),
+        Number("safe around the start, learned", rate, low, high, unit="%"),
         Number.rate("safe around the start, nominal", nominal["safe"], nominal["episodes"]),
         Number.rate("safe around the start, true", true["safe"], true["episodes"]),
     ]

@@ -14,7 +14,7 @@ from PIL import Image
 from agents.evaluation import package_versions
 from safe_envs.files import write_atomically
 from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
-from scripts.reproduce.verdict import RULES, Judgement, agrees, judge
+from scripts.reproduce.verdict import RULES, Judgement, judge
 
 _COLOURS = 64
 """Of a picture on the page, which need not be larger than its lines and few areas ask for."""
@@ -33,15 +33,21 @@ class _Entry:
     @property
     def settings(self) -> list[tuple[str, Sequence[Number]]]:
         """The tables of numbers, with their headings."""
-        tables = [("", self.outcome.numbers), *((f"With {name}", found.numbers) for name, found in self.outcome.elsewhere.items())]
+        tables = [
+            ("", self.outcome.numbers),
+            *((f"Other setting: {name}", found.numbers) for name, found in self.outcome.elsewhere.items()),
+        ]
         tables.append(("By the printed formula", self.outcome.as_printed))
         return [(heading, numbers) for heading, numbers in tables if numbers]
 
     @property
-    def claims(self) -> list[Claim]:
-        """The claims, and those with other settings by their names."""
-        others = [replace(c, sentence=f"With {name}: {c.sentence}") for name, found in self.outcome.elsewhere.items() for c in found.claims]
-        return [*self.outcome.claims, *others]
+    def checks(self) -> list[tuple[str, list[Claim]]]:
+        """Claims of the thesis and checks of ours, with their headings; those of another setting by its name."""
+        claims = [*self.outcome.claims]
+        for name, found in self.outcome.elsewhere.items():
+            claims += [replace(claim, sentence=f"{claim.sentence} (other setting: {name})") for claim in found.claims]
+        both = [("claim of the thesis", [c for c in claims if c.printed]), ("check of ours", [c for c in claims if not c.printed])]
+        return [(heading, some) for heading, some in both if some]
 
 
 def write_page(folder: Path, found: Sequence[tuple[Artefact, Outcome, float]], sample: Sample) -> None:
@@ -52,7 +58,7 @@ def write_page(folder: Path, found: Sequence[tuple[Artefact, Outcome, float]], s
         found: artefacts with their outcomes and the seconds that these took.
         sample: by which they were computed.
     """
-    entries = [_Entry(a, o, s, judge(a, o), _picture(folder, a)) for a, o, s in found]
+    entries = [_Entry(a, o, s, judge(a, o, sample), _picture(folder, a)) for a, o, s in found]
     environment = Environment(
         loader=PackageLoader("scripts.reproduce", "templates"),
         undefined=StrictUndefined,
@@ -60,10 +66,10 @@ def write_page(folder: Path, found: Sequence[tuple[Artefact, Outcome, float]], s
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"value": _value, "range": _range, "printed": _printed}
+    environment.filters |= {"value": _value, "range": _range, "printed": _printed, "cell": _cell}
     for name in ("index.html", "index.md"):
         text = environment.get_template(f"{name}.jinja").render(
-            entries=entries, sample=sample, rules=RULES, versions=package_versions(), agrees=agrees, seconds=sum(e.seconds for e in entries)
+            entries=entries, sample=sample, rules=RULES, versions=package_versions(), seconds=sum(e.seconds for e in entries)
         )
         write_atomically(folder / name, lambda part, text=text: part.write_text(text))
 
@@ -99,6 +105,11 @@ def _printed(number: Number) -> str:
         return "-"
     size = f" (of {number.printed_trials})" if number.printed_trials else ""
     return f"{number.printed:g}{_unit(number.unit)}{size}"
+
+
+def _cell(text: str) -> str:
+    """As a cell of a Markdown table."""
+    return text.replace("|", "\\|")
 
 
 def _quantity(value: float, unit: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,26 +20,31 @@ from scripts.figure import QUIET, UNSAFE, add_legend
 from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
 from scripts.reproduce.learned_runs import (
     CORRECTED,
+    EPISODES,
     LEARNED_COLOR,
-    LEARNING,
     NOMINAL_COLOR,
     PRINTED_COLOR,
     TRUE_COLOR,
     Run,
     cut,
+    learning,
     over_learnings,
+    parameters,
     rates_around,
     residuals,
     runs,
     thinned,
 )
 from wrappers import AffineConstraint, Condition, SafetyFilterVectorWrapper
+from wrappers.learning.residual import ResidualModel
 
 QUADROTOR = "QuadrotorAltitude-v0"
 GAINS = (2.0, 8.0)  # p_1, p_2, 1/s
 CENTER, HALF_WIDTH = 5.0, 2.0  # c and p of the band, m
 LEAST_STEPS = 140  # control periods: past the first time that the nominal derivatives leave the band
 _GAINS = ",".join(f"{gain:g}" for gain in GAINS)
+
+Altitudes = Mapping[str, Sequence[Run]]  # by what the filter knows: one run for each learning, one each without learning
 
 
 @dataclass(frozen=True)
@@ -79,60 +84,76 @@ def printed_run(problem: SafetyProblem, knowledge: str) -> Run:
 
 def compute(sample: Sample) -> Outcome:
     """Altitudes under all filters."""
-    problem = load_problem(QUADROTOR, {"start": "thesis"})
-    problem = problem.configured(horizon=problem.dt * max(LEAST_STEPS, sample.work(problem.steps)))
-    models = residuals(QUADROTOR, sample)
-    exact = f"hocbf:p={_GAINS}"
-    nominal, none = runs(problem, [exact, "none"])
-    (true,) = runs(problem, [exact], knowledge="plant")
-    learned = [runs(problem, [f"learned-hocbf:p={_GAINS}"], model)[0] for model in models]
+    problem, models = hover(sample), residuals(QUADROTOR, sample)
+    found = altitudes(problem, models)
     printed = {"nominal": printed_run(problem, "model"), "true": printed_run(problem, "plant")}
-    found = {"nominal": nominal, "true": true, "none": none}
-    heights = np.concatenate([run.states[:, 0] for run in learned])
-    wandering = printed["true"]
+    pictures = {**{kind: run for kind, (run, *_) in found.items()}, "printed": printed["true"]}
     return Outcome(
         numbers=[
-            over_learnings("smallest h, learned", [run.smallest for run in learned], ""),
-            *(Number(f"smallest h, {kind}", run.smallest) for kind, run in found.items()),
-            Number("time in the workspace, true", true.steps * problem.dt, unit="s"),
+            over_learnings("smallest h, learned", [run.smallest for run in found["learned"]], ""),
+            *(Number(f"smallest h, {kind}", found[kind][0].smallest) for kind in ("nominal", "true", "none")),
+            Number("time in the workspace, true", found["true"][0].steps * problem.dt, unit="s"),
             *rates_around(problem, sample, models, _GAINS),
         ],
         as_printed=[
             *(Number(f"smallest h, {kind}", run.smallest) for kind, run in printed.items()),
-            Number("time in the workspace, true", wandering.steps * problem.dt, unit="s"),
+            Number("time in the workspace, true", printed["true"].steps * problem.dt, unit="s"),
         ],
-        claims=[
-            Claim(
-                "With the nominal derivatives the altitude leaves the band",
-                nominal.smallest < 0,
-                f"smallest h {nominal.smallest:.3g}, altitude {_range(nominal.states[:, 0])}",
-            ),
-            Claim(
-                "With the learned derivatives the altitude stays in the band",
-                min(run.smallest for run in learned) > 0,
-                f"smallest h over the learnings {min(run.smallest for run in learned):.3g}, altitude {_range(heights)}",
-            ),
-        ],
+        claims=altitude_claims(found),
         data={
-            kind: {"time": thinned(problem.dt * np.arange(len(run.h))), "z": thinned(run.states[:, 0])}
-            for kind, run in {**found, "learned": learned[0], "printed": wandering}.items()
+            kind: {"time": thinned(problem.dt * np.arange(len(run.h))), "z": thinned(run.states[:, 0])} for kind, run in pictures.items()
         },
         notes=[
-            f"Eq. (3.33) as printed, with the true mass: h < 0 from t = {_fall(wandering, problem.dt)} s on, and the altitude leaves "
-            f"[0, 10] m after {wandering.steps * problem.dt:.3g} s of {problem.horizon:g} s, at {wandering.states[-1, 0]:.3g} m"
-            if wandering.steps < problem.steps
-            else f"Eq. (3.33) as printed, with the true mass: smallest h {wandering.smallest:.3g}",
-            f"without a filter the altitude goes from {_range(none.states[:, 0])}, for the thrust law, too, believes in the wrong mass",
+            f"Eq. (3.33) as printed, with the true mass: {fate(printed['true'], problem)}",
+            f"without a filter the altitude goes from {_range(found['none'])}, for the thrust law, too, believes in the wrong mass",
         ],
     )
 
 
-def _range(heights: np.ndarray) -> str:
+def hover(sample: Sample) -> SafetyProblem:
+    """The problem from the printed start, as long as the sample lets it be."""
+    problem = load_problem(QUADROTOR, {"start": "thesis"})
+    return problem.configured(horizon=problem.dt * max(LEAST_STEPS, sample.work(problem.steps)))
+
+
+def altitudes(problem: SafetyProblem, models: Sequence[ResidualModel]) -> dict[str, list[Run]]:
+    """Trajectories: with learned derivatives for each learning, one each with others and without a filter."""
+    exact = f"hocbf:p={_GAINS}"
+    nominal, none = runs(problem, [exact, "none"])
+    learned = [runs(problem, [f"learned-hocbf:p={_GAINS}"], model)[0] for model in models]
+    return {"nominal": [nominal], "true": runs(problem, [exact], knowledge="plant"), "none": [none], "learned": learned}
+
+
+def altitude_claims(found: Altitudes) -> list[Claim]:
+    """The text about the figure."""
+    nominal, lowest = found["nominal"][0].smallest, min(run.smallest for run in found["learned"])
+    return [
+        Claim(
+            "With the nominal derivatives the altitude leaves the band",
+            nominal < 0,
+            f"smallest h {nominal:.3g}, altitude {_range(found['nominal'])}",
+        ),
+        Claim(
+            "With the learned derivatives the altitude stays in the band",
+            lowest > 0,
+            f"smallest h over the learnings {lowest:.3g}, altitude {_range(found['learned'])}",
+        ),
+    ]
+
+
+def fate(run: Run, problem: SafetyProblem) -> str:
+    """When a run leaves the band and the workspace, if it does."""
+    low, high = problem.states[0].low, problem.states[0].high
+    first = f"h < 0 from t = {problem.dt * int(np.argmax(run.h < 0)):.3g} s" if run.smallest < 0 else "h stays at 0 or above"
+    if run.steps >= problem.steps:
+        return f"smallest h {run.smallest:.3g}; {first}"
+    end = f"after {run.steps * problem.dt:.3g} s of {problem.horizon:g} s, at {run.states[-1, 0]:.3g} m"
+    return f"{first}, and the state leaves the workspace, of which the altitudes are [{low:g}, {high:g}] m, {end}"
+
+
+def _range(each: Sequence[Run]) -> str:
+    heights = np.concatenate([run.states[:, 0] for run in each])
     return f"{heights.min():.2f} to {heights.max():.2f} m"
-
-
-def _fall(run: Run, dt: float) -> str:
-    return f"{dt * int(np.argmax(run.h < 0)):.3g}" if run.smallest < 0 else "never"
 
 
 def draw(figure: Figure, outcome: Outcome) -> None:
@@ -158,23 +179,35 @@ def draw(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
 
+def setting(sample: Sample) -> tuple[str, ...]:
+    """How it is simulated."""
+    problem = hover(sample)
+    plant, model = parameters(problem.plant), parameters(problem.model)
+    return (
+        f"{QUADROTOR}: plant {plant['m']:g} kg, model {model['m']:g} kg, band {CENTER:g} +- {HALF_WIDTH:g} m, p_1 = {GAINS[0]:g}, p_2 = "
+        f"{GAINS[1]:g} 1/s, reference 5 + 2.5 sin(t) m, start (5 m, 0), dt {problem.dt:g} s, {problem.horizon:g} s",
+        learning(sample),
+        f"rates from {sample.size(EPISODES)} starts within .5 m and .5 m/s of the printed one",
+        "the picture shows the first learning",
+    )
+
+
 ARTEFACTS: tuple[Artefact, ...] = (
     Artefact(
         name="figure-3.3",
         title="Altitude of a quadrotor with nominal and learned derivatives of the HOCBF",
         compute=compute,
         draw=draw,
-        setting=(
-            f"{QUADROTOR}: plant .6 kg, model .4 kg, band 5 +- 2 m, p_1 = 2, p_2 = 8 1/s, reference 5 + 2.5 sin(t) m, start (5 m, 0)",
-            LEARNING,
-        ),
+        setting=setting,
         chosen=(
-            "c = 5 m, g = 9.81 m/s^2, level flight, thrust U = m_model (g + 6 e + 4 edot), 0 <= U <= 12 N, dt .05 s, 30 s",
-            "starts within .5 m and .5 m/s of the printed one for rates",
+            "c = 5 m, the middle of the reference; g = 9.81 m/s^2, level flight, at rest at first; 0 <= U <= 12 N, dt and duration",
+            "thrust U = m_model (g + 6 e + 4 edot), where the print has a PID controller without its gains",
+            "network inputs z and zdot",
         ),
         corrections=(
             "Eq. (3.33): L_f^2 h is +4 (z-c)^3 g/p^4 - 12 (z-c)^2 zdot^2/p^4, and L_g L_f h has a minus; nothing here is derived by hand",
             "Eq. (3.34), (3.36): E stands inside its own argument, and hats are missing; E = hddot - hddot of the model",
+            "Sec. 3.5.2: the two inputs that are learned from come of two PID controllers; here 3 and 9 N in every state, always far apart",
             *CORRECTED,
         ),
         size=(7.0, 4.0),

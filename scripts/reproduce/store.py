@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterable
 from dataclasses import asdict
 from functools import cache
 from importlib.resources import files
@@ -14,6 +15,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from agents.evaluation import package_versions
+from safe_envs.errors import ConfigurationError
 from safe_envs.files import write_atomically, write_json
 from scripts.figure import STYLE
 from scripts.reproduce.artefact import Artefact, Outcome, Sample
@@ -35,7 +37,25 @@ def source_checksum() -> str:
 
 def configuration(artefact: Artefact, sample: Sample) -> dict[str, Any]:
     """What a result hangs on."""
-    return {"artefact": artefact.name, "sample": asdict(sample), "versions": package_versions(), "source": source_checksum()}
+    versions = {**package_versions(), "matplotlib": mpl.__version__}
+    return {"artefact": artefact.name, "sample": asdict(sample), "versions": versions, "source": source_checksum()}
+
+
+def require_same_sample(folder: Path, artefacts: Iterable[Artefact], sample: Sample) -> None:
+    """Check that a folder holds no results of another sample, which would be written over.
+
+    Raises:
+        ConfigurationError: it does.
+    """
+    for artefact in artefacts:
+        try:
+            found = json.loads((folder / f"{artefact.name}.json").read_text())["configuration"]["sample"]
+        except (OSError, LookupError, TypeError, ValueError):
+            continue
+        if found != asdict(sample):
+            raise ConfigurationError(
+                f"{folder} holds {artefact.name} by other options: {json.dumps(found)}; give another --out, or the same options"
+            )
 
 
 def read(folder: Path, artefact: Artefact, sample: Sample) -> tuple[Outcome, float] | None:
@@ -52,7 +72,8 @@ def read(folder: Path, artefact: Artefact, sample: Sample) -> tuple[Outcome, flo
 
 
 def keep(folder: Path, artefact: Artefact, sample: Sample, outcome: Outcome, seconds: float) -> None:
-    """Draw the outcome, and write it; the JSON comes last, so that it stands for all."""
+    """Draw the outcome, and write it; the JSON goes first and comes last, so that it stands for all."""
+    (folder / f"{artefact.name}.json").unlink(missing_ok=True)
     if artefact.draw is not None:
         with mpl.rc_context({**STYLE, "svg.hashsalt": artefact.name}):
             figure = Figure(figsize=artefact.size)

@@ -22,7 +22,7 @@ def coin(computed):
         trials = sample.size(1000)
         return Outcome(
             [Number.rate("heads", trials // 2, trials, 48.0, 50), Number("edge", 0.25, 0.2, 0.3, unit="s")],
-            [Claim("it lands", True, "1 of 1")],
+            [Claim("it lands", True, "1 of 1"), Claim("it rolls", False, "|v| = 0", printed=False)],
             data={"x": [0.0, 1.0]},
             notes=["a < b"],
         )
@@ -30,7 +30,9 @@ def coin(computed):
     def draw(figure, outcome):
         figure.subplots().plot(outcome.data["x"])
 
-    return Artefact("table-0.1", "A coin", compute, ("thrown",), ("the coin",), ("Eq 0.1: a sign",), draw=draw)
+    return Artefact(
+        "table-0.1", "A coin", compute, lambda sample: (f"thrown {sample.size(1000)} times",), ("the coin",), ("Eq 0.1: a sign",), draw=draw
+    )
 
 
 @pytest.fixture

@@ -1,0 +1,104 @@
+"""The same episodes under several filters: when each is first unsafe, and by how much two filters differ."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from agents.episodes import play
+from agents.policy import Policy
+from agents.statistics import paired_difference_interval
+from safe_envs.problem import SafetyProblem
+from safe_envs.vector import SafeVectorEnv
+from scripts.reproduce.artefact import Number
+from wrappers import Condition, SafetyFilterVectorWrapper, parse_conditions
+
+_WAVE = 1024
+
+
+@dataclass(frozen=True)
+class Exits:
+    """When the episodes of a filter are first unsafe.
+
+    Attributes:
+        instant: first control instant with h <= 0 of each episode, past the last one if there is none, shape (episodes,).
+        infeasible: share of the steps before it in which no action meets the condition.
+    """
+
+    instant: np.ndarray
+    infeasible: float
+
+    def safe(self, step: int) -> np.ndarray:
+        """Which episodes are safe up to a control instant, that one included, shape (episodes,)."""
+        return self.instant > step
+
+    def rate(self, name: str, step: int) -> Number:
+        """The share of these."""
+        return Number.rate(name, int(self.safe(step).sum()), len(self.instant))
+
+
+def exits(problem: SafetyProblem, condition: str | Condition, policy: Policy, episodes: int, seed: int) -> Exits:
+    """Simulate a filter over a policy; episode i has the same start and noise under every filter.
+
+    Args:
+        problem: with its horizon.
+        condition: of the filter, or its text.
+        policy: whose actions are filtered.
+        episodes: how many.
+        seed: of all of them.
+    """
+    conditions = parse_conditions(condition, problem) if isinstance(condition, str) else condition
+    env = SafetyFilterVectorWrapper(SafeVectorEnv(problem, min(episodes, _WAVE)), conditions)
+    instants, counted, infeasible = [], 0, 0
+    for played in play(env, policy, range(episodes), seed):
+        wave, count = played.wave, played.count
+        instants.append(wave.first_violation(problem.steps + 1)[:count])
+        counted += int(wave.counted[:count].sum())
+        infeasible += int(wave.infeasible[:count].sum())
+    return Exits(np.concatenate(instants), infeasible / max(counted, 1))
+
+
+def difference(name: str, first: np.ndarray, second: np.ndarray) -> Number:
+    """By how much the rate of one filter is above another's on the same episodes, in points, with its paired interval.
+
+    Args:
+        name: of the number.
+        first: which episodes are safe with the one, shape (episodes,).
+        second: with the other.
+    """
+    table = [int(both.sum()) for both in (first & second, first & ~second, ~first & second, ~first & ~second)]
+    low, high = paired_difference_interval(*table)
+    return Number(name, 100 * (table[1] - table[2]) / len(first), 100 * low, 100 * high, unit="points")
+
+
+def mean_of(name: str, values: Sequence[float] | np.ndarray, bounds: tuple[float, float], unit: str) -> Number:
+    """The mean of a quantity over independent episodes or starts, with Student's interval, which `bounds` end.
+
+    Args:
+        name: of the number.
+        values: at least one; of a single one nothing is known but the bounds.
+        bounds: between which the quantity always is.
+        unit: of all of them.
+    """
+    mean, count = float(np.mean(values)), len(values)
+    half = float(stdtrit(count - 1, 0.975) * np.std(values, ddof=1)) / math.sqrt(count) if count > 1 else math.inf
+    return Number(name, mean, max(mean - half, bounds[0]), min(mean + half, bounds[1]), unit=unit)
+
+
+def is_above(number: Number, value: float = 0.0) -> bool:
+    """Whether the whole interval of a number is above a value."""
+    return number.low is not None and number.low > value
+
+
+def is_below(number: Number, value: float = 0.0) -> bool:
+    """Whether the whole interval of a number is below a value."""
+    return number.high is not None and number.high < value
+
+
+def with_interval(number: Number) -> str:
+    """A difference with its sign and its interval, as text."""
+    return f"{number.ours:+.1f} [{number.low:.1f}, {number.high:.1f}]"
