@@ -146,7 +146,7 @@ def compute_clearance(sample: Sample) -> Outcome:
     return Outcome(
         numbers=_clearance_numbers(found),
         claims=clearance_claims(found, problem),
-        elsewhere={AT_REST: Outcome(_clearance_numbers(at_rest), clearance_claims(at_rest, problem))},
+        elsewhere={AT_REST: Outcome(_clearance_numbers(at_rest), _printed(at_rest, problem))},
         as_printed=[
             Number("smallest h, nominal", at_rest["nominal"][0].smallest, unit="m^2"),
             Number("smallest h, true", blind.smallest, unit="m^2"),
@@ -186,8 +186,12 @@ def clearance_claims(found: Ways, problem: SafetyProblem) -> list[Claim]:
     ]
 
 
+def _printed(found: Ways, problem: SafetyProblem) -> list[Claim]:
+    return [claim for claim in clearance_claims(found, problem) if claim.printed]
+
+
 def _held(found: Ways, problem: SafetyProblem) -> str:
-    claims = [claim for claim in clearance_claims(found, problem) if claim.printed]
+    claims = _printed(found, problem)
     return f"{sum(claim.holds for claim in claims)} of {len(claims)}"
 
 
