@@ -39,7 +39,7 @@ class Repetitions:
         paths: how many these are.
         outside: how many of them start where h <= 0.
         kept_length: mean length of those that do not violate, in control periods; None without any.
-        length: their mean length, up to a violation, in control periods.
+        length: mean length of all of these, up to a violation, in control periods.
         stuck: for each repetition all of whose paths stood at one level, h there.
         endless: for each one that fell below `LEAST`, h of its last level.
         climbed: of the paths that violate, as in `agents.drifting.DriftingEnv`, shape (V, 2).

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -92,6 +92,9 @@ def _compute(missing: Sequence[Artefact], sample: Sample, out: Path, jobs: int, 
                 failures[name] = f"{type(error).__name__}: {error}"
             tell(done / len(names))
     except KeyboardInterrupt:
+        # A job manager tells this process only, and the others would compute on to their ends.
+        for process in active_children():
+            process.terminate()
         print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
         raise
     return failures

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import time
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -124,6 +126,23 @@ def test_an_interrupt_ends_a_single_job_at_once(safe_envs_command, catalogue, co
     assert "Stopped. The same command goes on after what is in report." in err
     assert computed == [1]
     assert not list(Path("report").glob("table*"))
+
+
+def test_an_interrupt_ends_the_processes(monkeypatch, tmp_path, coin):
+    from scripts.reproduce import command
+
+    def interrupted(*_):
+        yield "table-0.1", None
+        raise KeyboardInterrupt
+
+    context = get_context("spawn")
+    process = context.Process(target=time.sleep, args=(600,), daemon=True)
+    process.start()
+    monkeypatch.setattr(command, "_in_processes", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        command._compute([coin, coin], Sample(), tmp_path, 2, print)
+    process.join(60)
+    assert process.exitcode is not None
 
 
 def test_a_picture_without_its_numbers_is_not_taken_for_a_result(tmp_path, coin, monkeypatch):
