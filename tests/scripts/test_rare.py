@@ -23,6 +23,9 @@ def test_acceptance_in_small(safe_envs_command):
     assert law < 1e-6
     assert row["ci_low"] < law < row["ci_high"]
     assert f"{row['probability']:.3g} [" in out
+    check = row["check"]
+    assert f"the check on scbf, by {check['method']}, is {check['probability']:.3g} [{check['ci_low']:.3g}" in out
+    assert max(map(len, out.splitlines()[3:7])) < 140
 
 
 def test_reason_in_place_of_a_number(safe_envs_command):
@@ -59,14 +62,6 @@ def test_rare_violations_of_episodes_that_end_early_are_told(safe_envs_command):
     (row,) = strictly("out.json")["rows"]
     assert 0 < row["plain"]["kept_length"] < 450
     assert f"the mean episode without a violation ends after {row['plain']['kept_length']:.1f} of 500 steps" in out
-
-
-def test_the_other_method_is_a_check_below(safe_envs_command):
-    out = safe_envs_command(*ACC, "--rare", *FEW, "--json", "rare.json")[1]
-    (row,) = strictly("rare.json")["rows"]
-    check = row["check"]
-    assert f"the check on scbf, by {check['method']}, is {check['probability']:.3g} [{check['ci_low']:.3g}" in out
-    assert max(map(len, out.splitlines()[3:7])) < 140
 
 
 def test_continuous_monitoring_is_told_in_the_heading(safe_envs_command):
