@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from matplotlib.figure import Figure
 
-from agents.statistics import rate_interval
+from agents.statistics import rate_interval, repeated_interval
 from safe_envs.errors import require_whole
 
 
@@ -75,6 +76,22 @@ class Number:
         """
         low, high = rate_interval(safe, trials)
         return cls(name, 100 * safe / trials, 100 * low, 100 * high, printed, printed_trials, "%")
+
+    @classmethod
+    def mean(cls, name: str, values: Any, unit: str = "", least: float = -math.inf, most: float = math.inf) -> Number:
+        """The mean of a quantity over independent repetitions, such as learnings, starts or episodes, with Student's interval.
+
+        Args:
+            name: see the class.
+            values: of the repetitions, shape (R,); a single one says nothing but the bounds.
+            unit: see the class.
+            least: lower bound of the quantity.
+            most: upper bound.
+        """
+        mean = math.fsum(values) / len(values)
+        bounds = least, most
+        low, high = repeated_interval(values, (mean, mean), 0.95, bounds) if len(values) > 1 else bounds
+        return cls(name, mean, low, high, unit=unit)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,6 @@ from scripts.reproduce.identifications import (
     SIGMA_ERRATA,
     STARTS,
     STEPS,
-    averaged,
     draw_estimate,
     draw_levels,
     estimated_drift,
@@ -62,7 +61,7 @@ def _drift_picture(sample: Sample) -> Outcome:
     sigma, rows = noise_level(problem, "sigma_1"), 2 * STARTS * STEPS
     law = float(np.sqrt(learned[0].features.count * sigma**2 / (REPETITIONS[-1] * rows * problem.dt)))
     most = problem.box[0][1] / {p.name: v for p, v in problem.plant.parameters.items()}["M"]
-    by_data = averaged("rms error in standard deviations of the posterior", doubts)
+    by_data = Number.mean("rms error in standard deviations of the posterior", doubts, least=0.0)
     order = x[:, 0].argsort()
     shown: dict[str, Any] = {"v": x[order, 0].tolist()}
     for i in (0, 1):

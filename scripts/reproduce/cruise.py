@@ -31,7 +31,7 @@ from scripts.reproduce.cruise_setting import (
     Setting,
     describe,
 )
-from scripts.reproduce.paired_episodes import difference, exits, is_above, mean_of, with_interval
+from scripts.reproduce.paired_episodes import difference, exits, is_above, with_interval
 
 COARSE = 0.2
 """Control period of a quick look at the table, in s."""
@@ -74,7 +74,7 @@ def claims_of_table(safe: Safe) -> list[Claim]:
     unbounded = difference("", safe["SRCBF, unbounded"], safe["SCBF, unbounded"])
     bounded = difference("", safe["SCBF, bounded"], safe["SRCBF, bounded"])
     lost = {name: safe[f"{name}, unbounded"].astype(float) - safe[f"{name}, bounded"] for name in ("SRCBF", "SCBF")}
-    more = mean_of("", 100 * (lost["SRCBF"] - lost["SCBF"]), (-200.0, 200.0), "points")
+    more = Number.mean("", 100 * (lost["SRCBF"] - lost["SCBF"]), "points", -200.0, 200.0)
     each = ", ".join(f"{name} {_change(values)}" for name, values in lost.items())
     return [
         Claim("with unbounded control SRCBF is the safer one (Sec. 4.3.1, 4.2.3)", is_above(unbounded), _by(unbounded, "SRCBF - SCBF")),

@@ -31,7 +31,7 @@ from scripts.reproduce.cruise_setting import (
     Setting,
     describe,
 )
-from scripts.reproduce.paired_episodes import is_above, mean_of
+from scripts.reproduce.paired_episodes import is_above
 from wrappers import SafetyFilter, SafetyFilterVectorWrapper, parse_conditions
 
 NEAR = 20.0
@@ -127,7 +127,7 @@ def outcome_of(runs: Runs, forces: Mapping[str, np.ndarray]) -> Outcome:
     """Numbers and claims of the figure."""
     larger, smaller = (share_of_time(runs[a], runs[b]) for a, b in (("SRCBF", "SCBF"), ("SCBF", "SRCBF")))
     shares = [
-        mean_of(f"time in which J of SRCBF is the {word} one", 100 * share, (0.0, 100.0), "%")
+        Number.mean(f"time in which J of SRCBF is the {word} one", 100 * share, "%", 0.0, 100.0)
         for word, share in (("larger", larger), ("smaller", smaller))
     ]
     return Outcome(
@@ -159,7 +159,7 @@ def median_peak(name: str, peaks: np.ndarray) -> Number:
 
 def claim_on_time(larger: np.ndarray, smaller: np.ndarray) -> Claim:
     """By the share of time in each episode, so that a few peaks do not decide."""
-    ahead = mean_of("", 100 * (larger - smaller), (-100.0, 100.0), "points")
+    ahead = Number.mean("", 100 * (larger - smaller), "points", -100.0, 100.0)
     return Claim(
         "SRCBF requires the higher control effort J = u^2 over time",
         is_above(ahead),

@@ -14,7 +14,7 @@ from agents.problems import load_problem
 from agents.statistics import repeated_interval
 from safe_envs.problem import SafetyProblem
 from scripts.figure import COLORS, add_legend
-from scripts.reproduce.artefact import Artefact, Claim, Outcome, Sample
+from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
 from scripts.reproduce.identifications import (
     AT_REST,
     CONFIDENCE,
@@ -24,7 +24,6 @@ from scripts.reproduce.identifications import (
     REPETITIONS,
     STARTS,
     STEPS,
-    averaged,
     draw_estimate,
     estimated_drift,
     identified_from,
@@ -151,12 +150,12 @@ def _drift_errors(sample: Sample) -> Outcome:
     many, doubt = found[REPETITIONS[-1]], f"rms error in standard deviations of the posterior, K = {REPETITIONS[-1]}"
     widths = [n.high / n.low for n in numbers if n.low and n.high]
     return Outcome(
-        numbers=[*numbers, averaged(doubt, many.doubts)],
+        numbers=[*numbers, Number.mean(doubt, many.doubts, least=0.0)],
         claims=[
             *(falls(name, by) for name, by in squares.items()),
             *(falls_as_printed(name, by, _PRINTED_MSE[name]) for name, by in squares.items()),
         ],
-        as_printed=[averaged(doubt, many.overconfident)],
+        as_printed=[Number.mean(doubt, many.overconfident, least=0.0)],
         notes=[
             f"The errors of single identifications differ so much that the intervals span {min(widths):.0f} to {max(widths):.0f}-fold: a "
             "printed number of one identification tells little.",
@@ -170,7 +169,7 @@ def _beside_the_law(problem: SafetyProblem, x: np.ndarray, chosen: range, follow
     spread_out = study(problem, x, REPETITIONS[0], chosen, STARTS * STEPS, 1)
     sigma = noise_level(problem, "sigma_1")
     law = Features.of(problem, DEGREE).count * sigma**2 / (REPETITIONS[0] * STARTS * STEPS * problem.dt)
-    ratio = averaged("ratio", spread_out.squares.mean(axis=1) / law)
+    ratio = Number.mean("ratio", spread_out.squares.mean(axis=1) / law, least=0.0)
     return (
         f"From {STARTS * STEPS} states drawn over the disk the MSE at K = {REPETITIONS[0]} is {ratio.ours:.2f} [{ratio.low:.2f}, "
         f"{ratio.high:.2f}] times M sigma^2/(K R dt) = {law:.2g} (mean of {len(chosen)} identifications); from as many on {STARTS} "
@@ -185,8 +184,10 @@ def _drift_picture(sample: Sample) -> Outcome:
     chosen = seeds(sample, _PICTURED)
     found = {k: study(problem, x, k, chosen, STARTS, STEPS) for k in REPETITIONS}
     numbers = [predicted(f"rms error of f_2, K = {k}", np.sqrt(s.squares[:, 1]), unit="1/s") for k, s in found.items()]
-    covered = averaged("rms error in standard deviations of the posterior, all K", np.concatenate([s.doubts for s in found.values()]))
-    printed = averaged(covered.name, np.concatenate([s.overconfident for s in found.values()]))
+    covered = Number.mean(
+        "rms error in standard deviations of the posterior, all K", np.concatenate([s.doubts for s in found.values()]), least=0.0
+    )
+    printed = Number.mean(covered.name, np.concatenate([s.overconfident for s in found.values()]), least=0.0)
     return Outcome(
         numbers=[*numbers, covered],
         claims=[falls("f_2 = x_1^3", {k: np.sqrt(s.squares[:, 1]) for k, s in found.items()})],

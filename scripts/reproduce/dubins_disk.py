@@ -15,7 +15,7 @@ from agents.problems import load_problem
 from safe_envs.problem import SafetyProblem
 from scripts.figure import COLORS, QUIET, UNSAFE, add_legend
 from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
-from scripts.reproduce.learned_runs import CORRECTED, Run, learning, over_learnings, parameters, residuals, runs, seeds, thinned
+from scripts.reproduce.learned_runs import CORRECTED, Run, learning, parameters, residuals, runs, seeds, thinned
 from scripts.reproduce.printed_differences import printed_residuals
 from wrappers import HOCBF
 from wrappers.learning.residual import ResidualModel
@@ -85,7 +85,7 @@ def disk_numbers(found: Learnings, printed: float | None = None) -> list[Number]
     each = zip(RATES, zip(*map(_smallest, found), strict=True), strict=True)
     return [
         Number(SAFE_COUNT, float(min(_counts(found))), printed=printed),
-        *(over_learnings(f"smallest h, p = {p:g}", h, "m^2") for p, h in each),
+        *(Number.mean(f"smallest h, p = {p:g}", h, "m^2") for p, h in each),
     ]
 
 

@@ -26,7 +26,6 @@ from scripts.reproduce.learned_runs import (
     TRUE_COLOR,
     Run,
     learning,
-    over_learnings,
     parameters,
     rates_around,
     residuals,
@@ -61,9 +60,9 @@ def compute_passage(sample: Sample) -> Outcome:
     learned, none = found["learned"], found["none"][0]
     return Outcome(
         numbers=[
-            over_learnings("path, learned", _paths(learned), "m", 0.0),
+            Number.mean("path, learned", _paths(learned), "m", 0.0),
             *(Number(f"path, {kind}", _paths(found[kind])[0], unit="m") for kind in ("nominal", "true", "none")),
-            over_learnings("time to the goal, learned", [run.steps * problem.dt for run in learned], "s", 0.0),
+            Number.mean("time to the goal, learned", [run.steps * problem.dt for run in learned], "s", 0.0),
             Number("time to the goal, none", none.steps * problem.dt, unit="s"),
             Number("lowest speed, learned", float(_speeds(learned, problem.dt).min()), unit="m/s"),
             *rates_around(problem, sample, residuals(OBSTACLE, sample), OBSTACLE_RATES),
@@ -198,9 +197,9 @@ def _held(found: Ways, problem: SafetyProblem) -> str:
 def _clearance_numbers(found: Ways) -> list[Number]:
     others = ("nominal", "true", "none")
     return [
-        over_learnings("smallest h, learned", [run.smallest for run in found["learned"]], "m^2"),
+        Number.mean("smallest h, learned", [run.smallest for run in found["learned"]], "m^2"),
         *(Number(f"smallest h, {kind}", found[kind][0].smallest, unit="m^2") for kind in others),
-        over_learnings("time steps, learned", [float(run.steps) for run in found["learned"]], "", 0.0),
+        Number.mean("time steps, learned", [float(run.steps) for run in found["learned"]], "", 0.0),
         Number("time steps, nominal", float(found["nominal"][0].steps)),
     ]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from agents.episodes import episode_seed
-from scripts.reproduce.artefact import Artefact, Claim, Outcome, Sample
+from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
 from scripts.reproduce.dubins_pictures import draw_points
 from scripts.reproduce.dubins_runs import (
     ALPHAS,
@@ -32,7 +32,7 @@ from scripts.reproduce.dubins_runs import (
     simulate,
     step_of,
 )
-from scripts.reproduce.paired_episodes import Exits, is_above, mean_of, with_interval
+from scripts.reproduce.paired_episodes import Exits, is_above, with_interval
 from wrappers import SCBF
 from wrappers.bounds import theorem_4_2_10_printed, union_bound
 from wrappers.formulas import Formulas
@@ -108,7 +108,7 @@ def _drawn_anew(runs: Sequence[Runs]) -> list[str]:
     """What ten starts say of others."""
     notes = []
     for rival in ALPHAS:
-        gap = mean_of("", [ahead_of(rival, run, HORIZON).ours for run in runs], (-100.0, 100.0), "points")
+        gap = Number.mean("", [ahead_of(rival, run, HORIZON).ours for run in runs], "points", -100.0, 100.0)
         notes.append(f"the print's starts are not given; over random starts anew SCBF - {rival} is {with_interval(gap)} points on average")
     return notes
 

@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import stdtrit
 
-from agents.statistics import repeated_interval
 from safe_envs.problem import SafetyProblem
 from scripts.figure import COLORS, add_legend
 from scripts.reproduce.artefact import Claim, Number, Outcome, Sample
@@ -117,13 +116,6 @@ def credible(name: str, draws: np.ndarray, unit: str) -> Number:
 def _ends(content: float) -> tuple[float, float]:
     """Levels between which there is so much of a distribution."""
     return (1 - content) / 2, (1 + content) / 2
-
-
-def averaged(name: str, values: Any, unit: str = "") -> Number:
-    """The mean of a positive quantity over identifications, with Student's interval of that mean."""
-    mean = float(np.mean(values))
-    low, high = repeated_interval(list(map(float, values)), (mean, mean), CONFIDENCE, (0.0, float("inf")))
-    return Number(name, mean, low, high, unit=unit)
 
 
 def noise_levels(problem: SafetyProblem, sample: Sample, prior: float, unit: tuple[str, ...]) -> Outcome:

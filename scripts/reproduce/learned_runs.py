@@ -13,7 +13,6 @@ import numpy as np
 from agents.evaluation import evaluate
 from agents.problems import load_problem
 from agents.repeats import pooled
-from agents.statistics import repeated_interval
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
 from scripts.figure import COLORS
@@ -114,13 +113,6 @@ def cut(states: np.ndarray, h: np.ndarray) -> Run:
     """The part of a recorded trajectory up to its end."""
     present = np.isfinite(h)
     return Run(states[present], h[present])
-
-
-def over_learnings(name: str, values: Sequence[float], unit: str, least: float = -math.inf) -> Number:
-    """Mean of a quantity that is not printed and at least so much, with its interval over the repetitions of the learning."""
-    mean = math.fsum(values) / len(values)
-    low, high = repeated_interval(values, (mean, mean), 0.95, (least, math.inf))
-    return Number(name, mean, low, high, unit=unit)
 
 
 def rates_around(problem: SafetyProblem, sample: Sample, models: Sequence[ResidualModel], gains: str) -> list[Number]:

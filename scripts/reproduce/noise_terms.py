@@ -13,7 +13,6 @@ import sympy as sp
 from matplotlib.figure import Figure
 
 from agents.problems import load_problem
-from agents.statistics import repeated_interval
 from safe_envs.calculus import gradient, ito_term
 from safe_envs.codegen import compile_function
 from safe_envs.problem import SafetyProblem
@@ -63,8 +62,8 @@ class _Errors:
 
     @property
     def number(self) -> Number:
-        """Their mean."""
-        return Number(_NETWORK, *over_identifications(self.each), unit="1/s")
+        """Their mean. The states at which one network is looked at are not independent of each other: only networks are."""
+        return Number.mean(_NETWORK, self.each, "1/s", least=0.0)
 
 
 @lru_cache(maxsize=16)
@@ -171,14 +170,15 @@ def as_derived(said: str, term: np.ndarray, printed: np.ndarray) -> Claim:
 def learnable(errors: Sequence[float], truth: np.ndarray) -> Claim:
     """Whether networks are nearer to the term than the best constant: then they learned something of its shape."""
     constant = float(np.std(truth))
-    mean, low, high = over_identifications(errors)
-    evidence = f"rms error of the network {mean:.2g} 1/s [{low:.2g}, {high:.2g}], of the best constant {constant:.2g} 1/s"
-    return Claim("what the noise adds to the generator of h can be learned from data", high < constant, evidence)
+    found = Number.mean("", errors, least=0.0)
+    holds = found.high is not None and found.high < constant
+    evidence = f"rms error of the network {found.ours:.2g} 1/s [{found.low:.2g}, {found.high:.2g}], of the best constant {constant:.2g} 1/s"
+    return Claim("what the noise adds to the generator of h can be learned from data", holds, evidence)
 
 
 def near(errors: Sequence[float], truth: np.ndarray) -> Claim:
     """Whether networks are near to the term, by a limit of ours."""
-    share = over_identifications(errors)[0] / _rms(truth)
+    share = float(np.mean(errors)) / _rms(truth)
     sentence = f"the rms error of the network is below {CLOSE:.0%} of the term's rms"
     return Claim(sentence, share < CLOSE, f"it is {share:.1%} of it", printed=False)
 
@@ -201,15 +201,6 @@ def _why_printed_fails(problem: SafetyProblem, first: Lesson, missed: np.ndarray
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def over_identifications(values: Sequence[float]) -> tuple[float, float, float]:
-    """The mean of a positive quantity of several identifications, and its interval over them.
-
-    The states at which one network is looked at are not independent of each other: only networks are.
-    """
-    mean = math.fsum(values) / len(values)
-    return mean, *repeated_interval(values, (mean, mean), 0.95, (0.0, math.inf))
 
 
 def root_mean_square(name: str, values: np.ndarray) -> Number:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
 
 from agents.episodes import play
 from agents.policy import Policy
@@ -73,20 +70,6 @@ def difference(name: str, first: np.ndarray, second: np.ndarray) -> Number:
     table = [int(both.sum()) for both in (first & second, first & ~second, ~first & second, ~first & ~second)]
     low, high = paired_difference_interval(*table)
     return Number(name, 100 * (table[1] - table[2]) / len(first), 100 * low, 100 * high, unit="points")
-
-
-def mean_of(name: str, values: Sequence[float] | np.ndarray, bounds: tuple[float, float], unit: str) -> Number:
-    """The mean of a quantity over independent episodes or starts, with Student's interval, which `bounds` end.
-
-    Args:
-        name: of the number.
-        values: at least one; of a single one nothing is known but the bounds.
-        bounds: between which the quantity always is.
-        unit: of all of them.
-    """
-    mean, count = float(np.mean(values)), len(values)
-    half = float(stdtrit(count - 1, 0.975) * np.std(values, ddof=1)) / math.sqrt(count) if count > 1 else math.inf
-    return Number(name, mean, max(mean - half, bounds[0]), min(mean + half, bounds[1]), unit=unit)
 
 
 def is_above(number: Number, value: float = 0.0) -> bool:

@@ -28,7 +28,6 @@ from scripts.reproduce.learned_runs import (
     Run,
     cut,
     learning,
-    over_learnings,
     parameters,
     rates_around,
     residuals,
@@ -90,7 +89,7 @@ def compute(sample: Sample) -> Outcome:
     pictures = {**{kind: run for kind, (run, *_) in found.items()}, "printed": printed["true"]}
     return Outcome(
         numbers=[
-            over_learnings("smallest h, learned", [run.smallest for run in found["learned"]], ""),
+            Number.mean("smallest h, learned", [run.smallest for run in found["learned"]], ""),
             *(Number(f"smallest h, {kind}", found[kind][0].smallest) for kind in ("nominal", "true", "none")),
             Number("time in the workspace, true", found["true"][0].steps * problem.dt, unit="s"),
             *rates_around(problem, sample, models, _GAINS),

@@ -10,7 +10,7 @@ import pytest
 from agents.problems import load_problem
 from scripts.reproduce import dubins_disk, dubins_learning, quadrotor, verdict
 from scripts.reproduce.artefact import Outcome, Sample
-from scripts.reproduce.learned_runs import Run, over_learnings
+from scripts.reproduce.learned_runs import Run
 
 GOAL = (3.0, 1.5)
 OBSTACLE = load_problem(dubins_learning.OBSTACLE)
@@ -131,13 +131,3 @@ def test_what_becomes_of_a_run_is_told_as_it_is():
 def test_each_claim_about_the_altitude_can_fail(nominal, learned, holds):
     found = {"nominal": [run_with(1.0, nominal)], "learned": [run_with(1.0, 0.1), run_with(1.0, learned)]}
     assert [claim.holds for claim in quadrotor.altitude_claims(found)] == holds
-
-
-def test_equal_repetitions_have_an_interval_of_no_width():
-    number = over_learnings("n", [3.0, 3.0, 3.0], "")
-    assert (number.low, number.ours, number.high) == (3.0, 3.0, 3.0)
-
-
-def test_intervals_over_learnings_stay_where_the_quantity_is():
-    assert over_learnings("n", [1.0, 3.0], "").low < 0
-    assert over_learnings("n", [1.0, 3.0], "", 0.0).low == 0.0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,7 @@ from agents.evaluation import evaluate
 from agents.nominal import ZeroController
 from agents.problems import load_problem
 from agents.statistics import paired_difference_interval
-from scripts.reproduce.paired_episodes import difference, exits, is_above, is_below, mean_of, with_interval
+from scripts.reproduce.paired_episodes import difference, exits, is_above, is_below, with_interval
 
 
 def test_exits_are_those_of_an_evaluation() -> None:
@@ -36,14 +34,3 @@ def test_difference_is_of_pairs() -> None:
     assert (number.low, number.high) == pytest.approx([100 * end for end in paired_difference_interval(50, 10, 0, 40)])
     assert with_interval(number).startswith("+10.0 [")
     assert not is_above(difference("", first, second[::-1]))
-
-
-def test_mean_has_students_interval() -> None:
-    """The quantile of 3 degrees of freedom is 3.182; bounds end it, and one value says nothing."""
-    values = [10.0, 20.0, 30.0, 40.0]
-    half = 3.182446 * math.sqrt(500.0 / 3.0) / 2.0
-    number = mean_of("", values, (-100.0, 100.0), "points")
-    assert (number.low, number.ours, number.high) == pytest.approx((25.0 - half, 25.0, 25.0 + half))
-    assert mean_of("", values, (10.0, 30.0), "%").high == 30.0
-    alone = mean_of("", [5.0], (0.0, 100.0), "%")
-    assert (alone.low, alone.ours, alone.high) == (0.0, 5.0, 100.0)
