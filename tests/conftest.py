@@ -9,10 +9,15 @@ import os
 os.environ["OMP_NUM_THREADS"] = "1"
 
 import gymnasium as gym
+import hypothesis
 import pytest
 
 import safe_envs
 from safe_envs.problem import SafetyProblem
+
+# The same examples on every machine, and no deadline: a busy machine is no failure.
+hypothesis.settings.register_profile("project", derandomize=True, database=None, deadline=None, print_blob=False)
+hypothesis.settings.load_profile("project")
 
 
 @pytest.fixture(params=safe_envs.ENV_IDS, ids=lambda env_id: env_id.split("/")[1])
