@@ -1,5 +1,8 @@
 # make demo   train a small agent, and print safety rates with and without filters
 # make test   the test suite
+# make check  the quick part of it, for every edit
+# make oracle the long comparisons with exact answers, which the suite holds in small
+# make mutants   wrong versions of the code, each of which the tests must notice
 # make lint   style, formatting and types
 # make wheel-test   a wheel, installed without extras in an environment of its own, and used there
 # make docs   the documentation, in site/; nothing is fetched but the packages
@@ -10,13 +13,22 @@ BIN := .venv/bin
 READY := .venv/.ready
 DOCS_READY := .venv/.docs-ready
 
-.PHONY: demo test lint wheel-test docs clean
+.PHONY: demo test check oracle mutants lint wheel-test docs clean
 
 demo: $(READY)
 	$(BIN)/safe-envs demo
 
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadfile
+
+check: $(READY)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not oracle"
+
+oracle: $(READY)
+	$(BIN)/python -m pytest -n 2 -m oracle
+
+mutants: $(READY)
+	$(BIN)/python tests/mutants/run.py
 
 lint: $(READY)
 	$(BIN)/ruff check .
