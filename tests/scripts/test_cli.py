@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import pty
+import runpy
 import subprocess
 import sys
+from contextlib import suppress
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
 
 import safe_envs
+from scripts import cli
 from tests.scripts.conftest import strictly
 
 ROOT = Path(__file__).parents[2]
@@ -60,62 +64,52 @@ def test_other_commands_check_their_paths_before_they_begin(safe_envs_command, c
     assert arguments[1] in err
 
 
-def run_process(*command, cwd=ROOT):
-    return subprocess.run([*map(str, command)], capture_output=True, text=True, cwd=cwd, timeout=120)
+def run_at_a_terminal(*command):
+    """Run a process whose standard error is a terminal; return its status, its output and what the terminal shows."""
+    master, slave = pty.openpty()
+    environment = {**os.environ, "TERM": "xterm"}
+    process = subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, stderr=slave, text=True, env=environment)
+    os.close(slave)
+    shown = b""
+    with suppress(OSError):  # the terminal ends with the process
+        while part := os.read(master, 4096):
+            shown += part
+    out = process.communicate(timeout=60)[0]
+    os.close(master)
+    return process.returncode, out, shown.decode()
 
 
-def test_the_installed_command_and_the_script_give_the_same(tmp_path):
-    arguments = ["Scalar-v0", "--filter", "none", "--filter", "cbf", *QUICK]
-    commands = {
-        "installed": [Path(sys.executable).with_name("safe-envs"), "evaluate"],
-        "script": [sys.executable, ROOT / "scripts" / "evaluate.py"],
-    }
-    tables, documents = [], []
-    for name, command in commands.items():
-        done = run_process(*command, *arguments, "--json", tmp_path / f"{name}.json")
-        assert (done.returncode, done.stderr) == (0, ""), done.stderr
-        tables.append(without_speed(done.stdout))
-        documents.append(strictly(tmp_path / f"{name}.json"))
-        del documents[-1]["timing"]
-    assert tables[0] == tables[1]
-    assert len(tables[0]) > 4
+def test_the_script_gives_the_same_as_the_command_and_a_terminal_gets_a_progress_bar(safe_envs_command, tmp_path):
+    arguments = ["Scalar-v0", "--filter", "none", "--filter", "cbf", *QUICK, "--json"]
+    status, out, shown = run_at_a_terminal(sys.executable, ROOT / "scripts" / "evaluate.py", *arguments, tmp_path / "script.json")
+    assert status == 0, shown
+    assert "Evaluating" in shown
+    assert "%" in shown
+    assert "Evaluating" not in out
+    table = without_speed(out)
+    assert len(table) > 4
+    status, out, err = safe_envs_command("evaluate", *arguments, tmp_path / "command.json")
+    assert (status, err) == (0, "")
+    assert without_speed(out) == table
+    documents = [strictly(tmp_path / f"{name}.json") for name in ("script", "command")]
+    for document in documents:
+        del document["timing"]
     assert documents[0] == documents[1]
 
 
-def test_errors_of_the_script_end_with_status_2():
-    done = run_process(sys.executable, "-m", "scripts.evaluate", DUBINS, "--filter", "hocb")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert "did you mean 'hocbf'" in done.stderr
-    assert "Traceback" not in done.stderr
+def test_the_installed_command_is_this_one():
+    (installed,) = entry_points(group="console_scripts", name="safe-envs")
+    assert installed.load() is cli.main
+    assert Path(sys.executable).with_name("safe-envs").exists()
 
 
-def test_a_terminal_gets_a_progress_bar():
-    master, slave = pty.openpty()
-    command = [sys.executable, "-m", "scripts.evaluate", "Scalar-v0", "--filter", "none", *QUICK]
-    environment = {**os.environ, "TERM": "xterm"}
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=slave, cwd=ROOT, env=environment)
-    os.close(slave)
-    shown = b""
-    while True:
-        try:
-            part = os.read(master, 4096)
-        except OSError:
-            break
-        if not part:
-            break
-        shown += part
-    out = process.communicate(timeout=60)[0]
-    os.close(master)
-    assert process.returncode == 0
-    assert b"Evaluating" in shown
-    assert b"%" in shown
-    assert b"Evaluating" not in out
-    assert b"none" in out
-
-
-def test_the_command_starts_light():
-    code = (
-        "import sys, agents, scripts.cli; "
-        "print([m for m in ('torch', 'stable_baselines3', 'matplotlib', 'proxsuite', 'qpsolvers') if m in sys.modules])"
-    )
-    assert run_process(sys.executable, "-c", code).stdout == "[]\n"
+def test_errors_of_the_script_end_with_status_2(monkeypatch, capsys):
+    path = ROOT / "scripts" / "evaluate.py"
+    monkeypatch.setattr(sys, "argv", [str(path), DUBINS, "--filter", "hocb"])
+    with pytest.raises(SystemExit) as ended:
+        runpy.run_path(str(path), run_name="__main__")
+    assert ended.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "did you mean 'hocbf'" in err
+    assert "Traceback" not in err

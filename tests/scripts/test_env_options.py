@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -79,19 +77,6 @@ def test_identify_has_no_episodes(safe_envs_command):
         status, _, err = safe_envs_command("identify", "Scalar-v0", *COMMANDS["identify"], option, "1")
         assert status == 2
         assert f"No such option: {option}" in err
-
-
-def test_help_imports_no_agents():
-    code = """
-import sys
-from scripts import cli
-for command in sys.argv[1:]:
-    cli.app([command, "--help"], standalone_mode=False)
-print([module for module in sys.modules if module.startswith("agents")])
-"""
-    printed = subprocess.run([sys.executable, "-c", code, *COMMANDS], check=True, capture_output=True, text=True).stdout
-    assert printed.count("Usage: ") == len(COMMANDS)
-    assert printed.endswith("\n[]\n")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,53 @@
+"""What is imported, and when: each stage of one fresh process has only what it needs."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+STAGES = """
+import sys
+
+
+def loaded(*names):
+    return [name for name in names if name in sys.modules]
+
+
+from scripts import cli
+
+assert not loaded("sympy", "scipy", "torch", "matplotlib", "pygame", "agents"), "the command line, for completion"
+for command in ("evaluate", "verify", "identify", "train", "render"):
+    cli.app([command, "--help"], standalone_mode=False)
+assert not loaded("agents", "torch", "matplotlib", "pygame"), "help"
+
+import agents
+
+HEAVY = ("torch", "stable_baselines3", "matplotlib", "proxsuite", "qpsolvers", "pygame")
+assert not loaded(*HEAVY), "the packages"
+
+from wrappers.qp import several_rows
+
+box = ([0.0, 0.0], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0], [1.0, 1.0])
+assert not several_rows.project_floats([[1.0, 0.2], [-1.0, 0.1]], [-0.5, 0.1], *box)[3]
+assert not loaded("scipy", *HEAVY), "programs of two inputs"
+box = ([0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0, 1.0])
+assert several_rows.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.1], *box)[2] == [True, False]
+assert not loaded("scipy", *HEAVY), "one constraint of several binds"
+assert several_rows.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.5], *box)[2] == [True, True]
+assert loaded("proxsuite", "qpsolvers") == ["proxsuite", "qpsolvers"]
+
+import gymnasium as gym
+from safe_envs import SafeEnv
+
+env = SafeEnv(gym.make("safe_envs/Scalar-v0").unwrapped.problem, render_mode="rgb_array")
+env.reset(seed=0)
+assert not loaded("pygame", "torch", "matplotlib"), "an env that draws nothing yet"
+env.render()
+assert loaded("pygame")
+"""
+
+
+def test_nothing_is_imported_before_it_is_needed():
+    done = subprocess.run([sys.executable, "-W", "error", "-c", STAGES], capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.count("Usage: ") == 5
