@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from agents import blas_threads
 from agents.bridge import Bridge, smallest
 from agents.episodes import Env, Progress
 from agents.policy import Policy
@@ -198,7 +198,7 @@ class Drifting:
             self.policy.begin(range(len(lengths)), int(generator.integers(2**63)))
         hit = smallest(info["barrier"]) <= 0.0
         alive, weights, steps = ~hit, hit.astype(np.float64), 0
-        with threadpool_limits(1, "blas"):
+        with blas_threads.limited():
             while alive.any():
                 x, before = world.components, info["barrier"]
                 actions, _ = self.policy.predict(observation, None, np.zeros(len(lengths), dtype=bool), deterministic=True)

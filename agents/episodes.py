@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from agents import blas_threads
 from agents.bridge import Bridge, Exponentials, smallest
 from agents.comparison import Flags
 from agents.policy import Policy
@@ -220,8 +220,7 @@ def play(
     for first in range(episodes.start, episodes.stop, env.num_envs):
         count = min(env.num_envs, episodes.stop - first)
         rows = range(first, first + env.num_envs)
-        # Threads of BLAS gain nothing on small networks, and on a busy machine they wait for each other for most of the time.
-        with threadpool_limits(1, "blas"):
+        with blas_threads.limited():
             if isinstance(policy, Policy):
                 policy.begin(rows, seed)
             started = env.reset(seed=[episode_seed(seed, i) for i in rows])

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from agents import blas_threads
 from agents.bridge import Bridge
 from agents.drifting import MakeDrifting
 from agents.particles import Particles
@@ -159,15 +159,14 @@ class _Run:
         self.estimates, self.levels = np.ones(len(powers)), np.zeros(len(powers), dtype=np.int64)
         self.stuck: list[float] = []
         self.endless: list[float] = []
-        # Threads of BLAS gain nothing on small networks, and on a busy machine they wait for each other for most of the time.
-        with threadpool_limits(1, "blas"):
+        with blas_threads.limited():
             self.paths.begin()
         self.first = int(np.count_nonzero(self.paths.lowest <= 0.0))
 
     def finish(self, progress: Callable[[float], None] | None) -> None:
         """Go from level to level until every repetition has its estimate or is given up."""
         active, highest = range(len(self.estimates)), 0.0
-        with threadpool_limits(1, "blas"):
+        with blas_threads.limited():
             while True:
                 found = {r: kill for r in active if (kill := self._next_level(r)) is not None}
                 if not found:

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from agents import blas_threads
 from agents.algorithms import OFF_POLICY, new_model
 from agents.checkpoints import (
     copy_policy,
@@ -81,7 +81,7 @@ def train(training: Training, folder: Path, *, resume: bool = False, tensorboard
             (folder / name).unlink(missing_ok=True)
         write_json(folder / _CONFIG, {"training": asdict(training), "versions": package_versions()})
     session.log(tensorboard)
-    with threadpool_limits(training.threads, "blas"):
+    with blas_threads.limited(training.threads):
         session.run(tell or (lambda _: None))
     return session.seconds
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+from functools import cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -84,7 +85,13 @@ def main(command: str | None = None) -> None:
     Args:
         command: the one to run, for a script that is one; that of the command line by default.
     """
-    run(lambda: app(None if command is None else [command, *sys.argv[1:]], prog_name="safe-envs"))
+    run(lambda: _command()(None if command is None else [command, *sys.argv[1:]], prog_name="safe-envs"))
+
+
+@cache
+def _command() -> Any:
+    """Build the command with its options; Typer does so at every call, which takes longer than to run a quick one."""
+    return typer.main.get_command(app)
 
 
 if __name__ == "__main__":
