@@ -31,7 +31,7 @@ from wrappers.safe_set import draw_starts
 from wrappers.survey import Survey
 from wrappers.verify import verify
 
-STATUSES = {"proved", "hypothesis fails", "no bound", "unproved"}
+STATUSES = {"estimated", "hypothesis fails", "no bound", "not established"}
 
 
 def test_radial_headings_leave_the_dubins_disk_without_control():
@@ -101,7 +101,7 @@ def test_every_id_is_verified(env_id, monkeypatch):
     for bound in bounds:
         assert bound.status in STATUSES
         assert bound.value is None or 0.0 <= bound.value <= 1.0
-        assert bound.reason or bound.status == "proved"
+        assert bound.reason or bound.status == "estimated"
 
 
 def test_infeasibility_and_shortfall_are_those_of_the_filter():

@@ -11,7 +11,7 @@ from safe_envs.problem import SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
 from tests.conftest import problem_of
 from wrappers import parse_conditions, search, survey
-from wrappers.proved import proved_bound
+from wrappers.estimated import estimated_bound
 from wrappers.verify import verify
 
 DUBINS = "safe_envs/DubinsDisk-v0"
@@ -53,7 +53,7 @@ def made(problem, text="scbf", **options):
 
 def made_bound(problem, text="scbf"):
     """The proved bound of a problem under a filter."""
-    return proved_bound(problem, parse_conditions(text, problem))
+    return estimated_bound(problem, parse_conditions(text, problem))
 
 
 def findings(env_id, text=None, knowledge="model", **options):
@@ -71,9 +71,9 @@ def _found_anew(env_id, text, knowledge, options):
     return verify(problem, parse_conditions(text or problem.filter, problem), knowledge)
 
 
-def proved(env_id, text=None, knowledge="model", **options):
+def estimated(env_id, text=None, knowledge="model", **options):
     problem = problem_of(env_id, **options)
-    return proved_bound(problem, parse_conditions(text or problem.filter, problem), knowledge)
+    return estimated_bound(problem, parse_conditions(text or problem.filter, problem), knowledge)
 
 
 def by_name(bounds, part):

@@ -13,8 +13,8 @@ from agents.statistics import rate_interval
 from safe_envs import Barrier, ConfigurationError
 from tests.conftest import problem_of
 from wrappers import SCBF, BayesianSCBF, SafetyFilterVectorWrapper
-from wrappers.certificate import certificate
 from wrappers.learning.bayesian import identify
+from wrappers.posterior_bound import posterior_bound
 
 START = (0.0, 0.6)
 
@@ -31,12 +31,12 @@ def posterior(cubic):
 
 @pytest.fixture(scope="module")
 def found(cubic, posterior):
-    return certificate(cubic, [BayesianSCBF(posterior, simultaneous=0.95)])
+    return posterior_bound(cubic, [BayesianSCBF(posterior, simultaneous=0.95)])
 
 
 @pytest.fixture(scope="module")
 def looser(cubic, posterior):
-    return certificate(cubic, [BayesianSCBF(posterior, simultaneous=0.5)])
+    return posterior_bound(cubic, [BayesianSCBF(posterior, simultaneous=0.5)])
 
 
 def best_rows(problem, posterior, simultaneous, x):
@@ -97,18 +97,18 @@ def test_the_probability_by_hand(found):
 
 
 def test_it_is_hardly_another_with_another_seed(cubic, posterior, found):
-    other = certificate(cubic, [BayesianSCBF(posterior, simultaneous=0.95)], seed=1)
+    other = posterior_bound(cubic, [BayesianSCBF(posterior, simultaneous=0.95)], seed=1)
     assert other.shortfall == pytest.approx(found.shortfall, rel=1e-3)
 
 
 def test_plant_and_model_do_not_matter(cubic, posterior, found):
     blind = cubic.configured(model={"a": 5.0}, plant={"a": 9.0}, noise=3.0)
-    other = certificate(blind, [BayesianSCBF(posterior, simultaneous=0.95)])
+    other = posterior_bound(blind, [BayesianSCBF(posterior, simultaneous=0.95)])
     assert (other.shortfall, other.supremum) == (found.shortfall, found.supremum)
 
 
 def test_more_data_certify_more(cubic, found):
-    few = certificate(cubic, [BayesianSCBF(identify(cubic, starts=200, repetitions=50), simultaneous=0.95)])
+    few = posterior_bound(cubic, [BayesianSCBF(identify(cubic, starts=200, repetitions=50), simultaneous=0.95)])
     assert few.shortfall > 1.2 * found.shortfall
     assert few.at(np.array([START]), 0.5) < found.at(np.array([START]), 0.5)
 
@@ -129,7 +129,7 @@ def test_what_has_no_certificate_is_refused(cubic, posterior):
         (cubic, []),
     ):
         with pytest.raises(ConfigurationError, match="one barrier with bayesian-scbf:simultaneous=P"):
-            certificate(problem, conditions)
+            posterior_bound(problem, conditions)
 
 
 def test_an_unbounded_set_has_none(cubic, posterior):
@@ -137,11 +137,11 @@ def test_an_unbounded_set_has_none(cubic, posterior):
     # Its noise varies with the state: no intervals of sigma are known.
     varying = identify(problem, starts=200, repetitions=20, diffusion_degree=2)
     with pytest.raises(ConfigurationError, match="intervals of sigma are known for constant noise"):
-        certificate(problem, [BayesianSCBF(varying, simultaneous=0.9)])
+        posterior_bound(problem, [BayesianSCBF(varying, simultaneous=0.9)])
     # The same set with the noise of the disk, which is constant.
     parabola = replace(cubic, barriers=problem.barriers)
     with pytest.raises(ConfigurationError, match="beyond the workspace"):
-        certificate(parabola, [BayesianSCBF(posterior, simultaneous=0.9)])
+        posterior_bound(parabola, [BayesianSCBF(posterior, simultaneous=0.9)])
 
 
 def test_what_is_certified_happens(cubic, monkeypatch):
@@ -150,7 +150,7 @@ def test_what_is_certified_happens(cubic, monkeypatch):
     envs, horizon, promised = 100, 0.5, []
     for seed in range(6):
         condition = BayesianSCBF(identify(cubic, starts=800, repetitions=50, degree=3, seed=seed), simultaneous=0.9)
-        (bound,) = certificate(cubic, [condition]).at(np.array([START]), horizon)
+        (bound,) = posterior_bound(cubic, [condition]).at(np.array([START]), horizon)
         env = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/CubicSDEDisk-v0", num_envs=envs, start=START, horizon=horizon), condition)
         env.reset(seed=seed)
         safe = np.ones(envs, dtype=bool)
