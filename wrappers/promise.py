@@ -140,7 +140,7 @@ def _judged(candidate: _Candidate, verdict: _Verdict) -> Bound:
 def _certain(verification: Verification, b: np.ndarray, horizon: float) -> list[_Candidate]:
     """Conditions that keep every path: without noise, or SRCBF."""
     noisy, stages = verification.formulas.noisy, _stages(verification)
-    name = "Prop. 4.2.2: safe with probability 1" if noisy else "no noise: safe for sure"
+    name = "Prop. 4.2.2: safe with probability 1" if noisy else "no noise: no path leaves"
     found = [_Candidate(name, (b > 0.0).all(axis=1).astype(float), forever=True)]
     if any(stages.shortfalls) and not noisy and not any(map(math.isnan, stages.rates)):
         values = outlasting(stages, b, horizon)

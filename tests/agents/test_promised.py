@@ -44,5 +44,5 @@ def test_of_several_identifications_the_mean_counts():
     rates = [{**row, "outside_rate": rate} for rate in (0.25, 0.5)]
     assert together(rates)["outside_rate"] == 0.375
     assert together([rates[0], {**row, "outside_rate": None}])["outside_rate"] is None
-    certified = [{**each, "posterior_bound": {"probability": 0.5, "note": ""}} for each in rates]
-    assert together(certified)["outside_rate"] == 0.375
+    robust = [{**each, "posterior_bound": {"probability": 0.5, "note": ""}} for each in rates]
+    assert together(robust)["outside_rate"] == 0.375

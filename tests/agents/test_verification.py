@@ -86,7 +86,7 @@ def test_without_a_bound_there_is_one_measurement_and_nothing_to_contradict():
 def test_a_mismatched_model_contradicts_its_promise():
     (only,) = measured("safe_envs/DubinsDisk-v0", episodes=1, start="valid", horizon=5.0)
     assert only.repeats
-    assert contradicted(only) == {"no noise: safe for sure"}
+    assert contradicted(only) == {"no noise: no path leaves"}
 
 
 @pytest.mark.usefixtures("short")

@@ -1,4 +1,4 @@
-"""Which bounds hold, which fail and why, and the proved one."""
+"""Which bounds apply, which fail and why, and the estimated one."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def test_an_endless_range_counts_on_its_endless_side_only():
     assert made(problem, samples=256).survey.suprema[0] == pytest.approx(2.0, rel=1e-9)
 
 
-def test_the_attained_bound_is_proved():
+def test_the_attained_bound_is_estimated():
     problem = system_in_a_box()
     conditions = parse_conditions("scbf", problem)
     found = verify(problem, conditions)
@@ -140,7 +140,7 @@ def test_bounds_of_several_barriers_are_put_together_by_the_union():
         ((CUBIC_DISK, "srcbf"), "unbounded control towards the edge"),
     ],
 )
-def test_what_has_no_estimated_bound_says_why(arguments, note):
+def test_what_has_no_bound_says_why(arguments, note):
     bound = estimated(*arguments)
     assert bound.note is not None
     assert note in bound.note
@@ -169,7 +169,7 @@ def test_conditions_without_noise_keep_every_path_if_they_can_be_met():
     assert (bound.status, bound.value) == ("estimated", 1.0)
     weak = findings("safe_envs/Scalar-v0", "cbf:alpha=0.5", noise=0, box=[-0.8, 0.8])
     near, far = promise(weak, np.array([[0.99]]), 1.0), promise(weak, np.array([[0.0]]), 1.0)
-    assert by_name(near, "for sure").status == "hypothesis fails"
+    assert by_name(near, "no path leaves").status == "hypothesis fails"
     # Missed by .2 at the edge at most: h >= h_0 e^(-t/2) - .4 (1 - e^(-t/2)) is positive up to 1 s from the middle only.
     assert weak.safe.shortfall == pytest.approx(0.2)
     assert (by_name(near, "in spite").value, by_name(far, "in spite").value) == (0.0, 1.0)
@@ -186,7 +186,7 @@ def test_zeroing_forms_and_the_misprint():
     assert by_name(slow, "as printed").status == by_name(slow, "corrected").status
 
 
-def test_every_id_has_a_estimated_bound_or_a_note(env_id, monkeypatch):
+def test_every_id_has_a_bound_or_a_note(env_id, monkeypatch):
     hurry(monkeypatch)
     bound, starts = estimated(env_id), draw_starts(problem_of(env_id), 16)
     values = bound.at(starts, problem_of(env_id).horizon)
@@ -229,11 +229,11 @@ def test_no_box_holds_an_srcbf_under_noise(width, scale):
     assert "unbounded control towards the edge" in (made_bound(problem, "srcbf").note or "")
 
 
-@pytest.mark.parametrize(("noise", "proved_there"), [(1 - x**2, True), (sp.sqrt(1 - x**2), True), ((1 - x**2) ** sp.Rational(1, 4), False)])
-def test_an_srcbf_is_kept_where_the_noise_fades_at_the_edge(noise, proved_there):
+@pytest.mark.parametrize(("noise", "kept"), [(1 - x**2, True), (sp.sqrt(1 - x**2), True), ((1 - x**2) ** sp.Rational(1, 4), False)])
+def test_an_srcbf_is_kept_where_the_noise_fades_at_the_edge(noise, kept):
     # |sigma' grad h|^2/h is 4 x^2 sigma^2/h, which stays finite for a sigma^2 that falls at least like h.
     problem = problem_with([0 * x], [1 - x**2], noise=(noise,), box=(-1e6, 1e6))
-    assert made(problem, "srcbf", samples=512).survey.runaway is not proved_there
+    assert made(problem, "srcbf", samples=512).survey.runaway is not kept
 
 
 def test_a_kink_has_no_bound_under_noise():
@@ -243,7 +243,7 @@ def test_a_kink_has_no_bound_under_noise():
     assert made_bound(problem_with([0 * x], [barrier]), "cbf").note is None
 
 
-def test_a_range_that_was_chosen_proves_nothing():
+def test_a_range_that_was_chosen_establishes_nothing():
     problem = problem_with(
         [-((y / 15) ** 9), sp.Integer(2)],
         [1 - x**2],
@@ -259,7 +259,7 @@ def test_a_range_that_was_chosen_proves_nothing():
     assert made_bound(problem, "szcbf:alphas=.1").note == reason
 
 
-def test_conditions_that_share_several_inputs_are_not_proved():
+def test_conditions_that_share_several_inputs_have_no_bound():
     problem = system_in_a_box(count=2)
     x_1, x_2 = problem.plant.states
     coupled = replace(problem, barriers=(Barrier(1 - x_1**2 - x_2**2 / 2, "h_1"), Barrier(1 - x_2**2 - x_1**2 / 2, "h_2")))
@@ -273,7 +273,7 @@ def test_conditions_that_share_several_inputs_are_not_proved():
     ("env_id", "text"),
     [(CUBIC_DISK, "scbf"), (CUBIC_DISK, "szcbf:alphas=2"), (STOCHASTIC, "szcbf:alphas=.1,.1")],
 )
-def test_the_estimated_bound_is_the_best_of_the_proved_ones(env_id, text):
+def test_the_estimated_bound_is_the_best_of_them(env_id, text):
     found = findings(env_id, text)
     starts = draw_starts(found.formulas.problem, 64)
     for horizon in (0.1, 1.0):

@@ -77,7 +77,7 @@ def test_correlated_noise_makes_the_row_less_sure():
     assert share_below(problem, (0.6, 0.6), 0.0, starts=100, repetitions=30) >= LEAST
 
 
-def test_what_the_features_miss_is_no_noise_and_has_no_certificate():
+def test_what_the_features_miss_is_no_noise_and_has_no_bound():
     x_1 = DISK.plant.states[0]
     problem = changed(drift=DISK.plant.drift + sp.Matrix([sp.sin(4 * x_1), 0]))
     with pytest.warns(UserWarning, match="miss"):
@@ -90,7 +90,7 @@ def test_what_the_features_miss_is_no_noise_and_has_no_certificate():
         posterior_bound(problem, [BayesianSCBF(posterior, simultaneous=0.9)])
 
 
-def test_noise_that_is_taken_for_constant_and_is_not_has_no_certificate():
+def test_noise_that_is_taken_for_constant_and_is_not_has_no_bound():
     pendulum = problem_of("safe_envs/Pendulum-v0")
     with pytest.warns(UserWarning, match="diffusion degree"):
         posterior = identify(pendulum)

@@ -52,7 +52,7 @@ def made(problem, text="scbf", **options):
 
 
 def made_bound(problem, text="scbf"):
-    """The proved bound of a problem under a filter."""
+    """The estimated bound of a problem under a filter."""
     return estimated_bound(problem, parse_conditions(text, problem))
 
 
