@@ -211,8 +211,8 @@ def _rates(sample: Sample) -> Outcome:
         as_printed=[number for place in places for number in place.as_printed(sample, dull.get(place.name))],
         notes=[
             f"The hypothesis of h/c fails: no input keeps A h >= 0 near the centre: it is missed by up to {worst.missed:.3f}. What holds "
-            f"is (h - {worst.missed:.3f} T)/{worst.supremum:g}: the row '{_ANALYTICAL}' of ours is this repaired bound, estimated with the m "
-            f"and c found, at T = {world.horizon:g} s. The thesis has no number for it; h/c is in that row by the printed formula.",
+            f"is (h - {worst.missed:.3f} T)/{worst.supremum:g}: the row '{_ANALYTICAL}' of ours is this repaired bound, estimated with the "
+            f"m and c found, at T = {world.horizon:g} s. The thesis has no number for it; h/c is in that row by the printed formula.",
             *(f"{place.name}: the repaired bound is withheld: {place.withheld}" for place in places if place.withheld),
             at_one_horizon(places[0].scbf.rows[0], places[1].scbf.rows[0], PRINTED_RATES["SCBF"]),
             *(
