@@ -72,7 +72,7 @@ def test_a_bound_over_a_posterior_sees_a_hidden_kink(monkeypatch):
 
 @pytest.mark.usefixtures("credulous")
 def test_nothing_converges_beside_a_bound_that_is_contradicted():
-    answer = refine(false_bounds.kink(), filters=["none", "szcbf:alphas=0.1"], episodes=200)
+    answer = refine(false_bounds.kink(), filters=["none", "szcbf:alphas=0.1"], episodes=100)
     bare, filtered = answer.rows
     assert bare["verdict"] != "contradicted"
     assert (filtered["verdict"], bool(filtered["withheld"])) == ("contradicted", True)

@@ -11,16 +11,16 @@ from agents import verification
 from agents.verification import Horizon, Measurement, measure, starts_of
 from safe_envs.errors import ConfigurationError
 from tests.conftest import problem_of
+from tests.wrappers.verified import verify_once
 from wrappers import parse_conditions
 from wrappers.promise import Bound
-from wrappers.verify import verify
 
 CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
 
 
 def measured(env_id, text=None, knowledge="model", episodes=200, **options):
     problem = problem_of(env_id, **options)
-    found = verify(problem, parse_conditions(text or problem.filter, problem), knowledge, samples=512)
+    found = verify_once(problem, parse_conditions(text or problem.filter, problem), knowledge, samples=512)
     return measure(found, episodes=episodes)
 
 
@@ -92,13 +92,14 @@ def test_a_mismatched_model_contradicts_its_promise():
 @pytest.mark.usefixtures("short")
 def test_progress_reaches_the_end():
     problem = problem_of(CUBIC_DISK, horizon=0.1)
-    found = verify(problem, parse_conditions("scbf", problem), samples=256)
+    found = verify_once(problem, parse_conditions("scbf", problem), samples=256)
     told = []
     measure(found, episodes=5, progress=told.append)
     assert told == sorted(told)
     assert told[-1] == pytest.approx(1.0)
 
 
+@pytest.mark.usefixtures("short")
 def test_starts_are_one_or_many():
     assert starts_of(problem_of(CUBIC_DISK)).shape == (verification.STARTS, 2)
     np.testing.assert_array_equal(starts_of(problem_of(CUBIC_DISK, start="thesis-1")), [[-0.1, 0.7]])
@@ -108,7 +109,7 @@ def test_starts_are_one_or_many():
 def test_an_unknown_policy_is_an_error():
     problem = problem_of(CUBIC_DISK)
     with pytest.raises(ConfigurationError, match="unknown policy"):
-        measure(verify(problem, parse_conditions("scbf", problem), samples=256), "nobody")
+        measure(verify_once(problem, parse_conditions("scbf", problem), samples=256), "nobody")
 
 
 @pytest.mark.parametrize(("trials", "error"), [(50, 0.005), (500, 0.00125)])

@@ -9,6 +9,7 @@ import pytest
 from agents import verification
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
+from tests.wrappers.verified import verify_once
 
 CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
 
@@ -18,11 +19,12 @@ def verify(monkeypatch, safe_envs_command):
     """Runs `safe-envs verify` over the shorter horizons, from fewer starts."""
     monkeypatch.setattr(verification, "_LONG_MULTIPLES", ())
     monkeypatch.setattr(verification, "STARTS", 512)
+    monkeypatch.setattr("wrappers.verify.verify", verify_once)
     return lambda *arguments: safe_envs_command("verify", *arguments)
 
 
 def test_the_report_names_what_was_found(verify):
-    status, out, err = verify(CUBIC_DISK, "--episodes", 100)
+    status, out, err = verify(CUBIC_DISK, "--episodes", 100, "--dt", 0.05)
     assert (status, err) == (0, "")
     for text in (
         "relative degree 1 with scbf",

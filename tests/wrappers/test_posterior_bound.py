@@ -180,7 +180,7 @@ def test_long_steps_bias_what_is_identified_and_are_allowed_for():
     problem, (x, u) = unstable(dt=0.05, substeps=10), np.meshgrid(np.linspace(-1.0, 1.0, 21), [-10.0, 0.0, 10.0])
     truth = -2 * x * (3 * x + u) - 0.05**2
     covered = allowed = 0
-    for seed in range(8):
+    for seed in range(4):
         posterior = identify(problem, starts=200, repetitions=50, degree=1, seed=seed)
         condition = BayesianSCBF(posterior, simultaneous=0.9)
         row = SafetyFilter.for_problem(problem, condition).constraints[0]
@@ -192,13 +192,13 @@ def test_long_steps_bias_what_is_identified_and_are_allowed_for():
         allowed += bool((robust - found.bias <= truth).all())
         assert "steps of 0.05 s in the data may shift the rate of h by up to" in found.remark
     assert covered == 0
-    assert allowed == 8
+    assert allowed == 4
     # dt/2 times h' L F + 1/2 h'' 2 J S, with F = 3 x + u, J = 3, L F = 3 F and h = 1 - x^2: largest at x = 1 and u = 10.
     expected = 0.025 * (2 * 3 * 13 + 2 * 3 * 0.05**2)
     assert found.bias == pytest.approx(expected, rel=0.2)
     assert found.at(np.array([[0.1]]), 0.2)[0] < 0.9 * (1 - 0.1**2 - found.bias * 0.2) + 1e-9
 
 
-def test_steps_of_the_plants_own_method_have_no_bias(posterior):
+def test_steps_of_the_plants_own_method_have_no_bias(posterior, found):
     assert posterior.record.settings["substeps"] == 1
-    assert posterior_bound(problem_of("safe_envs/CubicSDEDisk-v0"), [BayesianSCBF(posterior, simultaneous=0.9)]).bias == 0.0
+    assert found.bias == 0.0

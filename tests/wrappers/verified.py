@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import sympy as sp
 
 from safe_envs.barrier import Barrier
@@ -17,6 +15,8 @@ from wrappers.verify import verify
 DUBINS = "safe_envs/DubinsDisk-v0"
 STOCHASTIC = "safe_envs/StochasticDubins-v0"
 CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
+
+_FOUND = {}
 
 x, y, u = sp.symbols("x y u", real=True)
 
@@ -57,18 +57,19 @@ def made_bound(problem, text="scbf"):
 
 
 def findings(env_id, text=None, knowledge="model", **options):
-    """What is found of a registered id; with its defaults once for all tests."""
-    return _found_anew(env_id, text, knowledge, options) if options else _found_once(env_id, text, knowledge)
-
-
-@cache
-def _found_once(env_id, text, knowledge):
-    return _found_anew(env_id, text, knowledge, {})
-
-
-def _found_anew(env_id, text, knowledge, options):
+    """What is found of a registered id, once for all tests."""
     problem = problem_of(env_id, **options)
-    return verify(problem, parse_conditions(text or problem.filter, problem), knowledge)
+    return verify_once(problem, parse_conditions(text or problem.filter, problem), knowledge)
+
+
+def verify_once(problem, conditions, knowledge="model", samples=survey.SAMPLES, seed=0):
+    """`verify`, once for all tests that ask for the same."""
+    start = problem.starts[problem.start]
+    of_problem = (problem.name, problem.plant, problem.model, problem.barriers, problem.states, problem.box, problem.start, repr(start))
+    key = (of_problem, problem.dt, problem.horizon, tuple(conditions), knowledge, samples, seed)
+    if key not in _FOUND:
+        _FOUND[key] = verify(problem, conditions, knowledge, samples, seed)
+    return _FOUND[key]
 
 
 def estimated(env_id, text=None, knowledge="model", **options):
