@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -45,6 +46,7 @@ class Promised:
         self._total, self._count = RunningSum(), 0
         self._outside = _outside_of(conditions, problem, knowledge)
         self._lost, self._starts = 0, 0
+        self._against, self._nothing = "", Seen.nothing(problem)
         if conditions and not why_not:
             self._look(conditions, problem, knowledge)
 
@@ -67,6 +69,7 @@ class Promised:
         states = np.stack(start, axis=1)[:count]
         if self._found is not None and not self._why_none:
             self._total.add(self._found.at(states, self._horizon))
+            self._against = self._against or by_states(self._found, [replace(self._nothing, deepest=states)])
             self._count += count
         if self._outside is not None:
             self._lost += int(np.count_nonzero(self._outside(states)))
@@ -90,7 +93,7 @@ class Promised:
             row |= {"posterior_bound": {"probability": bound, "note": note, **sizes}}
         else:
             row |= {"estimated_bound": bound, "bound_note": note, "posterior_bound": None}
-        reason = "" if bound is None or self._found is None else by_states(self._found, [seen])
+        reason = "" if bound is None or self._found is None else self._against or by_states(self._found, [seen])
         return withheld(row, reason) if reason else row
 
     def _mean(self) -> tuple[float | None, str | None]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from wrappers.formulas import Formulas
-from wrappers.safe_set import workspace_of
+from wrappers.safe_set import in_workspace, workspace_of
 
 _RELATIVE = 1e-6
 """What a search and rounding may leave, in parts of the number itself."""
@@ -39,9 +39,8 @@ def below_slack(formulas: Formulas, shortfall: float, x: np.ndarray, u: np.ndarr
 
 
 def _inside(formulas: Formulas, x: np.ndarray) -> np.ndarray:
-    """Which states are in the set that is kept and in the workspace, which a last step may leave, shape (B,)."""
-    low, high = workspace_of(formulas.problem)
-    return (formulas.chain(x) > 0.0).all(axis=1) & (x >= low).all(axis=1) & (x <= high).all(axis=1)
+    """Which states are in the set that is kept, and in the workspace, shape (B,)."""
+    return np.all(formulas.chain(x) > 0.0, axis=1) & in_workspace(x, workspace_of(formulas.problem))
 
 
 def described(formulas: Formulas, j: int) -> str:

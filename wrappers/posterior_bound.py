@@ -15,7 +15,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem import SafetyProblem
 from wrappers import bounds
 from wrappers.conditions import BayesianSCBF, Condition
-from wrappers.safe_set import Region, draw_starts, region_of, sample, workspace_of
+from wrappers.safe_set import Region, draw_starts, in_workspace, region_of, sample, workspace_of
 from wrappers.safety_filter import SafetyFilter
 from wrappers.search import Score, largest
 from wrappers.smoothness import Asked, roughness
@@ -65,19 +65,14 @@ class PosteriorBound:
 
     def contradiction(self, reached: np.ndarray, missed: np.ndarray, actions: np.ndarray, slack: np.ndarray) -> str:
         """What states say against c and m; see `wrappers.estimated.EstimatedBound.contradiction`."""
-        h = _values(self._barrier, reached[self._inside(reached)])
+        h = _values(self._barrier, reached[in_workspace(reached, self._workspace)])
         if (h > self.supremum * (1.0 + _RELATIVE)).any():
             return f"h reaches {h.max():.4g}, above the supremum of {self.supremum:.4g} that the search found"
-        inside = self._inside(missed) & (_values(self._barrier, missed) > 0.0)
+        inside = in_workspace(missed, self._workspace) & (_values(self._barrier, missed) > 0.0)
         most = float(slack[inside].max(initial=0.0))
         if most > self.shortfall * (1.0 + _RELATIVE):
             return f"the filter missed the condition by {most:.4g}, more than the shortfall of {self.shortfall:.4g} that the search found"
         return ""
-
-    def _inside(self, x: np.ndarray) -> np.ndarray:
-        """Which states are in the workspace, which a last step may leave, shape (B,)."""
-        low, high = self._workspace
-        return (x >= low).all(axis=1) & (x <= high).all(axis=1)
 
 
 def posterior_bound(problem: SafetyProblem, conditions: Sequence[Condition], seed: int = 0) -> PosteriorBound:

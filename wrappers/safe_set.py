@@ -74,6 +74,12 @@ def workspace_of(problem: SafetyProblem) -> tuple[np.ndarray, np.ndarray]:
     return np.array([v.low for v in problem.states]), np.array([v.high for v in problem.states])
 
 
+def in_workspace(x: np.ndarray, ends: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Which states (B, n) are between the ends of a workspace, which the last step of an episode may leave, shape (B,)."""
+    low, high = ends
+    return np.all((x >= low) & (x <= high), axis=1)
+
+
 def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Sequence[sp.Expr]) -> Region:
     """The workspace of a problem, with a finite range for what it leaves unbounded.
 

@@ -35,23 +35,26 @@ class Edge(NamedTuple):
 
 def edges(expression: Any) -> Iterator[Edge]:
     """The parts of an expression that are smooth in the inside of their domains only, each once."""
+    part: Any
     for part in dict.fromkeys(sp.preorder_traversal(expression)):
-        if isinstance(part, sp.Pow) and part.base.free_symbols and not (part.exp.is_Integer and part.exp >= 0):
-            yield Edge(part, part.base, not part.exp.is_nonnegative)
-        elif isinstance(part, sp.log):
-            yield Edge(part, part.args[0], True)
-        elif isinstance(part, (sp.tan, sp.sec)):
-            yield Edge(part, sp.cos(part.args[0]), True)
-        elif isinstance(part, (sp.cot, sp.csc)):
-            yield Edge(part, sp.sin(part.args[0]), True)
-        elif isinstance(part, (sp.asin, sp.acos, sp.atanh)):
-            yield Edge(part, 1 - part.args[0] ** 2, isinstance(part, sp.atanh))
-        elif isinstance(part, sp.acosh):
-            yield Edge(part, part.args[0] - 1, False)
-        elif isinstance(part, sp.atan2):
-            y, x = part.args
-            # It jumps where y = 0 and x <= 0.
-            yield Edge(part, sp.sqrt(x**2 + y**2) + x, True)
+        arguments: tuple[Any, ...] = part.args
+        match part:
+            case sp.Pow() if part.base.free_symbols and not (part.exp.is_Integer and part.exp >= 0):
+                yield Edge(part, part.base, not part.exp.is_nonnegative)
+            case sp.log():
+                yield Edge(part, arguments[0], True)
+            case sp.tan() | sp.sec():
+                yield Edge(part, sp.cos(arguments[0]), True)
+            case sp.cot() | sp.csc():
+                yield Edge(part, sp.sin(arguments[0]), True)
+            case sp.asin() | sp.acos() | sp.atanh():
+                yield Edge(part, 1 - arguments[0] ** 2, isinstance(part, sp.atanh))
+            case sp.acosh():
+                yield Edge(part, arguments[0] - 1, False)
+            case sp.atan2():
+                # It jumps where y = 0 and x <= 0.
+                y, x = arguments
+                yield Edge(part, sp.sqrt(x**2 + y**2) + x, True)
 
 
 class Asked(NamedTuple):

@@ -229,7 +229,7 @@ def _directions(n: int) -> Iterator[Sequence[int]]:
     yield from itertools.product((1, -1, 0), repeat=n)
 
 
-def _origin(region: Region) -> list[sp.Rational]:
+def _origin(region: Region) -> list[sp.Expr]:
     """A point of a region that is nowhere special."""
     shares = np.linspace(2.0 / 7.0, 5.0 / 7.0, len(region.low) + 1)[:-1]
     return [sp.Rational(x) for x in (region.low + shares * (region.high - region.low)).tolist()]
