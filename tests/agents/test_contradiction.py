@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import sympy as sp
 
-from agents import evaluate, verification
+from agents import evaluate, refinement, verification
 from agents.contradiction import by_rate, judged
 from agents.refinement import refine
+from safe_envs import ControlAffineSDE, state_problem
 from tests import false_bounds
 from wrappers import parse_conditions, survey
 from wrappers.learning.bayesian import identify
@@ -105,6 +109,27 @@ def test_a_start_above_a_supremum_withholds_at_once(monkeypatch):
     bounds = promise(found, np.array([[1.5, 0.3]]), HORIZON)
     assert {bound.status for bound in bounds} == {"hypothesis fails", "withheld"}
     assert all("above the supremum" in bound.reason for bound in bounds if bound.status == "withheld")
+
+
+def test_a_rate_with_a_smaller_period_withholds_too():
+    row = {"filter": "scbf", "estimated_bound": 0.5, "bound_note": "", "posterior_bound": None, "withheld": None}
+    finer = [SimpleNamespace(rows=[{"filter": "none", "ci_high": 0.1}, {"filter": "scbf", "ci_high": high}]) for high in (0.6, 0.4)]
+    assert refinement._judged(row, finer[:1]) == row
+    assert refinement._judged(row, finer)["withheld"].startswith("the interval of the measured rate ends at 40.0 %, below 50.0 %")
+
+
+def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch):
+    """h = 1 + x and b_1 = v + .1 h: a start with a large v brakes, so that no later state has as large a b_1."""
+    x, v, u = sp.symbols("x v u", real=True)
+    system = ControlAffineSDE.from_rate((x, v), (u,), [v, u], diffusion=[0, 0.01])
+    problem = state_problem(
+        system, [1 + x], box=(-9, 9), workspace={x: (-1, 1), v: (-1, 1)}, start=(0.0, 0.9), dt=0.05, horizon=1.0, nominal=-5
+    )
+    (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
+    assert (row["estimated_bound"], row["withheld"]) == (pytest.approx((1 / 2 + 1 / 1.2) * np.exp(-0.1) - 1, abs=1e-3), None)
+    monkeypatch.setattr(survey.Survey, "suprema", np.array([2.0, 0.8]))
+    (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
+    assert row["withheld"] == "b_1 reaches 1, above the supremum of 0.8 that the search found"
 
 
 @pytest.mark.parametrize(("bound", "high", "reason"), [(0.5, 0.5, ""), (0.5, 0.49, "ends at 49.0 %, below 50.0 %"), (None, 0.1, "")])

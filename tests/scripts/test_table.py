@@ -97,6 +97,10 @@ def test_violations_that_are_no_more_than_rounding_are_told():
     below = evaluate(moving(1e-12, 1e-12 - X, start=0.0), filters="none", episodes=3, bounds=False)
     assert (below.rows[0]["violations"], below.rows[0]["touching"]) == (3, 0)
     assert "touch the edge" not in printed(below)
+    # The terms are those at the lowest state, not at the start: here h is x, and the state itself is as far below 0.
+    passed = evaluate(moving(-1.000000000000002, X, start=0.5, horizon=0.5), filters="none", episodes=3, bounds=False)
+    assert -1e-14 < passed.rows[0]["min_h_median"] < 0.0
+    assert (passed.rows[0]["violations"], passed.rows[0]["touching"]) == (3, 0)
 
 
 @pytest.mark.parametrize(
