@@ -24,6 +24,7 @@ from wrappers.verify import SMALL, BarrierFindings, Part, Verification
 _NOTHING = 1e-6
 """What a coordinate of a state found by a search is off by, in parts of the workspace."""
 
+_NO_BOUND = ("hypothesis fails", "not established")
 _COLORS = {"estimated": "green", "hypothesis fails": "red", "withheld": "red", "no bound": "yellow", "not established": "yellow"}
 
 
@@ -201,11 +202,16 @@ def _print_bounds(console: Console, found: Verification, starts: np.ndarray, bou
     for i, bound in enumerate(bounds, start=1):
         empty = bound.status == "estimated" and not bound.value
         status = f"[{_COLORS[bound.status]}]{bound.status}[/]{', but empty' if empty else ''}"
-        value = _percent(bound.value) if bound.status == "estimated" or bound.value is None else f"({_percent(bound.value)})"
-        table.add_row(str(i), escape(bound.name), value, status, escape(bound.reason))
+        table.add_row(str(i), escape(bound.name), _value(bound), status, escape(bound.reason))
     console.print(table)
     if any(bound.status == "estimated" for bound in bounds):
         _say(console, "Estimated: a theorem, with the c and m found. Larger ones that the search missed would make the bound smaller.")
+    if any(bound.status in _NO_BOUND and bound.value is not None for bound in bounds):
+        _say(console, "In brackets: what a formula gives whose hypotheses fail here, or whose proof does; that is no bound.")
+
+
+def _value(bound: Bound) -> str:
+    return f"({_percent(bound.value)})" if bound.status in _NO_BOUND and bound.value is not None else _percent(bound.value)
 
 
 def _print_measurement(console: Console, problem: SafetyProblem, policy: str, found: Measurement, numbers: dict[str, str]) -> None:
@@ -224,14 +230,14 @@ def _print_measurement(console: Console, problem: SafetyProblem, policy: str, fo
 
 
 def _marked(horizon: Horizon, names: Sequence[str]) -> list[str]:
-    values = {bound.name: bound.value for bound in horizon.bounds}
-    return [_cell(values[n], n in horizon.contradicted) for n in names]
+    bounds = {bound.name: bound for bound in horizon.bounds}
+    return [_cell(bounds[n], n in horizon.contradicted) for n in names]
 
 
-def _cell(value: float | None, contradicted: bool) -> str:
-    if value is None:
+def _cell(bound: Bound, contradicted: bool) -> str:
+    if bound.value is None:
         return "[red]contradicted[/]" if contradicted else "withheld"
-    return f"[red]contradicted {_percent(value)}[/]" if contradicted else _percent(value)
+    return f"[red]contradicted {_value(bound)}[/]" if contradicted else _value(bound)
 
 
 def _verdict(measurements: Sequence[Measurement], numbers: dict[str, str]) -> str:

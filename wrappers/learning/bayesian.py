@@ -259,14 +259,14 @@ def identify(
         warnings.warn(text, IdentifiabilityWarning, stacklevel=2)
     settings = {
         **({"starts": starts, "steps": steps} if collected else {"points": data.points}),
-        # Of data from elsewhere it is not known how finely a step was integrated: see `wrappers.step_bias`.
-        **({"substeps": problem.substeps} if collected and step is None else {}),
         "repetitions": data.repetitions,
         "degree": chosen,
         "diffusion_degree": diffusion_degree,
         "prior": prior,
         "alpha": alpha,
         "beta": beta,
+        # Of data from elsewhere it is not known how finely a step was integrated: see `wrappers.step_bias`.
+        **({"substeps": problem.substeps} if collected and step is None else {}),
     }
     if progress is not None:
         progress(1.0)
