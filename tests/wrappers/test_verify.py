@@ -31,7 +31,7 @@ from wrappers.safe_set import draw_starts
 from wrappers.survey import Survey
 from wrappers.verify import _infeasible, verify
 
-STATUSES = {"estimated", "hypothesis fails", "no bound", "not established"}
+STATUSES = {"estimated", "withheld", "hypothesis fails", "no bound", "not established"}
 
 
 def test_radial_headings_leave_the_dubins_disk_without_control():
