@@ -18,6 +18,7 @@ from tests.wrappers.verified import (
     by_name,
     estimated,
     findings,
+    hurried,
     hurry,
     made,
     made_bound,
@@ -27,7 +28,7 @@ from tests.wrappers.verified import (
     y,
 )
 from wrappers import parse_conditions
-from wrappers.estimated import estimated_bound
+from wrappers.estimated import estimated_bound, from_survey
 from wrappers.formulas import Formulas
 from wrappers.promise import best_start, promise
 from wrappers.safe_set import draw_starts
@@ -188,7 +189,7 @@ def test_zeroing_forms_and_the_misprint():
 
 def test_every_id_has_a_bound_or_a_note(env_id, monkeypatch):
     hurry(monkeypatch)
-    bound, starts = estimated(env_id), draw_starts(problem_of(env_id), 16)
+    bound, starts = from_survey(hurried(env_id).survey), draw_starts(problem_of(env_id), 16)
     values = bound.at(starts, problem_of(env_id).horizon)
     assert values.shape == (16,)
     assert ((values >= 0.0) & (values <= 1.0)).all()
