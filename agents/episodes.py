@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from agents.bridge import Bridge, Exponentials, smallest
 from agents.comparison import Flags
 from agents.policy import Policy
-from agents.rounding import touches
+from agents.rounding import may_touch, touches
 from agents.seen import Seen, Watch
 from agents.statistics import FirstValues, RunningSum, SafetyCurve, rate_interval, share
 from safe_envs.codegen import Components
@@ -31,8 +31,6 @@ Row = dict[str, Any]
 _KEPT_BARRIERS = 256
 _KEPT_STATES = 32
 _MOST_RECORDED = 1_000_000
-_NEARLY = 1e-6
-"""Only where an episode's smallest h is above minus this part of its largest, rounding may have made the violation."""
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -152,10 +150,9 @@ class Totals:
         self._return.add(wave.returns[:count])
         self._h_min.add(wave.h_min[:count])
         self.seen = self.seen.joined(wave.watch.seen(count))
-        violated = ~wave.safe[:count] & (wave.h_min[:count] >= -_NEARLY * wave.watch.depth[:count])
-        if violated.any():
-            lowest, x = wave.h_min[:count][violated], wave.watch.lowest.T[:count][violated]
-            self._touching += int(touches(self._problem, lowest, x).sum())
+        near = ~wave.safe[:count] & may_touch(wave.h_min[:count], wave.watch.depth[:count])
+        if near.any():
+            self._touching += int(touches(self._problem, wave.h_min[:count][near], wave.watch.lowest.T[:count][near]).sum())
 
     def row(self, confidence: float) -> Row:
         """The statistics of the episodes, with intervals of a confidence; None where no step counts."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,14 @@ from safe_envs.problem import SafetyProblem
 
 _EPSILONS = 64 * np.finfo(float).eps
 """What rounding may add up to over an episode, in parts of the terms of h."""
+
+
+_NEARLY = 1e-6
+
+
+def may_touch(lowest: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """Which episodes are worth a look at by `touches`, which compiles formulas, by their smallest and their largest h, shape (B,)."""
+    return lowest >= -_NEARLY * largest
 
 
 def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -26,19 +35,20 @@ def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.nda
         x: the states where they were, shape (B, n).
     """
     plant = problem.plant
-    compiled = _sizes(plant.states, tuple(plant.numeric(b.expression) for b in problem.barriers))
+    compiled, ends = _parts(plant.states, tuple(plant.numeric(b.expression) for b in problem.barriers))
     with np.errstate(all="ignore"):
-        sizes = stacked(compiled(*np.ascontiguousarray(x.T)), len(x)).max(axis=1)
+        parts = abs(stacked(compiled(*np.ascontiguousarray(x.T)), len(x)))
+    sizes = np.max([parts[:, first:end].sum(axis=1) for first, end in pairwise(ends)], axis=0)
     return (lowest <= 0.0) & (lowest >= -_EPSILONS * sizes)
 
 
 @lru_cache(maxsize=64)
-def _sizes(states: tuple[sp.Symbol, ...], barriers: tuple[sp.Expr, ...]) -> Any:
-    """Compiled sums of the sizes of the terms of each barrier, and of each state times its slope."""
-    return compile_function(states, [_size(h, states) for h in barriers], "arrays")
+def _parts(states: tuple[sp.Symbol, ...], barriers: tuple[sp.Expr, ...]) -> tuple[Any, list[int]]:
+    """The compiled terms of each barrier, and each state times its slope; and where those of a barrier end, after a 0."""
+    parts = [[*sp.Add.make_args(h), *(s * slope for s in states if not _jumps(slope := sp.diff(h, s)))] for h in barriers]
+    ends = np.cumsum([0, *map(len, parts)]).tolist()
+    return compile_function(states, [part for each in parts for part in each], "arrays"), ends
 
 
-def _size(expression: Any, states: tuple[sp.Symbol, ...]) -> sp.Expr:
-    slopes = [(sp.diff(expression, s), s) for s in states]
-    parts = [*sp.Add.make_args(expression), *(slope * s for slope, s in slopes if not slope.has(sp.DiracDelta, sp.Derivative, sp.Subs))]
-    return sp.Add(*[sp.Abs(part) for part in parts])
+def _jumps(slope: Any) -> bool:
+    return slope.has(sp.DiracDelta, sp.Derivative, sp.Subs)
