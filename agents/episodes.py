@@ -12,6 +12,8 @@ from agents import blas_threads
 from agents.bridge import Bridge, Exponentials, smallest
 from agents.comparison import Flags
 from agents.policy import Policy
+from agents.rounding import may_touch, touches
+from agents.seen import Seen, Watch
 from agents.statistics import FirstValues, RunningSum, SafetyCurve, rate_interval, share
 from safe_envs.codegen import Components
 from safe_envs.errors import ConfigurationError
@@ -68,7 +70,8 @@ class Recorder:
 class Wave:
     """Counts of episodes that run side by side, an array entry for each; ended and surplus ones stay as they are."""
 
-    def __init__(self, size: int, count: int, h: np.ndarray) -> None:
+    def __init__(self, size: int, count: int, h: np.ndarray, x: Components, inputs: int) -> None:
+        self.watch = Watch(x, h, inputs)
         self.alive = np.arange(size) < count
         self.safe = h > 0.0
         self.h_min = h.copy()
@@ -79,9 +82,19 @@ class Wave:
         self.effort = np.zeros(size)
         self.returns = np.zeros(size)
 
-    def add(self, h: np.ndarray, u: Components, reward: np.ndarray, info: Info) -> None:
-        """Count a step with its smallest h; it counts for the filter only if the episode was safe up to its beginning."""
+    def add(self, h: np.ndarray, x: tuple[Components, Components], u: Components, reward: np.ndarray, info: Info) -> None:
+        """Count a step with its smallest h; it counts for the filter only if the episode was safe up to its beginning.
+
+        Args:
+            h: smallest barrier value of the step.
+            x: the states before and after it.
+            u: what was executed.
+            reward: of the step.
+            info: of the env.
+        """
         alive, counts = self.alive, self.alive & self.safe
+        self.watch.add(x[0], u, info.get("slack"), counts)
+        self.watch.reached(x[1], h, self.h_min, alive, counts)
         self.counted += counts
         self.lengths += alive
         if "intervention" in info:
@@ -109,10 +122,13 @@ class Totals:
 
     Attributes:
         flags: which of the episodes were safe.
+        seen: states that say something against a bound.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
-        self.episodes = self.safe = self.steps = 0
+        self.episodes = self.safe = self.steps = self._touching = 0
+        self.seen = Seen.nothing(problem)
+        self._problem = problem
         self.flags = Flags()
         self._curve, self._dt, self._never = SafetyCurve(problem.steps), problem.dt, problem.steps + 1
         self._counted = self._interventions = self._infeasible = self._with_effort = 0
@@ -133,6 +149,10 @@ class Totals:
         self._effort.add(wave.effort[:count][some] / wave.counted[:count][some])
         self._return.add(wave.returns[:count])
         self._h_min.add(wave.h_min[:count])
+        self.seen = self.seen.joined(wave.watch.seen(count))
+        near = ~wave.safe[:count] & may_touch(wave.h_min[:count], wave.watch.depth[:count])
+        if near.any():
+            self._touching += int(touches(self._problem, wave.h_min[:count][near], wave.watch.lowest.T[:count][near]).sum())
 
     def row(self, confidence: float) -> Row:
         """The statistics of the episodes, with intervals of a confidence; None where no step counts."""
@@ -147,6 +167,7 @@ class Totals:
             "min_h_median": median,
             "min_h_p05": p05,
             "violations": self.episodes - self.safe,
+            "touching": self._touching,
             "intervention_rate": share(self._interventions, self._counted),
             "infeasible_rate": share(self._infeasible, self._counted),
             "effort_mean": share(self._effort.total, self._with_effort),
@@ -258,16 +279,17 @@ def _play(
     steps = world.problem.steps
     observation, info = started
     h = smallest(info["barrier"])
-    wave = Wave(len(h), count, h)
+    wave = Wave(len(h), count, h, world.components, len(world.problem.inputs))
     if recorder:
         recorder.note(0, first, wave.alive, h, world.components)
     state, start = None, np.ones(len(h), dtype=bool)
     for k in range(1, steps + 1):
         actions, state = policy.predict(observation, state, start, deterministic=True)
+        before = world.components
         observation, reward, terminated, truncated, info = env.step(actions)
         h = smallest(info["barrier"])
         lowest = h if watch is None else watch.lowest(world.components, info["barrier"])
-        wave.add(lowest, _executed(world, actions, info), reward, info)
+        wave.add(lowest, (before, world.components), _executed(world, actions, info), reward, info)
         if recorder:
             recorder.note(k, first, wave.alive, h, world.components)
         start = terminated | truncated

@@ -12,11 +12,13 @@ from typing import Any
 
 from agents.bridge import Bridge, require_monitoring
 from agents.comparison import Comparison, Flags, compare_all
+from agents.contradiction import judged
 from agents.episodes import Progress, Recorder, Row, Totals, play, totals_of
 from agents.learning import describe, seconds_of
 from agents.processes import play_in_processes
 from agents.promised import Promised, together
 from agents.repeats import pooled
+from agents.seen import Seen
 from agents.setting import BARE, Setting, Work
 from agents.statistics import require_confidence
 from safe_envs.errors import ConfigurationError, require_whole
@@ -41,6 +43,7 @@ class Evaluation:
         timing: the only part that depends on the machine and on `num_envs`.
         recorders: trajectories for each filter, if asked for.
         flags: which episodes were safe, for each filter, with each identification of what it rests on.
+        seen: states of the episodes that say something against a bound, for each filter and identification.
         learned: what the first identifications of the filters rest on.
         repeats: whether nothing is random, so that all episodes are one and the same.
     """
@@ -52,6 +55,7 @@ class Evaluation:
     timing: dict[str, Any]
     recorders: dict[str, Recorder]
     flags: dict[str, list[Flags]]
+    seen: dict[str, list[Seen]]
     learned: list[LearnedModel]
     repeats: bool
 
@@ -100,8 +104,9 @@ def evaluate(
     episode's interventions, infeasible steps and effort are no longer counted: the conditions mean nothing outside the safe
     set. Its simulation goes on, and its return and smallest h are of the whole episode.
 
-    Beside the rate stands the largest bound that is proved for the filter, on average over the starts: see
-    `wrappers.bounds`. It is of continuous time and rests on suprema that are estimated.
+    Beside the rate stands the largest bound that is estimated for the filter, on average over the starts: see
+    `wrappers.bounds`. It is of continuous time and rests on suprema from a search. What the episodes contradict is withheld: see
+    `agents.contradiction`.
 
     Episode i is seeded by its own child of `seed`, the same for all filters; all but `timing` is the same, to the
     last bit, for every `num_envs`.
@@ -121,7 +126,7 @@ def evaluate(
         knowledge: what the filters know, "model" or "plant"; those that correct the model start from it in any case.
         objective: of the filters, "nearest" to the policy's action or "clf": see `SafetyFilter.for_problem`.
         confidence: of all intervals, between 0 and 1.
-        bounds: look for proved bounds and certificates, which takes a search of the safe set for each filter.
+        bounds: look for bounds, which takes a search of the safe set for each filter.
         spec: how filters see an env of somebody else, or FILE.py:NAME of that. There `problem` is the model that filters believe, and
             episodes are simulated one by one.
         learned: models, or files of `safe-envs identify`, to use in place of learning.
@@ -175,7 +180,7 @@ def evaluate(
     }
     bridge = Bridge(world) if monitoring == "continuous" else None
     why_not = simulated.why_no_bound or (None if bounds else "it was not asked for")
-    rows, speeds, flags = [], [], {}
+    rows, speeds, flags, seen = [], [], {}, {}
     recorders = {name: Recorder(world.steps, world.plant.n, episodes) for name in names} if record else {}
     for name in names:
         promised = [Promised(conditions, world, knowledge, why_not) for conditions in filters_of[name]]
@@ -199,15 +204,15 @@ def evaluate(
                 "filter": name,
                 "policy": config["policy"]["name"],
                 **found,
-                **together([promise.row() for promise in promised]),
+                **judged(together([promise.row(each.seen) for promise, each in zip(promised, totals, strict=True)]), found["ci_high"]),
                 "learning": describe(filters_of[name], [each.safe / each.episodes for each in totals], world, knowledge),
             }
         )
-        flags[name] = [each.flags for each in totals]
+        flags[name], seen[name] = [each.flags for each in totals], [each.seen for each in totals]
     timing = {"num_envs": num_envs, "rows": speeds}
     comparisons = compare_all(flags, confidence)
     return Evaluation(
-        world, config, rows, comparisons, timing, recorders, flags, learning.models(), simulated.is_deterministic(setting.actor)
+        world, config, rows, comparisons, timing, recorders, flags, seen, learning.models(), simulated.is_deterministic(setting.actor)
     )
 
 

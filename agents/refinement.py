@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from agents.contradiction import judged
 from agents.episodes import Progress, Row
 from agents.evaluation import Evaluation, evaluate
 from agents.statistics import paired_difference_interval
@@ -54,7 +56,8 @@ def refine(
 
     The verdict on a rate is "converged" where the interval of its change from dt/2 to dt/4 reaches no further than
     `TOLERANCE` either way. Elsewhere it is "still changing" where the interval does not contain 0, and "not resolved"
-    where it does, so that more episodes are needed. It says nothing of still smaller periods.
+    where it does, so that more episodes are needed. It says nothing of still smaller periods. A rate with any of these periods
+    contradicts a bound as it does in `evaluate`: then that is withheld, and the verdict "contradicted".
 
     Args:
         problem: as for `evaluate`.
@@ -75,9 +78,21 @@ def refine(
     first = evaluate(problem, policy, progress=_share(progress, 0), record=record, **arguments)
     arguments |= {"options": None, "filters": [row["filter"] for row in first.rows], "bounds": False, "learned": first.learned}
     finer = [evaluate(_divided(first.problem, d), policy, progress=_share(progress, i), **arguments) for i, d in enumerate(DIVISORS) if i]
+    # The finer ones are nearer to continuous time, of which the bounds are.
+    first = replace(first, rows=[_judged(row, finer) for row in first.rows])
     evaluations = (first, *finer)
-    rows = [_row(row["filter"], evaluations) for row in first.rows]
-    return Refinement(evaluations, rows)
+    return Refinement(evaluations, [_row(row["filter"], evaluations) for row in first.rows])
+
+
+def _judged(row: Row, finer: Sequence[Evaluation]) -> Row:
+    """A row without bounds that a rate with a finer period contradicts."""
+    for evaluation in finer:
+        row = judged(row, _of(evaluation, row["filter"])["ci_high"])
+    return row
+
+
+def _of(evaluation: Evaluation, name: str) -> Row:
+    return next(row for row in evaluation.rows if row["filter"] == name)
 
 
 def _share(progress: Progress | None, i: int) -> Progress | None:
@@ -94,7 +109,7 @@ def _divided(problem: SafetyProblem, divisor: int) -> SafetyProblem:
 
 
 def _row(name: str, evaluations: tuple[Evaluation, ...]) -> Row:
-    cells = [next(row for row in evaluation.rows if row["filter"] == name) for evaluation in evaluations]
+    cells = [_of(evaluation, name) for evaluation in evaluations]
     coarse, fine = evaluations[-2:]
     low, high = paired_difference_interval(*fine.flags[name][0].table(coarse.flags[name][0]), fine.config["confidence"])
     return {
@@ -103,7 +118,8 @@ def _row(name: str, evaluations: tuple[Evaluation, ...]) -> Row:
         "change": cells[-1]["safety_rate"] - cells[-2]["safety_rate"],
         "change_low": low,
         "change_high": high,
-        "verdict": verdict(low, high),
+        "verdict": "contradicted" if cells[0]["withheld"] else verdict(low, high),
+        "withheld": cells[0]["withheld"],
     }
 
 

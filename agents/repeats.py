@@ -12,7 +12,7 @@ from agents.episodes import Row
 from agents.statistics import rate_interval, repeated_interval
 
 _MEANS = ("min_h_median", "min_h_p05", "intervention_rate", "infeasible_rate", "effort_mean", "return_mean")
-_SUMS = ("episodes", "safe", "violations")
+_SUMS = ("episodes", "safe", "violations", "touching")
 
 
 def pooled(rows: Sequence[Row], confidence: float) -> Row:

@@ -38,7 +38,7 @@ _STATISTICS = (
     "infeasible_rate",
     "effort_mean",
     "return_mean",
-    "bound",
+    "estimated_bound",
 )
 _DOCUMENTS = ("settings", "files", "versions", "config", "row")
 

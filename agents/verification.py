@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from agents.contradiction import by_rate, by_states
 from agents.evaluation import Evaluation, evaluate
+from agents.seen import Seen
 from safe_envs.problem import SafetyProblem
 from wrappers import spec_of
+from wrappers.estimated import from_survey
 from wrappers.promise import Bound, best_start, promise
 from wrappers.safe_set import draw_starts
 from wrappers.verify import Verification
@@ -62,6 +65,7 @@ class Measurement:
         episodes: how many were simulated.
         repeats: whether nothing is random, so that all episodes are one and the same.
         horizons: the shortest first.
+        seen: states that say something against a bound.
     """
 
     start: str
@@ -69,6 +73,35 @@ class Measurement:
     episodes: int
     repeats: bool
     horizons: tuple[Horizon, ...]
+    seen: tuple[Seen, ...] = ()
+
+
+def judged(
+    bounds: Sequence[Bound], measurements: Sequence[Measurement], verification: Verification
+) -> tuple[list[Bound], list[Measurement]]:
+    """Bounds and measurements without the values of what was estimated and is contradicted; see `agents.contradiction`.
+
+    Args:
+        bounds: at the start.
+        measurements: of the same conditions.
+        verification: on which the bounds rest.
+    """
+    of_all = by_states(from_survey(verification.survey), [seen for m in measurements for seen in m.seen])
+    of_each: dict[str, str] = {}
+    for m in measurements:
+        for h in m.horizons:
+            for bound in h.bounds:
+                below = by_rate(bound.value, h.rate if m.repeats else h.ci_high)
+                if below:
+                    of_each.setdefault(bound.name, f"from {m.start}, up to {h.time:g} s, {below}")
+
+    def without(bound: Bound) -> Bound:
+        return bound.without(of_each.get(bound.name) or of_all)
+
+    def cleared(h: Horizon) -> Horizon:
+        return replace(h, bounds=tuple(map(without, h.bounds)))
+
+    return [without(bound) for bound in bounds], [replace(m, horizons=tuple(map(cleared, m.horizons))) for m in measurements]
 
 
 def measure(
@@ -100,7 +133,7 @@ def measure(
     for i, (name, world) in enumerate(worlds):
         told = None if progress is None else _part_of(progress, i / len(worlds), 1.0 / len(worlds))
         found.append(_measure(verification, name, world, policy, episodes, seed, told))
-    return _judged(found)
+    return _all_compared(found)
 
 
 def starts_of(problem: SafetyProblem, seed: int = 0) -> np.ndarray:
@@ -120,6 +153,7 @@ def _measure(
     lasting = formulas.noisy and any(b.forever and b.value for b in promise(verification, starts, world.duration))
     runs = _runs(world, lasting, episodes)
     horizons: list[Horizon] = []
+    seen: list[Seen] = []
     repeats = False
     done, whole = 0, sum(run[-1] for run in runs)
     for run in runs:
@@ -134,8 +168,9 @@ def _measure(
             progress=None if progress is None else _part_of(progress, done / whole, run[-1] / whole),
         )
         horizons += [_horizon(verification, answer, k * world.duration, starts) for k in run]
+        seen += answer.seen[answer.rows[0]["filter"]]
         repeats, done = answer.repeats, done + run[-1]
-    return Measurement(name, starts[0] if len(starts) == 1 else None, episodes, repeats, tuple(horizons))
+    return Measurement(name, starts[0] if len(starts) == 1 else None, episodes, repeats, tuple(horizons), tuple(seen))
 
 
 def _runs(world: SafetyProblem, lasting: bool, episodes: int) -> list[list[int]]:
@@ -160,7 +195,7 @@ def _horizon(verification: Verification, answer: Evaluation, horizon: float, sta
     return Horizon(time, curve["safe"][i], curve["rate"][i], curve["ci_low"][i], curve["ci_high"][i], bounds)
 
 
-def _judged(found: list[Measurement]) -> list[Measurement]:
+def _all_compared(found: list[Measurement]) -> list[Measurement]:
     comparisons = max(1, sum(bool(bound.value) for m in found for h in m.horizons for bound in h.bounds))
     return [replace(m, horizons=tuple(_compared(m, h, comparisons) for h in m.horizons)) for m in found]
 

@@ -1,4 +1,4 @@
-"""What the table of an evaluation says of learning: its time, the worst identification, certificates, and notes."""
+"""What the table of an evaluation says of learning: its time, the worst identification, bounds over posteriors, and notes."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ def learned_columns(rows: Sequence[Row]) -> dict[str, Cell]:
         columns["learned\nin" if repeats == 1 else "learned in,\nmean"] = _seconds
     if repeats > 1:
         columns["worst\nident."] = _worst
-    if any(row["certificate"] for row in rows):
-        columns["certificate"] = _certificate
+    if any(row["posterior_bound"] for row in rows):
+        columns["estimated,\nposterior"] = _posterior_bound
     return columns
 
 
 def learned_notes(rows: Sequence[Row], problem: SafetyProblem) -> list[str]:
-    """What has to be known of what was learned of a problem, and of certificates."""
+    """What has to be known of what was learned of a problem, and of bounds over posteriors."""
     repeats = _repeats(rows)
     if not repeats:
         return []
-    untried = not any(row["certificate"] for row in rows) and _may_be_certified(problem)
-    hint = "; bayesian-scbf:simultaneous=P may have a certificate" if untried else ""
-    notes = [f"no proved bound for what rests on something learned{hint}."]
+    untried = not any(row["posterior_bound"] for row in rows) and _may_have_a_bound(problem)
+    hint = "; for bayesian-scbf:simultaneous=P one may be estimated over the posterior" if untried else ""
+    notes = [f"no bound for what rests on something learned{hint}."]
     if repeats > 1:
         notes.append(
             f"the intervals take the rates of the {repeats} identifications for nearly normal: bad ones that are rarer than about 1 in "
             f'{repeats} go unseen, and "worst ident." is the worst of those seen.'
         )
     for row in rows:
-        learning, certificate = row["learning"], row["certificate"]
+        learning, bound = row["learning"], row["posterior_bound"]
         if learning and learning["files"]:
             notes.append(
                 f"{row['filter']} was learned before, from {learning['transitions']:,} transitions: {', '.join(learning['files'])}"
@@ -52,12 +52,13 @@ def learned_notes(rows: Sequence[Row], problem: SafetyProblem) -> list[str]:
             each = " each" if learning["repeats"] > 1 else ""
             notes.append(f"{row['filter']} was learned from {learning['transitions']:,} transitions{each}.")
         notes += [f"{row['filter']}: {warning}" for warning in ([*learning["remarks"], *learning["warnings"]] if learning else ())]
-        if certificate and certificate["note"]:
-            notes.append(f"certificate of {row['filter']}: {certificate['note']}")
-        if certificate and "delta" in certificate:
+        if bound and bound["note"]:
+            notes.append(f"bound of {row['filter']} over the posterior: {bound['note']}")
+        if bound and "delta" in bound:
             notes.append(
-                f"certificate of {row['filter']}: P >= (1 - delta)(h_0 - m T)/c, with probability delta = {certificate['delta']:.3g} that "
-                f"the identification misses the system, shortfall m = {certificate['shortfall']:.3g}, c = {certificate['supremum']:.3g}."
+                f"bound of {row['filter']} over the posterior: (1 - delta)(h_0 - (m + e) T)/c, estimated, with probability delta = "
+                f"{bound['delta']:.3g} that the identification misses the system, shortfall m = {bound['shortfall']:.3g}, bias of the "
+                f"steps e = {bound['bias']:.3g}, c = {bound['supremum']:.3g}."
             )
     return notes
 
@@ -67,8 +68,8 @@ def _repeats(rows: Sequence[Row]) -> int:
     return max((row["learning"]["repeats"] for row in rows if row["learning"]), default=0)
 
 
-def _may_be_certified(problem: SafetyProblem) -> bool:
-    """Whether a problem has one barrier, of relative degree 1: for others there is no robust condition, on which a certificate rests."""
+def _may_have_a_bound(problem: SafetyProblem) -> bool:
+    """Whether a problem has one barrier, of relative degree 1: for others there is no robust condition, on which such a bound rests."""
     if len(problem.barriers) != 1:
         return False
     (barrier,) = problem.barriers
@@ -85,8 +86,10 @@ def _worst(row: Row, _: Mapping[str, Any]) -> str:
     return percent(min(learning["rates"])) if learning and learning["repeats"] > 1 else _NONE
 
 
-def _certificate(row: Row, _: Mapping[str, Any]) -> str:
-    certificate = row["certificate"]
-    if certificate is None:
+def _posterior_bound(row: Row, _: Mapping[str, Any]) -> str:
+    bound = row["posterior_bound"]
+    if bound is None:
         return _NONE
-    return "none" if certificate["probability"] is None else f"≥ {percent(certificate['probability'])}"
+    if bound["probability"] is None:
+        return "withheld" if row["withheld"] else "none"
+    return percent(bound["probability"])

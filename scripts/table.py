@@ -27,10 +27,17 @@ _COLUMNS = (
     "steps/s",
 )
 _WIDEST = 1000
+ESTIMATED = (
+    "a bound is estimated: a theorem, with a supremum and a shortfall from a search of the safe set, and as far as these episodes do not "
+    "contradict it. It counts leaving the workspace as an end, not as a violation."
+)
+"""What an estimated bound is."""
+
 _VERDICTS = {
     "converged": "converged, {}",
     "not resolved": "not resolved, {}: more episodes are needed",
     "still changing": "still changing by {}",
+    "contradicted": "changed by {}, but not called converged: its bound is withheld, {}",
 }
 
 
@@ -39,7 +46,7 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     interval = _interval(evaluation)
     console.print(heading(evaluation), soft_wrap=True, highlight=False)
     learned = learned_columns(evaluation.rows)
-    table = _table(f"safe [{interval}]", *learned, "bound", *_COLUMNS)
+    table = _table(f"safe [{interval}]", *learned, "estimated\nbound", *_COLUMNS)
     for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True):
         name, rate, *rest = _cells(row, speed["steps_per_second"])
         table.add_row(Text(name), rate, *[cell(row, speed) for cell in learned.values()], *rest)
@@ -70,7 +77,7 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
         return
     for row in refinement.rows:
         change = _points(row["change"], row["change_low"], row["change_high"])
-        _say(console, f"  {row['filter']}: {_VERDICTS[row['verdict']].format(change)}")
+        _say(console, f"  {row['filter']}: {_VERDICTS[row['verdict']].format(change, row['withheld'])}")
     reach = f"{100 * TOLERANCE:g} points"
     _say(console, f"Converged: the {interval} of the change from dt/2 to dt/4 reaches no further than {reach} either way.")
 
@@ -151,32 +158,17 @@ def _describe(comparison: Comparison) -> str:
 
 def _notes(evaluation: Evaluation) -> list[str]:
     """What has to be known to read the table."""
-    steps, episodes = evaluation.problem.steps, evaluation.config["episodes"]
+    steps = evaluation.problem.steps
     curve = evaluation.rows[0]["curve"]
     notes = unsafe_starts(1.0 - curve["rate"][0])
-    notes += [
-        f"no proved bound for {row['filter']}: {row['bound_note']}"
-        for row in evaluation.rows
-        if row["filter"] != BARE and row["bound"] is None and row["learning"] is None
-    ]
-    notes += [
-        f"{100 * row['outside_rate']:.3g} % of the starts lie outside the sets C_j = {{b_j >= 0}}, j >= 1, that {row['filter']} keeps: "
-        "nothing is promised from there"
-        for row in evaluation.rows
-        if row["outside_rate"]
-    ]
+    notes += [note for row in evaluation.rows for note in (*_of_bound(row), *_of_violations(row))]
     notes += learned_notes(evaluation.rows, evaluation.problem)
-    notes += [
-        f"the rate of {row['filter']} lies below its proved bound, which asks for the condition at every instant: try --refine, and "
-        "--filter NAME:sampling_margin=first-order"
-        for row in evaluation.rows
-        if row["bound"] is not None and row["ci_high"] < row["bound"]
-    ]
-    notes += [
-        early_end(row["filter"], "mean episode", speed["steps"] / episodes, steps)
-        for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True)
-        if speed["steps"] < 0.99 * steps * episodes
-    ]
+    if any(row["estimated_bound"] is not None for row in evaluation.rows):
+        notes.append(ESTIMATED)
+    for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True):
+        length = speed["steps"] / row["episodes"]  # With repeats both are of all identifications.
+        if length < 0.99 * steps:
+            notes.append(early_end(row["filter"], "mean episode", length, steps))
     if evaluation.config["monitoring"] == "continuous":
         notes += bridge_notes(evaluation.problem)
     if evaluation.repeats:
@@ -185,6 +177,28 @@ def _notes(evaluation: Evaluation) -> list[str]:
             "one and the same: the interval says nothing."
         )
     return notes
+
+
+def _of_bound(row: Row) -> list[str]:
+    """Why a row has no bound, or is promised nothing from some of its starts."""
+    name, notes = row["filter"], []
+    if name != BARE and row["estimated_bound"] is None and row["learning"] is None:
+        notes.append(f"no bound for {name}: {row['bound_note']}")
+    if row["outside_rate"]:
+        notes.append(
+            f"{100 * row['outside_rate']:.3g} % of the starts lie outside the sets C_j = {{b_j >= 0}}, j >= 1, that {name} keeps: "
+            "nothing is promised from there"
+        )
+    return notes
+
+
+def _of_violations(row: Row) -> list[str]:
+    """How many violations are no more than rounding."""
+    touching, violations = row["touching"], row["violations"]
+    if not touching:
+        return []
+    some = "all violations" if touching == violations else f"{touching} of the {violations} violations"
+    return [f"{some} of {row['filter']} come no lower than h = 0 to rounding: they touch the edge, and safe is h > 0"]
 
 
 def unsafe_starts(share: float) -> list[str]:
@@ -223,7 +237,9 @@ def _cells(row: Row, speed: float) -> list[str]:
 def _bound(row: Row) -> str:
     if row["filter"] == BARE:
         return "-"
-    return "none" if row["bound"] is None else f"≥ {percent(row['bound'])}"
+    if row["estimated_bound"] is None:
+        return "withheld" if row["withheld"] and row["posterior_bound"] is None else "none"
+    return percent(row["estimated_bound"])
 
 
 def _points(difference: float, low: float, high: float) -> str:

@@ -41,14 +41,15 @@ def verify(
         Path | None, typer.Option(metavar="FILE", help=f"Draw where the conditions cannot be met, h and the boundaries: {options.FORMATS}")
     ] = None,
 ) -> None:
-    """Print where the filter's conditions cannot be met, what is proved of its safety, and what a simulation says to that.
+    """Print where the filter's conditions cannot be met, what bounds on its safety are estimated at, and what a simulation says to that.
 
     The safe set C is sampled, and searched for the worst: where the input has no say, where no action in the box meets the
-    conditions, and the suprema on which the bounds rest. Nothing of this depends on the policy; the simulation does.
+    conditions, and the suprema on which the bounds rest. Nothing of this depends on the policy; the simulation does, and a bound
+    that it contradicts is withheld.
     """
     from agents.policy import make_policy
     from agents.problems import load_problem, title_of
-    from agents.verification import measure, starts_of
+    from agents.verification import judged, measure, starts_of
     from scripts.verify_report import document, print_report
     from wrappers import parse_conditions
     from wrappers.promise import promise
@@ -67,6 +68,7 @@ def verify(
     if simulate:
         with progress_bar("Simulating") as tell:
             measurements = measure(found, actor, episodes=episodes, seed=seed, progress=tell)
+        bounds, measurements = judged(bounds, measurements, found)
     print_report(stdout(), title, found, starts, bounds, policy, measurements)
     config = {"env_id": known, "options": arguments, "policy": policy, "seed": seed}
     write_result(json, lambda: document(config, found, bounds, measurements))

@@ -24,7 +24,8 @@ from wrappers.verify import SMALL, BarrierFindings, Part, Verification
 _NOTHING = 1e-6
 """What a coordinate of a state found by a search is off by, in parts of the workspace."""
 
-_COLORS = {"proved": "green", "hypothesis fails": "red", "no bound": "yellow", "unproved": "yellow"}
+_NO_BOUND = ("hypothesis fails", "not established")
+_COLORS = {"estimated": "green", "hypothesis fails": "red", "withheld": "red", "no bound": "yellow", "not established": "yellow"}
 
 
 def print_report(
@@ -57,8 +58,8 @@ def print_report(
         _say(console, _verdict(measurements, numbers))
     _say(
         console,
-        "\nSuprema, shortfalls and shares are estimates from samples and a local search, no proofs. The bounds are about conditions that "
-        f"are met at every instant, not every {problem.dt:g} s.",
+        "\nSuprema, shortfalls and shares are estimates from samples and a local search. The bounds are about conditions that "
+        f"are met at every instant, not every {problem.dt:g} s, and count leaving the workspace as an end, not as a violation.",
     )
 
 
@@ -82,11 +83,14 @@ def document(config: dict[str, Any], found: Verification, bounds: Sequence[Bound
             "kept": vars(found.kept) if found.kept else None,
             "barriers": [{**vars(b), "vanishes": b.vanishes, "unbounded": math.isinf(b.supremum)} for b in found.barriers],
             "bounds": [vars(b) for b in bounds],
-            "measurements": [
-                {**vars(m), "horizons": [{**vars(h), "bounds": [vars(b) for b in h.bounds]} for h in m.horizons]} for m in measurements
-            ],
+            "measurements": [_measured(m) for m in measurements],
         }
     )
+
+
+def _measured(found: Measurement) -> dict[str, Any]:
+    horizons = [{**vars(h), "bounds": [vars(b) for b in h.bounds]} for h in found.horizons]
+    return {key: getattr(found, key) for key in ("start", "state", "episodes", "repeats")} | {"horizons": horizons}
 
 
 def _plain(value: Any) -> Any:
@@ -126,7 +130,7 @@ def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
     if found.beyond and found.region.chosen.any():
         lines.append("C reaches beyond these ranges: shares and shortfalls are of the part inside")
     elif found.beyond:
-        lines.append("C reaches beyond the workspace: shares and shortfalls are of the part inside, where the episodes are")
+        lines.append("C reaches beyond the workspace: shares, shortfalls and suprema are of the part inside, where the episodes are")
     if found.undefined:
         lines.append(
             f"a condition has no finite value on {_percent(found.undefined)} of {_searched(found)}; nothing can be met or missed there"
@@ -193,16 +197,21 @@ def _print_bounds(console: Console, found: Verification, starts: np.ndarray, bou
     where = f"at {_state(problem, starts[0])}" if len(starts) == 1 else f"on average over {len(starts)} starts {problem.start!r}"
     console.print(f"\n[bold]Bounds on the probability of no violation[/] {escape(where)}, T = {problem.duration:g} s", highlight=False)
     table = _table()
-    for name in ("", "bound", "P >=", "status with the c and m found", "why"):
-        table.add_column(name, justify="right" if name == "P >=" else "left", no_wrap=name in ("", "P >="))
+    for name in ("", "bound", "value", "status with the c and m found", "why"):
+        table.add_column(name, justify="right" if name == "value" else "left", no_wrap=name in ("", "value"))
     for i, bound in enumerate(bounds, start=1):
-        empty = bound.status == "proved" and not bound.value
+        empty = bound.status == "estimated" and not bound.value
         status = f"[{_COLORS[bound.status]}]{bound.status}[/]{', but empty' if empty else ''}"
-        value = _percent(bound.value) if bound.status == "proved" or bound.value is None else f"({_percent(bound.value)})"
-        table.add_row(str(i), escape(bound.name), value, status, escape(bound.reason))
+        table.add_row(str(i), escape(bound.name), _value(bound), status, escape(bound.reason))
     console.print(table)
-    if any(bound.status == "proved" for bound in bounds):
-        _say(console, "Proved is the theorem, with the c and m found: larger ones that the search missed would make the bound smaller.")
+    if any(bound.status == "estimated" for bound in bounds):
+        _say(console, "Estimated: a theorem, with the c and m found. Larger ones that the search missed would make the bound smaller.")
+    if any(bound.status in _NO_BOUND and bound.value is not None for bound in bounds):
+        _say(console, "In brackets: what a formula gives whose hypotheses fail here, or whose proof does; that is no bound.")
+
+
+def _value(bound: Bound) -> str:
+    return f"({_percent(bound.value)})" if bound.status in _NO_BOUND and bound.value is not None else _percent(bound.value)
 
 
 def _print_measurement(console: Console, problem: SafetyProblem, policy: str, found: Measurement, numbers: dict[str, str]) -> None:
@@ -221,24 +230,28 @@ def _print_measurement(console: Console, problem: SafetyProblem, policy: str, fo
 
 
 def _marked(horizon: Horizon, names: Sequence[str]) -> list[str]:
-    values = {bound.name: bound.value for bound in horizon.bounds}
-    return [f"[red]contradicted {_percent(values[n])}[/]" if n in horizon.contradicted else _percent(values[n]) for n in names]
+    bounds = {bound.name: bound for bound in horizon.bounds}
+    return [_cell(bounds[n], n in horizon.contradicted) for n in names]
+
+
+def _cell(bound: Bound, contradicted: bool) -> str:
+    if bound.value is None:
+        return "[red]contradicted[/]" if contradicted else "withheld"
+    return f"[red]contradicted {_value(bound)}[/]" if contradicted else _value(bound)
 
 
 def _verdict(measurements: Sequence[Measurement], numbers: dict[str, str]) -> str:
     bounds = {bound.name: bound for m in measurements for h in m.horizons for bound in h.bounds}
     wrong = {name for m in measurements for h in m.horizons for name in h.contradicted}
+    withheld = next((bound.reason for bound in bounds.values() if bound.status == "withheld"), "")
     if not bounds:
         return "\nThere is no bound that the measurement could contradict."
     if not wrong:
-        return "\nThe measurement contradicts no bound."
+        return "\nThe measurement contradicts no bound." if not withheld else f"\nWithheld: {withheld}"
     listing = "; ".join(f"{numbers[name]}, {bounds[name].status} ({name})" for name in sorted(wrong, key=lambda name: int(numbers[name])))
-    advice = (
-        " A proved one among them: reduce --dt, since it is of continuous time." if any(bounds[n].status == "proved" for n in wrong) else ""
-    )
     return (
         f"\nThe measurement contradicts bound {listing}. The interval of the rate lies below it, with the 5 % of error shared by all "
-        f"comparisons of this report.{advice}"
+        "comparisons of this report."
     )
 
 

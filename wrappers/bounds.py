@@ -1,13 +1,19 @@
 """Lower bounds on the probability of staying safe, as functions of numbers: each with its hypotheses.
 
 All of them are of continuous time, with the condition met at every instant: an input that is held for a control period
-meets it at its beginning only. They rest on one inequality. Let X be stopped when it leaves the set where b_0, ..., b_(r-1)
-are positive, at the time tau, and let A b >= -a b - m up to then, with a, m >= 0 and b <= c. Then
+meets it at its beginning only. They rest on one inequality. Let G be the set where b_0, ..., b_(r-1) are positive, cut to the
+inside of the workspace where leaving that ends an episode. Let b be twice continuously differentiable in G, continuous on its
+closure and at most c. Let X be stopped when it leaves G, at the time tau, and let A b >= -a b - m up to then, with a, m >= 0. Then
 
     e^(a t) b(X_t) + m (e^(a t) - 1)/a     (m t in place of the last term where a = 0)
 
 is a submartingale up to tau, so that b(x_0) is at most its expectation at min(tau, T), which is at most
-e^(a T) c P(b is not 0 at min(tau, T)) + m (e^(a T) - 1)/a. That gives `stage_bound`. All others follow from it.
+e^(a T) c P(b is not 0 at min(tau, T)) + m (e^(a T) - 1)/a. That gives `stage_bound`. All others follow from it. An episode that
+has left the workspace before is at an end, and safe until then: so c and m are taken over G alone. For that a >= 0 is needed,
+since tau may come before T.
+
+These are theorems about the numbers they are given. A bound with c and m from a search is an estimate: a larger c or m that the
+search missed would make it smaller.
 
 Every function broadcasts over arrays of starts, and returns values in [0, 1]. A value of 0 promises nothing, and so does an
 infinite c.
@@ -145,7 +151,7 @@ def union_bound(
 
 
 def theorem_4_2_10_printed(b: ArrayLike, c: ArrayLike, horizon: float = _FOREVER, rates: Sequence[float] | None = None) -> np.ndarray:
-    """The product of b_j/c_j, as it is printed, or its form for the zeroing chain: unproved for r >= 2.
+    """The product of b_j/c_j, as it is printed, or its form for the zeroing chain: without a valid proof for r >= 2.
 
     Its proof takes P(b_j stays positive | b_(j+1) stays positive) for at least b_j/c_j, Eq. (4.23). That conditions on the
     future: the paths on which b_(j+1) stays positive are not those of the unconditioned process, for which b_j is a

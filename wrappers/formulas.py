@@ -149,8 +149,13 @@ class Formulas:
 
     @property
     def joint(self) -> bool:
-        """Whether it is exact what the conditions miss together: for one, independent ones, or a single input."""
-        return self.independent or self.problem.plant.m == 1
+        """Whether it is exact what the conditions miss together: for one, independent ones, or a single input.
+
+        Where several share an input that cannot meet their margins of first order, these decide how the filter shares out what
+        is missed, and they depend on what is proposed.
+        """
+        sampled = any(c.change is not None for c in self._constraints)
+        return self.independent or (self.problem.plant.m == 1 and not sampled)
 
     @cached_property
     def _changes(self) -> Any:

@@ -44,14 +44,14 @@ def mismatch(formulas: Formulas) -> str:
 
 def failures(survey: Survey) -> list[str]:
     """The hypotheses that fail, whatever a bound makes of a shortfall."""
-    found = [mismatch(survey.formulas), _undefined(survey)]
+    found = [mismatch(survey.formulas), _undefined(survey), survey.rough]
     if survey.runaway:
         found.append("it asks for unbounded control towards the edge")
     return [reason for reason in found if reason]
 
 
 def doubts(survey: Survey) -> list[str]:
-    """What is not established, so that nothing is proved."""
+    """What is not established even as an estimate."""
     found = [survey.limits]
     if not survey.formulas.joint:
         found.append("the shortfall of several conditions together is not established")

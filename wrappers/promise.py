@@ -1,9 +1,9 @@
-"""What conditions promise at a start: which bounds hold, which fail and why, and the one that is proved."""
+"""The bounds of conditions at a start: which theorems apply, which fail and why, and what their values are estimated at."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -11,11 +11,14 @@ import numpy as np
 from wrappers import bounds
 from wrappers.formulas import Formulas
 from wrappers.hypotheses import amount, doubts, failures, no_bound, unbounded
+from wrappers.observed import above_suprema, described
 from wrappers.safe_set import sample
 from wrappers.search import largest
 from wrappers.verify import Verification
 
-Status = Literal["proved", "hypothesis fails", "no bound", "unproved"]
+Status = Literal["estimated", "withheld", "hypothesis fails", "no bound", "not established"]
+"""What a bound is worth: no hypothesis was found to fail; it did until episodes contradicted it; one fails; there is none; or what it
+rests on is known to be false or was not looked at."""
 
 _SAMPLES = 2048
 
@@ -29,7 +32,7 @@ class Bound:
         value: at the start, or its mean over several; None if there is none.
         error: standard error of that mean as the mean over all starts; 0 for one start.
         status: what it is worth.
-        reason: why, in words; may be empty where it is proved.
+        reason: why, in words; may be empty where it is estimated.
         forever: whether it is of all times, not only up to the horizon.
     """
 
@@ -39,6 +42,12 @@ class Bound:
     reason: str
     forever: bool = False
     error: float = 0.0
+
+    def without(self, reason: str) -> Bound:
+        """The bound as withheld for a reason, if it was estimated and there is one; itself otherwise."""
+        if not reason or self.status != "estimated":
+            return self
+        return replace(self, value=None, error=0.0, status="withheld", reason=reason)
 
 
 @dataclass(frozen=True)
@@ -80,7 +89,9 @@ def promise(verification: Verification, starts: np.ndarray, horizon: float) -> l
     partly = "" if inside.all() else f"0 at the {100 * (1 - inside.mean()):.1f} % of the starts that are outside some C_j"
     verdict = _Verdict(failures(verification.survey), _infeasible(verification), doubts(verification.survey), partly)
     candidates = _certain(verification, b, horizon) if formulas.certain else _from_chains(verification, b, horizon)
-    return [_judged(candidate, verdict) for candidate in candidates]
+    found = [_judged(candidate, verdict) for candidate in candidates]
+    high = above_suprema(formulas, _stages(verification).suprema, starts)
+    return [bound.without(high) for bound in found]
 
 
 class _Candidate(NamedTuple):
@@ -90,14 +101,14 @@ class _Candidate(NamedTuple):
         name: of it.
         values: at the starts, shape (B,).
         forever: whether it is of all times.
-        unproved: why it is not proved even where its hypotheses hold; may be empty.
+        gap: what its proof lacks even where its hypotheses hold; may be empty.
         allows_shortfall: whether the conditions may be missed somewhere.
     """
 
     name: str
     values: np.ndarray
     forever: bool
-    unproved: str = ""
+    gap: str = ""
     allows_shortfall: bool = False
 
 
@@ -107,7 +118,7 @@ class _Verdict(NamedTuple):
     Attributes:
         failures: hypotheses that fail, in words.
         infeasible: where the conditions cannot be met; may be empty.
-        doubts: what keeps them from being proved, in words.
+        doubts: what was not looked at, in words.
         partly: at how many starts they are 0; may be empty.
     """
 
@@ -119,9 +130,9 @@ class _Verdict(NamedTuple):
 
 def _judged(candidate: _Candidate, verdict: _Verdict) -> Bound:
     broken = [*verdict.failures, *[verdict.infeasible] * (not candidate.allows_shortfall and bool(verdict.infeasible))]
-    unproved = [*verdict.doubts, *[candidate.unproved] * bool(candidate.unproved)]
-    status: Status = "hypothesis fails" if broken else "unproved" if unproved else "proved"
-    reason = "; ".join([*broken, *unproved, *[verdict.partly] * bool(verdict.partly)])
+    open_questions = [*verdict.doubts, *[candidate.gap] * bool(candidate.gap)]
+    status: Status = "hypothesis fails" if broken else "not established" if open_questions else "estimated"
+    reason = "; ".join([*broken, *open_questions, *[verdict.partly] * bool(verdict.partly)])
     error = float(candidate.values.std(ddof=1)) / math.sqrt(len(candidate.values)) if len(candidate.values) > 1 else 0.0
     return Bound(candidate.name, float(candidate.values.mean()), status, reason, candidate.forever, error)
 
@@ -129,7 +140,7 @@ def _judged(candidate: _Candidate, verdict: _Verdict) -> Bound:
 def _certain(verification: Verification, b: np.ndarray, horizon: float) -> list[_Candidate]:
     """Conditions that keep every path: without noise, or SRCBF."""
     noisy, stages = verification.formulas.noisy, _stages(verification)
-    name = "Prop. 4.2.2: safe with probability 1" if noisy else "no noise: safe for sure"
+    name = "Prop. 4.2.2: safe with probability 1" if noisy else "no noise: no path leaves"
     found = [_Candidate(name, (b > 0.0).all(axis=1).astype(float), forever=True)]
     if any(stages.shortfalls) and not noisy and not any(map(math.isnan, stages.rates)):
         values = outlasting(stages, b, horizon)
@@ -155,7 +166,7 @@ def _of_order_one(h: np.ndarray, c: float, k: float, horizon: float) -> list[_Ca
     false = f"its exponent is misprinted, and false for k > c: k = {k:g}, c = {c:.4g}" if k > c else ""
     printed, corrected = bounds.proposition_4_2_5_printed(h, c, horizon), bounds.proposition_4_2_5(h, c, k, horizon)
     return [
-        _Candidate("Prop. 4.2.5 as printed: (h/c) e^(-c T)", printed, forever=False, unproved=false),
+        _Candidate("Prop. 4.2.5 as printed: (h/c) e^(-c T)", printed, forever=False, gap=false),
         _Candidate("Prop. 4.2.5 corrected: (h/c) e^(-k T)", corrected, forever=False),
     ]
 
@@ -170,7 +181,7 @@ def _of_stages(verification: Verification, b: np.ndarray, stages: Stages, horizo
     if not several:
         name = "Thm. 4.2.10 as printed: product of b_j/c_j" if forever else "Thm. 4.2.10, zeroing: product of (b_j/c_j) e^(-a_j T)"
         product = bounds.theorem_4_2_10_printed(b, stages.suprema, time, stages.rates)
-        found.insert(0, _Candidate(f"{name}, {length}", product, forever, unproved="its proof conditions on the future"))
+        found.insert(0, _Candidate(f"{name}, {length}", product, forever, gap="its proof conditions on the future"))
     return found
 
 
@@ -179,11 +190,8 @@ def _outside(formulas: Formulas, b: np.ndarray) -> str:
     if (b > 0.0).any(axis=0).all():
         return "no start lies in all C_j at once"
     j = int(b.max(axis=0).argmin())
-    i = next(i for i, stage in enumerate(formulas.stages) if stage.start <= j < stage.stop)
-    name = formulas.problem.barriers[i].name
-    stage = j - formulas.stages[i].start
-    what = name if stage == 0 else f"b_{stage}" + (f" of {name}" if len(formulas.stages) > 1 else "")
-    return f"the start is outside C_{stage}: {what} = {b[:, j].max():.4g}" + (" at most" if len(b) > 1 else "")
+    stage = j - next(s.start for s in formulas.stages if s.start <= j < s.stop)
+    return f"the start is outside C_{stage}: {described(formulas, j)} = {b[:, j].max():.4g}" + (" at most" if len(b) > 1 else "")
 
 
 def _infeasible(verification: Verification) -> str:

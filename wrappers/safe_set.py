@@ -46,6 +46,10 @@ class Region:
         center = (self.high + self.low) / 2.0
         return replace(self, low=center - half, high=center + half)
 
+    def within(self, low: np.ndarray, high: np.ndarray) -> Region:
+        """The part of the box between ends, shape (n,), which may be infinite."""
+        return replace(self, low=np.maximum(self.low, low), high=np.minimum(self.high, high))
+
     def around(self, points: np.ndarray, widened: float) -> Region:
         """The part of the box around points, wider than they are by a factor."""
         low, high = points.min(axis=0), points.max(axis=0)
@@ -65,6 +69,17 @@ class Region:
         return self.low + (self.high - self.low) * ((unit + rng.random(len(self.low))) % 1.0)
 
 
+def workspace_of(problem: SafetyProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper ends of the workspace, shape (n,); infinite where it has none. To leave it ends an episode."""
+    return np.array([v.low for v in problem.states]), np.array([v.high for v in problem.states])
+
+
+def in_workspace(x: np.ndarray, ends: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Which states (B, n) are between the ends of a workspace, which the last step of an episode may leave, shape (B,)."""
+    low, high = ends
+    return np.all((x >= low) & (x <= high), axis=1)
+
+
 def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Sequence[sp.Expr]) -> Region:
     """The workspace of a problem, with a finite range for what it leaves unbounded.
 
@@ -73,7 +88,7 @@ def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Seq
         system: whose parameters are in the expressions.
         expressions: all that will be asked of a state: where they repeat after 2 pi, a period is enough.
     """
-    low, high = [np.array([getattr(v, end) for v in problem.states]) for end in ("low", "high")]
+    low, high = workspace_of(problem)
     periodic, chosen = np.zeros(len(low), dtype=bool), np.zeros(len(low), dtype=bool)
     unbounded = np.flatnonzero(~(np.isfinite(low) & np.isfinite(high)))
     for i in unbounded.tolist():

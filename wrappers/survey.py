@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -12,8 +12,9 @@ import sympy as sp
 from safe_envs.errors import ConfigurationError
 from wrappers.conditions import SRCBF
 from wrappers.formulas import Formulas
-from wrappers.safe_set import Region, Sample, sample
+from wrappers.safe_set import Region, Sample, draw_starts, sample, workspace_of
 from wrappers.search import Score, largest, search, towards_zero
+from wrappers.smoothness import asked_of, roughness
 
 SAMPLES = 8192
 
@@ -30,6 +31,7 @@ _NEAR, _NEARER = 1e-6, 1e-8
 _FALL = 0.03
 _BISECTIONS = 64
 _RAYS = 64
+_STARTS = 64
 
 
 class Survey:
@@ -39,6 +41,7 @@ class Survey:
         formulas: the chains and conditions, compiled.
         region: where is looked.
         safe: points of C, where all barriers are positive.
+        starts: states at which episodes may start, which every search looks at too.
         kept: points of the intersection of the C_j, which the conditions keep; None if it is empty.
 
     Args:
@@ -53,6 +56,7 @@ class Survey:
     def __init__(self, formulas: Formulas, samples: int = SAMPLES, seed: int = 0) -> None:
         self.formulas, self.region, self._seed = formulas, formulas.region, seed
         self.safe: Sample = sample("C", formulas.barrier_level, self.region, samples, self.rng(0))
+        self.starts = draw_starts(formulas.problem, _STARTS)
         self.kept = self._kept()
 
     def rng(self, task: int) -> np.random.Generator:
@@ -76,20 +80,36 @@ class Survey:
         count = self.formulas.stages[-1].stop
         if self.kept is None:
             return np.full(count, np.nan)
-        return np.array([supremum(j, self.formulas, range(count), self.kept, self.rng(10 + j)) for j in range(count)])
+        points = self.with_starts(self.kept, self.formulas.kept_level)
+        return np.array([supremum(j, self.formulas, range(count), points, self.rng(10 + j)) for j in range(count)])
+
+    def with_starts(self, points: np.ndarray, level: Score) -> np.ndarray:
+        """Points (B, n) of a set {level >= 0} and its starts: what lies in a narrow pocket around these is found in any case."""
+        return np.concatenate([points, self.starts[level(self.starts) >= 0.0]])
 
     @cached_property
     def missed(self) -> tuple[float, np.ndarray]:
         """By how much the conditions are missed where that is most in the intersection, and the state; of C if that is empty."""
         if self.kept is None:
-            return worst(self.formulas, self.formulas.barrier_level, self.safe.points, self.rng(2))
-        return worst(self.formulas, self.formulas.kept_level, self.kept, self.rng(2))
+            level, points = self.formulas.barrier_level, self.safe.points
+        else:
+            level, points = self.formulas.kept_level, self.kept
+        return worst(self.formulas, level, self.with_starts(points, level), self.rng(2))
 
     @cached_property
     def undefined(self) -> np.ndarray:
         """Those points of C where a condition has no finite value."""
-        points = self.safe.points
+        points = self.with_starts(self.safe.points, self.formulas.barrier_level)
         return points[~(self.formulas.defined(points) & np.isfinite(self.formulas.chain(points)).all(axis=1))]
+
+    @cached_property
+    def rough(self) -> str:
+        """Which function is not smooth where it has to be, in words; empty if none was found."""
+        if self.kept is None:
+            return ""
+        level = self.formulas.kept_level
+        points = self.with_starts(self.kept, level)
+        return roughness(asked_of(self.formulas), self.formulas.system.states, level, points, self.region, self.rng(7))
 
     @cached_property
     def limits(self) -> str:
@@ -151,7 +171,10 @@ class Survey:
 
 
 def supremum(j: int, formulas: Formulas, positive: Sequence[int], points: np.ndarray, rng: np.random.Generator) -> float:
-    """Supremum of the j-th chain function over the states where others are positive; infinite if it grows with the box that is searched.
+    """Supremum of the j-th chain function over the states of the workspace where others are positive.
+
+    To leave the workspace ends an episode, so that what lies beyond does not matter (see `wrappers.bounds`). Ranges that were
+    chosen for states without any are widened: it is infinite if it grows with them.
 
     Args:
         j: which of all chain functions.
@@ -165,33 +188,51 @@ def supremum(j: int, formulas: Formulas, positive: Sequence[int], points: np.nda
         b = formulas.chain(x)
         return np.where(b[:, positive].min(axis=1) > 0.0, b[:, j], -np.inf)
 
-    reached = -np.inf
+    reached, region = -np.inf, formulas.region
     for factor in _BOXES:
-        box = formulas.region.scaled(factor)
+        box = region.scaled(factor).within(*workspace_of(formulas.problem))
         more = _pool(points, box, rng) if factor == 1.0 else box.draw(_BOX_LOG2, rng)
         before, (reached, _) = reached, largest(score, np.concatenate([points, more]), box, rng)
+        if not region.chosen.any():
+            return reached
         if factor > 1.0 and reached <= _GROWTH * before:
             return max(reached, before)
     return np.inf
 
 
 def unbounded(formulas: Formulas, j: int) -> bool:
-    """Whether it is certain that the j-th chain function is unbounded where all are positive: polynomials along a straight line."""
+    """Whether it is certain that the j-th chain function is unbounded where all are positive: polynomials along a straight line.
+
+    The line stays in the workspace: it goes where that has no end.
+    """
     states, t = formulas.system.states, sp.Dummy("t", real=True)
     chain = [formulas.system.exact(e) for c in formulas.safety_filter.constraints for e in c.chain]
     if not all(e.is_polynomial(*states) for e in chain):
         return False
-    directions = itertools.chain(np.eye(len(states), dtype=int), -np.eye(len(states), dtype=int), _signs(len(states)))
-    for direction in itertools.islice(directions, _RAYS):
-        line = {s: sp.Rational(i + 2, 7) + int(d) * t for i, (s, d) in enumerate(zip(states, direction, strict=True))}
+    for direction in itertools.islice(filter(_endless(formulas), _directions(len(states))), _RAYS):
+        line = {s: p + int(d) * t for s, p, d in zip(states, _origin(formulas.region), direction, strict=True)}
         along = [sp.Poly(e.subs(line), t) for e in chain]
         if along[j].degree() > 0 and all(p.LC() > 0 for p in along):
             return True
     return False
 
 
-def _signs(n: int) -> itertools.product[tuple[int, ...]]:
-    return itertools.product((1, -1, 0), repeat=n)
+def _endless(formulas: Formulas) -> Callable[[Sequence[int]], bool]:
+    """Tells of a direction whether the workspace has no end there."""
+    ends = np.isinf(workspace_of(formulas.problem))
+    return lambda direction: any(direction) and all(ends[int(d > 0), i] for i, d in enumerate(direction) if d)
+
+
+def _directions(n: int) -> Iterator[Sequence[int]]:
+    yield from np.eye(n, dtype=int).tolist()
+    yield from (-np.eye(n, dtype=int)).tolist()
+    yield from itertools.product((1, -1, 0), repeat=n)
+
+
+def _origin(region: Region) -> list[sp.Expr]:
+    """A point of a region that is nowhere special."""
+    shares = np.linspace(2.0 / 7.0, 5.0 / 7.0, len(region.low) + 1)[:-1]
+    return [sp.Rational(x) for x in (region.low + shares * (region.high - region.low)).tolist()]
 
 
 def worst(formulas: Formulas, level: Score, points: np.ndarray, rng: np.random.Generator) -> tuple[float, np.ndarray]:

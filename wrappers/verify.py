@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -55,7 +55,7 @@ class BarrierFindings:
         typical: its median over C.
         small: part of C where it is below `SMALL` of that.
         small_infeasible: part of these points where no action in the box meets all conditions.
-        supremum: of h over C, infinite where it grows with the box that is searched.
+        supremum: of h over C within the workspace, infinite where it grows with the ranges that were chosen for states without any.
         growth: how sure it is that it is infinite, in words; empty where it is not.
         deepest: the state where h is largest in C within the workspace, shape (n,).
         deepest_h: h there.
@@ -152,15 +152,15 @@ def verify(
 def _kept_part(survey: Survey, kept: np.ndarray) -> Part:
     points = survey.safe.points
     share = float((survey.formulas.kept_level(points) >= 0.0).mean())
-    return Part(len(kept), survey.safe.share if share == 1.0 else share, _infeasible(survey.formulas, kept), *survey.missed)
+    return Part(len(kept), share, _infeasible(survey.formulas, kept), *survey.missed)
 
 
 def _safe_part(survey: Survey, kept: Part | None) -> Part:
-    """C, which is one with the intersection where that is all of it."""
+    """C: what was found of the intersection holds for it where that is all of it, but for what each is a part of."""
     formulas, points = survey.formulas, survey.safe.points
-    if kept is not None and bool((formulas.kept_level(points) >= 0.0).all()):
-        return kept
-    shortfall, state = worst(formulas, formulas.barrier_level, points, survey.rng(4))
+    if kept is not None and kept.share == 1.0:
+        return replace(kept, share=survey.safe.share)
+    shortfall, state = worst(formulas, formulas.barrier_level, survey.with_starts(points, formulas.barrier_level), survey.rng(4))
     return Part(len(points), survey.safe.share, _infeasible(formulas, points), shortfall, state)
 
 
@@ -174,7 +174,9 @@ def _barrier(i: int, survey: Survey) -> BarrierFindings:
     _, deepest = largest(lambda x: where_inside(level, x, lambda y: formulas.chain(y)[:, stages.start]), safe, region, rng)
     deepest = without_control(formulas, i, deepest)
     suprema = survey.suprema[stages]
-    highest = suprema[0] if formulas.first_order else supremum(stages.start, formulas, formulas.barriers, safe, rng)
+    highest = (
+        suprema[0] if formulas.first_order else supremum(stages.start, formulas, formulas.barriers, survey.with_starts(safe, level), rng)
+    )
     return BarrierFindings(
         name=formulas.problem.barriers[i].name,
         condition=formulas.conditions[i].spec,

@@ -134,7 +134,7 @@ def _draw_program(axes: Axes, row: np.ndarray, nominal: np.ndarray, result: Any)
 
 
 def _promise() -> Figure:
-    """The measured rate over the horizon beside what is proved, for the thesis' cubic SDE in a disk."""
+    """The measured rate over the horizon beside the bounds, for the thesis' cubic SDE in a disk."""
     problem = _problem("safe_envs/CubicSDEDisk-v0").configured(horizon=_HORIZON)
     evaluation = evaluate(problem, filters=["none", "scbf"], episodes=_EPISODES, seed=0)
     verification = verify(problem, parse_conditions("scbf", problem))

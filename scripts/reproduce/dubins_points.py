@@ -114,7 +114,7 @@ def _drawn_anew(runs: Sequence[Runs]) -> list[str]:
 
 
 def printed_and_union_bound(starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thm. 4.2.10's product and the proved union bound for ever, at each start, shape (2, starts): 0 where A h <= 0."""
+    """Thm. 4.2.10's product and the union bound for ever, at each start, shape (2, starts): 0 where A h <= 0."""
     formulas = Formulas(dubins_problem(NOISE, "uniform"), [SCBF()], "model")
     speed = next(value for symbol, value in formulas.system.parameters.items() if symbol.name == "v")
     # A h = -2 v (x cos + y sin) - 2 sigma^2 is largest at the edge, straight inwards.

@@ -49,7 +49,7 @@ CHOSEN = (
 )
 CORRECTIONS = (
     "Sec. 4.3.2: h_2 = A h_1 + alpha_2 h_1, not alpha_2 h; by the print even paths without noise can leave the set",
-    "Thm. 4.2.10: the product is no proved bound for degree 2, since Eq. (4.23) conditions on the future; the union bound is",
+    "Thm. 4.2.10: the product is no valid bound for degree 2, since Eq. (4.23) conditions on the future; the union bound is",
 )
 Runs = Mapping[str, Exits]
 """Of the same episodes, by the name of the filter."""

@@ -15,7 +15,21 @@ from tests.agents.evaluated import Constant, Schedule, replay, safe_so_far
 COUNTS = ("episodes", "safe", "violations")
 MEASURES = ("safety_rate", "ci_low", "ci_high", "min_h_median", "min_h_p05", "effort_mean", "return_mean")
 RATES = ("intervention_rate", "infeasible_rate")
-KEYS = {"filter", "policy", *COUNTS, *MEASURES, *RATES, "curve", "bound", "bound_note", "certificate", "outside_rate", "learning"}
+KEYS = {
+    "filter",
+    "policy",
+    *COUNTS,
+    "touching",
+    *MEASURES,
+    *RATES,
+    "curve",
+    "estimated_bound",
+    "bound_note",
+    "posterior_bound",
+    "withheld",
+    "outside_rate",
+    "learning",
+}
 
 
 @pytest.mark.parametrize(

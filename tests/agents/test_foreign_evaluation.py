@@ -24,7 +24,7 @@ def test_the_filter_of_the_spec_makes_the_difference():
     bare, filtered = evaluate("Pendulum-v1", **FEW).rows
     assert (bare["safe"], filtered["safe"]) == (0, 6)
     assert filtered["filter"] == SPEC.filter
-    assert filtered["bound"] is None
+    assert filtered["estimated_bound"] is None
     assert "may differ from the model" in filtered["bound_note"]
 
 

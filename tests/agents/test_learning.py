@@ -159,18 +159,18 @@ def test_it_is_repeatable(repeated):
     assert again.rows[0] in repeated.rows
 
 
-def test_certificates_stand_beside_the_rates():
+def test_bounds_over_posteriors_stand_beside_the_rates():
     name = "bayesian-scbf:simultaneous=0.9"
     found = evaluate(DISK, filters=["bayesian-scbf", name], episodes=60, repeats=2)
     plain, row = found.rows
-    assert plain["certificate"] is None
-    assert "certificate" in row["bound_note"]
-    assert row["certificate"]["delta"] == pytest.approx(0.1)
+    assert plain["posterior_bound"] is None
+    assert "its bound over the posterior" in row["bound_note"]
+    assert row["posterior_bound"]["delta"] == pytest.approx(0.1)
     # (1 - delta)(h_0 - m T)/c, of h = 1 - x_1^2 - x_2^2 with c = 1, for the mean m of both identifications.
-    expected = 0.9 * (1 - 0.1**2 - 0.7**2 - row["certificate"]["shortfall"] * DISK.horizon)
-    assert row["certificate"]["supremum"] == pytest.approx(1.0, abs=1e-6)
-    assert row["certificate"]["probability"] == pytest.approx(expected, abs=1e-6)
-    assert row["ci_high"] >= row["certificate"]["probability"] > 0
+    expected = 0.9 * (1 - 0.1**2 - 0.7**2 - row["posterior_bound"]["shortfall"] * DISK.horizon)
+    assert row["posterior_bound"]["supremum"] == pytest.approx(1.0, abs=1e-6)
+    assert row["posterior_bound"]["probability"] == pytest.approx(expected, abs=1e-6)
+    assert row["ci_high"] >= row["posterior_bound"]["probability"] > 0
 
 
 def test_progress_goes_from_the_learning_to_the_end():

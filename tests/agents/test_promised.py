@@ -40,9 +40,9 @@ def test_where_there_is_no_chain_no_start_is_outside_of_it():
 
 
 def test_of_several_identifications_the_mean_counts():
-    row = {"bound": None, "bound_note": "", "certificate": None}
+    row = {"estimated_bound": None, "bound_note": "", "posterior_bound": None, "withheld": None}
     rates = [{**row, "outside_rate": rate} for rate in (0.25, 0.5)]
     assert together(rates)["outside_rate"] == 0.375
     assert together([rates[0], {**row, "outside_rate": None}])["outside_rate"] is None
-    certified = [{**each, "certificate": {"probability": 0.5, "note": ""}} for each in rates]
-    assert together(certified)["outside_rate"] == 0.375
+    robust = [{**each, "posterior_bound": {"probability": 0.5, "note": ""}} for each in rates]
+    assert together(robust)["outside_rate"] == 0.375

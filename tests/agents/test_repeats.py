@@ -18,6 +18,7 @@ def row(safe, episodes, **changes):
         "episodes": episodes,
         "safe": safe,
         "violations": episodes - safe,
+        "touching": 1,
         "safety_rate": safe / episodes,
         "ci_low": 0.0,
         "ci_high": 1.0,
@@ -34,7 +35,7 @@ def test_one_identification_is_left_as_it_is():
 
 def test_several_are_summed_and_averaged():
     found = pooled([row(3, 10, effort_mean=None), row(5, 10, effort_mean=2.0)], 0.95)
-    assert (found["episodes"], found["safe"], found["violations"]) == (20, 8, 12)
+    assert (found["episodes"], found["safe"], found["violations"], found["touching"]) == (20, 8, 12, 2)
     assert found["safety_rate"] == found["return_mean"] == pytest.approx(0.4)
     assert found["effort_mean"] == 2.0
     assert found["curve"]["safe"] == [20, 8]

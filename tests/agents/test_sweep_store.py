@@ -42,7 +42,9 @@ def test_what_was_kept_is_read_in_the_order_of_the_file(tmp_path: Path, sweep: S
     assert table["episodes"].to_pylist() == [20] * 3
     for row, outcome in zip(table.to_pylist(), outcomes[1:], strict=True):
         assert outcome.row is not None
-        assert all(row[name] == outcome.row[name] for name in ("safe", "safety_rate", "ci_low", "min_h_p05", "return_mean", "bound"))
+        assert all(
+            row[name] == outcome.row[name] for name in ("safe", "safety_rate", "ci_low", "min_h_p05", "return_mean", "estimated_bound")
+        )
         assert json.loads(row["row"]) == outcome.row
         assert json.loads(row["config"])["problem"]["dt"] == 0.01
         assert set(json.loads(row["versions"])) > {"python", "numpy", "safe-envs", "source"}

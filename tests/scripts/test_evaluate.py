@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from rich.console import Console
 
 from agents import evaluate
+from agents.contradiction import judged
 from scripts.table import print_evaluation
 from tests.scripts.conftest import strictly
 
@@ -27,15 +29,17 @@ ROW_KEYS = [
     "min_h_median",
     "min_h_p05",
     "violations",
+    "touching",
     "intervention_rate",
     "infeasible_rate",
     "effort_mean",
     "return_mean",
     "curve",
-    "bound",
-    "bound_note",
-    "certificate",
+    "withheld",
     "outside_rate",
+    "estimated_bound",
+    "bound_note",
+    "posterior_bound",
     "learning",
 ]
 
@@ -199,16 +203,20 @@ def test_bounds_are_shown_where_there_are_any():
         print_evaluation(console, replace(answer, rows=rows))
         return console.file.getvalue()
 
-    bounded = printed({}, {"bound": None, "bound_note": "it ignores the noise"}, {"bound": 0.492, "bound_note": ""})
+    bounded = printed({}, {"estimated_bound": None, "bound_note": "it ignores the noise"}, {"estimated_bound": 0.492, "bound_note": ""})
     lines = {line.split()[0]: line for line in bounded.splitlines() if line.startswith(("none", "hocbf", "scbf"))}
-    assert "≥ 49.2 %" in lines["scbf"]
+    assert " 49.2 % " in lines["scbf"]
+    assert not re.search("≥|>=|proved|guaranteed", bounded.replace("{b_j >= 0}", ""))
     assert "] none " in " ".join(lines["hocbf"].split())
     assert "] - " in " ".join(lines["none"].split())
-    assert "Note: no proved bound for hocbf: it ignores the noise\n" in bounded
-    assert bounded.count("no proved bound") == 1
-    below = printed({}, {}, {"bound": 0.999, "ci_high": 0.98})
-    assert "the rate of scbf lies below its proved bound" in below
-    assert "lies below" not in bounded
+    assert "Note: no bound for hocbf: it ignores the noise\n" in bounded
+    assert bounded.count("no bound for") == 1
+    assert bounded.count("Note: a bound is estimated: ") == 1
+    nothing = {"estimated_bound": None, "bound_note": "it ignores the noise"}
+    below = printed({}, nothing, judged({**answer.rows[2], "estimated_bound": 0.999}, 0.98))
+    assert "Note: no bound for scbf: withheld: the interval of the measured rate ends at 98.0 %, below 99.9 %" in below
+    assert "] withheld " in " ".join(next(line for line in below.splitlines() if line.startswith("scbf")).split())
+    assert "a bound is estimated" not in below
 
 
 def test_the_plants_mass_saves_the_quadrotor(safe_envs_command):

@@ -16,27 +16,27 @@ from scripts.learned_columns import learned_columns, learned_notes
 from scripts.table import heading, print_evaluation
 from wrappers import LEARNED
 
-NO_BOUND = "no proved bound for what rests on something learned"
+NO_BOUND = "no bound for what rests on something learned"
 LEARNING = {"repeats": 1, "transitions": 20, "files": [], "remarks": [], "warnings": [], "rates": [0.9]}
 OFTEN = {**LEARNING, "repeats": 3, "rates": [0.9, 0.5, 0.8]}
-CERTIFICATE = {"probability": 0.4, "note": "", "delta": 0.1, "shortfall": 0.0, "supremum": 1.0}
+POSTERIOR_BOUND = {"probability": 0.4, "note": "", "delta": 0.1, "shortfall": 0.0, "bias": 0.0, "supremum": 1.0}
 
 
-def row(learning=None, certificate=None, name="bayesian-scbf"):
-    return {"filter": name, "learning": learning, "certificate": certificate}
+def row(learning=None, bound=None, name="bayesian-scbf"):
+    return {"filter": name, "learning": learning, "posterior_bound": bound}
 
 
 @pytest.mark.parametrize(
     ("env_id", "rows", "first"),
     [
-        ("CubicSDEDisk-v0", [row(LEARNING)], f"{NO_BOUND}; bayesian-scbf:simultaneous=P may have a certificate."),
-        ("CubicSDEDisk-v0", [row(LEARNING), row(LEARNING, CERTIFICATE)], f"{NO_BOUND}."),
+        ("CubicSDEDisk-v0", [row(LEARNING)], f"{NO_BOUND}; for bayesian-scbf:simultaneous=P one may be estimated over the posterior."),
+        ("CubicSDEDisk-v0", [row(LEARNING), row(LEARNING, POSTERIOR_BOUND)], f"{NO_BOUND}."),
         ("CubicSDEDisk-v0", [row(LEARNING, {"probability": None, "note": "none"})], f"{NO_BOUND}."),
         ("StochasticDubins-v0", [row(LEARNING)], f"{NO_BOUND}."),
         ("DubinsObstacles-v0", [row(LEARNING)], f"{NO_BOUND}."),
     ],
 )
-def test_a_certificate_is_proposed_where_there_may_be_one(env_id, rows, first):
+def test_a_bound_over_the_posterior_is_proposed_where_there_may_be_one(env_id, rows, first):
     notes = learned_notes(rows, load_problem(env_id))
     assert notes[0] == first
     assert sum(note.startswith(NO_BOUND) for note in notes) == 1

@@ -25,9 +25,9 @@ from wrappers import (
     parse_condition,
     parse_conditions,
 )
+from wrappers.estimated import estimated_bound
 from wrappers.formulas import Formulas
 from wrappers.learning.files import LearnedFileError
-from wrappers.proved import proved_bound
 from wrappers.verify import verify
 
 
@@ -194,7 +194,7 @@ def test_no_promise_is_looked_for(kept):
     for look in (
         lambda: Formulas(problem, [condition], "model"),
         lambda: verify(problem, [condition]),
-        lambda: proved_bound(problem, [condition]),
+        lambda: estimated_bound(problem, [condition]),
     ):
         with pytest.raises(ConfigurationError, match="rests on something learned"):
             look()

@@ -14,9 +14,9 @@ from safe_envs.calculus import generator
 from safe_envs.codegen import compile_function
 from tests.conftest import problem_of
 from wrappers import BayesianSCBF
-from wrappers.certificate import certificate
 from wrappers.learning.bayesian import identify
 from wrappers.learning.posterior import Diffusion
+from wrappers.posterior_bound import posterior_bound
 
 TIMES = 40
 # The share of so many that are right with the probability .95 is within three standard deviations of it.
@@ -77,7 +77,7 @@ def test_correlated_noise_makes_the_row_less_sure():
     assert share_below(problem, (0.6, 0.6), 0.0, starts=100, repetitions=30) >= LEAST
 
 
-def test_what_the_features_miss_is_no_noise_and_has_no_certificate():
+def test_what_the_features_miss_is_no_noise_and_has_no_bound():
     x_1 = DISK.plant.states[0]
     problem = changed(drift=DISK.plant.drift + sp.Matrix([sp.sin(4 * x_1), 0]))
     with pytest.warns(UserWarning, match="miss"):
@@ -87,15 +87,15 @@ def test_what_the_features_miss_is_no_noise_and_has_no_certificate():
     above = {c: np.mean([robust_row(posterior, c, x, 0.0) > true_row(problem.plant, x, 0.0) for x in states]) for c in (sure, plain)}
     assert above[sure] <= 0.1 < above[plain]
     with pytest.raises(ConfigurationError, match=r"miss .* % of the rate of x_1"):
-        certificate(problem, [BayesianSCBF(posterior, simultaneous=0.9)])
+        posterior_bound(problem, [BayesianSCBF(posterior, simultaneous=0.9)])
 
 
-def test_noise_that_is_taken_for_constant_and_is_not_has_no_certificate():
+def test_noise_that_is_taken_for_constant_and_is_not_has_no_bound():
     pendulum = problem_of("safe_envs/Pendulum-v0")
     with pytest.warns(UserWarning, match="diffusion degree"):
         posterior = identify(pendulum)
     with pytest.raises(ConfigurationError, match="noise of theta varies"):
-        certificate(pendulum, [BayesianSCBF(posterior, simultaneous=0.9)])
+        posterior_bound(pendulum, [BayesianSCBF(posterior, simultaneous=0.9)])
 
 
 @pytest.mark.parametrize(("sigma", "count"), [(1e-3, 40), (0.01, 200), (0.2, 50), (30.0, 1000)])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import sympy as sp
 
 from safe_envs.barrier import Barrier
@@ -11,12 +9,14 @@ from safe_envs.problem import SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
 from tests.conftest import problem_of
 from wrappers import parse_conditions, search, survey
-from wrappers.proved import proved_bound
+from wrappers.estimated import estimated_bound
 from wrappers.verify import verify
 
 DUBINS = "safe_envs/DubinsDisk-v0"
 STOCHASTIC = "safe_envs/StochasticDubins-v0"
 CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
+
+_FOUND = {}
 
 x, y, u = sp.symbols("x y u", real=True)
 
@@ -52,28 +52,35 @@ def made(problem, text="scbf", **options):
 
 
 def made_bound(problem, text="scbf"):
-    """The proved bound of a problem under a filter."""
-    return proved_bound(problem, parse_conditions(text, problem))
+    """The estimated bound of a problem under a filter."""
+    return estimated_bound(problem, parse_conditions(text, problem))
 
 
 def findings(env_id, text=None, knowledge="model", **options):
-    """What is found of a registered id; with its defaults once for all tests."""
-    return _found_anew(env_id, text, knowledge, options) if options else _found_once(env_id, text, knowledge)
-
-
-@cache
-def _found_once(env_id, text, knowledge):
-    return _found_anew(env_id, text, knowledge, {})
-
-
-def _found_anew(env_id, text, knowledge, options):
+    """What is found of a registered id, once for all tests."""
     problem = problem_of(env_id, **options)
-    return verify(problem, parse_conditions(text or problem.filter, problem), knowledge)
+    return verify_once(problem, parse_conditions(text or problem.filter, problem), knowledge)
 
 
-def proved(env_id, text=None, knowledge="model", **options):
+def hurried(env_id):
+    """What is found of a registered id by a search that was hurried, once for all tests."""
+    problem = problem_of(env_id)
+    return verify_once(problem, parse_conditions(problem.filter, problem), samples=128)
+
+
+def verify_once(problem, conditions, knowledge="model", samples=survey.SAMPLES, seed=0):
+    """`verify`, once for all tests that ask for the same."""
+    start = problem.starts[problem.start]
+    of_problem = (problem.name, problem.plant, problem.model, problem.barriers, problem.states, problem.box, problem.start, repr(start))
+    key = (of_problem, problem.dt, problem.horizon, tuple(conditions), knowledge, samples, seed)
+    if key not in _FOUND:
+        _FOUND[key] = verify(problem, conditions, knowledge, samples, seed)
+    return _FOUND[key]
+
+
+def estimated(env_id, text=None, knowledge="model", **options):
     problem = problem_of(env_id, **options)
-    return proved_bound(problem, parse_conditions(text or problem.filter, problem), knowledge)
+    return estimated_bound(problem, parse_conditions(text or problem.filter, problem), knowledge)
 
 
 def by_name(bounds, part):

@@ -265,6 +265,8 @@ def identify(
         "prior": prior,
         "alpha": alpha,
         "beta": beta,
+        # Of data from elsewhere it is not known how finely a step was integrated: see `wrappers.step_bias`.
+        **({"substeps": problem.substeps} if collected and step is None else {}),
     }
     if progress is not None:
         progress(1.0)

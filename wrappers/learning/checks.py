@@ -19,7 +19,7 @@ class Purpose(IntEnum):
     """Second entries of the seeds of everything random in learning, so that no two uses of a seed share their randomness.
 
     None is 0: NumPy takes [s, 0] for s, whose children are those of safe sets and episodes. The small numbers belong to
-    surveys, certificates and the states at which an identification is reported.
+    surveys, bounds and the states at which an identification is reported.
     """
 
     DATA = 1001

@@ -1,4 +1,4 @@
-"""Certificates of identified systems: by hand, against a dense grid, and against what happens."""
+"""Bounds over posteriors: by hand, against a dense grid, and against what happens."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from dataclasses import replace
 import gymnasium as gym
 import numpy as np
 import pytest
+import sympy as sp
 from scipy import stats
 
 from agents.statistics import rate_interval
-from safe_envs import Barrier, ConfigurationError
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, state_problem
+from safe_envs.codegen import compile_function
 from tests.conftest import problem_of
-from wrappers import SCBF, BayesianSCBF, SafetyFilterVectorWrapper
-from wrappers.certificate import certificate
+from wrappers import SCBF, BayesianSCBF, SafetyFilter, SafetyFilterVectorWrapper
 from wrappers.learning.bayesian import identify
+from wrappers.posterior_bound import posterior_bound
 
 START = (0.0, 0.6)
 
@@ -31,12 +33,12 @@ def posterior(cubic):
 
 @pytest.fixture(scope="module")
 def found(cubic, posterior):
-    return certificate(cubic, [BayesianSCBF(posterior, simultaneous=0.95)])
+    return posterior_bound(cubic, [BayesianSCBF(posterior, simultaneous=0.95)])
 
 
 @pytest.fixture(scope="module")
 def looser(cubic, posterior):
-    return certificate(cubic, [BayesianSCBF(posterior, simultaneous=0.5)])
+    return posterior_bound(cubic, [BayesianSCBF(posterior, simultaneous=0.5)])
 
 
 def best_rows(problem, posterior, simultaneous, x):
@@ -97,18 +99,18 @@ def test_the_probability_by_hand(found):
 
 
 def test_it_is_hardly_another_with_another_seed(cubic, posterior, found):
-    other = certificate(cubic, [BayesianSCBF(posterior, simultaneous=0.95)], seed=1)
+    other = posterior_bound(cubic, [BayesianSCBF(posterior, simultaneous=0.95)], seed=1)
     assert other.shortfall == pytest.approx(found.shortfall, rel=1e-3)
 
 
 def test_plant_and_model_do_not_matter(cubic, posterior, found):
     blind = cubic.configured(model={"a": 5.0}, plant={"a": 9.0}, noise=3.0)
-    other = certificate(blind, [BayesianSCBF(posterior, simultaneous=0.95)])
+    other = posterior_bound(blind, [BayesianSCBF(posterior, simultaneous=0.95)])
     assert (other.shortfall, other.supremum) == (found.shortfall, found.supremum)
 
 
-def test_more_data_certify_more(cubic, found):
-    few = certificate(cubic, [BayesianSCBF(identify(cubic, starts=200, repetitions=50), simultaneous=0.95)])
+def test_more_data_give_a_larger_bound(cubic, found):
+    few = posterior_bound(cubic, [BayesianSCBF(identify(cubic, starts=200, repetitions=50), simultaneous=0.95)])
     assert few.shortfall > 1.2 * found.shortfall
     assert few.at(np.array([START]), 0.5) < found.at(np.array([START]), 0.5)
 
@@ -118,7 +120,7 @@ def test_a_smaller_probability_of_the_regions_asks_for_less(found, looser):
     assert looser.delta == pytest.approx(0.5)
 
 
-def test_what_has_no_certificate_is_refused(cubic, posterior):
+def test_what_has_no_bound_is_refused(cubic, posterior):
     robust = BayesianSCBF(posterior, simultaneous=0.9)
     twice = replace(cubic, barriers=(cubic.barriers[0], Barrier(2 * cubic.barriers[0].expression, "twice")))
     for problem, conditions in (
@@ -129,7 +131,7 @@ def test_what_has_no_certificate_is_refused(cubic, posterior):
         (cubic, []),
     ):
         with pytest.raises(ConfigurationError, match="one barrier with bayesian-scbf:simultaneous=P"):
-            certificate(problem, conditions)
+            posterior_bound(problem, conditions)
 
 
 def test_an_unbounded_set_has_none(cubic, posterior):
@@ -137,20 +139,23 @@ def test_an_unbounded_set_has_none(cubic, posterior):
     # Its noise varies with the state: no intervals of sigma are known.
     varying = identify(problem, starts=200, repetitions=20, diffusion_degree=2)
     with pytest.raises(ConfigurationError, match="intervals of sigma are known for constant noise"):
-        certificate(problem, [BayesianSCBF(varying, simultaneous=0.9)])
+        posterior_bound(problem, [BayesianSCBF(varying, simultaneous=0.9)])
     # The same set with the noise of the disk, which is constant.
     parabola = replace(cubic, barriers=problem.barriers)
-    with pytest.raises(ConfigurationError, match="beyond the workspace"):
-        certificate(parabola, [BayesianSCBF(posterior, simultaneous=0.9)])
+    endless = replace(parabola, states=tuple(replace(s, low=-np.inf, high=np.inf) for s in cubic.states))
+    with pytest.raises(ConfigurationError, match="beyond the states that are searched"):
+        posterior_bound(endless, [BayesianSCBF(posterior, simultaneous=0.9)])
+    # To leave a workspace ends an episode, so that h counts inside of it only: 1 - x_1 - x_2^2 is largest at x_1 = -2.
+    assert posterior_bound(parabola, [BayesianSCBF(posterior, simultaneous=0.9)]).supremum == pytest.approx(3.0, rel=1e-9)
 
 
-def test_what_is_certified_happens(cubic, monkeypatch):
+def test_the_bound_is_below_what_happens(cubic, monkeypatch):
     """From one start, with identifications that know little; a shorter search finds less of the shortfall, and promises more."""
     monkeypatch.setattr("wrappers.search._ROUNDS", (30, 10))
     envs, horizon, promised = 100, 0.5, []
     for seed in range(6):
         condition = BayesianSCBF(identify(cubic, starts=800, repetitions=50, degree=3, seed=seed), simultaneous=0.9)
-        (bound,) = certificate(cubic, [condition]).at(np.array([START]), horizon)
+        (bound,) = posterior_bound(cubic, [condition]).at(np.array([START]), horizon)
         env = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/CubicSDEDisk-v0", num_envs=envs, start=START, horizon=horizon), condition)
         env.reset(seed=seed)
         safe = np.ones(envs, dtype=bool)
@@ -161,3 +166,39 @@ def test_what_is_certified_happens(cubic, monkeypatch):
         assert rate_interval(np.count_nonzero(safe), envs, 0.99)[1] >= bound
     assert min(promised) > 0.2
     assert max(promised) < 0.9
+
+
+def unstable(**options):
+    """dx = (3 x + u) dt + .05 dW, inside of |x| < 1."""
+    x, u = sp.symbols("x u", real=True)
+    system = ControlAffineSDE.from_rate((x,), (u,), [3 * x + u], diffusion=[0.05])
+    return state_problem(system, [1 - x**2], box=(-10, 10), workspace={x: (-2, 2)}, start=(0.5,), horizon=1.0, nominal=0, **options)
+
+
+def test_long_steps_bias_what_is_identified_and_are_allowed_for():
+    """Data of .05 s that are integrated finely: the posterior is surer of the wrong rates than its probability says."""
+    problem, (x, u) = unstable(dt=0.05, substeps=10), np.meshgrid(np.linspace(-1.0, 1.0, 21), [-10.0, 0.0, 10.0])
+    truth = -2 * x * (3 * x + u) - 0.05**2
+    covered = allowed = 0
+    for seed in range(4):
+        posterior = identify(problem, starts=200, repetitions=50, degree=1, seed=seed)
+        condition = BayesianSCBF(posterior, simultaneous=0.9)
+        row = SafetyFilter.for_problem(problem, condition).constraints[0]
+        parts = [np.broadcast_to(e, x.shape) for e in compile_function(problem.plant.states, [*row.coefficient, row.offset], "arrays")(x)]
+        q0, q1, q2 = compile_function(problem.plant.states, row.uncertainty, "arrays")(x)
+        robust = parts[0] * u + parts[1] - np.sqrt(q0 + 2 * q1 * u + q2 * u**2)
+        found = posterior_bound(problem, [condition])
+        covered += bool((robust <= truth).all())
+        allowed += bool((robust - found.bias <= truth).all())
+        assert "steps of 0.05 s in the data may shift the rate of h by up to" in found.remark
+    assert covered == 0
+    assert allowed == 4
+    # dt/2 times h' L F + 1/2 h'' 2 J S, with F = 3 x + u, J = 3, L F = 3 F and h = 1 - x^2: largest at x = 1 and u = 10.
+    expected = 0.025 * (2 * 3 * 13 + 2 * 3 * 0.05**2)
+    assert found.bias == pytest.approx(expected, rel=0.2)
+    assert found.at(np.array([[0.1]]), 0.2)[0] < 0.9 * (1 - 0.1**2 - found.bias * 0.2) + 1e-9
+
+
+def test_steps_of_the_plants_own_method_have_no_bias(posterior, found):
+    assert posterior.record.settings["substeps"] == 1
+    assert found.bias == 0.0

@@ -1,4 +1,4 @@
-"""The bound that is proved for conditions, quickly: for the table of an evaluation."""
+"""The bound that is estimated for conditions, quickly: for the table of an evaluation."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from wrappers import bounds
 from wrappers.conditions import Condition
 from wrappers.formulas import Formulas
 from wrappers.hypotheses import amount, doubts, failures, mismatch, no_bound, unbounded
+from wrappers.observed import above_suprema, below_slack
 from wrappers.promise import Stages, assembled, outlasting
 from wrappers.survey import Survey
 
 
 @dataclass(frozen=True)
-class ProvedBound:
-    """The largest proved bound of conditions.
+class EstimatedBound:
+    """The largest bound of conditions, with the suprema and the shortfall that a search found: an estimate.
 
     Attributes:
         note: why there is none; None if there is one.
@@ -42,9 +43,23 @@ class ProvedBound:
             return outlasting(stages, b, horizon)
         return (b > 0.0).all(axis=1).astype(float)
 
+    def contradiction(self, reached: np.ndarray, missed: np.ndarray, actions: np.ndarray, slack: np.ndarray) -> str:
+        """What states say against the numbers that the bound rests on; "" if nothing, or if there is no bound.
 
-def proved_bound(problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str = "model") -> ProvedBound:
-    """What conditions are proved to promise: deterministic, and without a look at more than that needs.
+        Args:
+            reached: states that were reached, starts among them, shape (B, n).
+            missed: states where the filter missed its conditions, shape (E, n).
+            actions: what it executed there, shape (E, m).
+            slack: by how much it says to have missed, shape (E,); the actions themselves say how much of it a sampling margin is.
+        """
+        if self._stages is None:
+            return ""
+        high = above_suprema(self._formulas, self._stages.suprema, reached)
+        return high or below_slack(self._formulas, max(self._stages.shortfalls), missed, actions)
+
+
+def estimated_bound(problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str = "model") -> EstimatedBound:
+    """The bound that is estimated for conditions: deterministic, and without a look at more than that needs.
 
     The suprema and the shortfall are those of `verify` with its defaults.
 
@@ -59,25 +74,28 @@ def proved_bound(problem: SafetyProblem, conditions: Sequence[Condition], knowle
     formulas = Formulas(problem, conditions, knowledge)
     # What needs no search comes first.
     note = no_bound(formulas) or mismatch(formulas)
+    return EstimatedBound(note, "", formulas, None) if note else from_survey(Survey(formulas))
+
+
+def from_survey(survey: Survey) -> EstimatedBound:
+    """The bound that is estimated by what a survey found."""
+    formulas = survey.formulas
+    note = no_bound(formulas) or _note(survey)
     if note:
-        return ProvedBound(note, "", formulas, None)
-    survey = Survey(formulas)
-    note = _note(survey)
-    if note:
-        return ProvedBound(note, "", formulas, None)
+        return EstimatedBound(note, "", formulas, None)
     shortfall, _ = survey.missed
     # Where every path is kept, no supremum matters.
     suprema = np.ones(formulas.stages[-1].stop) if formulas.certain else survey.suprema
     found = assembled(formulas, suprema, shortfall)
     remark = f"no action meets the condition somewhere, {amount(shortfall)}" if shortfall else ""
     if formulas.certain and shortfall and (formulas.noisy or any(map(math.isnan, found.rates))):
-        return ProvedBound(remark, "", formulas, None)
-    return ProvedBound(None, remark, formulas, found)
+        return EstimatedBound(remark, "", formulas, None)
+    return EstimatedBound(None, remark, formulas, found)
 
 
 def _note(survey: Survey) -> str:
-    """Why nothing is proved, the first of several reasons; may be empty."""
+    """Why there is no bound, the first of several reasons; may be empty."""
     if survey.kept is None:
         return "the sets C_j have no state in common"
-    against = [*failures(survey), *doubts(survey)]
-    return against[0] if against else unbounded(survey)
+    against = [*failures(survey), unbounded(survey), *doubts(survey)]
+    return next(filter(None, against), "")
