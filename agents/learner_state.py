@@ -79,7 +79,9 @@ def restore_learner(model: Any, arrays: Mapping[str, np.ndarray], counts: Mappin
     _restore_tensors(model, arrays)
     for name in _OBSERVED:
         if name in arrays:
-            setattr(model, name, arrays[name].copy())
+            # As those of the envs lie in memory, on which it depends how sums are rounded.
+            setattr(model, name, np.empty_like(getattr(model, name)))
+            getattr(model, name)[...] = arrays[name]
     for layer, moments in _moments(model.get_vec_normalize_env()):
         moments.mean, moments.var = (arrays[f"{layer}/{key}"].copy()[()] for key in ("mean", "var"))
         moments.count = arrays[f"{layer}/count"].item()
