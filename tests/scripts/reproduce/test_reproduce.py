@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import os
 import time
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
@@ -18,6 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
+from agents.processes import end_with_parent
 from safe_envs.errors import ConfigurationError, WorkersLostError
 from scripts.reproduce.artefact import Outcome, Sample
 from scripts.reproduce.catalogue import ARTEFACTS
@@ -280,6 +282,23 @@ def test_what_a_lost_process_computed_is_computed_again(tmp_path, monkeypatch):
     assert asked == [(["first", "kills", "beside"], 2), (["kills"], 1), (["beside"], 1)]
     assert ended["first"] is ended["beside"] is None
     assert isinstance(ended["kills"], WorkersLostError)
+
+
+def test_the_processes_watch_their_parent(monkeypatch, tmp_path):
+    from scripts.reproduce import command
+
+    given = {}
+
+    class Pool:
+        def __init__(self, jobs, **arguments):
+            given.update(arguments)
+
+        def shutdown(self, **_):
+            pass
+
+    monkeypatch.setattr(command, "ProcessPoolExecutor", Pool)
+    assert list(command._pooled([], Sample(), tmp_path, 2)) == []
+    assert (given["initializer"], given["initargs"]) == (end_with_parent, (os.getpid(),))
 
 
 def test_a_run_that_was_stopped_goes_on(safe_envs_command, catalogue, computed, coin, monkeypatch):
