@@ -91,9 +91,11 @@ def restore_learner(model: Any, arrays: Mapping[str, np.ndarray], counts: Mappin
 
 
 def buffer_arrays(buffer: ReplayBuffer) -> Arrays:
-    """Return the rows of a replay buffer that are in use, as views."""
-    # A buffer that saves memory keeps the last next observation in the row after those that are filled.
-    rows = buffer.buffer_size if buffer.full else min(buffer.pos + 1, buffer.buffer_size)
+    """Return the rows of a replay buffer that are filled, as views.
+
+    A buffer that saves memory has the last next observation in the row after them, where the next step's observation replaces it.
+    """
+    rows = buffer.buffer_size if buffer.full else buffer.pos
     return {name: getattr(buffer, name)[:rows] for name in _ROWS if hasattr(buffer, name)}
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import resource
 import shutil
 import signal
 import subprocess
 import sys
 import zipfile
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from hypothesis import strategies as st
 from agents.trainer import train
 from agents.training import Training
 from safe_envs import ConfigurationError
+from tests.full_disk import no_file_larger_than
 
 DUBINS = "safe_envs/StochasticDubins-v0"
 SAC = {"learning_starts": 16, "batch_size": 16, "train_freq": 4, "policy_kwargs": {"net_arch": [8]}}
@@ -220,17 +220,6 @@ def test_texts_of_another_shape_are_refused(name, text, copied):
     (folder / name).write_bytes(f"{text}\n".encode(errors="surrogateescape"))
     with pytest.raises(ConfigurationError, match=f"{name} cannot be read"):
         train(WHOLE, folder, resume=True)
-
-
-@contextmanager
-def no_file_larger_than(size):
-    """As on a full disk: the operating system takes no more bytes of any file of this process."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 @pytest.mark.parametrize("size", [0, 300, 3000, 20_000])
