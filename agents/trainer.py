@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from agents.algorithms import OFF_POLICY, new_model
+from agents.algorithms import OFF_POLICY, SHOWN, new_model
 from agents.checkpoints import (
     copy_policy,
     drop_replay_buffer,
@@ -233,12 +233,12 @@ class _Session:
                 log_interval=4 if training.algorithm in OFF_POLICY else 1,
                 reset_num_timesteps=False,
             )
-        except (AssertionError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        except (ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError) as error:
             if isinstance(error, SafeEnvsError):
                 raise
             raise ConfigurationError(
-                f"the training failed after {model.num_timesteps} steps ({type(error).__name__}: {error}): "
-                f"it diverged, or a hyperparameter is not allowed; they are {training.hyperparameters}"
+                f"the training failed after {model.num_timesteps} steps ({type(error).__name__}: {str(error)[:SHOWN]}): "
+                f"it diverged, or a hyperparameter is not allowed; they are {str(training.hyperparameters)[:SHOWN]}"
             ) from error
         finally:
             del model._update_current_progress_remaining
