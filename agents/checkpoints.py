@@ -94,7 +94,8 @@ def keep_checkpoint(folder: Path, model: Any, problem: SafetyProblem, figures: S
     finally:
         shutil.rmtree(part, ignore_errors=True)
     for old in before:
-        shutil.rmtree(old)
+        with writing(old):
+            shutil.rmtree(old)
     return target
 
 
@@ -222,4 +223,5 @@ def copy_policy(checkpoint: Path, target: Path) -> None:
 
 def drop_replay_buffer(checkpoint: Path) -> None:
     """Remove the largest part of a checkpoint, which nobody goes on from."""
-    (checkpoint / _BUFFER).unlink(missing_ok=True)
+    with writing(checkpoint):
+        (checkpoint / _BUFFER).unlink(missing_ok=True)

@@ -43,8 +43,8 @@ _CONFIG, _EVALUATIONS, _PROGRESS, _BEST, _LOCK = "config.json", "evaluations.jso
 _SHOWN = ("safety_rate", "ci_low", "ci_high", "return_mean")
 """Of an evaluation, what is logged and shown."""
 
-_MOST_TEXT = 100_000_000
-"""Bytes of a file of JSON, at most: an evaluation takes a thousand."""
+_MOST_TEXT = 30_000_000
+"""Bytes of a file of JSON, at most: an evaluation takes a thousand, and what is read may take 25 times as much memory."""
 
 Told = Callable[[float], None]
 """Told the part of the training that is done, from 0 to 1."""

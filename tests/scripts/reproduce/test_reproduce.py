@@ -195,7 +195,7 @@ def with_checksum(document):
 
 
 @given(data=st.data())
-@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_digit_that_was_changed_is_not_taken_for_a_result(data, kept, coin, tmp_path):
     content = kept.read_text()
     try:
