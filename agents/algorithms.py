@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.hyperparameters import scheduled
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
 from safe_envs.problem import SafetyProblem
 
 if TYPE_CHECKING:
@@ -22,6 +22,9 @@ OFF_POLICY = ("sac", "td3")
 
 ACTIONS = ("executed", "proposed", "both")
 """On which these may learn behind a filter; see `agents.replay`."""
+
+SHOWN = 1000
+"""Characters of hyperparameters, or of what others say of them, at most, that a message repeats."""
 
 _OF_THE_ENV = ("normalize",)
 _OF_THE_NOISE = ("noise_type", "noise_std")
@@ -62,10 +65,12 @@ def new_model(name: str, envs: VecEnv, problem: SafetyProblem, settings: Mapping
         if isinstance(left.get("train_freq"), list):
             left["train_freq"] = tuple(left["train_freq"])
         model: Any = algorithm_class(name)(env=envs, seed=seed, device="cpu", **left)
-    except ConfigurationError:
+    except SafeEnvsError:
         raise
-    except (AssertionError, LookupError, SyntaxError, TypeError, ValueError) as error:
-        raise ConfigurationError(f"{name} does not take these hyperparameters: {error}; they are {dict(settings)}") from error
+    except (ArithmeticError, AssertionError, LookupError, RecursionError, SyntaxError, TypeError, ValueError) as error:
+        raise ConfigurationError(
+            f"{name} does not take these hyperparameters: {str(error)[:SHOWN]}; they are {str(settings)[:SHOWN]}"
+        ) from error
     # Better now than when the first checkpoint is written.
     actor_of(model.policy)
     return model

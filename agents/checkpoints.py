@@ -1,36 +1,62 @@
 """Checkpoints of a training: written whole or not at all, and all that it takes to go on as if nothing had happened.
 
-The last one is a pickle of Stable-Baselines3 in part: restore only your own.
+What a training goes on from is data: JSON, and arrays in safetensors. `model.zip` and `normalization.pkl` are for the users of
+Stable-Baselines3; they hold code, and are never read here.
 """
 
 from __future__ import annotations
 
+import io
 import json
+import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file
+from safetensors.numpy import save as serialized
 
-from agents.algorithms import algorithm_class
+from agents.learner_state import (
+    Arrays,
+    begin,
+    buffer_arrays,
+    counters,
+    env_arrays,
+    learner_arrays,
+    restore_buffer,
+    restore_envs,
+    restore_learner,
+)
 from agents.policy import DESCRIPTION, TENSORS
 from agents.weights import save_policy
-from safe_envs.errors import ConfigurationError
-from safe_envs.files import write_atomically, write_json
+from safe_envs.errors import ConfigurationError, SafeEnvsError
+from safe_envs.files import write_atomically, write_json, writing
 from safe_envs.problem import SafetyProblem
 
 if TYPE_CHECKING:
-    from stable_baselines3.common.vec_env import VecEnv
+    from agents.figures import SafetyFigures
 
-_STATE, _MODEL, _BUFFER, _SCALES, _ENVS = "state.json", "model.zip", "replay_buffer.pkl", "normalization.pkl", "envs.npz"
+_STATE, _LEARNER, _BUFFER, _ENVS = "state.json", "learner.safetensors", "replay_buffer.safetensors", "envs.safetensors"
+_MODEL, _SCALES = "model.zip", "normalization.pkl"
 _OF_THE_POLICY = (_MODEL, _SCALES, TENSORS, DESCRIPTION)
 _CHECKPOINT = "checkpoint_"
+_FORMAT = 2
 
-# What zip archives, pickles and those who read them raise on damaged files.
-_DAMAGED = (AttributeError, EOFError, ImportError, LookupError, OSError, RuntimeError, TypeError, ValueError, UnpicklingError, BadZipFile)
+_MOST_TEXT = 1_000_000
+"""Bytes of the JSON of a checkpoint, at most: it has a few hundred numbers."""
+
+_HEADER = 1_000_000
+"""Bytes, at most, of what a file of arrays has besides them: their names, types and shapes."""
+
+_PER_PARAMETER = 8
+"""Numbers, at most, that the networks and optimizers of a learner have for one of a new learner, which has no optimizers' state yet."""
+
+# What JSON, safetensors and those who read them raise on damaged files.
+_DAMAGED = (AttributeError, ArithmeticError, LookupError, OSError, RecursionError, RuntimeError, SafetensorError, TypeError, ValueError)
 
 
 def last_checkpoint(folder: Path) -> Path | None:
@@ -38,60 +64,92 @@ def last_checkpoint(folder: Path) -> Path | None:
     return max(folder.glob(f"{_CHECKPOINT}*"), default=None)
 
 
-def keep_checkpoint(folder: Path, model: Any, problem: SafetyProblem, state: Mapping[str, Any]) -> Path:
+def remove_unfinished(folder: Path) -> None:
+    """Remove what a training left that was killed while it wrote a checkpoint."""
+    for part in folder.glob(f".{_CHECKPOINT}*"):
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def keep_checkpoint(folder: Path, model: Any, problem: SafetyProblem, figures: SafetyFigures, seconds: float) -> Path:
     """Write a whole checkpoint beside the last one, and only then remove that.
 
     Args:
         folder: of the training.
         model: as it is between two rollouts.
         problem: of its env.
-        state: JSON-able, returned by `read_state`.
+        figures: of the training so far.
+        seconds: that it took.
+
+    Raises:
+        ConfigurationError: it cannot be written, as on a full disk; the last one stays.
     """
     before = list(folder.glob(f"{_CHECKPOINT}*"))
     target = folder / f"{_CHECKPOINT}{model.num_timesteps:012d}"
     part = folder / f".{target.name}"
-    shutil.rmtree(part, ignore_errors=True)
-    part.mkdir()
-    model.save(part / _MODEL)
-    if hasattr(model, "save_replay_buffer"):
-        model.save_replay_buffer(part / _BUFFER)
-    scales = model.get_vec_normalize_env()
-    if scales is not None:
-        scales.save(str(part / _SCALES))
-    arrays: Any = _snapshot(model.get_env())
-    np.savez(part / _ENVS, **arrays)
-    save_policy(model, part, problem, scales)
-    write_json(part / _STATE, state)
-    part.rename(target)
+    try:
+        with writing(target):
+            part.mkdir()
+            _write(part, model, problem, {"counts": figures.counts, "seconds": seconds})
+            part.rename(target)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
     for old in before:
-        shutil.rmtree(old)
+        with writing(old):
+            shutil.rmtree(old)
     return target
 
 
-def restored_model(checkpoint: Path, algorithm: str, envs: VecEnv) -> Any:
-    """The model of a checkpoint, over fresh envs; `resume_episodes` puts these where they were.
+def _write(part: Path, model: Any, problem: SafetyProblem, state: dict[str, Any]) -> None:
+    # Where a file cannot take what it writes, PyTorch does not say why.
+    archive = io.BytesIO()
+    model.save(archive)
+    (part / _MODEL).write_bytes(archive.getvalue())
+    scales, buffer = model.get_vec_normalize_env(), getattr(model, "replay_buffer", None)
+    if scales is not None:
+        scales.save(str(part / _SCALES))
+    document = {"format": _FORMAT, "counters": counters(model), **state}
+    if buffer is not None:
+        (part / _BUFFER).write_bytes(serialized(buffer_arrays(buffer)))
+        document["buffer"] = {"pos": buffer.pos, "full": buffer.full}
+    (part / _LEARNER).write_bytes(serialized(_contiguous(learner_arrays(model))))
+    (part / _ENVS).write_bytes(serialized(_contiguous(env_arrays(model.get_env()))))
+    save_policy(model, part, problem, scales)
+    write_json(part / _STATE, document)
+
+
+def restore_model(checkpoint: Path, model: Any, figures: SafetyFigures, n_timesteps: int) -> float:
+    """Give a new model what a checkpoint holds; no code of the checkpoint is run.
+
+    Args:
+        checkpoint: of a model with the same hyperparameters.
+        model: new, over fresh envs, which `resume_episodes` puts where they were.
+        figures: new, to go on with those of the checkpoint.
+        n_timesteps: after which the training is finished.
+
+    Returns:
+        The seconds that the training took until then.
 
     Raises:
-        ConfigurationError: the checkpoint cannot be read.
+        ConfigurationError: the checkpoint cannot be read, or is that of another model.
     """
-    try:
-        if (checkpoint / _SCALES).exists():
-            from stable_baselines3.common.vec_env import VecNormalize
-
-            envs = VecNormalize.load(str(checkpoint / _SCALES), envs)
-        model: Any = algorithm_class(algorithm).load(checkpoint / _MODEL, env=envs, device="cpu", force_reset=False)
-        if (checkpoint / _BUFFER).exists():
-            model.load_replay_buffer(checkpoint / _BUFFER)
-    except _DAMAGED as error:
-        raise ConfigurationError(
-            f"the checkpoint {checkpoint} cannot be read ({type(error).__name__}: {error}); start the training anew in another folder"
-        ) from error
-    return model
-
-
-def read_state(checkpoint: Path) -> dict[str, Any]:
-    """What was given to `keep_checkpoint`."""
-    return json.loads((checkpoint / _STATE).read_text())
+    with _reading(checkpoint):
+        document = json.loads(_content(checkpoint / _STATE, _MOST_TEXT))
+        if document.get("format") != _FORMAT:
+            raise ConfigurationError(
+                f"{checkpoint} was written by another version, whose checkpoints this one does not read; "
+                "go on with the version that wrote it, or start the training again in another folder"
+            )
+        begin(model)
+        restore_learner(model, _arrays(checkpoint / _LEARNER, _PER_PARAMETER * _size(learner_arrays(model))), document["counters"])
+        buffer = getattr(model, "replay_buffer", None)
+        # A finished training has dropped its buffer.
+        if buffer is not None and (model.num_timesteps < n_timesteps or (checkpoint / _BUFFER).exists()):
+            most = sum(getattr(buffer, name).nbytes for name in buffer_arrays(buffer))
+            restore_buffer(buffer, _arrays(checkpoint / _BUFFER, most), document["buffer"]["pos"], document["buffer"]["full"])
+        figures.restore(document["counts"])
+        if type(document["seconds"]) is not float or not 0.0 <= document["seconds"] < math.inf:
+            raise ValueError(f"it took {document['seconds']!r} seconds")
+        return document["seconds"]
 
 
 def resume_episodes(checkpoint: Path, model: Any, seed: int) -> None:
@@ -99,13 +157,65 @@ def resume_episodes(checkpoint: Path, model: Any, seed: int) -> None:
 
     A training that goes on does this at each of its checkpoints too, so that one which was interrupted does the same.
     """
-    with np.load(checkpoint / _ENVS) as arrays:
-        _restore(model.get_env(), dict(arrays), seed)
+    with _reading(checkpoint):
+        envs = model.get_env()
+        restore_envs(envs, _arrays(checkpoint / _ENVS, _size(env_arrays(envs))), seed)
+
+
+@contextmanager
+def _reading(checkpoint: Path) -> Iterator[None]:
+    """Say of what damaged files raise which checkpoint it is."""
+    try:
+        yield
+    except SafeEnvsError:
+        raise
+    except _DAMAGED as error:
+        raise ConfigurationError(
+            f"the checkpoint {checkpoint} cannot be read ({type(error).__name__}: {error}); start the training anew in another folder"
+        ) from error
+
+
+def _content(path: Path, most: int) -> bytes:
+    """Return the content of a file of at most so many bytes.
+
+    Raises:
+        ValueError: it is no file, or larger.
+    """
+    _require_size(path, most)
+    return path.read_bytes()
+
+
+def _arrays(path: Path, most: int) -> Arrays:
+    """Return the arrays of a file, which together have at most so many bytes.
+
+    Raises:
+        ValueError: it is no file, or larger.
+    """
+    _require_size(path, most + _HEADER)
+    return load_file(path)
+
+
+def _size(arrays: Arrays) -> int:
+    """The bytes of arrays."""
+    return sum(array.nbytes for array in arrays.values())
+
+
+def _require_size(path: Path, most: int) -> None:
+    if not path.is_file():
+        raise ValueError(f"there is no file {path.name}")
+    if (size := path.stat().st_size) > most:
+        raise ValueError(f"{path.name} has {size} bytes, and {most} at most where it is not altered")
+
+
+def _contiguous(arrays: Arrays) -> Arrays:
+    """The arrays in the order in which safetensors reads them."""
+    return {name: np.array(array, order="C") for name, array in arrays.items()}
 
 
 def copy_policy(checkpoint: Path, target: Path) -> None:
     """Copy what an evaluation reads, and what Stable-Baselines3 does."""
-    target.mkdir(exist_ok=True)
+    with writing(target):
+        target.mkdir(exist_ok=True)
     for name in _OF_THE_POLICY:
         if (checkpoint / name).exists():
             write_atomically(target / name, lambda part, name=name: shutil.copyfile(checkpoint / name, part))
@@ -113,26 +223,5 @@ def copy_policy(checkpoint: Path, target: Path) -> None:
 
 def drop_replay_buffer(checkpoint: Path) -> None:
     """Remove the largest part of a checkpoint, which nobody goes on from."""
-    (checkpoint / _BUFFER).unlink(missing_ok=True)
-
-
-def _snapshot(envs: VecEnv) -> dict[str, np.ndarray]:
-    """Where the episodes of a `SafeVecEnv` and of the VecMonitor and VecNormalize over it stand, as arrays by name."""
-    found = dict(envs.unwrapped.snapshot())  # pyright: ignore[reportAttributeAccessIssue]
-    return found | {f"{name}_of_layers": getattr(layer, name) for layer, name in _sums(envs)}
-
-
-def _restore(envs: VecEnv, arrays: Mapping[str, np.ndarray], seed: int) -> None:
-    """Go on from a `_snapshot`, with the randomness of a seed."""
-    envs.unwrapped.restore(arrays, seed)  # pyright: ignore[reportAttributeAccessIssue]
-    for layer, name in _sums(envs):
-        setattr(layer, name, arrays[f"{name}_of_layers"].copy())
-
-
-def _sums(envs: VecEnv) -> list[tuple[Any, str]]:
-    """What the wrappers add up in an episode."""
-    from stable_baselines3.common.vec_env import VecMonitor, VecNormalize, unwrap_vec_wrapper
-
-    monitor, scales = (unwrap_vec_wrapper(envs, layer) for layer in (VecMonitor, VecNormalize))
-    of_monitor = [] if monitor is None else [(monitor, "episode_returns"), (monitor, "episode_lengths")]
-    return of_monitor + ([] if scales is None else [(scales, "returns")])
+    with writing(checkpoint):
+        (checkpoint / _BUFFER).unlink(missing_ok=True)

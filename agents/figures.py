@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,13 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
 
+from safe_envs.errors import ConfigurationError
+from safe_envs.files import write_atomically, writing
+
 _EPISODES = 100
+
+_LONGEST = 1_000_000
+"""Characters of a line of a log, at most: it has some tens of numbers."""
 
 
 class SafetyFigures(BaseCallback):
@@ -52,6 +58,21 @@ class SafetyFigures(BaseCallback):
         for name, value in self.figures().items():
             self.logger.record(f"safety/{name}", value)
 
+    def restore(self, counts: Any) -> None:
+        """Go on with the counts of another run.
+
+        Raises:
+            ValueError: they are not such counts.
+        """
+        whole = [count for name, count in counts.items() if name != "episodes"]
+        ended = [number for episode in counts["episodes"] for number in episode]
+        known = {"steps", "violations", "episodes"} <= set(counts) <= {*self.counts, "interventions", "infeasible"}
+        if not (known and all(type(n) is int and n >= 0 for n in whole) and len(ended) == 2 * len(counts["episodes"]) <= 2 * _EPISODES):
+            raise ValueError(f"the counts are {list(counts)}")
+        if not all(type(number) in (int, float) and math.isfinite(number) for number in ended):
+            raise ValueError("the last episodes are not numbers")
+        self.counts = counts
+
     def figures(self) -> dict[str, float]:
         """The figures by name; those of episodes from the first one on that ended."""
         counts = self.counts
@@ -73,13 +94,12 @@ class ProgressLog(KVWriter):
 
     def __init__(self, path: Path, until: int) -> None:
         self._path = path
-        kept = [line for line in _lines(path) if json.loads(line)["step"] <= until]
-        path.write_text("".join(f"{line}\n" for line in kept))
+        write_atomically(path, lambda part: _copy(path, part, until))
 
     def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """Append a line; numbers that are not finite are null."""
         numbers = {key: _number(value) for key, value in sorted(key_values.items()) if isinstance(value, int | float | np.number)}
-        with self._path.open("a") as stream:
+        with writing(self._path), self._path.open("a") as stream:
             stream.write(json.dumps({"step": step, **numbers}, allow_nan=False) + "\n")
 
     def close(self) -> None:
@@ -88,13 +108,31 @@ class ProgressLog(KVWriter):
 
 def read_progress(path: Path) -> list[Mapping[str, Any]]:
     """The lines of a `ProgressLog`."""
-    return [json.loads(line) for line in _lines(path)]
+    return [line for _, line in _lines(path)]
 
 
-def _lines(path: Path) -> list[str]:
-    # The last line of a training that was killed may be half a line.
-    text = path.read_text() if path.exists() else ""
-    return text.split("\n")[:-1]
+def _copy(path: Path, to: Path, until: int) -> None:
+    """Copy the lines of a log up to a step."""
+    with to.open("w") as stream:
+        stream.writelines(text for text, line in _lines(path) if line["step"] <= until)
+
+
+def _lines(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """The whole lines of a log, as they are and read."""
+    if not path.is_file():
+        return
+    with path.open() as stream:
+        try:
+            # The last line of a training that was killed may be half a line.
+            while (text := stream.readline(_LONGEST)).endswith("\n"):
+                line = json.loads(text)
+                if type(line["step"]) is not int:
+                    raise ValueError(f"a line is of step {line['step']!r}")
+                yield text, line
+            if len(text) == _LONGEST:
+                raise ValueError("a line is too long")
+        except (LookupError, RecursionError, TypeError, ValueError) as error:
+            raise ConfigurationError(f"{path} cannot be read ({error}); it is damaged or altered: remove it") from error
 
 
 def _number(value: Any) -> float | int | None:

@@ -1,8 +1,11 @@
-"""The episodes of an evaluation in several processes: the same answer, sooner."""
+"""Processes of this machine that end with the one that started them, and the episodes of an evaluation in several of them."""
 
 from __future__ import annotations
 
 import math
+import os
+import threading
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any
@@ -17,6 +20,37 @@ from wrappers import Condition
 
 _PARTS = 4
 """In how many parts the work of a process comes, so that there is progress to tell."""
+
+_LOOK = 1.0
+"""Seconds between two looks of a worker at whether the process that started it is still there."""
+
+
+def end_with_parent(parent: int) -> None:
+    """Let this process end soon after its parent, which may be killed without a word; for the initializer of a pool of processes.
+
+    The operating system gives a process whose parent has ended another parent. (Windows does not: there it stays until it is idle.)
+
+    Args:
+        parent: id of the process that started this one.
+    """
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(_LOOK)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True, name="end_with_parent").start()
+
+
+def local_processes(idle: int = 300) -> Any:
+    """Return joblib's backend of processes of this machine, each of which ends with this one.
+
+    Args:
+        idle: seconds after which a process ends that has nothing to do.
+    """
+    from joblib._parallel_backends import LokyBackend
+
+    return LokyBackend(idle_worker_timeout=idle, initializer=end_with_parent, initargs=(os.getpid(),))
 
 
 def play_in_processes(
@@ -50,7 +84,8 @@ def play_in_processes(
     size = max(1, math.ceil(episodes / (jobs * _PARTS)))
     parts = [range(first, min(first + size, episodes)) for first in range(0, episodes, size)]
     sent = _sent(setting, conditions, jobs)
-    found: Any = Parallel(n_jobs=jobs, return_as="generator")(delayed(_played)(sent, part, seed, num_envs, bridge) for part in parts)
+    parallel = Parallel(jobs, backend=local_processes(), return_as="generator")
+    found: Any = parallel(delayed(_played)(sent, part, seed, num_envs, bridge) for part in parts)
     try:
         for part, waves in zip(parts, found, strict=True):
             yield from waves

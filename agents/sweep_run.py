@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any, cast
 
+from agents.processes import local_processes
 from agents.sweep_cell import Cell, Outcome, compute
 from agents.sweep_clusters import TaskLostError, dask_settings, ray_settings
 from safe_envs.errors import ConfigurationError, SafeEnvsError, WorkersLostError, nearest, require_whole
@@ -22,7 +23,7 @@ _MOST_TRIED = 5
 """How many cells are tried, one by one, before it is said that none can be computed."""
 
 _IDLE = 30
-"""Seconds after which a process of this machine ends that has nothing to do, as when the one that started it was killed."""
+"""Seconds after which a process of this machine ends that has nothing to do."""
 
 
 class _LossError(Exception):
@@ -183,11 +184,9 @@ def _told(error: BaseException) -> str:
 def _settings(place: Place, count: int, tell: Callable[[str], None]) -> Iterator[dict[str, Any]]:
     """The arguments of joblib for a place, connected as long as the context lasts."""
     if place.backend == "local":
-        from joblib._parallel_backends import LokyBackend
-
         # A single cell of several jobs is to have a process of its own too.
         jobs = 1 if place.jobs == 1 else max(2, min(place.jobs, count))
-        yield {"backend": LokyBackend(idle_worker_timeout=_IDLE), "n_jobs": jobs}
+        yield {"backend": local_processes(_IDLE), "n_jobs": jobs}
     elif place.backend == "dask":
         with dask_settings(str(place.address), tell) as settings:
             yield settings

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
@@ -92,24 +92,23 @@ class Store:
         if not self._is_indexed:
             self._write_index()
         if outcome.error is None or not _is_finished(path):
-            self._write(path, lambda: write_atomically(path, lambda part: _write_table(part, self._cells[outcome.key], outcome)))
+            self._write(lambda: write_atomically(path, lambda part: _write_table(part, self._cells[outcome.key], outcome)))
             (self._finished if outcome.error is None else self._failed).add(outcome.key)
         else:
             self._finished.add(outcome.key)
 
     def _write_index(self) -> None:
         path = self._folder / INDEX
-        self._write(path, lambda: write_json(path, self._index))
+        self._write(lambda: write_json(path, self._index))
         self._is_indexed = True
 
-    def _write(self, path: Path, write: Any) -> None:
+    def _write(self, write: Callable[[], None]) -> None:
         try:
             write()
-        except (OSError, ConfigurationError) as error:
-            reason = str(error) if isinstance(error, ConfigurationError) else f"cannot write {path}: {error.strerror or error}"
+        except ConfigurationError as error:
             raise ConfigurationError(
-                f"{reason}. {len(self._finished)} of {len(self._cells)} cells are finished and kept in {self._folder}; "
-                "see to it that files can be written there and start again, and only the others are computed"
+                f"{error}. {len(self._finished)} of {len(self._cells)} cells are finished and kept in {self._folder}; "
+                "start again then, and only the others are computed"
             ) from error
 
 

@@ -7,6 +7,7 @@ go on from one part to the next. So a training that was interrupted goes on afte
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -17,26 +18,33 @@ from typing import Any
 import numpy as np
 
 from agents import blas_threads
-from agents.algorithms import OFF_POLICY, new_model
+from agents.algorithms import OFF_POLICY, SHOWN, new_model
 from agents.checkpoints import (
     copy_policy,
     drop_replay_buffer,
     keep_checkpoint,
     last_checkpoint,
-    read_state,
-    restored_model,
+    remove_unfinished,
+    restore_model,
     resume_episodes,
 )
 from agents.evaluation import BARE, evaluate, package_versions
 from agents.problems import load_problem
 from agents.training import Training
 from safe_envs.errors import ConfigurationError, SafeEnvsError
-from safe_envs.files import write_json
+from safe_envs.files import write_json, writing
+from safe_envs.locks import locked
 
 _OF_EVALUATIONS = 2**32 - 1
 """Key of their seeds, which no number of steps is."""
 
-_CONFIG, _EVALUATIONS, _PROGRESS, _BEST = "config.json", "evaluations.json", "progress.jsonl", "best"
+_CONFIG, _EVALUATIONS, _PROGRESS, _BEST, _LOCK = "config.json", "evaluations.json", "progress.jsonl", "best", ".lock"
+
+_SHOWN = ("safety_rate", "ci_low", "ci_high", "return_mean")
+"""Of an evaluation, what is logged and shown."""
+
+_MOST_TEXT = 30_000_000
+"""Bytes of a file of JSON, at most: an evaluation takes a thousand, and what is read may take 25 times as much memory."""
 
 Told = Callable[[float], None]
 """Told the part of the training that is done, from 0 to 1."""
@@ -52,7 +60,7 @@ def train(training: Training, folder: Path, *, resume: bool = False, tensorboard
 
     Args:
         training: what to do.
-        folder: a new one, or with `resume` that of an interrupted training, whose checkpoint is a pickle: resume only your own.
+        folder: a new one, or with `resume` that of an interrupted training. Nothing in it is run; Stable-Baselines3's files are not read.
         resume: go on after the last checkpoint.
         tensorboard: folder of logs for tensorboard, in which this training gets one by the name of its own.
         tell: told how far the training is.
@@ -61,7 +69,8 @@ def train(training: Training, folder: Path, *, resume: bool = False, tensorboard
         The processor's seconds that the learning took, in all its runs, evaluations left out.
 
     Raises:
-        ConfigurationError: the folder holds something else, or the training is not the one that is resumed.
+        ConfigurationError: the folder holds something else, another training writes to it, or it cannot be written, as on a full disk;
+            or the training is not the one that is resumed.
     """
     import torch
 
@@ -70,27 +79,39 @@ def train(training: Training, folder: Path, *, resume: bool = False, tensorboard
     if tensorboard is not None and find_spec("tensorboard") is None:
         raise ConfigurationError("--tensorboard: tensorboard is not installed; install it with pip install safe-envs[tensorboard]")
     _require_folder(folder, training, resume)
-    session = _Session(training, folder)
+    # Before a folder is made for it: its arguments may be refused.
+    begun = None if resume else _Session(training, folder)
     for wanted in (folder, *([] if tensorboard is None else [tensorboard])):
         try:
             wanted.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigurationError(f"the folder {wanted} cannot be made: {error.strerror}; give another one") from error
-    if not resume:
-        for name in (_EVALUATIONS, _PROGRESS):
-            (folder / name).unlink(missing_ok=True)
-        write_json(folder / _CONFIG, {"training": asdict(training), "versions": package_versions()})
-    session.log(tensorboard)
-    with blas_threads.limited(training.threads):
-        session.run(tell or (lambda _: None))
+    with locked(folder / _LOCK, f"another training is writing to {folder} just now; wait until it has ended, or give another folder"):
+        # Another training may have begun in it since.
+        _require_folder(folder, training, resume)
+        session = begun or _Session(training, folder, resume=True)
+        _prepare(folder, training, resume)
+        session.log(tensorboard)
+        with blas_threads.limited(training.threads):
+            session.run(tell or (lambda _: None))
     return session.seconds
+
+
+def _prepare(folder: Path, training: Training, resume: bool) -> None:
+    """Remove what is left over, and write what is trained."""
+    remove_unfinished(folder)
+    if not resume:
+        with writing(folder):
+            for name in (_EVALUATIONS, _PROGRESS):
+                (folder / name).unlink(missing_ok=True)
+        write_json(folder / _CONFIG, {"training": asdict(training), "versions": package_versions()})
 
 
 def _require_folder(folder: Path, training: Training, resume: bool) -> None:
     """Raise ConfigurationError unless the folder is new, or that of the same training."""
     if not resume:
         # A training that did not reach its first checkpoint leaves nothing that could be lost.
-        if folder.is_dir() and {path.name for path in folder.iterdir()} <= {_CONFIG, _EVALUATIONS, _PROGRESS}:
+        if folder.is_dir() and {path.name for path in folder.iterdir()} <= {_CONFIG, _EVALUATIONS, _PROGRESS, _LOCK}:
             return
         if folder.exists():
             what = "is not empty" if folder.is_dir() else "is a file"
@@ -100,8 +121,8 @@ def _require_folder(folder: Path, training: Training, resume: bool) -> None:
     if not path.is_file():
         raise ConfigurationError(f"--resume: {folder} holds no training; start it without --resume")
     try:
-        known = _flat(json.loads(path.read_text())["training"])
-    except (LookupError, TypeError, ValueError) as error:
+        known = _flat(_read(path)["training"])
+    except (LookupError, OSError, RecursionError, TypeError, ValueError) as error:
         raise ConfigurationError(
             f"--resume: {path} cannot be read ({error}); it is damaged or altered: start anew in another folder"
         ) from error
@@ -122,7 +143,7 @@ def _flat(document: Mapping[str, Any]) -> dict[str, Any]:
 class _Session:
     """One run of a training, from its beginning or from a checkpoint."""
 
-    def __init__(self, training: Training, folder: Path) -> None:
+    def __init__(self, training: Training, folder: Path, resume: bool = False) -> None:
         from stable_baselines3.common.vec_env import VecMonitor
 
         from agents.figures import SafetyFigures
@@ -142,15 +163,13 @@ class _Session:
                 **training.options,
             )
         )
-        checkpoint = last_checkpoint(folder)
-        if checkpoint is None:
-            action = training.action if training.learns_on_executed else None
-            self._model: Any = new_model(training.algorithm, envs, self._problem, training.hyperparameters, action, training.seed)
-        else:
-            self._model = restored_model(checkpoint, training.algorithm, envs)
-            state = read_state(checkpoint)
-            self._figures.counts, self.seconds = state["counts"], state["seconds"]
-        self._evaluations = [e for e in _read_list(folder / _EVALUATIONS) if e["timesteps"] <= self._model.num_timesteps]
+        action = training.action if training.learns_on_executed else None
+        self._model: Any = new_model(training.algorithm, envs, self._problem, training.hyperparameters, action, training.seed)
+        checkpoint = last_checkpoint(folder) if resume else None
+        if checkpoint is not None:
+            self.seconds = restore_model(checkpoint, self._model, self._figures, training.n_timesteps)
+        known = _read_evaluations(folder / _EVALUATIONS) if resume else []
+        self._evaluations = [e for e in known if e["timesteps"] <= self._model.num_timesteps]
 
     def log(self, tensorboard: Path | None) -> None:
         """Log to the folder, and to another one for tensorboard."""
@@ -179,8 +198,7 @@ class _Session:
         while model.num_timesteps < training.n_timesteps:
             end = (model.num_timesteps // training.eval_freq + 1) * training.eval_freq
             self._train_part(checkpoint, min(end, training.n_timesteps), tell)
-            state = {"timesteps": model.num_timesteps, "counts": self._figures.counts, "seconds": self.seconds}
-            checkpoint = keep_checkpoint(folder, model, self._problem, state)
+            checkpoint = keep_checkpoint(folder, model, self._problem, self._figures, self.seconds)
             self._evaluate(checkpoint)
         if checkpoint is not None:
             copy_policy(checkpoint, folder)
@@ -215,12 +233,12 @@ class _Session:
                 log_interval=4 if training.algorithm in OFF_POLICY else 1,
                 reset_num_timesteps=False,
             )
-        except (AssertionError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        except (ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError) as error:
             if isinstance(error, SafeEnvsError):
                 raise
             raise ConfigurationError(
-                f"the training failed after {model.num_timesteps} steps ({type(error).__name__}: {error}): "
-                f"it diverged, or a hyperparameter is not allowed; they are {training.hyperparameters}"
+                f"the training failed after {model.num_timesteps} steps ({type(error).__name__}: {str(error)[:SHOWN]}): "
+                f"it diverged, or a hyperparameter is not allowed; they are {str(training.hyperparameters)[:SHOWN]}"
             ) from error
         finally:
             del model._update_current_progress_remaining
@@ -247,7 +265,7 @@ class _Session:
         self._evaluations.append({"timesteps": model.num_timesteps, "seed": seed, **row, "training": self._figures.figures()})
         if row["return_mean"] > best:
             copy_policy(checkpoint, self._folder / _BEST)
-        for key in ("safety_rate", "ci_low", "ci_high", "return_mean"):
+        for key in _SHOWN:
             model.logger.record(f"eval/{key}", row[key])
         model.logger.dump(model.num_timesteps)
         write_json(self._folder / _EVALUATIONS, self._evaluations)
@@ -257,5 +275,25 @@ def _child_seed(seed: int, *key: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0])
 
 
-def _read_list(path: Path) -> list[Any]:
-    return json.loads(path.read_text()) if path.exists() else []
+def _read_evaluations(path: Path) -> list[dict[str, Any]]:
+    """The evaluations so far, if there are any."""
+    if not path.exists():
+        return []
+    try:
+        rows = _read(path)
+        for row in rows:
+            numbers = [row["timesteps"], *(row[name] for name in _SHOWN), row["training"]["violations"]]
+            if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
+                raise ValueError(f"its numbers are {numbers}")
+    except (LookupError, OSError, RecursionError, TypeError, ValueError) as error:
+        raise ConfigurationError(
+            f"--resume: {path} cannot be read ({error}); it is damaged or altered: start anew in another folder"
+        ) from error
+    return rows
+
+
+def _read(path: Path) -> Any:
+    """The content of a JSON file that is no larger than a training's can be."""
+    if not path.is_file() or path.stat().st_size > _MOST_TEXT:
+        raise ValueError(f"it is no file, or larger than {_MOST_TEXT} bytes")
+    return json.loads(path.read_text())

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import inspect
 import io
 import json
+import os
 import re
 import signal
 import sys
@@ -28,6 +30,9 @@ _LEAST_WIDTH = 104
 _PIPE_WIDTH = 240
 _TOO_LARGE = ("can't allocate memory", "Maximum allowed dimension exceeded", "Maximum allowed size exceeded", "array is too big")
 """What PyTorch and NumPy say of sizes beyond the memory, where it is no MemoryError."""
+
+_UNWRITABLE = {errno.ENOSPC, errno.EFBIG, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)}
+"""What the operating system says of a disk that takes no more."""
 
 STDOUT = Path("-")
 """As the file of --json: the standard output, which has nothing else on it then."""
@@ -142,9 +147,21 @@ def run(command: Callable[[], object]) -> None:
     """Run a command; an error of the user's making ends it with a message and the exit status 2."""
     try:
         with _terminable():
-            command()
+            try:
+                command()
+            finally:
+                sys.stdout.flush()
     except SafeEnvsError as error:
         _fail(str(error))
+    except BrokenPipeError:
+        # Who reads the output has read enough.
+        _drop_output()
+        sys.exit(1)
+    except OSError as error:
+        if error.errno not in _UNWRITABLE:
+            raise
+        _drop_output()
+        _fail(f"cannot write {error.filename or 'the output'}: {error.strerror}; make room, or choose another place")
     except (MemoryError, RuntimeError, ValueError) as error:
         if not isinstance(error, MemoryError) and not any(text in str(error) for text in _TOO_LARGE):
             raise
@@ -157,6 +174,14 @@ def run(command: Callable[[], object]) -> None:
         if not isinstance(error, Error):
             raise
         _fail(str(error))
+
+
+def _drop_output() -> None:
+    """Forget what could not be written to stdout, which Python would try again when it ends."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager

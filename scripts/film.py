@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import math
 from collections.abc import Iterable, Iterator
@@ -94,11 +95,18 @@ def _write_video(path: Path, frames: Iterator[np.ndarray], seconds: float) -> No
     first = next(frames)
     height, width, _ = first.shape
     writer = _video_writer()(str(path), (width, height), 1.0 / seconds)
+    process, stopped = writer.proc, OSError(errno.EIO, "ffmpeg stopped before the end, as for want of room")
     try:
         for frame in itertools.chain([first], frames):
-            writer.write_frame(frame)
+            try:
+                writer.write_frame(frame)
+            except OSError as error:
+                raise stopped from error
     finally:
         writer.close()
+    # The library does not ask how it ended, which may have been after the last frame.
+    if process.returncode != 0:
+        raise stopped
 
 
 def _write_animation(path: Path, frames: Iterator[np.ndarray], seconds: float) -> None:

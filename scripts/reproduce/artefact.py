@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Any, get_type_hints
 
 from matplotlib.figure import Figure
 
@@ -137,19 +137,34 @@ class Outcome:
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> Outcome:
-        """Read what `document` wrote."""
+        """Read what `document` wrote.
 
-        def numbers(rows: list[dict[str, Any]]) -> list[Number]:
-            return [Number(**row) for row in rows]
-
+        Raises:
+            AttributeError, ArithmeticError, LookupError, TypeError, ValueError: it is of another shape.
+        """
+        data, notes = document["data"], document["notes"]
+        if not isinstance(data, dict) or not all(isinstance(note, str) for note in notes):
+            raise TypeError("its data is no object, or a note is no text")
         return cls(
-            numbers(document["numbers"]),
-            [Claim(**row) for row in document["claims"]],
+            [_typed(Number, row) for row in document["numbers"]],
+            [_typed(Claim, row) for row in document["claims"]],
             {name: cls.from_document(other) for name, other in document["elsewhere"].items()},
-            numbers(document["as_printed"]),
-            document["data"],
-            document["notes"],
+            [_typed(Number, row) for row in document["as_printed"]],
+            data,
+            notes,
         )
+
+
+def _typed(kind: type, row: dict[str, Any]) -> Any:
+    """A number or claim of an object of JSON, whose entries have the types of its attributes."""
+    hints = get_type_hints(kind)
+    for name, value in row.items():
+        # JSON does not tell 1.0 from 1.
+        if not isinstance(value, hints[name]) and not (type(value) is int and isinstance(0.0, hints[name])):
+            raise TypeError(f"its {name} is {value!r}")
+        if isinstance(value, int | float) and not math.isfinite(value):
+            raise ValueError(f"its {name} is {value!r}")
+    return kind(**row)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -129,10 +130,11 @@ def _in_processes(names: Sequence[str], sample: Sample, out: Path, jobs: int) ->
 
 
 def _pooled(names: Sequence[str], sample: Sample, out: Path, jobs: int) -> Ended:
+    from agents.processes import end_with_parent
     from scripts.reproduce.store import source_checksum
 
     # Not by fork: torch's threads do not survive it.
-    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"))
+    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=end_with_parent, initargs=(os.getpid(),))
     try:
         left: dict[Any, str] = {pool.submit(compute_one, name, sample, out, source_checksum()): name for name in names}
         for future in as_completed(left):

@@ -12,6 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
 from agents.evaluation import package_versions
+from safe_envs.errors import ConfigurationError
 from safe_envs.files import write_atomically
 from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
 from scripts.reproduce.verdict import RULES, Judgement, judge
@@ -82,9 +83,12 @@ def _picture(folder: Path, artefact: Artefact) -> str:
     """The picture as text for a page without other files."""
     if artefact.draw is None:
         return ""
-    light = io.BytesIO()
-    with Image.open(folder / f"{artefact.name}.png") as picture:
-        picture.convert("RGB").quantize(_COLOURS).save(light, "png", optimize=True)
+    light, path = io.BytesIO(), folder / f"{artefact.name}.png"
+    try:
+        with Image.open(path, formats=["png"]) as picture:
+            picture.convert("RGB").quantize(_COLOURS).save(light, "png", optimize=True)
+    except (Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
+        raise ConfigurationError(f"{path} cannot be read ({error}); remove it, and it is drawn again") from error
     return base64.b64encode(light.getvalue()).decode()
 
 

@@ -1,15 +1,20 @@
-"""Results of artefacts on disk: by configuration and version, so that a stopped run goes on and a changed one starts anew."""
+"""Results of artefacts on disk: by configuration and version, so that a stopped run goes on and a changed one starts anew.
+
+Each has a checksum of all that is kept, so that a digit that was changed is not taken for a result.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -22,6 +27,12 @@ from scripts.reproduce.artefact import Artefact, Outcome, Sample
 
 _PACKAGES = ("safe_envs", "wrappers", "agents", "scripts")
 _SUFFIXES = (".png", ".svg")
+
+_MOST = 30_000_000
+"""Bytes of a file, at most: a result with all that its picture shows has less than a million."""
+
+_SHOWN = 200
+"""Characters of what a file says, at most, that a message repeats."""
 
 
 @cache
@@ -45,35 +56,48 @@ def require_same_sample(folder: Path, artefacts: Iterable[Artefact], sample: Sam
     """Check that a folder holds no results of another sample, which would be written over.
 
     Raises:
-        ConfigurationError: it does.
+        ConfigurationError: it does, or holds a file that is damaged or altered.
     """
     for artefact in artefacts:
-        try:
-            found = json.loads((folder / f"{artefact.name}.json").read_text())["configuration"]["sample"]
-        except (OSError, LookupError, TypeError, ValueError):
-            continue
-        if found != asdict(sample):
+        document = _document(folder, artefact)
+        if document is not None and (found := document["configuration"].get("sample")) != asdict(sample):
             raise ConfigurationError(
-                f"{folder} holds {artefact.name} by other options: {json.dumps(found)}; give another --out, or the same options"
+                f"{folder} holds {artefact.name} by other options: {json.dumps(found)[:_SHOWN]}; give another --out, or the same options"
             )
 
 
 def read(folder: Path, artefact: Artefact, sample: Sample) -> tuple[Outcome, float] | None:
-    """The outcome and its seconds, if they are in the folder by the same configuration."""
-    path = folder / f"{artefact.name}.json"
-    try:
-        document = json.loads(path.read_text())
-        if document["configuration"] != configuration(artefact, sample):
-            return None
-        found = Outcome.from_document(document["outcome"]), float(document["seconds"])
-    except (OSError, LookupError, TypeError, ValueError):
+    """The outcome and its seconds, if they are in the folder by the same configuration.
+
+    Raises:
+        ConfigurationError: they are damaged or altered.
+    """
+    document = _document(folder, artefact)
+    if document is None or document["configuration"] != configuration(artefact, sample):
         return None
-    return found if artefact.draw is None or all((folder / f"{artefact.name}{s}").exists() for s in _SUFFIXES) else None
+    with _reading(_path(folder, artefact)):
+        if "sha256" not in document:
+            raise ValueError("it has no checksum")
+        outcome, pictures = Outcome.from_document(document["outcome"]), document["pictures"]
+        seconds = float(document["seconds"])
+        if not 0.0 <= seconds < math.inf:
+            raise ValueError(f"it took {seconds} seconds")
+        for suffix in _SUFFIXES if artefact.draw is not None else ():
+            picture = folder / f"{artefact.name}{suffix}"
+            if not picture.exists():
+                return None
+            if _checksum(_content(picture)) != pictures[suffix]:
+                raise ValueError(f"{picture.name} is another picture")
+    return outcome, seconds
 
 
 def keep(folder: Path, artefact: Artefact, sample: Sample, outcome: Outcome, seconds: float) -> None:
-    """Draw the outcome, and write it; the JSON goes first and comes last, so that it stands for all."""
-    (folder / f"{artefact.name}.json").unlink(missing_ok=True)
+    """Draw the outcome, and write it; the JSON comes last, with the checksums of the pictures, so that it stands for all.
+
+    Raises:
+        ConfigurationError: it cannot be written, as on a full disk.
+    """
+    pictures = {}
     if artefact.draw is not None:
         with mpl.rc_context({**STYLE, "svg.hashsalt": artefact.name}):
             figure = Figure(figsize=artefact.size)
@@ -81,8 +105,64 @@ def keep(folder: Path, artefact: Artefact, sample: Sample, outcome: Outcome, sec
             for suffix in _SUFFIXES:
                 # Without a date, so that equal results are equal files.
                 metadata = {"Date": None} if suffix == ".svg" else {"Software": None}
-                write_atomically(
-                    folder / f"{artefact.name}{suffix}", lambda part, metadata=metadata: figure.savefig(part, dpi=150, metadata=metadata)
-                )
-    document = {"configuration": configuration(artefact, sample), "outcome": outcome.document(), "seconds": seconds}
-    write_json(folder / f"{artefact.name}.json", document)
+                picture = folder / f"{artefact.name}{suffix}"
+                write_atomically(picture, lambda part, metadata=metadata: figure.savefig(part, dpi=150, metadata=metadata))
+                pictures[suffix] = _checksum(picture.read_bytes())
+                # To lay it out takes as long as to write it, and the next one is to look the same.
+                figure.set_layout_engine("none")
+    document = {"configuration": configuration(artefact, sample), "outcome": outcome.document(), "seconds": seconds, "pictures": pictures}
+    write_json(_path(folder, artefact), {**document, "sha256": _checksum_of_json(document)})
+
+
+def _document(folder: Path, artefact: Artefact) -> dict[str, Any] | None:
+    """What is in the file of an artefact, if there is one; of any version, with an object under "configuration".
+
+    Raises:
+        ConfigurationError: it is damaged or altered.
+    """
+    path = _path(folder, artefact)
+    if not path.exists():
+        return None
+    with _reading(path):
+        document = json.loads(_content(path), parse_constant=_refuse)
+        if not isinstance(document["configuration"], dict):
+            raise ValueError("it has no configuration")
+        digest = document.get("sha256")
+        # Versions before this one wrote none.
+        if digest is not None and digest != _checksum_of_json({k: v for k, v in document.items() if k != "sha256"}):
+            raise ValueError("its content does not match its checksum")
+    return document
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
+        raise ConfigurationError(
+            f"{path} cannot be read ({type(error).__name__}: {str(error)[:_SHOWN]}); it is damaged or altered: remove it, and it is "
+            "computed again"
+        ) from error
+
+
+def _path(folder: Path, artefact: Artefact) -> Path:
+    return folder / f"{artefact.name}.json"
+
+
+def _content(path: Path) -> bytes:
+    """The content of a file that is no larger than a result's can be."""
+    if not path.is_file() or path.stat().st_size > _MOST:
+        raise ValueError(f"{path.name} is no file, or larger than {_MOST} bytes")
+    return path.read_bytes()
+
+
+def _refuse(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _checksum_of_json(document: Mapping[str, Any]) -> str:
+    return _checksum(json.dumps(document, sort_keys=True).encode())
+
+
+def _checksum(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

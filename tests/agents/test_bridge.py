@@ -12,7 +12,9 @@ import sympy as sp
 from scipy.stats import kstest
 
 from agents import evaluate, load_problem
-from agents.bridge import Bridge, bridge_notes
+from agents.bridge import Bridge, Exponentials, bridge_notes
+from agents.episodes import episode_seed
+from agents.nominal import RandomPolicy
 from safe_envs import ConfigurationError
 from tests.agents.laws import X, brownian, first_passage, walk_passage
 
@@ -83,6 +85,14 @@ def test_answer_is_the_same_for_every_num_envs():
     first, *others = (evaluate("Scalar-v0", num_envs=n, **arguments) for n in (8, 1, 3))
     for other in others:
         assert first.rows == other.rows
+
+
+def test_bridges_policies_and_envs_of_all_episodes_have_streams_of_their_own():
+    policy = RandomPolicy(load_problem("Scalar-v0"))
+    policy.begin(range(3), 7)
+    generators = [*Exponentials(7, range(3), 1)._generators, *policy._streams]
+    generators += [np.random.default_rng(episode_seed(7, i)) for i in range(3)]
+    assert len({generator.bit_generator.random_raw() for generator in generators}) == 9
 
 
 def test_without_noise_in_h_nothing_changes_and_a_note_says_so():

@@ -47,6 +47,8 @@ def test_several_are_summed_and_averaged():
 def test_equal_identifications_have_the_interval_of_their_episodes():
     for safe in (0, 7, 10):
         assert interval_over([safe / 10] * 5, 10, 0.9) == pytest.approx(rate_interval(safe, 10, 0.9))
+    # 0.29 * 100 is a little less than 29 in floating point, which must not make it 28.
+    assert interval_over([0.29] * 2, 100, 0.9) == pytest.approx(rate_interval(29, 100, 0.9))
 
 
 def test_two_differing_ones_say_little():

@@ -14,6 +14,7 @@ from agents.statistics import (
     FirstValues,
     RunningSum,
     SafetyCurve,
+    log_normal_interval,
     mcnemar_p,
     paired_difference_interval,
     rate_band,
@@ -262,3 +263,16 @@ def test_first_values_keep_no_view_of_what_they_were_given():
 def test_share_of_nothing_is_none():
     assert share(1.0, 4) == 0.25
     assert share(0.0, 0) is None
+
+
+@pytest.mark.parametrize("estimates", [(1.0, 2.0), (3e-7, 4e-9)])
+def test_the_interval_of_two_log_normal_estimates_by_hand(estimates):
+    """Cox's, where all is elementary: Student's quantile with one degree of freedom is a tangent.
+
+    log E = mu + sigma^2/2 is estimated by the mean of the logs, with the variance s^2/R, and half of s^2, with the variance
+    (2 s^4/(R - 1))/4 = s^4/(2 (R - 1)).
+    """
+    square = math.log(estimates[1] / estimates[0]) ** 2 / 2
+    half = math.tan(math.pi * (0.975 - 0.5)) * math.sqrt(square / 2 + square**2 / 2)
+    mean = sum(estimates) / 2
+    assert log_normal_interval(estimates) == pytest.approx((mean * math.exp(-half), mean * math.exp(half)), rel=1e-12)

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -26,6 +29,41 @@ def test_versions_change_with_each_byte_and_name_of_the_code(tmp_path: Path, mon
     second = source()
     file.rename(file.with_name("other.py"))
     assert len({first, second, source()}) == 3
+
+
+def test_a_file_that_changed_or_went_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    file = tmp_path / "model.npz"
+    file.write_bytes(b"1")
+    monkeypatch.setattr(sweep_cell, "evaluate", lambda *_, **__: Evaluated([{"safe": 1}], {}))
+    (cell,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
+    cell = replace(cell, files={str(file): sweep_cell.checksum(file)})
+    assert compute(cell).row == {"safe": 1}
+    file.write_bytes(b"2")
+    assert f"the worker finds another content in {file}" in str(compute(cell).error)
+    file.unlink()
+    assert f"{file} cannot be read" in str(compute(cell).error)
+
+
+class Evaluated(NamedTuple):
+    """As much of an evaluation as a cell takes."""
+
+    rows: list[dict[str, Any]]
+    config: dict[str, Any]
+
+
+def test_threads_of_a_worker_compute_one_cell_at_a_time(monkeypatch: pytest.MonkeyPatch):
+    both = threading.Barrier(2)
+
+    def evaluate(*_: Any, **__: Any) -> Evaluated:
+        both.wait(0.3)
+        return Evaluated([], {})
+
+    monkeypatch.setattr(sweep_cell, "evaluate", evaluate)
+    (cell,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
+    with ThreadPoolExecutor(2) as threads:
+        errors = [outcome.error for outcome in threads.map(compute, [cell, cell])]
+    # Neither met the other.
+    assert all(error is not None and error.startswith("BrokenBarrierError") for error in errors)
 
 
 def test_a_cell_has_one_thread(monkeypatch: pytest.MonkeyPatch):

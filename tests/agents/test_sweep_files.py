@@ -6,7 +6,7 @@ import pytest
 
 from agents.sweep import sweep_of
 from agents.sweep_cell import compute
-from agents.sweep_files import with_imported
+from agents.sweep_files import absolute, read_by, with_imported
 
 FILES = {
     "mine.py": "import os, numpy as np, near.inner\nfrom other import x\nfrom bare import part\ndef problem():\n    import late, broken",
@@ -34,6 +34,24 @@ def test_what_a_file_imports_from_its_folder_is_found_without_running_it(folder:
     found = with_imported(folder / "mine.py")
     assert sorted(str(path.relative_to(folder)) for path in found) == sorted(FILES)
     assert with_imported(folder / "none.py") == [folder / "none.py"]
+
+
+def test_paths_mean_the_same_in_every_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "ppo").mkdir()
+    monkeypatch.chdir(tmp_path)
+    given = {"filter": "ddscbf:file=a.npz+bayesian-scbf:file=in/b.npz:delta=0.1", "policy": "ppo", "system": "mine.py:problem"}
+    first, second = tmp_path / "a.npz", tmp_path / "in" / "b.npz"
+    found = absolute({**given, "seed": 1})
+    assert found == {
+        "filter": f"ddscbf:file={first}+bayesian-scbf:file={second}:delta=0.1",
+        "policy": str(tmp_path / "ppo"),
+        "system": f"{tmp_path / 'mine.py'}:problem",
+        "seed": 1,
+    }
+    monkeypatch.chdir("/")
+    assert absolute(found) == found
+    assert list(read_by({"filter": found["filter"], "policy": "nominal"})) == [first, second]
+    assert absolute({"filter": "none", "policy": "nominal"}) == {"filter": "none", "policy": "nominal"}
 
 
 def test_a_cell_is_known_by_what_its_system_imports(folder: Path):

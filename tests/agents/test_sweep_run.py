@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 
 from agents import sweep_clusters, sweep_run
+from agents.processes import end_with_parent
 from agents.sweep import sweep_of
 from agents.sweep_run import Place, run
 from agents.sweep_store import Store, read
@@ -191,6 +192,13 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, document: Document):
     assert len(seen) == 4
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert rows(folder) == local_answer(document, tmp_path / "one")
+
+
+def test_the_processes_of_a_sweep_watch_their_parent():
+    with sweep_run._settings(Place(jobs=2), 3, print) as settings:
+        assert settings["n_jobs"] == 2
+        assert settings["backend"].backend_kwargs["initializer"] is end_with_parent
+        assert settings["backend"].backend_kwargs["initargs"] == (os.getpid(),)
 
 
 def test_dask_with_a_killed_worker_and_with_none(tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch):

@@ -194,6 +194,10 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
         ("sac", {"use_sde": True}, "saved"),
         ("sac", {"learning_starts": "soon"}, "failed after"),
         ("ppo", {"learning_rate": 1e12}, "diverged|not all finite"),
+        ("ppo", {"stats_window_size": 10**400}, "does not take|failed after"),
+        ("ppo", {"gamma": 10**400}, "does not take|failed after"),
+        ("ppo", {"normalize": {"clip_obs": 10**400}}, "does not take|failed after"),
+        ("ppo", {"normalize": "[" * 5000}, "does not take"),
     ],
 )
 def test_hyperparameters_that_do_not_work_are_refused_and_leave_the_folder_to_others(algorithm, settings, message, tmp_path):

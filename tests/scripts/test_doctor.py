@@ -10,6 +10,7 @@ import pytest
 import safe_envs
 from scripts import doctor
 from tests.scripts.conftest import strictly
+from wrappers import SafetyFilterWrapper
 
 
 @pytest.fixture
@@ -58,6 +59,27 @@ def test_an_env_that_breaks_is_named(quick, monkeypatch):
     assert check.ok is False
     assert "ConfigurationError" in check.found
     assert check.advice
+
+
+@pytest.mark.parametrize("bad", [0, doctor._STEPS - 1])
+@pytest.mark.parametrize("what", ["action", "reward"])
+def test_one_bad_step_of_an_env_is_found(quick, monkeypatch, bad, what):
+    steps = []
+    step = SafetyFilterWrapper.step
+
+    def stepped(self, action):
+        observation, reward, terminated, truncated, info = step(self, action)
+        if len(steps) == bad:
+            reward = float("nan") if what == "reward" else reward
+            info["safe_action"] = info["safe_action"] + (1e3 if what == "action" else 0.0)
+        steps.append(info)
+        return observation, reward, terminated, truncated, info
+
+    monkeypatch.setattr(doctor, "ENV_IDS", ("safe_envs/Scalar-v0",))
+    monkeypatch.setattr(SafetyFilterWrapper, "step", stepped)
+    (check,) = doctor.envs()
+    assert len(steps) == doctor._STEPS
+    assert (check.ok, check.found) == (False, "an action outside of the box, or a reward that is not finite")
 
 
 def test_what_is_missing_says_how_to_install_it(monkeypatch):

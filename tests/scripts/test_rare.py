@@ -29,9 +29,12 @@ def test_acceptance_in_small(safe_envs_command):
 
 
 def test_reason_in_place_of_a_number(safe_envs_command):
-    status, out, _ = safe_envs_command("evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--rare", *FEW, "--json", "-")
+    status, out, _ = safe_envs_command(
+        "evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--knowledge", "plant", "--rare", *FEW, "--json", "-"
+    )
     assert status == 0
     assert '"probability": null' in out
+    assert '"knowledge": "plant"' in out
     for quiet in ((), ("--quiet",)):
         status, out, _ = safe_envs_command("evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--rare", *FEW, *quiet)
         assert status == 0

@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
+import os
 import time
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
+from agents.processes import end_with_parent
 from safe_envs.errors import ConfigurationError, WorkersLostError
 from scripts.reproduce.artefact import Outcome, Sample
 from scripts.reproduce.catalogue import ARTEFACTS
 from scripts.reproduce.command import compute_one
+from scripts.reproduce.page import write_page
 from scripts.reproduce.store import keep, read, source_checksum
 from tests.scripts.conftest import strictly
+from tests.scripts.reproduce.test_chapter_6 import outcome as outcome_of
 
 ALL = [f"figure-{n}" for n in ("3.1", "3.2a", "3.2b", "3.3", "4.1", "4.2", "4.3", "5.1", "5.2", "5.3a", "5.3b", "5.3c", "5.3d")]
 ALL += (
@@ -41,9 +54,6 @@ def test_results_are_kept_by_configuration_and_version(tmp_path, coin, monkeypat
         patch.setattr("scripts.reproduce.store.source_checksum", lambda: "another")
         assert read(tmp_path, coin, sample) is None
     (tmp_path / "table-0.1.svg").unlink()
-    assert read(tmp_path, coin, sample) is None
-    keep(tmp_path, coin, sample, outcome, 1.5)
-    (tmp_path / "table-0.1.json").write_text("{")
     assert read(tmp_path, coin, sample) is None
 
 
@@ -112,8 +122,6 @@ def test_a_quick_run_has_no_verdict(safe_envs_command, catalogue):
 
 
 def test_an_interrupt_ends_a_single_job_at_once(safe_envs_command, catalogue, coin, monkeypatch):
-    from dataclasses import replace
-
     computed = []
 
     def interrupted(_):
@@ -145,18 +153,112 @@ def test_an_interrupt_ends_the_processes(monkeypatch, tmp_path, coin):
     assert process.exitcode is not None
 
 
+def test_a_result_that_cannot_be_written_leaves_the_one_before(tmp_path, coin, monkeypatch):
+    keep(tmp_path, coin, Sample(100), coin.compute(Sample(100)), 1.0)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "no room")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Figure, "savefig", full)
+        with pytest.raises(ConfigurationError, match=r"cannot write .*table-0.1.png: no room"):
+            keep(tmp_path, coin, Sample(100), coin.compute(Sample(100)), 2.0)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def test_a_picture_without_its_numbers_is_not_taken_for_a_result(tmp_path, coin, monkeypatch):
-    old = coin.compute(Sample(100))
-    keep(tmp_path, coin, Sample(100), old, 1.0)
+    keep(tmp_path, coin, Sample(100), coin.compute(Sample(100)), 1.0)
 
     def full(*_):
-        raise OSError("no room")
+        raise ConfigurationError("no room")
 
     with monkeypatch.context() as patch:
         patch.setattr("scripts.reproduce.store.write_json", full)
-        with pytest.raises(OSError, match="no room"):
-            keep(tmp_path, coin, Sample(100), old, 1.0)
-    assert read(tmp_path, coin, Sample(100)) is None
+        with pytest.raises(ConfigurationError, match="no room"):
+            keep(tmp_path, replace(coin, draw=lambda figure, _: figure.subplots()), Sample(100), coin.compute(Sample(100)), 1.0)
+    with pytest.raises(ConfigurationError, match=r"table-0.1.png is another picture.*remove it, and it is computed again"):
+        read(tmp_path, coin, Sample(100))
+
+
+@pytest.fixture
+def kept(tmp_path, coin):
+    """The file of a result."""
+    keep(tmp_path, coin, Sample(100), coin.compute(Sample(100)), 1.5)
+    return tmp_path / "table-0.1.json"
+
+
+def with_checksum(document):
+    """As somebody writes it who knows how."""
+    document = {name: value for name, value in document.items() if name != "sha256"}
+    return json.dumps({**document, "sha256": hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()})
+
+
+@given(data=st.data())
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_digit_that_was_changed_is_not_taken_for_a_result(data, kept, coin, tmp_path):
+    content = kept.read_text()
+    try:
+        place = data.draw(st.sampled_from([k for k, c in enumerate(content) if c.isdigit()]))
+        digit = data.draw(st.sampled_from([d for d in "0123456789" if d != content[place]]))
+        kept.write_text(content[:place] + digit + content[place + 1 :])
+        with suppress(ConfigurationError):
+            # One in its configuration makes it the result of another version, which is computed again.
+            assert read(tmp_path, coin, Sample(100)) is None
+    finally:
+        kept.write_text(content)
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.just(10**400) | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.sampled_from(["numbers", "ours", "name", "x"]), inner, max_size=2),
+    max_leaves=4,
+)
+
+
+@given(data=st.data())
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_result_of_another_shape_is_refused_or_shown(data, kept, coin, tmp_path):
+    """Even with a checksum that is right."""
+    content = kept.read_text()
+    document = json.loads(content)
+    place: Any = document
+    steps = data.draw(st.integers(1, 4))
+    for step in range(steps):
+        key = data.draw(st.sampled_from(sorted(place) if isinstance(place, dict) else list(range(len(place)))))
+        if step == steps - 1 or not isinstance(place[key], dict | list) or not place[key]:
+            place[key] = data.draw(json_values)
+            break
+        place = place[key]
+    try:
+        kept.write_text(with_checksum(document))
+        with suppress(ConfigurationError):
+            found = read(tmp_path, coin, Sample(100))
+            if found is not None:
+                write_page(tmp_path, [(coin, *found)], Sample(100))
+    finally:
+        kept.write_text(content)
+
+
+@pytest.mark.parametrize("text", ["{", "[1]", "[" * 20_000, "null", '{"configuration": 3}', '{"configuration": {}, "x": NaN}', "{}", ""])
+def test_what_is_no_result_is_told_before_the_work(text, safe_envs_command, catalogue, computed, tmp_path):
+    (tmp_path / "report").mkdir()
+    (tmp_path / "report" / "table-0.1.json").write_text(text)
+    status, _, err = safe_envs_command("reproduce", "--episodes", 100, "--jobs", 1, "--out", "report")
+    assert status == 2
+    assert "report/table-0.1.json cannot be read" in err
+    assert not computed
+
+
+def test_a_picture_that_is_none_is_told(tmp_path, coin, kept):
+    (tmp_path / "table-0.1.png").write_bytes(b"no picture")
+    document = json.loads(kept.read_text())
+    document["pictures"][".png"] = hashlib.sha256(b"no picture").hexdigest()
+    kept.write_text(with_checksum(document))
+    found = read(tmp_path, coin, Sample(100))
+    assert found is not None
+    with pytest.raises(ConfigurationError, match=r"table-0.1.png cannot be read .*remove it"):
+        write_page(tmp_path, [(coin, *found)], Sample(100))
 
 
 def test_code_that_changed_during_a_run_is_not_kept(tmp_path, catalogue, computed):
@@ -184,9 +286,24 @@ def test_what_a_lost_process_computed_is_computed_again(tmp_path, monkeypatch):
     assert isinstance(ended["kills"], WorkersLostError)
 
 
-def test_a_run_that_was_stopped_goes_on(safe_envs_command, catalogue, computed, coin, monkeypatch):
-    from dataclasses import replace
+def test_the_processes_watch_their_parent(monkeypatch, tmp_path):
+    from scripts.reproduce import command
 
+    given = {}
+
+    class Pool:
+        def __init__(self, jobs, **arguments):
+            given.update(arguments)
+
+        def shutdown(self, **_):
+            pass
+
+    monkeypatch.setattr(command, "ProcessPoolExecutor", Pool)
+    assert list(command._pooled([], Sample(), tmp_path, 2)) == []
+    assert (given["initializer"], given["initargs"]) == (end_with_parent, (os.getpid(),))
+
+
+def test_a_run_that_was_stopped_goes_on(safe_envs_command, catalogue, computed, coin, monkeypatch):
     def fail(_):
         raise ValueError("no luck")
 
@@ -216,11 +333,20 @@ def test_what_it_cannot_take_ends_with_status_2(safe_envs_command, catalogue, tm
     assert message in " ".join(err.split())
 
 
-def test_processes_compute_what_a_single_one_does(safe_envs_command, tmp_path):
-    """Over real artefacts, the quickest ones."""
-    real = {artefact.name: artefact for artefact in ARTEFACTS}
+def test_processes_compute_what_a_single_one_does(safe_envs_command, monkeypatch, tmp_path):
+    """Over real artefacts, the quickest ones; in one process, whose start takes longer than they do."""
+    from scripts.reproduce import command
+
+    asked = []
+
+    def pool(jobs, **arguments):
+        asked.append(jobs)
+        return ProcessPoolExecutor(1, **arguments)
+
+    monkeypatch.setattr(command, "ProcessPoolExecutor", pool)
     names = ("figure-6.2", "figure-6.4")
     assert safe_envs_command("reproduce", *names, "--quick", "--jobs", 2, "--out", "by-2")[0] == 0
+    assert asked == [2]
     for name in names:
         found = strictly(tmp_path / "by-2" / f"{name}.json")["outcome"]
-        assert found == json.loads(json.dumps(real[name].compute(Sample(quick=True)).document()))
+        assert found == json.loads(json.dumps(outcome_of(name).document()))
