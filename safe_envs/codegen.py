@@ -7,51 +7,107 @@ component is an array over the batch, so that elementwise arithmetic runs on con
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, Literal
 
 import numpy as np
 import sympy as sp
+from sympy.printing.codeprinter import PrintMethodNotImplementedError
 from sympy.printing.numpy import NumPyPrinter
 from sympy.printing.pycode import PythonCodePrinter
+
+from safe_envs.errors import SystemDefinitionError
 
 Flavour = Literal["floats", "arrays"]
 Components = tuple[Any, ...]
 
 _LARGEST_EXPANDED_POWER = 8
-_REMEMBERED = 4
+_LARGEST_FLOAT = sp.Rational(sys.float_info.max)
+_LONGEST_QUOTED = 120
 
 
 class _Remembering:
-    """A costly ufunc that knows the last few arrays it was applied to.
+    """A costly ufunc that knows its values at the arrays that were last given to `settled`.
 
-    The observation, the filter and the next step ask for the sine of one and the same heading. Arrays are told
-    apart by identity, so they must not be changed in place between calls: `compile_function` asks for that.
+    The observation, the filter and the next step ask for the sine of one and the same heading. No other array is
+    remembered: its owner may change it in place between two calls.
     """
+
+    settled: tuple[np.ndarray, ...] = ()
 
     def __init__(self, ufunc: np.ufunc) -> None:
         self._ufunc = ufunc
-        self._known: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._known: list[tuple[np.ndarray, np.ndarray]] = []
 
     def __call__(self, argument: Any) -> Any:
-        if type(argument) is not np.ndarray:
-            return self._ufunc(argument)
-        entry = self._known.get(id(argument))
-        if entry is not None and entry[0] is argument:
-            return entry[1]
+        for known, value in self._known:
+            if known is argument:
+                return value
         value = self._ufunc(argument)
-        value.flags.writeable = False
-        if len(self._known) >= _REMEMBERED:
-            self._known = {}
-        self._known[id(argument)] = (argument, value)
+        for array in _Remembering.settled:
+            if array is argument:
+                value.flags.writeable = False
+                self._known.append((array, value))
         return value
 
+    def forget(self) -> None:
+        """Drop the values of the arrays that were settled before."""
+        self._known = []
 
-_ARRAY_FUNCTIONS = {name: _Remembering(getattr(np, name)) for name in ("sin", "cos")}
+
+_REMEMBERING = {name: _Remembering(getattr(np, name)) for name in ("sin", "cos")}
 
 
-_PRINTER_SETTINGS = {"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True}
+def _elementwise(function: Callable[[float], float]) -> Callable[[Any], np.ndarray]:
+    """What NumPy lacks, one element at a time."""
+    ufunc = np.frompyfunc(function, 1, 1)
+    return lambda argument: np.asarray(ufunc(argument), dtype=float)
+
+
+_ARRAY_FUNCTIONS = {**_REMEMBERING, "erf": _elementwise(math.erf), "erfc": _elementwise(math.erfc)}
+
+
+def settled(components: Sequence[Any], shape: tuple[int, ...]) -> Components:
+    """Components as read-only arrays of their own, whose sines and cosines are computed once until the next call.
+
+    Args:
+        components: arrays that were made for the caller, and that nobody else can write to, or numbers.
+        shape: of the arrays returned.
+    """
+    arrays = tuple([a if a.__class__ is np.ndarray and a.flags.owndata else np.array(filled(a, shape)) for a in components])
+    for array in arrays:
+        array.flags.writeable = False
+    _Remembering.settled = arrays
+    for function in _REMEMBERING.values():
+        function.forget()
+    return arrays
+
+
+_SUPPORTED = (
+    *(sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc, sp.asin, sp.acos, sp.atan, sp.atan2, sp.acot, sp.asec, sp.acsc, sp.sinc),
+    *(sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch, sp.asinh, sp.acosh, sp.atanh, sp.exp, sp.log, sp.erf, sp.erfc),
+    *(sp.Abs, sp.sign, sp.Heaviside, sp.Piecewise, sp.floor, sp.ceiling, sp.frac, sp.Mod),
+)
+"""Functions that have the same values as floats and as arrays; besides sums, products, powers, Max and Min."""
+
+_PRINTER_SETTINGS = {"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": False, "strict": True}
+
+
+class _FloatPrinter(PythonCodePrinter):
+    """Prints what raises, or gives NaN, where Python itself would answer with a complex number or with None."""
+
+    def _print_Pow(self, expr: Any, rational: bool = False) -> str:  # noqa: N802  (sympy's dispatch by name)
+        if expr.exp.is_integer or abs(expr.exp) == sp.S.Half:
+            return super()._print_Pow(expr, rational)
+        return f"pow({self._print(expr.base)}, {self._print(expr.exp)})"
+
+    def _print_Piecewise(self, expr: Any) -> str:  # noqa: N802
+        return super()._print_Piecewise(expr if expr.args[-1].cond == sp.true else sp.Piecewise(*expr.args, (sp.nan, True)))
+
+    def _print_Mod(self, expr: Any) -> str:  # noqa: N802
+        return f"({super()._print_Mod(expr)})"
 
 
 class _ArrayPrinter(NumPyPrinter):
@@ -98,39 +154,107 @@ def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[Any],
     """Compile expressions that share their common subexpressions.
 
     Args:
-        arguments: symbols, in the order in which the function takes them.
+        arguments: symbols, in the order in which the function takes them; their names may be any texts.
         expressions: what it returns, in order; every free symbol must be an argument.
         flavour: "floats" for plain floats, "arrays" for NumPy arrays that broadcast against each other.
 
     Returns:
         A function of `len(arguments)` positional arguments that returns a tuple of `len(expressions)`. An
-        expression without any argument in it comes back as a number without axes. Neither the arrays given nor
-        those returned may be changed in place.
+        expression without any argument in it comes back as a number without axes. The arrays returned may be those
+        given, and must not be changed in place.
+
+    Raises:
+        SystemDefinitionError: an expression holds a symbol that is no argument, a function without a numerical form,
+            or a number that is not real or too large; or a symbol is an argument twice.
     """
     return _compile(tuple(arguments), tuple(sp.sympify(e) for e in expressions), flavour)
 
 
 @lru_cache(maxsize=1024)
 def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], flavour: Flavour) -> Callable[..., Components]:
-    arrays = _ArrayPrinter(_PRINTER_SETTINGS)
-    function = sp.lambdify(
-        arguments,
-        tuple(sp.Float(sp.N(e, 17), 17) if e.is_number else e for e in expressions),
-        modules=[_ARRAY_FUNCTIONS, np] if flavour == "arrays" else [math],
-        printer=arrays if flavour == "arrays" else PythonCodePrinter(_PRINTER_SETTINGS),
-        cse=_shared_subexpressions,  # pyright: ignore[reportArgumentType]  (annotated as bool, documented as callable)
-        docstring_limit=0,
-    )
-    function.__globals__.update(arrays.constants)
+    for expression in expressions:
+        _require_computable(expression, arguments)
+    names, formulas = in_plain_names(arguments, expressions)
+    printer = _ArrayPrinter(_PRINTER_SETTINGS) if flavour == "arrays" else _FloatPrinter(_PRINTER_SETTINGS)
+    try:
+        function = sp.lambdify(
+            names,
+            tuple(sp.Float(float(sp.N(e, 30)), 17) if e.is_number else e for e in formulas),
+            modules=[_ARRAY_FUNCTIONS, np] if flavour == "arrays" else [math],
+            printer=printer,
+            cse=_shared_subexpressions,  # pyright: ignore[reportArgumentType]  (annotated as bool, documented as callable)
+            docstring_limit=0,
+        )
+    except PrintMethodNotImplementedError as error:
+        raise SystemDefinitionError(f"{_shortened(expressions)} has no numerical form: {str(error).splitlines()[0]}") from error
+    if isinstance(printer, _ArrayPrinter):
+        function.__globals__.update(printer.constants)
+    elif any(e.has(sp.Piecewise, sp.Heaviside, sp.sinc) for e in formulas):
+        return _piece_by_piece(function, names, formulas)
     return function
+
+
+def _piece_by_piece(quick: Callable[..., Components], names: Sequence[sp.Symbol], formulas: Sequence[Any]) -> Callable[..., Components]:
+    """A function of floats that evaluates the pieces that apply, where a shared subexpression of others has no value."""
+    careful = lru_cache(maxsize=1)(
+        lambda: sp.lambdify(names, tuple(formulas), modules=[math], printer=_FloatPrinter(_PRINTER_SETTINGS), docstring_limit=0)
+    )
+
+    def function(*arguments: float) -> Components:
+        try:
+            return quick(*arguments)
+        except (ArithmeticError, ValueError):
+            return careful()(*arguments)
+
+    return function
+
+
+def _require_computable(expression: Any, arguments: tuple[sp.Symbol, ...]) -> None:
+    unknown = expression.free_symbols - set(arguments)
+    if unknown:
+        raise SystemDefinitionError(
+            f"{_shortened(expression)} holds {', '.join(sorted(map(str, unknown)))}, which is none of {', '.join(map(str, arguments))}"
+        )
+    if len(set(arguments)) < len(arguments):
+        raise SystemDefinitionError(f"a symbol stands for two arguments of {_shortened(expression)}: {', '.join(map(str, arguments))}")
+    strange = {f.func for f in expression.atoms(sp.Function) if not isinstance(f, _SUPPORTED)}
+    if strange:
+        advice = "; DiracDelta is the derivative of a jump: use a smooth function" if sp.DiracDelta in strange else ""
+        raise SystemDefinitionError(
+            f"{_shortened(expression)} holds {', '.join(sorted(map(str, strange)))}, which has no numerical form here; "
+            f"write it with {', '.join(f.__name__ for f in _SUPPORTED)}, Max and Min{advice}"
+        )
+    if expression.has(sp.I, sp.zoo):
+        raise SystemDefinitionError(f"{_shortened(expression)} is not real everywhere, or has a division by 0; look at its numbers")
+    if any(abs(number) > _LARGEST_FLOAT for number in expression.atoms(sp.Float, sp.Rational)):
+        raise SystemDefinitionError(f"{_shortened(expression)} holds a number beyond {float(_LARGEST_FLOAT):.2g}, the largest of floats")
+
+
+def _shortened(expression: Any) -> str:
+    try:
+        text = str(expression)
+    except ValueError:  # Python does not print whole numbers of thousands of digits.
+        return "an expression"
+    return text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}..."
+
+
+def in_plain_names(arguments: Sequence[sp.Symbol], expressions: Sequence[Any]) -> tuple[tuple[sp.Symbol, ...], tuple[Any, ...]]:
+    """The same formulas of arguments a000, a001, ..., so that no name in generated code is a user's.
+
+    A name of the user's may be a keyword, a function, no identifier at all, or one of those that common subexpressions
+    get. The new names sort like the old ones, for sympy orders the terms of a sum by them, and rounding follows the order.
+    """
+    ordered = sorted(arguments, key=sp.default_sort_key)
+    plain = {s: sp.Symbol(f"a{i:03d}", **s.assumptions0) for i, s in enumerate(ordered)}
+    return tuple(plain[s] for s in arguments), tuple(e.xreplace(plain) for e in expressions)
 
 
 def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
     """Common subexpressions, with small integer powers written as products: `pow` is many times slower."""
     shared: Any
     reduced: Any
-    shared, reduced = sp.cse(expressions, list=False)
-    fresh = sp.numbered_symbols("p", exclude=set().union(*(e.free_symbols for e in (*reduced, *(s for s, _ in shared)))))
+    shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("x"), list=False)
+    fresh = sp.numbered_symbols("p")
     replacements: list[tuple[sp.Symbol, sp.Expr]] = []
 
     def expand(expression: Any) -> Any:
