@@ -14,6 +14,9 @@ import sympy as sp
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
 
 
+_REAL = sp.Symbol("real", real=True).assumptions0
+
+
 def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
     """Read a list, nested list or matrix as an immutable matrix of the required shape (None: any width)."""
     try:
@@ -39,12 +42,51 @@ def finite_number(name: str, value: Any) -> float:
     return number
 
 
+def _require_real(states: Iterable[Any], inputs: Iterable[Any], parameters: Iterable[Any]) -> None:
+    """Check that states and inputs are declared real, and nothing more, and parameters real."""
+    wrong = []
+    for symbol in (*states, *inputs, *parameters):
+        if not isinstance(symbol, sp.Symbol):
+            raise SystemDefinitionError(f"{symbol!r} among states, inputs and parameters is no symbol; make it by sympy.symbols")
+        if symbol.assumptions0 != _REAL and not (symbol.is_real and symbol in parameters):
+            wrong.append(symbol)
+    if wrong:
+        told = "; ".join(f"{s} is declared {_declared(s) or 'nothing, so that it may be complex'}" for s in wrong)
+        names = " ".join(s.name for s in wrong)
+        raise SystemDefinitionError(
+            f"states and inputs are to be declared real and nothing more, parameters real at least, for sympy simplifies by that: {told}. "
+            f"Make them by sympy.symbols({names!r}, real=True), in the system and in all that is said of it"
+        )
+
+
+def _declared(symbol: sp.Symbol) -> str:
+    """What a symbol was declared to be, like "positive=True"."""
+    return ", ".join(f"{word}={value}" for word, value in getattr(symbol, "_assumptions_orig", symbol.assumptions0).items())
+
+
+def _fitting(symbol: sp.Symbol, value: Any) -> float:
+    """The value of a parameter, if it is a finite number and what its symbol is declared to be."""
+    number = finite_number(f"parameter {symbol}", value)
+    if symbol.assumptions0 != _REAL:
+        exact = sp.Rational(number)
+        wrong = [word for word, holds in symbol.assumptions0.items() if getattr(exact, f"is_{word}") is (not holds)]
+        if wrong:
+            raise ConfigurationError(
+                f"parameter {symbol} = {number:g}, but its symbol is declared {_declared(symbol)}, and sympy simplifies by that; "
+                f"give another value, or make the symbol by sympy.symbols({symbol.name!r}, real=True)"
+            )
+    return number
+
+
 @dataclass(frozen=True)
 class ControlAffineSDE:
     """dx = (f(x) + g(x) u) dt + sigma(x) dW.
 
     Exogenous motion, a moving obstacle say, is a state of its own with a known drift, so that no time derivative
     of a barrier can be forgotten.
+
+    States and inputs are symbols that are declared real and nothing more, parameters real or whatever else their values are:
+    sympy simplifies by these words, sqrt(x**2) to |x| for a real x, to x for a positive one, and not at all without.
 
     Attributes:
         states: n symbols x.
@@ -55,9 +97,9 @@ class ControlAffineSDE:
         parameters: value of every other symbol that occurs.
 
     Raises:
-        SystemDefinitionError: a shape does not fit, a symbol is unknown or defined twice, or an input occurs in
-            f, g or sigma, so that the system is not control-affine.
-        ConfigurationError: a parameter is no finite number.
+        SystemDefinitionError: a shape does not fit, a symbol is unknown, defined twice or not declared real, or an input
+            occurs in f, g or sigma, so that the system is not control-affine.
+        ConfigurationError: a parameter is no finite number, or not what its symbol is declared to be.
 
     Source: thesis Eq. (4.1).
     """
@@ -70,9 +112,7 @@ class ControlAffineSDE:
     parameters: Mapping[sp.Symbol, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for symbol in (*self.states, *self.inputs, *self.parameters):
-            if not isinstance(symbol, sp.Symbol):
-                raise SystemDefinitionError(f"{symbol!r} among states, inputs and parameters is no symbol; make it by sympy.symbols")
+        _require_real(self.states, self.inputs, self.parameters)
         n, m = len(self.states), len(self.inputs)
         if not n or not m:
             raise SystemDefinitionError(f"a system needs a state and an input; given {n} states and {m} inputs")
@@ -82,7 +122,7 @@ class ControlAffineSDE:
             "drift": _matrix("drift", self.drift, (n, 1)),
             "input_matrix": _matrix("input_matrix", self.input_matrix, (n, m)),
             "diffusion": _matrix("diffusion", self.diffusion, (n, None)),
-            "parameters": {p: finite_number(f"parameter {p}", v) for p, v in self.parameters.items()},
+            "parameters": {p: _fitting(p, v) for p, v in self.parameters.items()},
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -111,6 +151,7 @@ class ControlAffineSDE:
         """
         if not all(isinstance(given, list | tuple) and given for given in (states, inputs)):
             raise SystemDefinitionError(f"states = {states!r} and inputs = {inputs!r}; give lists of symbols, not empty")
+        _require_real(states, inputs, parameters or {})
         column = _matrix("rate", rate, (len(states), 1))
         used = set(inputs)
         effect = column.jacobian(list(inputs)).applyfunc(lambda e: sp.simplify(e) if e.free_symbols & used else e)
@@ -157,7 +198,7 @@ class ControlAffineSDE:
         if unknown:
             twins = {s.name for s in unknown} & {s.name for s in allowed}
             hint = (
-                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not Symbol('x')"
+                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not Symbol('x'), and the time is safe_envs.problem.TIME"
                 if twins
                 else "a parameter gets its value in parameters={...} of the system"
             )
