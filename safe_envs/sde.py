@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -12,7 +11,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
-
+from safe_envs.identities import is_zero
 
 _REAL = sp.Symbol("real", real=True).assumptions0
 
@@ -167,7 +166,7 @@ class ControlAffineSDE:
         for state, entry, at_zero in zip(states, rest, drift, strict=True):
             if at_zero.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
                 raise SystemDefinitionError(f"the rate of {state} has no value where the inputs are 0; cancel what divides by an input")
-            if not _is_zero(entry):
+            if not is_zero(sp.expand(entry)):
                 raise SystemDefinitionError(
                     f"the rate of {state} is not affine in the inputs: beside f + g u there is {entry}. Give f and g themselves where a "
                     "system has several pieces"
@@ -198,7 +197,7 @@ class ControlAffineSDE:
         if unknown:
             twins = {s.name for s in unknown} & {s.name for s in allowed}
             hint = (
-                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not Symbol('x'), and the time is safe_envs.problem.TIME"
+                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not Symbol('x'); the time is problem.TIME"
                 if twins
                 else "a parameter gets its value in parameters={...} of the system"
             )
@@ -246,19 +245,6 @@ class ControlAffineSDE:
     def exact(self, expression: Any) -> Any:
         """Like `numeric`, with the decimal value of each parameter as a rational, so that terms cancel exactly."""
         return expression.subs({p: sp.Rational(repr(v)) for p, v in self.parameters.items()})
-
-
-def _is_zero(expression: Any) -> bool:
-    """Whether an expression is zero, to all appearances: as it stands, simplified, or at numbers of either sign."""
-    if expression == 0 or sp.expand(expression) == 0:
-        return True
-    points = random.Random(0)
-    for scale in (0.1, 1.0, 3.0, 30.0):
-        at = {s: sp.Rational(points.randint(-(10**6), 10**6), 10**6) * sp.Rational(str(scale)) for s in expression.free_symbols}
-        value = expression.subs(at).evalf(30, maxn=200)
-        if value.is_finite and abs(value) > sp.Float("1e-20"):
-            return False
-    return True
 
 
 @lru_cache(maxsize=1024)
