@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import itertools
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import sympy as sp
@@ -136,3 +136,38 @@ class _Pieces:
 
     def _symbol(self, key: Any) -> sp.Dummy:
         return self._unknown.setdefault(key, sp.Dummy("unknown"))
+
+
+def pieces_fit(expression: Any, symbols: Sequence[sp.Symbol], order: int) -> bool:
+    """Whether the pieces of every `Piecewise` meet with the same value and the same derivatives up to an order.
+
+    Sympy differentiates each piece by itself, and says nothing of a jump or a kink between two of them.
+
+    Args:
+        expression: of the symbols.
+        symbols: that the derivatives are taken by.
+        order: of the highest derivative that has to be continuous.
+
+    Returns:
+        True where that is shown, which takes conditions that can be solved for one of the symbols.
+    """
+    return all(_fits(piecewise, symbols, order) for piecewise in expression.atoms(sp.Piecewise))
+
+
+def _fits(piecewise: sp.Piecewise, symbols: Sequence[sp.Symbol], order: int) -> bool:
+    pieces: Any = piecewise.args
+    if pieces[-1].cond != sp.true:
+        return False
+    for i, (value, condition) in enumerate(pieces[:-1]):
+        others = sp.Piecewise(*pieces[i + 1 :])
+        for edge in condition.atoms(sp.core.relational.Relational):
+            difference = edge.lhs - edge.rhs
+            solved = [s for s in symbols if difference.diff(s).is_nonzero and not difference.diff(s).has(s)]
+            if not solved or isinstance(edge, sp.Eq | sp.Ne):
+                return False
+            s = solved[0]
+            at = s - difference / difference.diff(s)
+            # A function that is zero on the edge has no slope along it.
+            if not all(is_zero((value.diff(s, k) - others.diff(s, k)).subs(s, sp.simplify(at))) for k in range(order + 1)):
+                return False
+    return True
