@@ -15,10 +15,9 @@ from typing import Any, Literal
 import numpy as np
 import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
-from sympy.printing.numpy import NumPyPrinter
-from sympy.printing.pycode import PythonCodePrinter
 
 from safe_envs.errors import SystemDefinitionError
+from safe_envs.printers import SUPPORTED, ArrayPrinter, FloatPrinter
 
 Flavour = Literal["floats", "arrays"]
 Components = tuple[Any, ...]
@@ -85,71 +84,6 @@ def settled(components: Sequence[Any], shape: tuple[int, ...]) -> Components:
     return arrays
 
 
-_SUPPORTED = (
-    *(sp.sin, sp.cos, sp.tan, sp.cot, sp.sec, sp.csc, sp.asin, sp.acos, sp.atan, sp.atan2, sp.acot, sp.asec, sp.acsc, sp.sinc),
-    *(sp.sinh, sp.cosh, sp.tanh, sp.coth, sp.sech, sp.csch, sp.asinh, sp.acosh, sp.atanh, sp.exp, sp.log, sp.erf, sp.erfc),
-    *(sp.Abs, sp.sign, sp.Heaviside, sp.Piecewise, sp.floor, sp.ceiling, sp.frac, sp.Mod),
-)
-"""Functions that have the same values as floats and as arrays; besides sums, products, powers, Max and Min."""
-
-_PRINTER_SETTINGS = {"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": False, "strict": True}
-
-
-class _FloatPrinter(PythonCodePrinter):
-    """Prints what raises, or gives NaN, where Python itself would answer with a complex number or with None."""
-
-    def _print_Pow(self, expr: Any, rational: bool = False) -> str:  # noqa: N802  (sympy's dispatch by name)
-        if expr.exp.is_integer or abs(expr.exp) == sp.S.Half:
-            return super()._print_Pow(expr, rational)
-        return f"pow({self._print(expr.base)}, {self._print(expr.exp)})"
-
-    def _print_Piecewise(self, expr: Any) -> str:  # noqa: N802
-        return super()._print_Piecewise(expr if expr.args[-1].cond == sp.true else sp.Piecewise(*expr.args, (sp.nan, True)))
-
-    def _print_Mod(self, expr: Any) -> str:  # noqa: N802
-        return f"({super()._print_Mod(expr)})"
-
-
-class _ArrayPrinter(NumPyPrinter):
-    """Prints Min and Max as nested binary ufuncs, where sympy stacks the operands first, and names the constants.
-
-    Attributes:
-        constants: arrays without axes by name: see `constants`.
-    """
-
-    def __init__(self, settings: dict[str, Any]) -> None:
-        super().__init__(settings)
-        self.constants: dict[str, np.ndarray] = {}
-
-    def _named_constant(self, expr: Any) -> str:
-        name = f"_c{len(self.constants)}"
-        self.constants[name] = np.array(float(expr))
-        return name
-
-    def _as_ordered_terms(self, expr: Any, order: str | None = None) -> list[Any]:
-        # A sum that begins with a negative term would cost a negation of its own.
-        return sorted(super()._as_ordered_terms(expr, order), key=lambda term: term.could_extract_minus_sign())
-
-    _print_Float = _print_Integer = _print_Rational = _print_Pi = _named_constant  # noqa: N815
-
-    def _print_Pow(self, expr: Any, rational: bool = False) -> str:  # noqa: N802  (sympy's dispatch by name)
-        # NumPy's power has short cuts for exponents that are literal.
-        return NumPyPrinter(_PRINTER_SETTINGS)._print_Pow(expr, rational)
-
-    def _nested(self, function: str, expression: Any) -> str:
-        first, *others = expression.args
-        code = self._print(first)
-        for argument in others:
-            code = f"{self._module_format('numpy.' + function)}({code}, {self._print(argument)})"
-        return code
-
-    def _print_Max(self, expr: Any) -> str:  # noqa: N802
-        return self._nested("maximum", expr)
-
-    def _print_Min(self, expr: Any) -> str:  # noqa: N802
-        return self._nested("minimum", expr)
-
-
 def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[Any], flavour: Flavour) -> Callable[..., Components]:
     """Compile expressions that share their common subexpressions.
 
@@ -175,7 +109,7 @@ def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...],
     for expression in expressions:
         _require_computable(expression, arguments)
     names, formulas = in_plain_names(arguments, expressions)
-    printer = _ArrayPrinter(_PRINTER_SETTINGS) if flavour == "arrays" else _FloatPrinter(_PRINTER_SETTINGS)
+    printer = ArrayPrinter() if flavour == "arrays" else FloatPrinter()
     try:
         function = sp.lambdify(
             names,
@@ -187,7 +121,7 @@ def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...],
         )
     except PrintMethodNotImplementedError as error:
         raise SystemDefinitionError(f"{_shortened(expressions)} has no numerical form: {str(error).splitlines()[0]}") from error
-    if isinstance(printer, _ArrayPrinter):
+    if isinstance(printer, ArrayPrinter):
         function.__globals__.update(printer.constants)
     elif any(e.has(sp.Piecewise, sp.Heaviside, sp.sinc) for e in formulas):
         return _piece_by_piece(function, names, formulas)
@@ -196,9 +130,7 @@ def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...],
 
 def _piece_by_piece(quick: Callable[..., Components], names: Sequence[sp.Symbol], formulas: Sequence[Any]) -> Callable[..., Components]:
     """A function of floats that evaluates the pieces that apply, where a shared subexpression of others has no value."""
-    careful = lru_cache(maxsize=1)(
-        lambda: sp.lambdify(names, tuple(formulas), modules=[math], printer=_FloatPrinter(_PRINTER_SETTINGS), docstring_limit=0)
-    )
+    careful = lru_cache(maxsize=1)(lambda: sp.lambdify(names, tuple(formulas), modules=[math], printer=FloatPrinter(), docstring_limit=0))
 
     def function(*arguments: float) -> Components:
         try:
@@ -217,12 +149,12 @@ def _require_computable(expression: Any, arguments: tuple[sp.Symbol, ...]) -> No
         )
     if len(set(arguments)) < len(arguments):
         raise SystemDefinitionError(f"a symbol stands for two arguments of {_shortened(expression)}: {', '.join(map(str, arguments))}")
-    strange = {f.func for f in expression.atoms(sp.Function) if not isinstance(f, _SUPPORTED)}
+    strange = {f.func for f in expression.atoms(sp.Function) if not isinstance(f, SUPPORTED)}
     if strange:
         advice = "; DiracDelta is the derivative of a jump: use a smooth function" if sp.DiracDelta in strange else ""
         raise SystemDefinitionError(
             f"{_shortened(expression)} holds {', '.join(sorted(map(str, strange)))}, which has no numerical form here; "
-            f"write it with {', '.join(f.__name__ for f in _SUPPORTED)}, Max and Min{advice}"
+            f"write it with {', '.join(f.__name__ for f in SUPPORTED)}, Max and Min{advice}"
         )
     if expression.has(sp.I, sp.zoo):
         raise SystemDefinitionError(f"{_shortened(expression)} is not real everywhere, or has a division by 0; look at its numbers")

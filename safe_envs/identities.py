@@ -160,7 +160,8 @@ def _fits(piecewise: sp.Piecewise, symbols: Sequence[sp.Symbol], order: int) -> 
         return False
     for i, (value, condition) in enumerate(pieces[:-1]):
         others = sp.Piecewise(*pieces[i + 1 :])
-        for edge in condition.atoms(sp.core.relational.Relational):
+        edges: Any = condition.atoms(sp.core.relational.Relational)
+        for edge in edges:
             difference = edge.lhs - edge.rhs
             solved = [s for s in symbols if difference.diff(s).is_nonzero and not difference.diff(s).has(s)]
             if not solved or isinstance(edge, sp.Eq | sp.Ne):
