@@ -113,7 +113,8 @@ class _Pieces:
         if condition in (sp.true, sp.false):
             return sp.Integer(condition == sp.true)
         if isinstance(condition, sp.Gt | sp.Ge | sp.Lt | sp.Le):
-            return (1 + self._sign(self._rewritten(condition.gts - condition.lts))) / 2
+            larger, smaller = condition.gts, condition.lts
+            return (1 + self._sign(self._rewritten(larger - smaller))) / 2  # pyright: ignore[reportOperatorIssue]
         if isinstance(condition, sp.Eq | sp.Ne):
             return sp.Integer(isinstance(condition, sp.Ne))
         if isinstance(condition, sp.Not):
