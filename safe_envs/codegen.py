@@ -27,6 +27,9 @@ _LARGEST_FLOAT = sp.Rational(sys.float_info.max)
 _LONGEST_QUOTED = 120
 
 
+_settled: dict[int, np.ndarray] = {}
+
+
 class _Remembering:
     """A costly ufunc that knows its values at the arrays that were last given to `settled`.
 
@@ -34,26 +37,19 @@ class _Remembering:
     remembered: its owner may change it in place between two calls.
     """
 
-    settled: tuple[np.ndarray, ...] = ()
-
     def __init__(self, ufunc: np.ufunc) -> None:
         self._ufunc = ufunc
-        self._known: list[tuple[np.ndarray, np.ndarray]] = []
+        self.known: dict[int, tuple[np.ndarray, np.ndarray]] = {}
 
     def __call__(self, argument: Any) -> Any:
-        for known, value in self._known:
-            if known is argument:
-                return value
+        entry = self.known.get(id(argument))
+        if entry is not None and entry[0] is argument:
+            return entry[1]
         value = self._ufunc(argument)
-        for array in _Remembering.settled:
-            if array is argument:
-                value.flags.writeable = False
-                self._known.append((array, value))
+        if _settled.get(id(argument)) is argument:
+            value.setflags(write=False)
+            self.known[id(argument)] = (argument, value)
         return value
-
-    def forget(self) -> None:
-        """Drop the values of the arrays that were settled before."""
-        self._known = []
 
 
 _REMEMBERING = {name: _Remembering(getattr(np, name)) for name in ("sin", "cos")}
@@ -75,12 +71,13 @@ def settled(components: Sequence[Any], shape: tuple[int, ...]) -> Components:
         components: arrays that were made for the caller, and that nobody else can write to, or numbers.
         shape: of the arrays returned.
     """
-    arrays = tuple([a if a.__class__ is np.ndarray and a.flags.owndata else np.array(filled(a, shape)) for a in components])
+    global _settled
+    arrays = tuple([a if type(a) is np.ndarray and a.base is None and a.shape == shape else np.array(filled(a, shape)) for a in components])
     for array in arrays:
-        array.flags.writeable = False
-    _Remembering.settled = arrays
+        array.setflags(False)
+    _settled = {id(array): array for array in arrays}
     for function in _REMEMBERING.values():
-        function.forget()
+        function.known = {}
     return arrays
 
 

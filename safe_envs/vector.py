@@ -305,7 +305,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._episode_cost += cost if counted is None else cost * counted
         np.minimum(self._h_min, h, out=self._h_min)
         terminated = filled(outside > 0.0, (self.num_envs,))
-        sound = finite(h) and finite(rows) and all(finite(x[i]) for i in self._unobserved)
+        sound = finite(h) and finite(rows)
+        for i in self._unobserved:
+            sound = sound and finite(x[i])
         if np.count_nonzero(terminated):
             envs = np.flatnonzero(terminated)
             observation[envs] = np.clip(observation[envs], self._bounds.low, self._bounds.high)

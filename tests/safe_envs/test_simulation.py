@@ -137,6 +137,21 @@ def test_a_control_period_of_shared_noise_is_that_of_euler_and_maruyama(flavour)
     np.testing.assert_allclose(np.ravel(found), by_hand([0.4, -0.3], 1.0, 0.2, 4, drawn, 0.3), rtol=1e-12)
 
 
+def forgetful():
+    """x + dt x' is 0, without x in it, and v + dt v' the input alone."""
+    system = ControlAffineSDE((x, v), (u,), [-4 * x, -4 * v], [0, 4], [0, sp.Float(1e-30)])
+    return state_problem(system, 9 - v, box=(-2, 2), start=[0.4, -0.3], dt=0.25, horizon=2.0)
+
+
+@both
+def test_a_state_that_forgets_all_within_a_step_is_a_batch_like_others(make):
+    env = make(forgetful())
+    env.reset(seed=0)
+    for action in (0.5, -0.25):
+        act(env, action)
+        np.testing.assert_allclose(np.reshape(env.state, (-1, 2)), [[0.0, 2 * action]] * (1 if isinstance(env, SafeEnv) else 2), atol=1e-20)
+
+
 def diverging(**changes):
     """x' = u beside v' = v^3, which is infinite after .5 s."""
     system = ControlAffineSDE((x, v), (u,), [0, v**3], [1, 0], [0, 0])
