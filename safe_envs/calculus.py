@@ -18,7 +18,7 @@ from safe_envs.sde import ControlAffineSDE
 
 Derivative = Callable[[ControlAffineSDE, sp.Expr], sp.Expr]
 
-_KINKED = (sp.Piecewise, sp.Abs, sp.Min, sp.Max, sp.sign, sp.Heaviside, sp.DiracDelta, sp.floor, sp.ceiling, sp.frac)
+_KINKED = (sp.Piecewise, sp.Abs, sp.Min, sp.Max, sp.sign, sp.Heaviside, sp.DiracDelta, sp.floor, sp.ceiling, sp.frac, sp.Mod)
 _LARGEST_TIDIED = 100
 _MOST_TERMS = 200
 

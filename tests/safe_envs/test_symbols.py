@@ -49,7 +49,7 @@ def test_a_root_of_a_square_is_the_size_of_a_real_state():
     assert problem.barriers[0].expression == 1 - sp.Abs(x)
 
 
-@pytest.mark.parametrize("name", ["t", "sin", "None", "x_{1}", "lambda", "p0", "_c0", "a b", "θ"])
+@pytest.mark.parametrize("name", ["t", "sin", "x_{1}", "_c0"])
 def test_names_of_states_are_free(name):
     def episode(state, force, rate):
         system = ControlAffineSDE((state, v), (force,), [sp.sin(v) * rate, 0], [0, 1], [0, sigma], {rate: 2.0, sigma: 0.3})

@@ -172,7 +172,7 @@ def test_single_state_of_batch_one_keeps_its_leading_axis():
 
 
 @given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3), st.floats(-1.0, 1.0)), min_size=1, max_size=8), st.sampled_from(["C", "F"]))
-@settings(max_examples=25)
+@settings(max_examples=15)
 def test_batches_may_change_in_place_between_decisions(changes, order):
     problem = problem_of("safe_envs/DubinsDisk-v0")
     safety_filter = SafetyFilter.for_problem(problem, "hocbf")
