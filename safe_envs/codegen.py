@@ -175,7 +175,19 @@ def in_plain_names(arguments: Sequence[sp.Symbol], expressions: Sequence[Any]) -
     """
     ordered = sorted(arguments, key=sp.default_sort_key)
     plain = {s: sp.Symbol(f"a{i:03d}", **s.assumptions0) for i, s in enumerate(ordered)}
-    return tuple(plain[s] for s in arguments), tuple(e.xreplace(plain) for e in expressions)
+    known: dict[Any, Any] = dict(plain)
+
+    def renamed(expression: Any) -> Any:
+        if not expression.args:
+            return known.get(expression, expression)
+        if expression not in known:
+            parts = [renamed(part) for part in expression.args]
+            # Sympy would compare all parts with each other once more, which takes longer than all else.
+            as_it_is = {"evaluate": False} if isinstance(expression, sp.Max | sp.Min) else {}
+            known[expression] = expression.func(*parts, **as_it_is)
+        return known[expression]
+
+    return tuple(plain[s] for s in arguments), tuple(renamed(e) for e in expressions)
 
 
 def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
