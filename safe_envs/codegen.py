@@ -74,7 +74,7 @@ def settled(components: Sequence[Any], shape: tuple[int, ...]) -> Components:
     global _settled
     arrays = tuple([a if type(a) is np.ndarray and a.base is None and a.shape == shape else np.array(filled(a, shape)) for a in components])
     for array in arrays:
-        array.setflags(False)
+        array.setflags(write=False)
     _settled = {id(array): array for array in arrays}
     for function in _REMEMBERING.values():
         function.known = {}
