@@ -72,9 +72,9 @@ def settled(components: Sequence[Any], shape: tuple[int, ...]) -> Components:
         shape: of the arrays returned.
     """
     global _settled
-    arrays = tuple([a if type(a) is np.ndarray and a.base is None and a.shape == shape else np.array(filled(a, shape)) for a in components])
+    arrays = tuple([a if type(a) is np.ndarray and a.base is None and a.ndim else np.array(filled(a, shape)) for a in components])
     for array in arrays:
-        array.setflags(write=False)
+        array.setflags(False)  # pyright: ignore[reportCallIssue]  (a keyword takes three times as long)
     _settled = {id(array): array for array in arrays}
     for function in _REMEMBERING.values():
         function.known = {}
