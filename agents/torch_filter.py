@@ -17,6 +17,7 @@ import sympy as sp
 import torch
 from sympy.printing.pytorch import TorchPrinter
 
+from safe_envs.codegen import in_plain_names
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.problem import SafetyProblem
 from wrappers.conditions import Condition
@@ -294,7 +295,8 @@ def _compiled_rows(program: Program) -> Callable[[torch.Tensor], tuple[torch.Ten
         raise ConfigurationError(f"torch has no {', '.join(sorted(map(str, unknown)))}, which a row holds; write it with other functions")
     # Torch's functions take no plain numbers.
     numbers = [e.xreplace({c: c.evalf(17) for c in e.atoms(sp.NumberSymbol, sp.Function) if c.is_number}) for e in expressions]
-    function = sp.lambdify(model.states, numbers, modules=[_FUNCTIONS], printer=_Printer, cse=True, docstring_limit=0)
+    names, formulas = in_plain_names(model.states, numbers)
+    function = sp.lambdify(names, formulas, modules=[_FUNCTIONS], printer=_Printer, cse=True, docstring_limit=0)
 
     def rows(states: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         entries = torch.stack([states.new_zeros(len(states)) + e for e in function(*states.unbind(dim=1))], dim=-1)

@@ -13,7 +13,8 @@ import sympy as sp
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, state_problem
 
 s, y, psi, v, curvature, acceleration = sp.symbols("s y psi v tan_delta a", real=True)
-length, wind = sp.symbols("L wind", positive=True)
+length = sp.Symbol("L", positive=True)
+wind = sp.Symbol("wind", nonnegative=True)
 
 bicycle = ControlAffineSDE(
     states=(s, y, psi, v),

@@ -13,7 +13,8 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, SafetyProblem, state_problem
 
 x, v, theta, omega, force = sp.symbols("x v theta omega F", real=True)
-M, m, length, gust = sp.symbols("M m l gust", positive=True)
+M, m, length = sp.symbols("M m l", positive=True)
+gust = sp.Symbol("gust", nonnegative=True)
 
 swing = (force + m * length * omega**2 * sp.sin(theta)) / (M + m)
 turn = (9.81 * sp.sin(theta) - sp.cos(theta) * swing) / (length * (sp.Rational(4, 3) - m * sp.cos(theta) ** 2 / (M + m)))

@@ -7,6 +7,7 @@ from typing import Any
 
 import sympy as sp
 
+from safe_envs.barrier import formula
 from safe_envs.calculus import generator, input_derivative
 from safe_envs.errors import ConfigurationError
 from safe_envs.sde import ControlAffineSDE, finite_number
@@ -28,6 +29,7 @@ class CLF:
 
     Raises:
         ConfigurationError: the rate is negative or not finite.
+        SystemDefinitionError: V or a weight is no expression.
 
     Source: the CLF part of the quadratic programs in thesis Sec. 4.3.1 and 5.4.2. Sec. 4.3.1 asks for AV <= d, without the
     rate, with the trace of sigma' sigma V_xx and weights of 1/2 each, at which u stays near 0.
@@ -42,7 +44,7 @@ class CLF:
         if finite_number("rate", self.rate) < 0:
             raise ConfigurationError(f"rate = {self.rate}; give a rate of decay >= 0 in 1/s")
         for name in ("V", "input_weight", "slack_weight"):
-            object.__setattr__(self, name, sp.sympify(getattr(self, name)))
+            object.__setattr__(self, name, formula(f"{name} of a clf", getattr(self, name)))
 
     def require_known(self, system: ControlAffineSDE) -> None:
         """Check that V is a function of the states, and the weights of the parameters.

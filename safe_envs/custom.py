@@ -14,6 +14,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.mistakes import require_sound
 from safe_envs.places import called, load_object, resolved
 from safe_envs.problem import SafetyProblem
+from safe_envs.systems import CUSTOM_ID
 from safe_envs.vector import AutoresetMode, SafeVectorEnv
 
 Factory = Callable[..., SafetyProblem]
@@ -21,7 +22,7 @@ Factory = Callable[..., SafetyProblem]
 _ENTRY = "safe_envs.custom:Custom"
 
 
-def load_system(place: str) -> Factory:
+def load_system(place: Any) -> Factory:
     """Import the statement of a system.
 
     Args:
@@ -33,6 +34,11 @@ def load_system(place: str) -> Factory:
     Raises:
         ConfigurationError: there is no such place, or the code there ends with an error.
     """
+    if not isinstance(place, str) or not place:
+        raise ConfigurationError(
+            f"system = {place!r}; give the place of its statement as a text, FILE.py:NAME or MODULE:NAME, like "
+            f"gym.make({CUSTOM_ID!r}, system='cart_pole.py:problem')"
+        )
     found = load_object(place)
     if isinstance(found, SafetyProblem):
         require_sound(found)
@@ -104,7 +110,7 @@ class Custom(SafeEnv):
 
     def __init__(
         self,
-        system: str,
+        system: str = "",
         *,
         barrier: Mapping[str, Any] | None = None,
         max_episode_steps: int | None = None,
@@ -119,7 +125,7 @@ class CustomVector(SafeVectorEnv):
 
     def __init__(
         self,
-        system: str,
+        system: str = "",
         num_envs: int = 1,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         barrier: Mapping[str, Any] | None = None,

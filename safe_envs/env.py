@@ -44,6 +44,9 @@ def make_problem(name: str, factory: Any, barrier: Mapping[str, Any] | None, opt
     """
     of_factory = inspect.signature(factory).parameters
     of_problem = [name for name in inspect.signature(SafetyProblem.configured).parameters if name != "self"]
+    for what, values in (("barrier", barrier), *((what, options.get(what)) for what in ("plant", "model"))):
+        if values is not None and not (isinstance(values, Mapping) and all(isinstance(key, str) for key in values)):
+            raise ConfigurationError(f"{what} = {values!r}; give a dictionary of names and values")
     shape = {**(barrier or {}), **{key: value for key, value in options.items() if key in of_factory}}
     settings = {key: value for key, value in options.items() if key not in of_factory}
     for what, allowed, given in (("barrier argument", of_factory, shape), ("argument", (*of_problem, *of_factory), settings)):

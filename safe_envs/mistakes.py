@@ -173,9 +173,10 @@ def _doubt_box_of_barriers(problem: SafetyProblem, x: Components) -> None:
         chain, gains = model.numeric(barrier.expression), problem.gains_of(i)
         for gain in gains[:-1]:
             chain = generator(model, chain) + gain * chain
+        rate = generator(model, chain).replace(sp.DiracDelta, lambda *_: sp.Integer(0))  # At a kink, which no start is likely to hit.
         effect = model.numeric(input_derivative(model, chain))
         best = sum(sp.Max(e * variable.low, e * variable.high) for e, variable in zip(effect, problem.inputs, strict=True))
-        without, reach = _values(model.states, [model.numeric(generator(model, chain) + gains[-1] * chain), best], x).T
+        without, reach = _values(model.states, [model.numeric(rate + gains[-1] * chain), best], x).T
         if (without < -_OTHER_UNITS * abs(reach)).all():
             nearest = int((abs(reach) / -without).argmax())
             _doubt(

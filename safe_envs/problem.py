@@ -17,8 +17,9 @@ from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
 from safe_envs.exploration import Exploration
 from safe_envs.sde import ControlAffineSDE, finite_number
 
-TIME = sp.Symbol("t", real=True)
-"""Time since the start of the episode, in s: references and rewards may depend on it."""
+TIME = sp.Symbol("t", nonnegative=True)
+"""Time since the start of the episode, in s: references and rewards may depend on it. No state or input, which may have any sign,
+is the same symbol, even if its name is t."""
 
 _WIDEST = 1e100
 """Largest bound of a box: its square, an effort, is still a number."""
@@ -144,6 +145,7 @@ class SafetyProblem:
         plant.require_known("the reward", self.reward.free_symbols, (*plant.states, *plant.inputs, TIME))
         for feature in self.features:
             plant.require_known(f"feature {feature.name}", feature.expression.free_symbols, (*plant.states, TIME))
+        self._check_feature_names()
         for law in self.nominal:
             known = (*(f.symbol for f in self.features), *model.parameters)
             plant.require_known("the nominal controller", law.free_symbols, known)
@@ -169,6 +171,13 @@ class SafetyProblem:
         ranges = [(s.low, s.high) for s in self.states]
         angles = [s.unit == "rad" and math.isinf(s.low) and math.isinf(s.high) for s in self.states]
         return self.explored.completed(self.plant.states, ranges, angles, self.box)
+
+    def _check_feature_names(self) -> None:
+        """Check that a symbol of the nominal controller means one thing."""
+        symbols = [f.symbol for f in self.features]
+        twice = {s.name for s in symbols if symbols.count(s) > 1 or s in self.model.parameters}
+        if twice:
+            raise SystemDefinitionError(f"features named twice, or like a parameter: {', '.join(sorted(twice))}; give each another name")
 
     def _check_timing(self) -> None:
         if not self.dt > 0 or not math.isfinite(self.dt):

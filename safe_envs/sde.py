@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import random
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -12,6 +11,9 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
+from safe_envs.identities import is_zero
+
+_REAL = sp.Symbol("real", real=True).assumptions0
 
 
 def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
@@ -39,12 +41,51 @@ def finite_number(name: str, value: Any) -> float:
     return number
 
 
+def _require_real(states: Iterable[Any], inputs: Iterable[Any], parameters: Iterable[Any]) -> None:
+    """Check that states and inputs are declared real, and nothing more, and parameters real."""
+    wrong = []
+    for symbol in (*states, *inputs, *parameters):
+        if not isinstance(symbol, sp.Symbol):
+            raise SystemDefinitionError(f"{symbol!r} among states, inputs and parameters is no symbol; make it by sympy.symbols")
+        if symbol.assumptions0 != _REAL and not (symbol.is_real and symbol in parameters):
+            wrong.append(symbol)
+    if wrong:
+        told = "; ".join(f"{s} is declared {_declared(s) or 'nothing, so that it may be complex'}" for s in wrong)
+        names = " ".join(s.name for s in wrong)
+        raise SystemDefinitionError(
+            f"states and inputs are to be declared real and nothing more, parameters real at least, for sympy simplifies by that: {told}. "
+            f"Make them by sympy.symbols({names!r}, real=True), in the system and in all that is said of it"
+        )
+
+
+def _declared(symbol: sp.Symbol) -> str:
+    """What a symbol was declared to be, like "positive=True"."""
+    return ", ".join(f"{word}={value}" for word, value in getattr(symbol, "_assumptions_orig", symbol.assumptions0).items())
+
+
+def _fitting(symbol: sp.Symbol, value: Any) -> float:
+    """The value of a parameter, if it is a finite number and what its symbol is declared to be."""
+    number = finite_number(f"parameter {symbol}", value)
+    if symbol.assumptions0 != _REAL:
+        exact = sp.Rational(number)
+        wrong = [word for word, holds in symbol.assumptions0.items() if getattr(exact, f"is_{word}") is (not holds)]
+        if wrong:
+            raise ConfigurationError(
+                f"parameter {symbol} = {number:g}, but its symbol is declared {_declared(symbol)}, and sympy simplifies by that; "
+                f"give another value, or make the symbol by sympy.symbols({symbol.name!r}, real=True)"
+            )
+    return number
+
+
 @dataclass(frozen=True)
 class ControlAffineSDE:
     """dx = (f(x) + g(x) u) dt + sigma(x) dW.
 
     Exogenous motion, a moving obstacle say, is a state of its own with a known drift, so that no time derivative
     of a barrier can be forgotten.
+
+    States and inputs are symbols that are declared real and nothing more, parameters real or whatever else their values are:
+    sympy simplifies by these words, sqrt(x**2) to |x| for a real x, to x for a positive one, and not at all without.
 
     Attributes:
         states: n symbols x.
@@ -55,9 +96,9 @@ class ControlAffineSDE:
         parameters: value of every other symbol that occurs.
 
     Raises:
-        SystemDefinitionError: a shape does not fit, a symbol is unknown or defined twice, or an input occurs in
-            f, g or sigma, so that the system is not control-affine.
-        ConfigurationError: a parameter is no finite number.
+        SystemDefinitionError: a shape does not fit, a symbol is unknown, defined twice or not declared real, or an input
+            occurs in f, g or sigma, so that the system is not control-affine.
+        ConfigurationError: a parameter is no finite number, or not what its symbol is declared to be.
 
     Source: thesis Eq. (4.1).
     """
@@ -70,9 +111,7 @@ class ControlAffineSDE:
     parameters: Mapping[sp.Symbol, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for symbol in (*self.states, *self.inputs, *self.parameters):
-            if not isinstance(symbol, sp.Symbol):
-                raise SystemDefinitionError(f"{symbol!r} among states, inputs and parameters is no symbol; make it by sympy.symbols")
+        _require_real(self.states, self.inputs, self.parameters)
         n, m = len(self.states), len(self.inputs)
         if not n or not m:
             raise SystemDefinitionError(f"a system needs a state and an input; given {n} states and {m} inputs")
@@ -82,7 +121,7 @@ class ControlAffineSDE:
             "drift": _matrix("drift", self.drift, (n, 1)),
             "input_matrix": _matrix("input_matrix", self.input_matrix, (n, m)),
             "diffusion": _matrix("diffusion", self.diffusion, (n, None)),
-            "parameters": {p: finite_number(f"parameter {p}", v) for p, v in self.parameters.items()},
+            "parameters": {p: _fitting(p, v) for p, v in self.parameters.items()},
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -111,6 +150,7 @@ class ControlAffineSDE:
         """
         if not all(isinstance(given, list | tuple) and given for given in (states, inputs)):
             raise SystemDefinitionError(f"states = {states!r} and inputs = {inputs!r}; give lists of symbols, not empty")
+        _require_real(states, inputs, parameters or {})
         column = _matrix("rate", rate, (len(states), 1))
         used = set(inputs)
         effect = column.jacobian(list(inputs)).applyfunc(lambda e: sp.simplify(e) if e.free_symbols & used else e)
@@ -126,7 +166,7 @@ class ControlAffineSDE:
         for state, entry, at_zero in zip(states, rest, drift, strict=True):
             if at_zero.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
                 raise SystemDefinitionError(f"the rate of {state} has no value where the inputs are 0; cancel what divides by an input")
-            if not _is_zero(entry):
+            if not is_zero(sp.expand(entry)):
                 raise SystemDefinitionError(
                     f"the rate of {state} is not affine in the inputs: beside f + g u there is {entry}. Give f and g themselves where a "
                     "system has several pieces"
@@ -157,7 +197,7 @@ class ControlAffineSDE:
         if unknown:
             twins = {s.name for s in unknown} & {s.name for s in allowed}
             hint = (
-                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not Symbol('x')"
+                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not Symbol('x'); the time is problem.TIME"
                 if twins
                 else "a parameter gets its value in parameters={...} of the system"
             )
@@ -205,19 +245,6 @@ class ControlAffineSDE:
     def exact(self, expression: Any) -> Any:
         """Like `numeric`, with the decimal value of each parameter as a rational, so that terms cancel exactly."""
         return expression.subs({p: sp.Rational(repr(v)) for p, v in self.parameters.items()})
-
-
-def _is_zero(expression: Any) -> bool:
-    """Whether an expression is zero, to all appearances: as it stands, simplified, or at numbers of either sign."""
-    if expression == 0 or sp.expand(expression) == 0:
-        return True
-    points = random.Random(0)
-    for scale in (0.1, 1.0, 3.0, 30.0):
-        at = {s: sp.Rational(points.randint(-(10**6), 10**6), 10**6) * sp.Rational(str(scale)) for s in expression.free_symbols}
-        value = expression.subs(at).evalf(30, maxn=200)
-        if value.is_finite and abs(value) > sp.Float("1e-20"):
-            return False
-    return True
 
 
 @lru_cache(maxsize=1024)

@@ -11,7 +11,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from safe_envs.codegen import Components, constants, filled, finite, stacked
+from safe_envs.codegen import Components, constants, filled, finite, settled, stacked
 from safe_envs.env import action_box, make_problem, observation_box
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.info import Info, safety_info, with_masks
@@ -77,6 +77,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._simulation = Simulation(problem, "arrays")
         self._noise = NoiseStreams(num_envs, self._simulation.integrator.channels)
         self._center, self._half = (constants(c) for c in center_and_half_width(problem))
+        observed = {f.expression for f in problem.features}
+        self._unobserved = [i for i, state in enumerate(problem.plant.states) if state not in observed]
         self._limit = steps_until(problem, max_episode_steps)
         self._rngs: list[np.random.Generator] = []
         self._seeds: list[int] = []
@@ -90,7 +92,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @property
     def components(self) -> Components:
-        """The exact states, an array of shape (num_envs,) for each of the problem's states."""
+        """The exact states, an array of shape (num_envs,), not to be written to, for each of the problem's states."""
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
         return self._x
@@ -289,8 +291,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _observe(self, u: Sequence[Any], counted: np.ndarray | None = None) -> VectorStep:
         """Read the states; `counted` are the envs whose states are new (None: all)."""
+        self._x = x = settled(self.components, (self.num_envs,))
         time = self._steps * self.problem.dt if self._simulation.timed else 0.0
-        features, barriers, reward, outside, goal = self._simulation.measure(self.components, u, time)
+        features, barriers, reward, outside, goal = self._simulation.measure(x, u, time)
         rows = np.empty((len(features), self.num_envs), dtype=np.float32)
         for row, feature in zip(rows, features, strict=True):
             row[:] = feature
@@ -302,10 +305,13 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._episode_cost += cost if counted is None else cost * counted
         np.minimum(self._h_min, h, out=self._h_min)
         terminated = filled(outside > 0.0, (self.num_envs,))
+        sound = finite(h) and finite(rows)
+        for i in self._unobserved:
+            sound = sound and finite(x[i])
         if np.count_nonzero(terminated):
             envs = np.flatnonzero(terminated)
             observation[envs] = np.clip(observation[envs], self._bounds.low, self._bounds.high)
-        if not (finite(h) and finite(rows)):
+        if not sound:
             self._report_breakdown(h, observation)
         if self.problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
@@ -313,7 +319,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return observation, filled(reward, (self.num_envs,)).copy(), terminated, self._steps >= self._limit, info
 
     def _report_breakdown(self, h: np.ndarray, observation: np.ndarray) -> None:
-        broken = ~(np.isfinite(h) & np.isfinite(observation).all(axis=1))
+        broken = ~(np.isfinite(self._x).all(axis=0) & np.isfinite(h) & np.isfinite(observation).all(axis=1))
         if broken.any():
             raise NumericalError(
                 f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r} have left the finite numbers; "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 
@@ -228,6 +229,23 @@ def test_rows_of_functions_with_kinks():
     module = TorchFilter(SafetyFilter(model, [(Barrier(1 - x - sp.sqrt(2) * y**2), CBF(alpha=1.0))], [(-9.0, 9.0)]))
     rng = np.random.default_rng(0)
     assert assert_slopes(module, rng.normal(size=(30, 2)), 4.0 + rng.normal(size=(30, 1))) > 25
+
+
+def test_names_of_symbols_change_nothing():
+    found = []
+    for names in (("y", "z"), ("x0", "x1"), ("x1", "sin"), ("torch", "None")):
+        a, b = (sp.Symbol(name, real=True) for name in names)
+        both, u = a + b, sp.Symbol("u", real=True)
+        model = ControlAffineSDE((a, b), (u,), [(both**2 + 3 * sp.sin(both)) * sp.sin(both), both**2], [[1], [0]], [[0], [0]])
+        module = TorchFilter(SafetyFilter(model, [(Barrier(1 - a - b**2), CBF(alpha=1.0))], [(-9.0, 9.0)]))
+        states = torch.tensor([0.9, 0.4], dtype=torch.float64, requires_grad=True)
+        module(states, torch.tensor([8.0], dtype=torch.float64)).sum().backward()
+        assert states.grad is not None
+        found.append(states.grad.tolist())
+    # u = 1 - a - b^2 - (s^2 + 3 sin s) sin s - 2 b s^2 with s = a + b.
+    s, b = 1.3, 0.4
+    by_both = -(2 * s + 3 * math.cos(s)) * math.sin(s) - (s**2 + 3 * math.sin(s)) * math.cos(s) - 4 * b * s
+    assert found == [pytest.approx([by_both - 1, by_both - 2 * b - 2 * s**2], rel=1e-12)] * 4
 
 
 def test_learning_through_the_filter():

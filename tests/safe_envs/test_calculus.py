@@ -11,7 +11,7 @@ import sympy as sp
 
 import safe_envs
 from safe_envs import ControlAffineSDE, RelativeDegreeError, SystemDefinitionError
-from safe_envs.calculus import derivatives, drift_derivative, generator, input_derivative, relative_degree
+from safe_envs.calculus import derivatives, drift_derivative, generator, input_derivative, relative_degree, spread
 from safe_envs.simulation import Simulation
 from tests.conftest import problem_of
 
@@ -65,6 +65,57 @@ def test_derivatives_equal_finite_differences(env_id, side):
                 assert abs(slope - derivative(x)) < mpmath.mpf("1e-9") * (1 + abs(slope))
             a_phi = slopes[0] + curvature / 2
             assert abs(a_phi - generated(x)) < mpmath.mpf("1e-9") * (1 + abs(a_phi))
+
+
+def correlated() -> ControlAffineSDE:
+    """Three states that share two channels of noise, of sizes that depend on the state."""
+    a, b, c, u = sp.symbols("a b c u", real=True)
+    sigma = [[1 + b**2, sp.sin(c)], [a * c, sp.Rational(1, 2)], [sp.cos(a), -b]]
+    return ControlAffineSDE((a, b, c), (u,), [b, -a * c, sp.sin(a)], [0, 0, 1], sigma)
+
+
+def coin_tosses(system, phi, x, dt):
+    """Mean and mean square of the change of phi by x + f dt + sigma dW, where each dW is +sqrt(dt) or -sqrt(dt), over dt.
+
+    Tosses have the mean and the covariance of dW, which is all of it that counts as dt -> 0.
+    """
+    f, sigma = in_fifty_digits(system, system.drift)(x), in_fifty_digits(system, system.diffusion)(x)
+    changes = []
+    for signs in itertools.product((-1, 1), repeat=system.diffusion.cols):
+        noise = [mpmath.sqrt(dt) * sum(s * sigma[i, j] for j, s in enumerate(signs)) for i in range(system.n)]
+        changes.append(phi([x[i] + f[i] * dt + noise[i] for i in range(system.n)]) - phi(x))
+    return sum(changes) / len(changes) / dt, sum(change**2 for change in changes) / len(changes) / dt
+
+
+def test_correlated_noise_enters_the_generator_and_the_spread():
+    system = correlated()
+    a, b, c = system.states
+    phi = a**2 * b + 3 * b * c + sp.sin(a * c)
+    with mpmath.workdps(60):
+        for _ in range(2):
+            exact, generated, square = (in_fifty_digits(system, e) for e in (phi, generator(system, phi), spread(system, phi)))
+            for x in ([0.3, -1.2, 0.8], [1.7, 0.4, -0.6]):
+                x = [mpmath.mpf(entry) for entry in x]
+                rate, variance = coin_tosses(system, exact, x, mpmath.mpf("1e-20"))
+                assert abs(rate - generated(x)) < mpmath.mpf("1e-12") * (1 + abs(rate))
+                assert abs(variance - square(x)) < mpmath.mpf("1e-12") * (1 + abs(variance))
+            # The second time it is the generator of the generator.
+            phi = generator(system, phi)
+
+
+def test_a_quadratic_form_under_correlated_noise():
+    # A x'Px = x'(F'P + PF)x + tr(P S S') for dx = Fx dt + S dW, and so on for the form of F'P + PF.
+    F, P = sp.Matrix([[1, 2, 0], [0, -1, 3], [1, 0, 2]]), sp.Matrix([[2, 1, -1], [1, 3, 2], [-1, 2, 1]])
+    S = sp.Matrix([[1, 2], [3, -1], [0, 4]])
+    x = sp.Matrix(sp.symbols("x_1:4", real=True))
+    system = ControlAffineSDE(tuple(x), (sp.Symbol("u", real=True),), list(F * x), [0, 0, 1], S)
+    form, constant, phi = P, sp.Integer(0), (x.T * P * x)[0, 0]
+    for _ in range(2):
+        constant = (form * S * S.T).trace()
+        form = F.T * form + form * F
+        phi = generator(system, phi)
+        assert sp.expand(phi - (x.T * form * x)[0, 0] - constant) == 0
+    assert sp.expand(spread(system, (x.T * P * x)[0, 0]) - 4 * (x.T * P * S * S.T * P * x)[0, 0]) == 0
 
 
 def test_relative_degrees_of_the_registered_systems(env_id):

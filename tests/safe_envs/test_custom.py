@@ -193,3 +193,17 @@ def test_ids_of_others_are_not_replaced(tmp_path, my_id):
         safe_envs.register("Pendulum-v1", place(tmp_path))
     for edge in ("1.0", "2.0"):
         safe_envs.register(my_id, place(tmp_path, statement=STATEMENT.replace("edge: float = 1.0", f"edge: float = {edge}")))
+
+
+@pytest.mark.parametrize("make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)])
+@pytest.mark.parametrize("arguments", [{}, {"system": ""}, {"system": None}, {"system": 3}, {"system": stated_here}])
+def test_the_id_for_any_system_asks_for_one(make, arguments):
+    with pytest.raises(ConfigurationError, match=r"system = .*; give the place of its statement as a text, FILE.py:NAME"):
+        make(CUSTOM_ID, **arguments)
+
+
+@pytest.mark.parametrize("make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)])
+@pytest.mark.parametrize("arguments", [{"barrier": 3}, {"plant": 3}, {"model": [("sigma", 1.0)]}, {"plant": {3: 4.0}}])
+def test_dictionaries_are_asked_for(make, arguments):
+    with pytest.raises(ConfigurationError, match="give a dictionary of names and values"):
+        make("safe_envs/Scalar-v0", **arguments)

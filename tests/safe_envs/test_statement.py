@@ -74,13 +74,6 @@ def test_from_rate_takes_a_rate_apart():
     assert not any(system.diffusion)
 
 
-def test_a_nominal_law_may_use_symbols_without_assumptions():
-    y, f = sp.symbols("y f")
-    plain = ControlAffineSDE((y,), (f,), [0], [1], [0])
-    problem = state_problem(plain, 1 - y**2, box=(-1, 1), start=[0.5], dt=0.1, horizon=1.0, nominal=-y)
-    assert problem.nominal[0].free_symbols == {sp.Symbol("y", real=True)}
-
-
 @pytest.mark.parametrize(
     ("change", "error", "says"),
     [

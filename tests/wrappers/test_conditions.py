@@ -8,7 +8,9 @@ import sympy as sp
 
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, RelativeDegreeError, SystemDefinitionError
 from tests.conftest import problem_of
-from wrappers import CBF, CONDITIONS, ECBF, HOCBF, SCBF, SRCBF, SZCBF, parse_condition, parse_conditions, spec_of
+from wrappers import CBF, CONDITIONS, ECBF, HOCBF, RCBF, SCBF, SRCBF, SZCBF, parse_condition, parse_conditions, spec_of
+
+X = sp.Symbol("x", real=True)
 
 
 def constraint(condition, env_id, **arguments):
@@ -124,6 +126,34 @@ def test_barriers_with_kinks_are_refused_where_the_chain_meets_them():
     chain = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1], [0, 0])
     with pytest.raises(SystemDefinitionError, match="cannot be differentiated as often as is needed"):
         HOCBF((1.0, 1.0)).constraint(chain, Barrier(1 - sp.Abs(x)))
+
+
+@pytest.mark.parametrize(
+    ("h", "smooth"),
+    [
+        (sp.Piecewise((1 - X, X > 0), (1 + X, True)), 0),
+        (sp.Piecewise((1 - X**2, X > 0), (1, True)), 1),
+        (sp.Piecewise((1, X < 2), (1 - (X - 2) ** 4, X < 3), (12 - 4 * X, True)), 1),
+        (1 - sp.Piecewise((X**4, X > 0), (0, True)), 3),
+        (sp.Piecewise((1 - X, X > 0), (2 + X, True)), -1),
+        (sp.Piecewise((1 - X, X**3 + X > 0), (1 + X, True)), -1),
+        (sp.Piecewise((1 - X, X > 0)), -1),
+    ],
+)
+def test_pieces_of_a_barrier_have_to_meet_as_smoothly_as_the_chain_differentiates(h, smooth):
+    u, y = sp.symbols("u y", real=True)
+    noisy = ControlAffineSDE((X,), (u,), [0], [1], [1])
+    chain = ControlAffineSDE((X, y), (u,), [y, 0], [0, 1], [0, 1])
+    needs = [
+        (CBF(1.0), noisy, 0), (RCBF(), noisy, 0), (CBF(1.0, sampling_margin="first-order"), noisy, 1), (HOCBF((1.0, 1.0)), chain, 1),
+        (SCBF(), noisy, 1), (SRCBF(), noisy, 1), (SZCBF((1.0, 1.0)), chain, 3), (SCBF(sampling_margin="first-order"), noisy, 3),
+    ]  # fmt: skip
+    for condition, system, order in needs:
+        if order <= smooth:
+            condition.constraint(system, Barrier(h))
+        else:
+            with pytest.raises(SystemDefinitionError, match="one barrier for each of its pieces"):
+                condition.constraint(system, Barrier(h))
 
 
 def test_ecbf_by_poles_has_the_gains_of_their_polynomial_and_keeps_the_sets_of_the_hocbf():

@@ -238,7 +238,7 @@ def test_an_srcbf_is_kept_where_the_noise_fades_at_the_edge(noise, kept):
 
 
 def test_a_kink_has_no_bound_under_noise():
-    barrier = sp.Piecewise((1 - x, x > 0), (1 + x, True))
+    barrier = sp.Piecewise((1 - x**2, x > 0), (1 - 2 * x**2, True))
     bound = made_bound(problem_with([0 * x], [barrier], noise=(1.0,)))
     assert bound.note == "h_1 is not twice differentiable, which Ito's formula asks for"
     assert made_bound(problem_with([0 * x], [barrier]), "cbf").note is None

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import gymnasium as gym
 import numpy as np
 import pytest
 import sympy as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, InvalidInputError, NumericalError, SystemDefinitionError
 from tests.conftest import problem_of
@@ -164,3 +169,35 @@ def test_single_state_of_batch_one_keeps_its_leading_axis():
     safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(1.0))], [(-1.0, 1.0)])
     assert safety_filter.filter(np.zeros((1, 1)), np.zeros((1, 1))).action.shape == (1, 1)
     assert safety_filter.filter(np.zeros((0, 1)), np.zeros((0, 1))).action.shape == (0, 1)
+
+
+@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3), st.floats(-1.0, 1.0)), min_size=1, max_size=8), st.sampled_from(["C", "F"]))
+@settings(max_examples=15)
+def test_batches_may_change_in_place_between_decisions(changes, order):
+    problem = problem_of("safe_envs/DubinsDisk-v0")
+    safety_filter = SafetyFilter.for_problem(problem, "hocbf")
+    states = np.array([[-1.5, 0.2, 0.1], [0.9, -1.3, 2.0], [1.1, 1.1, -2.0], [-1.2, 0.0, 0.0]], order=order)
+    inputs = np.zeros((4, 1))
+    columns, proposed = tuple(states.T), tuple(inputs.T)
+    # The envs' own states are remembered; these are not to be taken for them.
+    envs = gym.make_vec("safe_envs/DubinsDisk-v0", num_envs=4)
+    envs.reset(seed=0)
+    for state, row, moved in changes:
+        states[row, state] += moved
+        inputs[row] = moved
+        fresh = safety_filter.filter(states.copy(), inputs.copy())
+        for batch in (columns, tuple(c.view() for c in columns)):
+            np.testing.assert_array_equal(safety_filter.decide_arrays(batch, proposed).action[0], fresh.action[:, 0])
+        np.testing.assert_array_equal(safety_filter.filter(states, inputs).action, fresh.action)
+
+
+def test_the_states_of_a_batch_of_envs_cannot_be_written_to():
+    envs: Any = gym.make_vec("safe_envs/DubinsDisk-v0", num_envs=3)
+    envs.reset(seed=0)
+    for _ in range(2):
+        for component in envs.components:
+            with pytest.raises(ValueError, match="read-only"):
+                component[0] = 1.0
+        envs.state[:] = 7.0
+        envs.step(np.zeros((3, 1)))
+    assert abs(envs.state).max() < 7.0

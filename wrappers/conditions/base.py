@@ -15,6 +15,7 @@ from safe_envs.barrier import Barrier
 from safe_envs.calculus import Derivative, drift_derivative, generator, has_kinks, input_derivative, relative_degree, tidied
 from safe_envs.codegen import Components
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, SystemDefinitionError
+from safe_envs.identities import pieces_fit
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.class_k import ClassK, Rate, applied
 
@@ -162,6 +163,10 @@ def _constraint(condition: Condition, model: ControlAffineSDE, barrier: Barrier)
     """Remembered, for the bounds of a filter need the rows that it has, and derivatives of long expressions take their time."""
     model = condition.believed(model)
     found = condition.derived(model, barrier)
+    # The generator differentiates twice each time; only the last derivative may jump.
+    times = len(found.chain) + (condition.sampling_margin == FIRST_ORDER)
+    if not pieces_fit(barrier.expression, model.states, (2 if condition.stochastic and model.noisy else 1) * times - 1):
+        raise _not_smooth(barrier)
     if condition.sampling_margin == FIRST_ORDER:
         row = sum(a * u for a, u in zip(found.coefficient, model.inputs, strict=True)) + found.offset - (found.demand or 0)
         by_input = (input_derivative(model, row) * sp.Matrix(model.inputs))[0, 0]
@@ -211,8 +216,12 @@ def resolved(expression: Any, barrier: Barrier) -> sp.Expr:
     if not expression.has(sp.DiracDelta, sp.Derivative, sp.Subs):
         return expression
     if expression.has(sp.Derivative, sp.Subs) or has_kinks(barrier.expression):
-        raise SystemDefinitionError(
-            f"barrier {barrier.name} = {barrier.expression} cannot be differentiated as often as is needed; give a smooth one, of real "
-            "symbols, or one barrier for each of its pieces"
-        )
+        raise _not_smooth(barrier)
     return expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
+
+
+def _not_smooth(barrier: Barrier) -> SystemDefinitionError:
+    return SystemDefinitionError(
+        f"barrier {barrier.name} = {barrier.expression} cannot be differentiated as often as is needed; give a smooth one, of real "
+        "symbols, or one barrier for each of its pieces"
+    )
