@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from importlib.resources import files
 from typing import Any
 
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shown
 
 ALGORITHMS = ("ppo", "a2c", "sac", "td3")
 
@@ -43,6 +43,6 @@ def _linear(name: str, text: str) -> Callable[[float], float]:
             raise ValueError
         first = float(text.removeprefix(_LINEAR))
     except ValueError as error:
-        raise ConfigurationError(f"{name} = {text!r}; give a number, or {_LINEAR}NUMBER for one that falls to 0") from error
+        raise ConfigurationError(f"{name} = {shown(text)}; give a number, or {_LINEAR}NUMBER for one that falls to 0") from error
     # Whole rollouts may lead beyond the end of the training, where less than nothing is left.
     return lambda left: max(left, 0.0) * first

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.env import action_box, observation_box
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem import SafetyProblem
 
 POLICIES = ("nominal", "clf", "zero", "random")
@@ -96,7 +96,7 @@ def make_policy(name: str, problem: SafetyProblem, trust: bool = False, spaces: 
         return load_policy(name, problem)
     if not files[0].is_file():
         raise ConfigurationError(
-            f"unknown policy {name!r}; {nearest(name, POLICIES)}, a folder of `safe-envs train`, or the path of a Stable-Baselines3 "
+            f"unknown policy {shown(name)}; {nearest(name, POLICIES)}, a folder of `safe-envs train`, or the path of a Stable-Baselines3 "
             ".zip: there is no such file"
         )
     return _make_of_archive(files[0], spaces or (observation_box(problem), action_box(problem)), trust)

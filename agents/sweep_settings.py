@@ -10,7 +10,7 @@ from typing import Any
 from agents.evaluation import BARE
 from agents.problems import full_id
 from agents.sweep_cell import ENV_OPTIONS, PARAMETERS
-from safe_envs.errors import ConfigurationError, nearest, require_whole
+from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 
 _SECTIONS = ("fixed", "grid", "cells")
 _DEFAULTS: dict[str, Any] = {
@@ -81,7 +81,7 @@ def _mapping(given: Any, what: str, allowed: Sequence[str] | None) -> dict[str, 
     for name in given:
         if allowed is not None and name not in allowed:
             hint = "a setting goes under fixed, a list of its values under grid" if _is_known(name) else nearest(name, allowed)
-            raise ConfigurationError(f"{what} has the section {name!r}; {hint}")
+            raise ConfigurationError(f"{what} has the section {shown(name)}; {hint}")
     return dict(given)
 
 
@@ -117,7 +117,7 @@ def _is_known(name: str) -> bool:
 def _require_known(name: str, what: str) -> None:
     if not _is_known(name):
         hint = f"; give its parameters as {name}.NAME" if name in PARAMETERS else f"; {nearest(name, (*_NAMES, *_GROUPS))}"
-        raise ConfigurationError(f"{what} has the setting {name!r}{hint}")
+        raise ConfigurationError(f"{what} has the setting {shown(name)}{hint}")
 
 
 def _value(name: str, value: Any, what: str) -> Any:

@@ -20,7 +20,7 @@ from agents.blocks import BlockPolicy
 from agents.policy import DESCRIPTION, TENSORS, policy_files
 from agents.sb3 import require_spaces
 from safe_envs.env import action_box, observation_box
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
 
@@ -113,7 +113,7 @@ class NetworkPolicy(BlockPolicy):
         super().__init__(weights[0].shape[1])
         for what, name, allowed in (("activation", activation, _ACTIVATIONS), ("output", output, _OUTPUTS)):
             if name not in allowed:
-                raise ConfigurationError(f"{what} = {name!r}; {nearest(str(name), allowed)}")
+                raise ConfigurationError(f"{what} = {shown(name)}; {nearest(str(name), allowed)}")
         _require_finite([*weights, *biases])
         self._layers = [(np.ascontiguousarray(w.T, dtype=float), b.astype(float)) for w, b in zip(weights, biases, strict=True)]
         self._activation, self._output = _ACTIVATIONS[activation], _OUTPUTS[output]
@@ -270,7 +270,7 @@ def _require_problem(folder: Path, trained: Mapping[str, Any], problem: SafetyPr
 def _require_format(path: Path, description: Mapping[str, Any]) -> None:
     if description["format"] != _FORMAT:
         raise ConfigurationError(
-            f"{path} has the format {description['format']!r}; this version reads {_FORMAT}. Use the version that wrote it, or train again"
+            f"{path} has the format {shown(description['format'])}; this version reads {_FORMAT}: use the one that wrote it, or train again"
         )
 
 

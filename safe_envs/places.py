@@ -16,7 +16,7 @@ from typing import Any
 
 import cloudpickle
 
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
 
 
 def load_object(place: str) -> Any:
@@ -32,10 +32,10 @@ def load_object(place: str) -> Any:
     """
     source, colon, name = place.rpartition(":")
     if not (colon and source and name):
-        raise ConfigurationError(f"{place!r} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like my_system.py:problem")
+        raise ConfigurationError(f"{shown(place)} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like my_system.py:problem")
     module = _of_file(Path(source)) if source.endswith(".py") else _of_module(source)
     if not hasattr(module, name):
-        raise ConfigurationError(f"{source} has no {name!r}; {nearest(name, _stated_in(module))}")
+        raise ConfigurationError(f"{source} has no {shown(name)}; {nearest(name, _stated_in(module))}")
     return getattr(module, name)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
 
 
 def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
@@ -33,7 +33,7 @@ def finite_number(name: str, value: Any) -> float:
     try:
         number = float(value)
     except (TypeError, ValueError) as error:
-        raise ConfigurationError(f"{name} = {value!r} is not a number") from error
+        raise ConfigurationError(f"{name} = {shown(value)} is not a number") from error
     if not math.isfinite(number):
         raise ConfigurationError(f"{name} = {number} is not finite")
     return number
@@ -193,7 +193,7 @@ class ControlAffineSDE:
         by_name = {p.name: p for p in self.parameters}
         for name in values:
             if name not in by_name:
-                raise ConfigurationError(f"unknown parameter {name!r}; {nearest(name, by_name)}")
+                raise ConfigurationError(f"unknown parameter {shown(name)}; {nearest(name, by_name)}")
         return replace(self, parameters={**self.parameters, **{by_name[k]: v for k, v in values.items()}})
 
     def numeric(self, expression: Any) -> Any:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.files import require_writable
 from scripts.console import STDOUT
 
@@ -30,7 +30,7 @@ def numbers(option: str, text: str) -> list[float]:
     try:
         return [float(entry) for entry in text.split(",")]
     except ValueError as error:
-        raise ConfigurationError(f"{option} {text!r} is no number or list of numbers with commas between") from error
+        raise ConfigurationError(f"{option} {shown(text)} is no number or list of numbers with commas between") from error
 
 
 def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = None, inputs: Iterable[tuple[str, Path]] = ()) -> None:
@@ -107,7 +107,7 @@ def read_box(texts: Sequence[str]) -> list[float] | list[list[float]]:
     pairs = [numbers("--box", text) for text in texts]
     for text, pair in zip(texts, pairs, strict=True):
         if len(pair) != 2:
-            raise ConfigurationError(f"--box {text!r} has {len(pair)} numbers; give LO,HI")
+            raise ConfigurationError(f"--box {shown(text)} has {len(pair)} numbers; give LO,HI")
     return pairs[0] if len(pairs) == 1 else pairs
 
 
@@ -127,7 +127,7 @@ def parameters(option: str, texts: Sequence[str], words: bool = False) -> dict[s
         name, equals, value = text.partition("=")
         if not name or not equals or not value or name in found:
             problem = "comes twice" if name in found else "is not of this form"
-            raise ConfigurationError(f"{option} {text!r} {problem}; give NAME=VALUE, once for each parameter")
+            raise ConfigurationError(f"{option} {shown(text)} {problem}; give NAME=VALUE, once for each parameter")
         found[name] = _value(option, text, value, words)
     return found
 
@@ -138,4 +138,4 @@ def _value(option: str, text: str, value: str, words: bool) -> float | str:
     except ValueError as error:
         if words:
             return value
-        raise ConfigurationError(f"{option} {text!r}: {value!r} is not a number") from error
+        raise ConfigurationError(f"{option} {shown(text)}: {shown(value)} is not a number") from error

@@ -11,7 +11,7 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from scripts import completion, options
 from scripts.console import Json, progress_bar, stdout, write_result
 from scripts.env_options import EnvOptions, with_env
@@ -121,7 +121,7 @@ def _settings(texts: list[str]) -> dict[str, Any]:
         try:
             found[name] = _number(yaml.safe_load(value))
         except yaml.YAMLError as error:
-            raise ConfigurationError(f"--set {text}: {value!r} is no YAML") from error
+            raise ConfigurationError(f"--set {text}: {shown(value)} is no YAML") from error
     return found
 
 

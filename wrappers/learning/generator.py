@@ -15,7 +15,7 @@ import sympy as sp
 from safe_envs.barrier import Barrier
 from safe_envs.calculus import derivatives, drift_derivative, generator, gradient, relative_degree
 from safe_envs.codegen import Components, compile_function, filled, stacked
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem import SafetyProblem
 from wrappers.learning.base import LearnedModel, Progress, Record
 from wrappers.learning.checks import require_kind, require_problem
@@ -230,7 +230,7 @@ def learn_generator(
     require_problem(problem)
     require_estimator(estimator)
     if way not in (None, *get_args(Way)):
-        raise ConfigurationError(f"way = {way!r}; allowed: {', '.join(get_args(Way))}")
+        raise ConfigurationError(f"way = {shown(way)}; allowed: {', '.join(get_args(Way))}")
     begin, told = time.perf_counter(), progress or (lambda _: None)
     degrees = [relative_degree(problem.model, b.expression) for b in problem.barriers]
     if data is None:

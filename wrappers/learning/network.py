@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from safe_envs.codegen import finite
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shown
 
 Activation = Literal["relu", "tanh"]
 
@@ -153,7 +153,7 @@ class Network:
 def require_activation(name: str) -> None:
     """Raise ConfigurationError unless there is an activation of this name."""
     if name not in get_args(Activation):
-        raise ConfigurationError(f"activation = {name!r}; {nearest(name, get_args(Activation))}")
+        raise ConfigurationError(f"activation = {shown(name)}; {nearest(name, get_args(Activation))}")
 
 
 def _one(inputs: Sequence[float]) -> np.ndarray:

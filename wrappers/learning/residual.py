@@ -17,7 +17,7 @@ import sympy as sp
 
 from safe_envs.calculus import derivatives, drift_derivative, input_derivative, relative_degree
 from safe_envs.codegen import Components, compile_function, stacked
-from safe_envs.errors import ConfigurationError, require_whole
+from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE, finite_number
 from wrappers.learning.base import LearnedModel, Progress, Record
@@ -91,12 +91,12 @@ class LearnedResidual:
         Source: split conformal prediction, Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005.
         """
         if not 0 <= level <= 1:
-            raise ConfigurationError(f"level = {level!r}; give a share from 0 to 1")
+            raise ConfigurationError(f"level = {shown(level)}; give a share from 0 to 1")
         n = len(self.heldout)
         # A level such as .95 is no binary number: 20 times it has to count as 19.
         rank = max(1, math.ceil(level * (n + 1) - _ROUNDING * n))
         if rank > n:
-            raise ConfigurationError(f"level = {level!r} is more than {n} held-out states can tell; {_remedy(level, n)}")
+            raise ConfigurationError(f"level = {shown(level)} is more than {n} held-out states can tell; {_remedy(level, n)}")
         return np.sort(self.heldout, axis=0)[rank - 1]
 
 

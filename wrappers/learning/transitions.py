@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole
+from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole, shown
 from safe_envs.problem import SafetyProblem
 from wrappers.learning.checks import require_kind, require_problem
 from wrappers.learning.files import DATA, LearnedFileError, Signature, load, save
@@ -155,7 +155,7 @@ class Transitions:
     def held_out(self, share: float, rng: np.random.Generator) -> np.ndarray:
         """Which rows `split` holds out, shape (P,); arguments and errors are the same."""
         if not 0 < share < 1:
-            raise ConfigurationError(f"share = {share!r}; give the part of the data to be held out, between 0 and 1")
+            raise ConfigurationError(f"share = {shown(share)}; give the part of the data to be held out, between 0 and 1")
         labels = _labels(self.x)
         states = int(labels.max()) + 1
         if states < 2:
@@ -184,7 +184,7 @@ class Transitions:
         """
         content = load(path)
         if content.kind != DATA:
-            raise LearnedFileError(f"{path} holds {content.kind!r}, not {DATA!r}; give a file that `Transitions.save` wrote")
+            raise LearnedFileError(f"{path} holds {shown(content.kind)}, not {shown(DATA)}; give a file that `Transitions.save` wrote")
         try:
             return cls(content.signature, **{name: content.arrays[name] for name in _ARRAYS}, seed=content.details["seed"])
         except (KeyError, TypeError, ValueError) as error:
