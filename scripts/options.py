@@ -11,6 +11,7 @@ import typer
 
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.files import require_writable
+from safe_envs.numerals import real, whole_or_real
 from scripts.console import STDOUT
 
 Knowledge = Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")]
@@ -28,7 +29,7 @@ def numbers(option: str, text: str) -> list[float]:
         ConfigurationError: an entry is no number.
     """
     try:
-        return [float(entry) for entry in text.split(",")]
+        return [real(entry) for entry in text.split(",")]
     except ValueError as error:
         raise ConfigurationError(f"{option} {shown(text)} is no number or list of numbers with commas between") from error
 
@@ -134,7 +135,7 @@ def parameters(option: str, texts: Sequence[str], words: bool = False) -> dict[s
 
 def _value(option: str, text: str, value: str, words: bool) -> float | str:
     try:
-        return int(value) if value.lstrip("+-").isdecimal() else float(value)
+        return whole_or_real(value)
     except ValueError as error:
         if words:
             return value

@@ -11,7 +11,8 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from safe_envs.errors import ConfigurationError, shown
+from safe_envs.errors import ConfigurationError, shortened, shown
+from safe_envs.numerals import real
 from scripts import completion, options
 from scripts.console import Json, progress_bar, stdout, write_result
 from scripts.env_options import EnvOptions, with_env
@@ -113,22 +114,24 @@ def _settings(texts: list[str]) -> dict[str, Any]:
     """NAME=VALUE entries, the values read as YAML."""
     import yaml
 
+    from agents.sweep_document import value_of
+
     found = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not name:
-            raise ConfigurationError(f"--set {text}: give NAME=VALUE, such as learning_rate=0.001")
+            raise ConfigurationError(f"--set {shortened(text)}: give NAME=VALUE, such as learning_rate=0.001")
         try:
-            found[name] = _number(yaml.safe_load(value))
+            found[name] = _number(value_of(value, "--set"))
         except yaml.YAMLError as error:
-            raise ConfigurationError(f"--set {text}: {shown(value)} is no YAML") from error
+            raise ConfigurationError(f"--set {shortened(text)}: {shown(value)} is no plain number, word, list or mapping") from error
     return found
 
 
 def _number(value: Any) -> Any:
     """What YAML takes for a text although it is a number, such as 3e-4."""
     try:
-        return float(value) if isinstance(value, str) else value
+        return real(value) if isinstance(value, str) else value
     except ValueError:
         return value
 
