@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
@@ -25,7 +25,7 @@ class _Loader(yaml.SafeLoader):
     """Of YAML's data, without code, aliases and tags: a few aliases of aliases stand for more than any memory holds."""
 
     # No setting takes a date, and there are texts that look like one.
-    yaml_implicit_resolvers = {
+    yaml_implicit_resolvers: ClassVar[Any] = {
         first: [(tag, form) for tag, form in found if tag != _DATE] for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
     depth = 0

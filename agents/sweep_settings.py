@@ -144,7 +144,7 @@ def _word(name: str, value: Any, what: str) -> str:
         raise ConfigurationError(f"{what}: {name} = {shown(value)}, with a character that ends texts; leave it out")
     if name == "system" and not (":" in value and value.rpartition(":")[0].endswith(".py")):
         raise ConfigurationError(
-            f"{what}: system = {shortened(value)}; give FILE.py:NAME: by the content of that file a sweep tells which cells are done already, "
+            f"{what}: system = {shortened(value)}; give FILE.py:NAME: by the content of that file a sweep tells which cells are done, "
             "and a module has none of its own"
         )
     if name == "env":
@@ -168,8 +168,8 @@ def _number(name: str, value: Any, what: str) -> Any:
             if name == "start" or name.startswith("barrier."):
                 return value
     if not isinstance(given, int | float) or isinstance(given, bool):
-        raise ConfigurationError(f"{what}: {name} = {shortened(text_of(value))}; give a number")
+        raise ConfigurationError(f"{what}: {name} = {shortened(json.dumps(value, default=str))}; give a number")
     if not abs(given) <= sys.float_info.max:
-        raise ConfigurationError(f"{what}: {name} = {shortened(text_of(value))}; give a finite number")
+        raise ConfigurationError(f"{what}: {name} = {shortened(str(value))}; give a finite number")
     # 0.0 in place of -0.0, its equal.
     return given if name.startswith("barrier.") else float(given) + 0.0

@@ -124,7 +124,7 @@ def _settings(texts: list[str]) -> dict[str, Any]:
         try:
             found[name] = _number(value_of(value, "--set"))
         except yaml.YAMLError as error:
-            raise ConfigurationError(f"--set {shortened(text)}: {shown(value)} is no plain number, word, list or mapping") from error
+            raise ConfigurationError(f"--set {shortened(text)}: {shown(value)} is no YAML without tags and aliases") from error
     return found
 
 
