@@ -17,6 +17,7 @@ from agents.policy import policy_files
 from agents.worlds import world_of
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 from safe_envs.problem import SafetyProblem
+from safe_envs.reading import read_bytes
 from wrappers import CONDITIONS, LEARNED, Condition, FilterSpec, SafetyFilterVectorWrapper, parse_conditions, require_readable, spec_of
 from wrappers.learning import LearnedModel
 
@@ -162,4 +163,4 @@ def _describe_policy(policy: Any) -> dict[str, Any]:
     files = policy_files(policy)
     if not files:
         return {"name": policy}
-    return {"name": policy, "sha256": hashlib.sha256(files[0].read_bytes()).hexdigest()}
+    return {"name": policy, "sha256": hashlib.sha256(read_bytes(files[0])).hexdigest()}

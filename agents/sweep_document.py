@@ -74,11 +74,9 @@ def document_in(path: Path) -> Any:
     try:
         return value_of(read_bytes(path, _MOST_BYTES).decode(), str(path))
     except OSError as error:
-        raise ConfigurationError(
-            f"{shortened(str(path))} cannot be read: {error.strerror}; name a YAML file that says what to sweep"
-        ) from error
+        raise ConfigurationError(f"{shortened(path)} cannot be read: {error.strerror}; name a YAML file that says what to sweep") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path} is no YAML that says what to sweep: {shortened(str(error), 400)}") from error
+        raise ConfigurationError(f"{path} is no YAML that says what to sweep: {shortened(error, 400)}") from error
 
 
 def value_of(text: str, name: str) -> Any:

@@ -170,6 +170,6 @@ def _number(name: str, value: Any, what: str) -> Any:
     if not isinstance(given, int | float) or isinstance(given, bool):
         raise ConfigurationError(f"{what}: {name} = {shortened(json.dumps(value, default=str))}; give a number")
     if not abs(given) <= sys.float_info.max:
-        raise ConfigurationError(f"{what}: {name} = {shortened(str(value))}; give a finite number")
+        raise ConfigurationError(f"{what}: {name} = {shortened(value)}; give a finite number")
     # 0.0 in place of -0.0, its equal.
     return given if name.startswith("barrier.") else float(given) + 0.0

@@ -48,8 +48,9 @@ def shown(given: Any) -> str:
         return f"a {type(given).__name__} with too many digits"
 
 
-def shortened(text: str, most: int = 120) -> str:
-    """Return a text without its middle where it is longer than about so many characters."""
+def shortened(given: Any, most: int = 120) -> str:
+    """Return a text, a path or an error as text, without its middle where it is longer than about so many characters."""
+    text = str(given)
     if len(text) <= most:
         return text
     half = most // 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
+import os
 import sys
 import zlib
 from collections.abc import Callable, Iterator
@@ -16,7 +17,8 @@ from typing import Any
 
 import cloudpickle
 
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shortened, shown
+from safe_envs.reading import MOST_BYTES_OF_TEXT, open_regular
 
 
 def load_object(place: str) -> Any:
@@ -73,9 +75,14 @@ def _stated_in(module: ModuleType) -> list[str]:
 
 
 def _of_file(path: Path) -> ModuleType:
-    if not path.is_file():
-        raise ConfigurationError(f"there is no file {path}; give the path of a Python file, as in my_system.py:problem")
-    return _loaded(path.resolve(), path.stat().st_mtime_ns)
+    try:
+        with open_regular(path, MOST_BYTES_OF_TEXT) as stream:
+            changed = os.fstat(stream.fileno()).st_mtime_ns
+    except FileNotFoundError as error:
+        raise ConfigurationError(f"there is no file {path}; give the path of a Python file, as in my_system.py:problem") from error
+    except OSError as error:
+        raise ConfigurationError(f"{shortened(path)} cannot be read: {error.strerror}; give the path of a Python file") from error
+    return _loaded(path.resolve(), changed)
 
 
 @lru_cache(maxsize=32)

@@ -13,18 +13,24 @@ from typing import Any, BinaryIO
 
 from safe_envs.errors import ConfigurationError, shortened
 
-MOST_BYTES = 200_000_000
-"""Of a file with arrays: it is read within two seconds."""
+MOST_BYTES = 500_000_000
+"""Of a file with arrays: it is read in a second or two."""
 
 MOST_BYTES_OF_TEXT = 8_000_000
 """Of a file with JSON or Python: lists of nothing but empty lists take 25 times as much memory."""
 
 _MOST_BYTES_OF_DIRECTORY = 1_000_000
+_UNKNOWN = 0xFFFFFFFF
+"""Size that only the record for large files tells."""
+
 _END = struct.Struct("<4s4H2LH")
 """The record that ends a zip: signature, disks, entries, size and place of the directory, length of a comment."""
 
+_LARGE_END = struct.Struct("<4sQ2H2L4Q")
+"""That of archives in the format for large files, which torch writes always: the size of the directory is the last but one."""
+
 _LOCATOR = 20
-"""Bytes before it where the directory of a larger archive is told."""
+"""Bytes between the two, which point to the latter."""
 
 # They do not exist on every system.
 _FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
@@ -97,13 +103,15 @@ def open_archive(stream: BinaryIO, most: int = MOST_BYTES) -> zipfile.ZipFile:
         ValueError: it is damaged, or too large when it is unpacked.
     """
     size = stream.seek(0, os.SEEK_END)
-    stream.seek(max(size - _END.size - _LOCATOR, 0))
-    tail = stream.read()
-    # A directory of millions of parts would be read as a whole. The archives of NumPy and torch end with the record, without comment.
-    if len(tail) < _END.size or tail[-_END.size :][:4] != b"PK\5\6":
+    stream.seek(max(size - _LARGE_END.size - _LOCATOR - _END.size, 0))
+    tail = stream.read().rjust(_LARGE_END.size + _LOCATOR + _END.size, b"\0")
+    end, large_end = _END.unpack(tail[-_END.size :]), _LARGE_END.unpack(tail[: _LARGE_END.size])
+    # The archives of NumPy and torch end with the record, without comment.
+    if end[0] != b"PK\5\6":
         raise ValueError("it is no zip, or its end is missing")
-    directory = _END.unpack(tail[-_END.size :])[5]
-    if directory > _MOST_BYTES_OF_DIRECTORY or tail.startswith(b"PK\6\7"):
+    # zipfile reads a directory as a whole, which may be of millions of parts.
+    directory = large_end[8] if large_end[0] == b"PK\6\6" else end[5]
+    if max(directory, end[5] if end[5] != _UNKNOWN else 0) > _MOST_BYTES_OF_DIRECTORY:
         raise ValueError("it has too many parts")
     try:
         archive = zipfile.ZipFile(stream)

@@ -74,15 +74,15 @@ class ClassK:
         except AttributeError:
             raise ConfigurationError(f"class-K function {shown(given)} is no expression of s, like 2*s**3 or tanh(s)") from None
         if expression.free_symbols != {S} or expression.has(sp.zoo, sp.nan, sp.oo):
-            raise ConfigurationError(f"class-K function {shortened(str(given))}: give a finite expression of s alone, like 2*s**3")
+            raise ConfigurationError(f"class-K function {shortened(given)}: give a finite expression of s alone, like 2*s**3")
         object.__setattr__(self, "expression", expression)
         # Before its values are computed: what can be read is small.
         if parsed(str(self)) != expression:
-            texts = f"{shortened(str(given))} cannot be written and read again as {shortened(str(self))}"
+            texts = f"{shortened(given)} cannot be written and read again as {shortened(self)}"
             raise ConfigurationError(f"class-K function {texts}; write numbers as floats")
         _require_increasing(expression)
         if sp.diff(expression, S).has(sp.Derivative, sp.Subs):
-            raise ConfigurationError(f"class-K function {shortened(str(self))}: sympy cannot tell its slope; write it without that Abs")
+            raise ConfigurationError(f"class-K function {shortened(self)}: sympy cannot tell its slope; write it without that Abs")
 
     def __call__(self, value: sp.Expr) -> sp.Expr:
         """Return alpha(value)."""
@@ -177,7 +177,7 @@ def applied(rate: Rate, value: sp.Expr) -> sp.Expr:
 
 def _require_increasing(alpha: sp.Expr) -> None:
     value = sp.lambdify(S, alpha, _MODULES)
-    name = shortened(str(alpha))
+    name = shortened(alpha)
     near, far = [k / 100 for k in range(1, 201)], [10 ** (k / 25) for k in range(9, 101)]
     with mpmath.workdps(_DIGITS):
         try:
