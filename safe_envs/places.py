@@ -37,14 +37,14 @@ def load_object(place: str) -> Any:
         raise ConfigurationError(f"{shown(place)} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like my_system.py:problem")
     module = _of_file(Path(source)) if source.endswith(".py") else _of_module(source)
     if not hasattr(module, name):
-        raise ConfigurationError(f"{source} has no {shown(name)}; {nearest(name, _stated_in(module))}")
+        raise ConfigurationError(f"{shortened(source)} has no {shown(name)}; {nearest(name, _stated_in(module))}")
     return getattr(module, name)
 
 
 def resolved(place: str) -> str:
     """The same place with the whole path of its file, so that it holds in any folder."""
     source, _, name = place.rpartition(":")
-    return f"{Path(source).resolve()}:{name}" if source.endswith(".py") else place
+    return f"{os.path.realpath(source)}:{name}" if source.endswith(".py") else place
 
 
 def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) -> Any:
@@ -79,7 +79,9 @@ def _of_file(path: Path) -> ModuleType:
         with open_regular(path, MOST_BYTES_OF_TEXT) as stream:
             changed = os.fstat(stream.fileno()).st_mtime_ns
     except FileNotFoundError as error:
-        raise ConfigurationError(f"there is no file {path}; give the path of a Python file, as in my_system.py:problem") from error
+        raise ConfigurationError(
+            f"there is no file {shortened(path)}; give the path of a Python file, as in my_system.py:problem"
+        ) from error
     except OSError as error:
         raise ConfigurationError(f"{shortened(path)} cannot be read: {error.strerror}; give the path of a Python file") from error
     return _loaded(path.resolve(), changed)
@@ -108,7 +110,7 @@ def _loaded(path: Path, _changed: int) -> ModuleType:
 def _of_module(name: str) -> ModuleType:
     if name in sys.modules:
         return sys.modules[name]
-    with _running(None, f"module {name} (a file is named with .py)"):
+    with _running(None, f"module {shortened(name)} (a file is named with .py)"):
         return importlib.import_module(name)
 
 
@@ -124,7 +126,9 @@ def _running(path: Path | None, what: str) -> Iterator[None]:
     except SafeEnvsError as error:
         raise type(error)(f"{what}{_line(error, path)}: {error}") from error
     except (Exception, SystemExit) as error:
-        raise ConfigurationError(f"{what} ended with an error{_line(error, path)}: {type(error).__name__}: {error}") from error
+        raise ConfigurationError(
+            f"{what} ended with an error{_line(error, path)}: {type(error).__name__}: {shortened(error, 400)}"
+        ) from error
     finally:
         if folder is not None:
             sys.path.remove(folder)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -46,12 +47,12 @@ def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = 
     Raises:
         ConfigurationError: one cannot.
     """
-    taken = {path.resolve(): f"{option} {path}" for option, path in inputs}
+    taken = {os.path.realpath(path): f"{option} {path}" for option, path in inputs}
     for option, path in (("--out", out), ("--json", json), ("--plot", plot)):
         if path is None or (option == "--json" and path == STDOUT):
             continue
         require_writable(path)
-        place = path.resolve()
+        place = os.path.realpath(path)
         if place in taken:
             raise ConfigurationError(f"{option} {path} would overwrite the file of {taken[place]}; name another file")
         taken[place] = f"{option} {path}"
