@@ -162,7 +162,8 @@ def checksum(path: Path) -> str:
         return hashlib.sha256(read_bytes(path)).hexdigest()
     except OSError as error:
         raise ConfigurationError(
-            f"{shortened(path)} cannot be read ({error.strerror}); check the path, and that it is on a disk that all workers of the sweep share"
+            f"{shortened(path)} cannot be read ({error.strerror}); check the path, and that it is on a disk that all workers of the "
+            "sweep share"
         ) from error
 
 

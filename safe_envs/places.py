@@ -20,6 +20,8 @@ import cloudpickle
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shortened, shown
 from safe_envs.reading import MOST_BYTES_OF_TEXT, open_regular
 
+_ADVICE = "give the path of a Python file, as in my_system.py:problem"
+
 
 def load_object(place: str) -> Any:
     """Import what stands at a place, which runs the code there.
@@ -79,11 +81,9 @@ def _of_file(path: Path) -> ModuleType:
         with open_regular(path, MOST_BYTES_OF_TEXT) as stream:
             changed = os.fstat(stream.fileno()).st_mtime_ns
     except FileNotFoundError as error:
-        raise ConfigurationError(
-            f"there is no file {shortened(path)}; give the path of a Python file, as in my_system.py:problem"
-        ) from error
+        raise ConfigurationError(f"there is no file {shortened(path)}; {_ADVICE}") from error
     except OSError as error:
-        raise ConfigurationError(f"{shortened(path)} cannot be read: {error.strerror}; give the path of a Python file") from error
+        raise ConfigurationError(f"{shortened(path)} cannot be read: {error.strerror}; {_ADVICE}") from error
     return _loaded(path.resolve(), changed)
 
 
@@ -126,9 +126,8 @@ def _running(path: Path | None, what: str) -> Iterator[None]:
     except SafeEnvsError as error:
         raise type(error)(f"{what}{_line(error, path)}: {error}") from error
     except (Exception, SystemExit) as error:
-        raise ConfigurationError(
-            f"{what} ended with an error{_line(error, path)}: {type(error).__name__}: {shortened(error, 400)}"
-        ) from error
+        reason = f"{type(error).__name__}: {shortened(error, 400)}"
+        raise ConfigurationError(f"{what} ended with an error{_line(error, path)}: {reason}") from error
     finally:
         if folder is not None:
             sys.path.remove(folder)
