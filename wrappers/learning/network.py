@@ -54,7 +54,10 @@ class Network:
         for name in _VECTORS:
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         self._check()
-        object.__setattr__(self, "_folded", self._fold())
+        with np.errstate(over="ignore", invalid="ignore"):
+            object.__setattr__(self, "_folded", self._fold())
+        if not all(np.isfinite(part).all() for layer in self._folded for part in layer):
+            raise ConfigurationError("the numbers of a network are too large to be multiplied")
 
     def _check(self) -> None:
         require_activation(self.activation)

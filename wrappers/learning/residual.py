@@ -21,7 +21,7 @@ from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE, finite_number
 from wrappers.learning.base import LearnedModel, Progress, Record
-from wrappers.learning.checks import Purpose, random_stream, require_problem
+from wrappers.learning.checks import Purpose, random_stream, require_degrees, require_problem
 from wrappers.learning.collect import Step, collect_paths, draw_states
 from wrappers.learning.files import Signature
 from wrappers.learning.network import Network
@@ -137,13 +137,14 @@ class ResidualModel(LearnedModel):
         """
         coordinates = problem.exploration.coordinates
         if [str(c) for c in coordinates] != details["coordinates"]:
-            raise ConfigurationError(f"it has the coordinates {details['coordinates']}, those of {problem.name} are {coordinates}")
-        parts = [
-            LearnedResidual(
-                problem.plant.states, coordinates, degree, Network.from_arrays(arrays, f"part_{i}", activation), arrays[f"part_{i}_heldout"]
-            )
-            for i, (degree, activation) in enumerate(zip(details["degrees"], details["activations"], strict=True))
-        ]
+            raise ConfigurationError(f"it has the coordinates {shown(details['coordinates'])}, those of {problem.name} are {coordinates}")
+        require_degrees(problem, details["degrees"])
+        parts = []
+        for i, (degree, activation) in enumerate(zip(details["degrees"], details["activations"], strict=True)):
+            network, heldout = Network.from_arrays(arrays, f"part_{i}", activation), arrays[f"part_{i}_heldout"].astype(float)
+            if heldout.shape != (len(heldout), degree + problem.plant.m) or not heldout.size or not (heldout >= 0).all():
+                raise ValueError(f"errors of the shape {heldout.shape}, or below 0")
+            parts.append(LearnedResidual(problem.plant.states, coordinates, degree, network, heldout))
         return cls(Signature.of(problem), record, tuple(parts))
 
     @classmethod

@@ -142,7 +142,7 @@ def test_restored_is_the_same():
     again = LearnedDiffusion.restored(problem.plant.states, found.details(), found.to_arrays())
     assert again.covariance == found.covariance
     damaged = {name: weights[1:] for name, weights in found.to_arrays().items()}
-    with pytest.raises(ValueError, match="weights for"):
+    with pytest.raises(ValueError, match="has the shape"):
         LearnedDiffusion.restored(problem.plant.states, found.details(), damaged)
 
 
