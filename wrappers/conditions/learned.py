@@ -259,6 +259,8 @@ class BayesianSCBF(LearnedCondition):
         Raises:
             RelativeDegreeError: there is no relative degree, or it is not 1 and the robust form is asked for.
         """
+        if self.learned.pruned.all():
+            raise RelativeDegreeError("no input acts on the identified system: learn from more data, or under larger inputs")
         if not self.robust:
             return AffineConstraint.after(model, *chain_of(model, barrier, None, generator))
         degree = relative_degree(model, barrier.expression, generator)

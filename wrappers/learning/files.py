@@ -46,7 +46,8 @@ _DAMAGED = (
 )
 
 _MOST_PARTS = 1000
-_LARGEST = 1e100
+LARGEST = 1e100
+"""Number in a file: a product of a few is a number still."""
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -157,15 +158,15 @@ def require_finite(given: Any) -> float:
 
 
 def array_of(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the array of a name, with numbers of which a product of a few is a number still.
+    """Return the array of a name, as floats.
 
     Raises:
         KeyError: there is none.
         ValueError: its shape is another, or a number is not finite or too large.
     """
     array = arrays[name].astype(float, copy=False)
-    if array.shape != shape or not (np.abs(array) <= _LARGEST).all():
-        raise ValueError(f"{name} has the shape {array.shape}, not {shape}, or a number that is not finite or above {_LARGEST:g}")
+    if array.shape != shape or not (np.abs(array) <= LARGEST).all():
+        raise ValueError(f"{name} has the shape {array.shape}, not {shape}, or a number that is not finite or above {LARGEST:g}")
     return array
 
 

@@ -17,7 +17,7 @@ from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
 from wrappers.learning.base import LearnedModel, Record
 from wrappers.learning.features import Features
-from wrappers.learning.files import LearnedFileError, Signature, array_of, require_finite
+from wrappers.learning.files import LARGEST, LearnedFileError, Signature, array_of, require_finite
 from wrappers.learning.regression import Gaussian, sigma_map, sigma_samples
 
 _SIGNIFICANT = 0.999
@@ -297,8 +297,10 @@ class Posterior(LearnedModel):
         )
         _require_noise(noise)
         weights = numbers("mean", n, count), numbers("covariance", n, count, count)
-        rest = require_finite(details["dt"]), numbers("misfit", n), numbers("variation", n)
-        scale = numbers("input_scale", m)
+        scale, dt = numbers("input_scale", m), require_finite(details["dt"])
+        if not (0 < dt <= LARGEST and (scale > 0).all()):
+            raise ValueError("a step or the scale of an input is not positive, or too large")
+        rest = dt, numbers("misfit", n), numbers("variation", n)
         return cls(Signature.of(problem), record, phi, problem.plant.inputs, scale, *weights, noise, *rest)
 
     @classmethod
@@ -323,7 +325,8 @@ def _solved(covariance: np.ndarray, right: np.ndarray) -> np.ndarray:
 def _require_noise(noise: Diffusion) -> None:
     """Raise ValueError where noise has a variance, a correlation or a prior that there is not."""
     correlation = noise.correlation
-    fits = (noise.squares >= 0).all() and noise.count > 0 and noise.alpha >= 0 and noise.beta >= 0
+    fits = (noise.squares >= 0).all() and 0 < noise.count <= LARGEST and max(noise.alpha, noise.beta) <= LARGEST
+    fits = fits and min(noise.alpha, noise.beta) >= 0
     if not (fits and np.allclose(correlation, correlation.T, atol=_ROUNDING) and (abs(correlation) <= 1.0 + _ROUNDING).all()):
         raise ValueError("the noise has a negative variance, a correlation above 1, or no degrees of freedom")
 
