@@ -282,8 +282,10 @@ class SafetyProblem:
 def _numbers(given: Any) -> np.ndarray:
     """What the user gave as an array of at least one axis; empty if it holds no numbers."""
     try:
-        return np.atleast_1d(np.asarray(given, dtype=float))
-    except (TypeError, ValueError):
+        found = np.asarray(given)
+        # NumPy would read numbers out of texts.
+        return np.empty(0) if found.dtype.kind in "US" else np.atleast_1d(found.astype(float))
+    except (TypeError, ValueError, OverflowError):
         return np.empty(0)
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
+from safe_envs.numerals import real
 
 
 def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
@@ -31,8 +32,8 @@ def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.Immuta
 def finite_number(name: str, value: Any) -> float:
     """Return `value` as a float, or say why it cannot be one."""
     try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
+        number = real(value) if isinstance(value, str) else float(value)
+    except (TypeError, ValueError, OverflowError) as error:
         raise ConfigurationError(f"{name} = {shown(value)} is not a number") from error
     if not math.isfinite(number):
         raise ConfigurationError(f"{name} = {number} is not finite")

@@ -11,7 +11,7 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from safe_envs.errors import ConfigurationError, shortened, shown
+from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.numerals import real
 from scripts import completion, options
 from scripts.console import Json, progress_bar, stdout, write_result
@@ -124,7 +124,8 @@ def _settings(texts: list[str]) -> dict[str, Any]:
         try:
             found[name] = _number(value_of(value, "--set"))
         except yaml.YAMLError as error:
-            raise ConfigurationError(f"--set {shortened(text)}: {shown(value)} is no YAML without tags and aliases") from error
+            problem = shortened(getattr(error, "problem", error))
+            raise ConfigurationError(f"--set {shortened(text)} is no YAML that a setting may have: {problem}") from error
     return found
 
 

@@ -161,7 +161,8 @@ def positive_rates(name: str, given: Any) -> tuple[float, ...]:
     """
     entries = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
     try:
-        values = tuple(float(r) for r in entries)
+        # A text that is a number is one already.
+        values = () if any(isinstance(r, str) for r in entries) else tuple(float(r) for r in entries)
     except (TypeError, ValueError, OverflowError):
         values = ()
     if not values or not all(0 < v < float("inf") for v in values):
