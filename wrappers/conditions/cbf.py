@@ -18,6 +18,9 @@ from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.base import AffineConstraint, Condition, chain_of
 from wrappers.conditions.class_k import ClassK, Rate, positive_rates, rates
 
+_STEPS = 100
+"""Of the search for poles. Gains of real negative ones need fewer; others could keep it busy for seconds."""
+
 
 @dataclass(frozen=True)
 class CBF(Condition):
@@ -179,7 +182,7 @@ def _real_negative_roots(gains: Sequence[float]) -> tuple[float, ...]:
     polynomial = sp.Poly([1, *(sp.Rational(repr(k)) for k in reversed(gains))], sp.Symbol("s"))
     try:
         # A factor that is repeated exactly is solved once: the iteration does not converge at multiple roots.
-        roots = [root for factor, count in polynomial.sqf_list()[1] for root in factor.nroots(n=50, maxsteps=200) * count]
+        roots = [root for factor, count in polynomial.sqf_list()[1] for root in factor.nroots(n=50, maxsteps=_STEPS) * count]
     except NoConvergence as error:
         raise ConfigurationError(f"the poles of k = {shown(gains)} cannot be computed; give poles in place of gains") from error
     # Rounding of the gains splits a multiple pole into a ring about it: what oscillates so slowly is real.
