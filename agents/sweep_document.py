@@ -13,7 +13,7 @@ from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.numerals import whole_or_real
 from safe_envs.reading import read_bytes
 
-_MOST_BYTES = 100_000
+_MOST_BYTES = 65_000
 """Of a file: what this Python reads of YAML in a second."""
 
 _DEEPEST = 10

@@ -177,7 +177,7 @@ def test_what_these_tests_write_is_taken_where_nothing_was_changed(request, tmp_
     assert found.sha256 == model.sha256
 
 
-@hypothesis.settings(max_examples=40, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
+@hypothesis.settings(max_examples=25, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
 @hypothesis.given(data=st.data())
 @LEARNED
 def test_wrong_content_is_refused_or_gives_actions(request, tmp_path, what, env, filter_name, data):
