@@ -117,7 +117,7 @@ def _load(path: Path) -> Any:
         network.load_state_dict(parameters["policy"])
     except Exception as error:  # What a pickle may raise has no limits.
         raise ConfigurationError(
-            f"{path} cannot be read as a policy ({type(error).__name__}: {shortened(error.partition(chr(10))[0])}); "
+            f"{path} cannot be read as a policy ({type(error).__name__}: {shortened(str(error).partition(chr(10))[0])}); "
             "it is damaged, or another version of Stable-Baselines3 saved it"
         ) from error
     network.set_training_mode(False)

@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import yaml
+from yaml.composer import ComposerError
+from yaml.constructor import ConstructorError
 
 from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.numerals import whole_or_real
@@ -36,7 +38,7 @@ class _Loader(yaml.SafeLoader):
         what = "an alias" if isinstance(event, yaml.AliasEvent) else "a tag" if event.tag is not None else ""
         if what or self.depth > _DEEPEST:
             problem = f"{what} is not allowed; write the value itself" if what else f"it is nested more than {_DEEPEST} deep"
-            raise yaml.composer.ComposerError(None, None, problem, event.start_mark)
+            raise ComposerError(None, None, problem, event.start_mark)
         self.depth += 1
         try:
             return super().compose_node(parent, index)
@@ -48,16 +50,16 @@ class _Loader(yaml.SafeLoader):
         seen = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
-                raise yaml.constructor.ConstructorError(None, None, "a name is a list or a mapping; give a word", key.start_mark)
+                raise ConstructorError(None, None, "a name is a list or a mapping; give a word", key.start_mark)
             if key.value in seen:
-                raise yaml.constructor.ConstructorError(None, None, f"{key.value!r} is given twice", key.start_mark)
+                raise ConstructorError(None, None, f"{key.value!r} is given twice", key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
     def construct_number(self, node: Any) -> int | float:
         """A decimal number; refuses 010, which YAML takes for 8, 1:30, which it takes for 90, 1_000 and their kind."""
         if not _PLAIN.fullmatch(node.value):
-            raise yaml.constructor.ConstructorError(None, None, f"{node.value} is no plain number", node.start_mark)
+            raise ConstructorError(None, None, f"{node.value} is no plain number", node.start_mark)
         return whole_or_real(node.value)
 
 

@@ -146,6 +146,13 @@ def test_archives_that_are_damaged_or_bombs_are_refused_before_they_are_trusted(
         make_policy(str(tmp_path / "policy.zip"), problem, trust=True)
 
 
+@pytest.mark.parametrize("data", [b"{}", b"[]", b"9" * 5000, b'{"policy_class": {":serialized:": "x"}}'])
+def test_archives_without_a_policy_are_refused(problem, tmp_path, data):
+    (tmp_path / "policy.zip").write_bytes(archive_of(data=data, policy_pth=b"no tensors"))
+    with pytest.raises(ConfigurationError, match="cannot be read as a policy"):
+        make_policy(str(tmp_path / "policy.zip"), problem, trust=True)
+
+
 def test_pipes_are_no_archives(problem, tmp_path):
     os.mkfifo(tmp_path / "policy.zip")
     with pytest.raises(ConfigurationError, match="unknown policy"):

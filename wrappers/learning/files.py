@@ -199,7 +199,7 @@ def checksum(kind: str, signature: Signature, details: Mapping[str, Any], arrays
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
         digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
-        digest.update(array.reshape(-1))
+        digest.update(array.reshape(-1).data)
     return digest.hexdigest()
 
 
