@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.hyperparameters import scheduled
-from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.problem import SafetyProblem
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def _require_known(name: str, settings: Mapping[str, Any]) -> None:
     allowed += [*_OF_THE_ENV, *(_OF_THE_NOISE if name in OFF_POLICY else ())]
     for key in settings:
         if key not in allowed:
-            raise ConfigurationError(f"{name} does not take the hyperparameter {shown(key)}; {nearest(key, allowed)}")
+            raise ConfigurationError(f"{name} does not take the hyperparameter {key!r}; {nearest(key, allowed)}")
 
 
 def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:
@@ -92,7 +92,7 @@ def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:
         ConfigurationError: it is no whole number from 2, or it was asked for and leaves a rest.
     """
     if isinstance(batch_size, bool) or not isinstance(batch_size, int) or batch_size < 2:
-        raise ConfigurationError(f"batch_size = {shown(batch_size)}; give a whole number from 2")
+        raise ConfigurationError(f"batch_size = {batch_size!r}; give a whole number from 2")
     fits = next((size for size in range(min(batch_size, rollout), 1, -1) if rollout % size == 0), rollout)
     if asked_for and fits != batch_size:
         raise ConfigurationError(
@@ -109,7 +109,7 @@ def _normalized(envs: VecEnv, normalize: Any, gamma: float) -> VecEnv:
         return envs
     if normalize is not True and not isinstance(normalize, Mapping):
         raise ConfigurationError(
-            f"normalize = {shown(normalize)}; give true, false, or a mapping such as {{norm_obs: true, norm_reward: false}}"
+            f"normalize = {normalize!r}; give true, false, or a mapping such as {{norm_obs: true, norm_reward: false}}"
         )
     from stable_baselines3.common.vec_env import VecNormalize
 
@@ -123,9 +123,9 @@ def _action_noise(kind: str | None, deviation: float | None, inputs: int) -> dic
     if kind is None and deviation is None:
         return {}
     if kind not in kinds:
-        raise ConfigurationError(f"noise_type = {shown(kind)}; {nearest(str(kind), kinds)}")
+        raise ConfigurationError(f"noise_type = {kind!r}; {nearest(str(kind), kinds)}")
     if deviation is None:
-        raise ConfigurationError(f"noise_type = {shown(kind)} needs noise_std")
+        raise ConfigurationError(f"noise_type = {kind!r} needs noise_std")
     return {"action_noise": kinds[kind](np.zeros(inputs), np.full(inputs, float(deviation)))}
 
 
