@@ -91,6 +91,8 @@ def value_of(text: str, name: str) -> Any:
     Raises:
         YAMLError: it is no YAML, or holds a name twice or a number in an odd form.
     """
+    if len(text) > _MOST_BYTES:
+        raise yaml.YAMLError(f"it has {len(text)} characters, more than {_MOST_BYTES}")
     loader = _Loader(io.StringIO(text))
     loader.name = name
     try:

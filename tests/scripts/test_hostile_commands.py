@@ -32,6 +32,7 @@ LONG = "x" * 100_000
         ((*TRAIN, "n_steps=6_4"), "6_4 is no plain number"),
         ((*TRAIN, f"n_steps={'[' * 3000}"), "nested more than"),
         ((*TRAIN, "n_steps=[&a [1], *a]"), "an alias is not allowed"),
+        ((*TRAIN, f"n_steps=[{'? ,' * 30_000}]"), "it has 90002 characters"),
         ((*TRAIN, f"n_steps={'9' * 5000}"), "n_steps = inf; give a whole number"),
         ((*SCALAR, "--filter", LONG), "unknown filter"),
         ((*SCALAR, "--policy", LONG), "unknown policy"),
