@@ -49,6 +49,7 @@ def alpha_of(text: str) -> ClassK | None:
     return alpha
 
 
+@hypothesis.settings(max_examples=60)
 @hypothesis.given(expressions)
 def test_arithmetic_is_a_class_k_function_or_refused(text):
     alpha = alpha_of(text)

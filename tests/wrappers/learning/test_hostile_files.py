@@ -57,6 +57,7 @@ def whole(tmp_path_factory) -> bytes:
     return path.read_bytes()
 
 
+@hypothesis.settings(max_examples=50)
 @hypothesis.given(st.data())
 def test_a_damaged_file_is_the_same_or_refused(whole, data):
     content = loaded(damaged_by(data, whole))
