@@ -8,7 +8,7 @@ import numpy as np
 
 from safe_envs.calculus import spread, vanishes
 from safe_envs.codegen import Components, compile_function, stacked
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem import SafetyProblem
 
 MONITORING = ("discrete", "continuous")
@@ -24,7 +24,7 @@ def require_monitoring(monitoring: str) -> None:
         ConfigurationError: it is none of `MONITORING`.
     """
     if monitoring not in MONITORING:
-        raise ConfigurationError(f"monitoring = {monitoring!r}; {nearest(str(monitoring), MONITORING)}")
+        raise ConfigurationError(f"monitoring = {shown(monitoring)}; {nearest(str(monitoring), MONITORING)}")
 
 
 class Bridge:

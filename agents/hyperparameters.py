@@ -6,7 +6,8 @@ from collections.abc import Callable, Mapping
 from importlib.resources import files
 from typing import Any
 
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shortened, shown
+from safe_envs.numerals import real
 
 ALGORITHMS = ("ppo", "a2c", "sac", "td3")
 
@@ -27,7 +28,7 @@ def hyperparameters(algorithm: str, env_id: str) -> dict[str, Any]:
     import yaml
 
     if algorithm not in ALGORITHMS:
-        raise ConfigurationError(f"--algo {algorithm}: {nearest(algorithm, ALGORITHMS)}")
+        raise ConfigurationError(f"--algo {shortened(algorithm)}: {nearest(algorithm, ALGORITHMS)}")
     table = yaml.safe_load(files("agents").joinpath("hyperparams", f"{algorithm}.yml").read_text())
     return dict(table.get(env_id, table["default"]))
 
@@ -41,8 +42,8 @@ def _linear(name: str, text: str) -> Callable[[float], float]:
     try:
         if not text.startswith(_LINEAR):
             raise ValueError
-        first = float(text.removeprefix(_LINEAR))
+        first = real(text.removeprefix(_LINEAR))
     except ValueError as error:
-        raise ConfigurationError(f"{name} = {text!r}; give a number, or {_LINEAR}NUMBER for one that falls to 0") from error
+        raise ConfigurationError(f"{name} = {shown(text)}; give a number, or {_LINEAR}NUMBER for one that falls to 0") from error
     # Whole rollouts may lead beyond the end of the training, where less than nothing is left.
     return lambda left: max(left, 0.0) * first

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.env import action_box, observation_box
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem import SafetyProblem
 
 POLICIES = ("nominal", "clf", "zero", "random")
@@ -94,9 +95,9 @@ def make_policy(name: str, problem: SafetyProblem, trust: bool = False, spaces: 
         from agents.weights import load_policy
 
         return load_policy(name, problem)
-    if not files[0].is_file():
+    if not os.path.isfile(files[0]):
         raise ConfigurationError(
-            f"unknown policy {name!r}; {nearest(name, POLICIES)}, a folder of `safe-envs train`, or the path of a Stable-Baselines3 "
+            f"unknown policy {shown(name)}; {nearest(name, POLICIES)}, a folder of `safe-envs train`, or the path of a Stable-Baselines3 "
             ".zip: there is no such file"
         )
     return _make_of_archive(files[0], spaces or (observation_box(problem), action_box(problem)), trust)
@@ -119,7 +120,8 @@ def policy_files(name: str) -> list[Path]:
     if name in POLICIES:
         return []
     path = Path(name)
-    if path.is_dir():
+    # Unlike a path, these two take any text for the name of a file.
+    if os.path.isdir(path):
         return [path / TENSORS, path / DESCRIPTION]
     if path.name in (TENSORS, DESCRIPTION):
         return [path.with_name(TENSORS), path.with_name(DESCRIPTION)]

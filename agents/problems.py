@@ -9,7 +9,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
 from safe_envs import ENV_IDS, SafeEnv, SafetyProblem
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.systems import CUSTOM_ID
 
 
@@ -23,7 +23,7 @@ def full_id(env_id: str) -> str:
         if candidate in gym.registry:
             return candidate
     name = env_id if "/" in env_id else f"safe_envs/{env_id.removesuffix('-v0')}-v0"
-    raise ConfigurationError(f"unknown env {env_id!r}; {nearest(name, ENV_IDS)}")
+    raise ConfigurationError(f"unknown env {shown(env_id)}; {nearest(name, ENV_IDS)}")
 
 
 def which_env(env_id: str | None, system: str | None) -> str:

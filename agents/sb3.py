@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
-import struct
+import io
 import zipfile
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,10 @@ import gymnasium as gym
 import numpy as np
 
 from agents.blocks import BlockPolicy
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.reading import open_archive, open_regular
 
+_MOST_BYTES = 100_000_000
 _STATISTICS = ("normalization.pkl", "vecnormalize.pkl", "*/vecnormalize.pkl")
 """Where a VecNormalize lies beside a .zip: that of `safe-envs train`, one of RL Zoo, and the place where RL Zoo itself puts it."""
 
@@ -49,7 +51,8 @@ def require_archive(path: Path) -> None:
     """Raise ConfigurationError unless a file looks like a whole policy of Stable-Baselines3; nothing in it is run."""
     if not _is_archive(path):
         raise ConfigurationError(
-            f"{path} is not a policy that Stable-Baselines3 saved; give a .zip of `model.save(...)`, or a folder of `safe-envs train`"
+            f"{path} is not a policy that Stable-Baselines3 saved, or damaged, or larger than {_MOST_BYTES / 1e6:g} MB; give a .zip of "
+            "`model.save(...)`, or a folder of `safe-envs train`"
         )
     statistics = next((found for name in _STATISTICS for found in sorted(path.parent.glob(name))), None)
     if statistics is not None:
@@ -61,10 +64,18 @@ def require_archive(path: Path) -> None:
 
 
 def _is_archive(path: Path) -> bool:
-    if not zipfile.is_zipfile(path):
+    """Whether a file has the parts of a policy, none of which is large when it is unpacked."""
+    try:
+        with open_regular(path, _MOST_BYTES) as stream, open_archive(stream, _MOST_BYTES) as archive:
+            if not {"data", "policy.pth"} <= set(archive.namelist()):
+                return False
+            # What torch saves is an archive itself.
+            inner = [content for name in archive.namelist() if (content := archive.read(name)).startswith(b"PK")]
+            for content in inner:
+                open_archive(io.BytesIO(content), _MOST_BYTES).close()
+            return True
+    except (OSError, EOFError, NotImplementedError, RuntimeError, ValueError, zipfile.BadZipFile, zlib.error):
         return False
-    with zipfile.ZipFile(path) as archive:
-        return {"data", "policy.pth"} <= set(archive.namelist())
 
 
 def require_spaces(what: str, network: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
@@ -104,9 +115,9 @@ def _load(path: Path) -> Any:
             options["use_sde"] = True
         network = saved["policy_class"](saved["observation_space"], saved["action_space"], _no_learning, **options)
         network.load_state_dict(parameters["policy"])
-    except (AttributeError, EOFError, LookupError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError, struct.error) as error:
+    except Exception as error:  # What a pickle may raise has no limits.
         raise ConfigurationError(
-            f"{path} cannot be read as a policy ({type(error).__name__}: {str(error).splitlines()[0] if str(error) else error!r}); "
+            f"{path} cannot be read as a policy ({type(error).__name__}: {shortened(str(error).partition(chr(10))[0])}); "
             "it is damaged, or another version of Stable-Baselines3 saved it"
         ) from error
     network.set_training_mode(False)

@@ -15,8 +15,9 @@ from agents.episodes import Env, Progress
 from agents.learning import Learning
 from agents.policy import policy_files
 from agents.worlds import world_of
-from safe_envs.errors import ConfigurationError, nearest, require_whole
+from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 from safe_envs.problem import SafetyProblem
+from safe_envs.reading import read_bytes
 from wrappers import CONDITIONS, LEARNED, Condition, FilterSpec, SafetyFilterVectorWrapper, parse_conditions, require_readable, spec_of
 from wrappers.learning import LearnedModel
 
@@ -54,7 +55,7 @@ class Setting:
         require_whole("seed", seed, 0)
         for name, value, allowed in (("knowledge", knowledge, ("model", "plant")), ("objective", objective, ("nearest", "clf"))):
             if value not in allowed:
-                raise ConfigurationError(f"{name} = {value!r}; {nearest(value, allowed)}")
+                raise ConfigurationError(f"{name} = {shown(value)}; {nearest(value, allowed)}")
         self.simulated = world_of(problem, options, spec)
         self.problem = self.simulated.problem
         self.actor = self.simulated.policy(policy, trust) if isinstance(policy, str) else policy
@@ -131,9 +132,11 @@ def _checked(name: str, problem: SafetyProblem) -> str | None:
     if name == BARE:
         return BARE
     if BARE in name.split("+"):
-        raise ConfigurationError(f"filter {name!r}: {BARE!r} is the bare env and no condition of a barrier; give it alone or leave it out")
+        raise ConfigurationError(
+            f"filter {shown(name)}: {BARE!r} is the bare env, no condition of a barrier; give it alone or leave it out"
+        )
     if re.split("[:+]", name)[0] not in (*CONDITIONS, *LEARNED):
-        raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, (BARE, *CONDITIONS, *LEARNED))}")
+        raise ConfigurationError(f"unknown filter {shown(name)}; {nearest(name, (BARE, *CONDITIONS, *LEARNED))}")
     if any(re.split(":", part)[0] in LEARNED for part in name.split("+")):
         require_readable(name, problem)
         return None
@@ -160,4 +163,4 @@ def _describe_policy(policy: Any) -> dict[str, Any]:
     files = policy_files(policy)
     if not files:
         return {"name": policy}
-    return {"name": policy, "sha256": hashlib.sha256(files[0].read_bytes()).hexdigest()}
+    return {"name": policy, "sha256": hashlib.sha256(read_bytes(files[0])).hexdigest()}

@@ -16,7 +16,7 @@ from agents.sweep_cell import Cell, checksum, versions
 from agents.sweep_document import document_in
 from agents.sweep_files import absolute, read_by, with_imported
 from agents.sweep_settings import Settings, complete, sections, text_of
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
 from wrappers import LEARNED, SafetyFilter, require_readable
 
 _NO_PART = ("seed", "episodes", "bounds")
@@ -25,7 +25,8 @@ _NO_PART = ("seed", "episodes", "bounds")
 _BESIDE = {"filter": ("env", "system", "knowledge", "objective"), "policy": ("env", "system")}
 """With what else a setting has to suit."""
 
-_MOST_CELLS = 1_000_000
+_MOST_CELLS = 50_000
+"""They are all told apart before the first is computed, in a second."""
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,7 @@ def _check_cell(cell: Cell, derive: bool) -> None:
     settings = cell.settings
     for name, allowed in (("knowledge", ("model", "plant")), ("objective", ("nearest", "clf"))):
         if settings[name] not in allowed:
-            raise ConfigurationError(f"{name} = {settings[name]!r}; {nearest(settings[name], allowed)}")
+            raise ConfigurationError(f"{name} = {shown(settings[name])}; {nearest(settings[name], allowed)}")
     problem = load_problem(cell.env_id, cell.options)
     if settings["filter"] != BARE:
         require_readable(settings["filter"], problem)

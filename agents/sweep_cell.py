@@ -16,7 +16,8 @@ from typing import Any
 
 from agents.evaluation import evaluate, package_versions
 from agents.problems import which_env
-from safe_envs.errors import ConfigurationError, SafeEnvsError
+from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened
+from safe_envs.reading import read_bytes
 
 PARAMETERS = ("plant", "model", "barrier")
 """Groups of parameters, which a setting names as plant.NAME."""
@@ -158,10 +159,11 @@ def checksum(path: Path) -> str:
         ConfigurationError: it cannot be read.
     """
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        return hashlib.sha256(read_bytes(path)).hexdigest()
     except OSError as error:
         raise ConfigurationError(
-            f"{path} cannot be read ({error.strerror}); check the path, and that it is on a disk that all workers of the sweep share"
+            f"{shortened(path)} cannot be read ({error.strerror}); check the path, and that it is on a disk that all workers of the "
+            "sweep share"
         ) from error
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -10,18 +11,19 @@ from pathlib import Path
 from typing import Any
 
 from agents.policy import policy_files
+from safe_envs.reading import MOST_BYTES_OF_TEXT, read_bytes
 
 _FILE = re.compile("(?<=file=)[^:+]+")
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a cell with paths that mean the same in every process."""
-    found = {**settings, "filter": _FILE.sub(lambda match: str(Path(match.group()).resolve()), settings["filter"])}
-    if policy_files(settings["policy"]) and Path(settings["policy"]).exists():
-        found["policy"] = str(Path(settings["policy"]).resolve())
+    found = {**settings, "filter": _FILE.sub(lambda match: os.path.realpath(match.group()), settings["filter"])}
+    if policy_files(settings["policy"]) and os.path.exists(settings["policy"]):
+        found["policy"] = os.path.realpath(settings["policy"])
     if "system" in settings:
         file, _, name = settings["system"].rpartition(":")
-        found["system"] = f"{Path(file).resolve()}:{name}"
+        found["system"] = f"{os.path.realpath(file)}:{name}"
     return found
 
 
@@ -33,7 +35,7 @@ def read_by(settings: Mapping[str, Any]) -> Iterator[Path]:
     if "system" in settings:
         yield Path(settings["system"].rpartition(":")[0])
     yield from (Path(match) for match in _FILE.findall(settings["filter"]))
-    yield from (path for path in policy_files(settings["policy"]) if path.exists())
+    yield from (path for path in policy_files(settings["policy"]) if os.path.exists(path))
 
 
 def with_imported(path: Path) -> list[Path]:
@@ -59,8 +61,8 @@ def _imports(file: Path, root: Path) -> Iterable[tuple[Path, Sequence[str]]]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            tree = ast.parse(file.read_bytes())
-    except (OSError, SyntaxError, ValueError):
+            tree = ast.parse(read_bytes(file, MOST_BYTES_OF_TEXT))
+    except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
         return  # Who runs it says what is wrong.
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):

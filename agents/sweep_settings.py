@@ -10,7 +10,8 @@ from typing import Any
 from agents.evaluation import BARE
 from agents.problems import full_id
 from agents.sweep_cell import ENV_OPTIONS, PARAMETERS
-from safe_envs.errors import ConfigurationError, nearest, require_whole
+from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
+from safe_envs.numerals import real
 
 _SECTIONS = ("fixed", "grid", "cells")
 _DEFAULTS: dict[str, Any] = {
@@ -77,11 +78,11 @@ def _rank(name: str) -> int:
 def _mapping(given: Any, what: str, allowed: Sequence[str] | None) -> dict[str, Any]:
     if not isinstance(given, Mapping) or not all(isinstance(name, str) for name in given):
         form = "NAME: VALUE entries" if allowed is None else f"the sections {', '.join(allowed)}"
-        raise ConfigurationError(f"{what} is {text_of(given)[:80]}; give {form}")
+        raise ConfigurationError(f"{what} is {shortened(text_of(given))}; give {form}")
     for name in given:
         if allowed is not None and name not in allowed:
             hint = "a setting goes under fixed, a list of its values under grid" if _is_known(name) else nearest(name, allowed)
-            raise ConfigurationError(f"{what} has the section {name!r}; {hint}")
+            raise ConfigurationError(f"{what} has the section {shown(name)}; {hint}")
     return dict(given)
 
 
@@ -97,7 +98,7 @@ def _grid(given: Any, what: str) -> dict[str, list[Any]]:
     for name, values in lists.items():
         _require_known(name, what)
         if not isinstance(values, list) or not values:
-            raise ConfigurationError(f"{what}: {name} = {text_of(values)}; give a list of values, or put it under fixed")
+            raise ConfigurationError(f"{what}: {name} = {shortened(text_of(values))}; give a list of values, or put it under fixed")
     return {name: [_value(name, value, what) for value in values] for name, values in lists.items()}
 
 
@@ -105,7 +106,7 @@ def _listed(given: Any, what: str) -> list[Settings]:
     if given is None:
         return []
     if not isinstance(given, list) or not given:
-        raise ConfigurationError(f"{what} is {text_of(given)}; give a list, each entry with settings")
+        raise ConfigurationError(f"{what} is {shortened(text_of(given))}; give a list, each entry with settings")
     return [_settings(each, f"{what}, entry {i}") for i, each in enumerate(given, 1)]
 
 
@@ -117,7 +118,7 @@ def _is_known(name: str) -> bool:
 def _require_known(name: str, what: str) -> None:
     if not _is_known(name):
         hint = f"; give its parameters as {name}.NAME" if name in PARAMETERS else f"; {nearest(name, (*_NAMES, *_GROUPS))}"
-        raise ConfigurationError(f"{what} has the setting {name!r}{hint}")
+        raise ConfigurationError(f"{what} has the setting {shown(name)}{hint}")
 
 
 def _value(name: str, value: Any, what: str) -> Any:
@@ -126,7 +127,7 @@ def _value(name: str, value: Any, what: str) -> Any:
         return _word(name, value, what)
     if name == "bounds":
         if not isinstance(value, bool):
-            raise ConfigurationError(f"{what}: bounds = {text_of(value)}; give true or false")
+            raise ConfigurationError(f"{what}: bounds = {shortened(text_of(value))}; give true or false")
         return value
     if name in ("seed", "episodes", "substeps"):
         require_whole(f"{what}: {name}", value, 0 if name == "seed" else 1)
@@ -138,10 +139,12 @@ def _value(name: str, value: Any, what: str) -> Any:
 
 def _word(name: str, value: Any, what: str) -> str:
     if not isinstance(value, str):
-        raise ConfigurationError(f"{what}: {name} = {text_of(value)}; give a text")
+        raise ConfigurationError(f"{what}: {name} = {shortened(text_of(value))}; give a text")
+    if "\0" in value:
+        raise ConfigurationError(f"{what}: {name} = {shown(value)}, with a character that ends texts; leave it out")
     if name == "system" and not (":" in value and value.rpartition(":")[0].endswith(".py")):
         raise ConfigurationError(
-            f"{what}: system = {value}; give FILE.py:NAME: by the content of that file a sweep tells which cells are done already, "
+            f"{what}: system = {shortened(value)}; give FILE.py:NAME: by the content of that file a sweep tells which cells are done, "
             "and a module has none of its own"
         )
     if name == "env":
@@ -160,13 +163,13 @@ def _number(name: str, value: Any, what: str) -> Any:
     given = value
     if isinstance(value, str):
         try:
-            given = float(value)  # YAML reads 1e-3 as a word.
+            given = real(value)  # YAML reads 1e-3 as a word.
         except ValueError:
             if name == "start" or name.startswith("barrier."):
                 return value
     if not isinstance(given, int | float) or isinstance(given, bool):
-        raise ConfigurationError(f"{what}: {name} = {json.dumps(value, default=str)}; give a number")
+        raise ConfigurationError(f"{what}: {name} = {shortened(json.dumps(value, default=str))}; give a number")
     if not abs(given) <= sys.float_info.max:
-        raise ConfigurationError(f"{what}: {name} = {str(value)[:40]}; give a finite number")
+        raise ConfigurationError(f"{what}: {name} = {shortened(value)}; give a finite number")
     # 0.0 in place of -0.0, its equal.
     return given if name.startswith("barrier.") else float(given) + 0.0

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 from agents.sweep import Sweep
 from agents.sweep_cell import Cell, Outcome
 from agents.sweep_settings import text_of
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.files import write_atomically, write_json
+from safe_envs.reading import MOST_BYTES_OF_TEXT, open_regular, read_bytes
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -124,18 +125,19 @@ def read(folder: Path | str) -> pa.Table:
     """
     _require_pyarrow()
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     folder = Path(folder)
     index = read_index(folder)
-    paths = [path for key in index["cells"] if (path := _file_of(folder, key)).is_file()]
+    paths = [path for key in index["cells"] if os.path.isfile(path := _file_of(folder, key))]
     if not paths:
         return _schema().empty_table()
     try:
-        kept = pa.concat_tables([pq.ParquetFile(path).read().select(_schema().names) for path in paths])
-        settings = [json.loads(text) for text in kept["settings"].to_pylist()]
-    except (OSError, pa.ArrowException, KeyError, TypeError, ValueError) as error:
-        raise ConfigurationError(f"a file in {folder / _CELLS} cannot be read ({error}); remove it and start the sweep again") from error
+        kept = pa.concat_tables([_table_in(path) for path in paths])
+        settings = [dict(json.loads(text)) for text in kept["settings"].to_pylist()]
+    except (OSError, pa.ArrowException, KeyError, RecursionError, TypeError, ValueError) as error:
+        raise ConfigurationError(
+            f"a file in {folder / _CELLS} cannot be read ({shortened(error)}); remove it and start the sweep again"
+        ) from error
     # A swept setting may be one of cells only that are not there yet.
     names = dict.fromkeys([*(name for each in settings for name in each), *index["swept"]])
     columns = {"key": kept["key"], **{name: _column([each.get(name) for each in settings]) for name in names}}
@@ -149,9 +151,11 @@ def read_index(folder: Path) -> dict[str, Any]:
         ConfigurationError: the folder holds no sweep.
     """
     try:
-        index = json.loads((folder / INDEX).read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"{folder} holds no sweep: it has no {INDEX}; give the folder of `safe-envs sweep ... --out`") from error
+        index = json.loads(read_bytes(folder / INDEX, MOST_BYTES_OF_TEXT))
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigurationError(
+            f"{shortened(folder)} holds no sweep: it has no {INDEX}; give the folder of `safe-envs sweep ... --out`"
+        ) from error
     texts = [index.get(name) if isinstance(index, dict) else None for name in ("cells", "swept")]
     if not all(isinstance(each, list) and all(isinstance(text, str) for text in each) for each in texts):
         raise ConfigurationError(f"{folder / INDEX} is not as `safe-envs sweep` writes it; run the sweep again, which writes it anew")
@@ -184,12 +188,32 @@ def _file_of(folder: Path, key: str) -> Path:
 
 def _is_finished(path: Path) -> bool:
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
     try:
-        return pq.ParquetFile(path).read(columns=["error"])["error"][0].as_py() is None
-    except (OSError, pa.ArrowException, KeyError, IndexError):
+        return _table_in(path)["error"][0].as_py() is None
+    except (OSError, pa.ArrowException, ValueError):
         return False
+
+
+def _table_in(path: Path) -> pa.Table:
+    """The row that the file of a cell holds.
+
+    Raises:
+        OSError, ArrowException, ValueError: it cannot be read, or is not as `_write_table` writes it.
+    """
+    import pyarrow.parquet as pq
+
+    with open_regular(path, MOST_BYTES_OF_TEXT) as stream:
+        file = pq.ParquetFile(stream)
+        told = file.metadata
+        parts = [told.row_group(i).column(j) for i in range(told.num_row_groups) for j in range(told.num_columns)]
+        # A few bytes under another compression, or in many rows, stand for more than the memory holds.
+        if told.num_rows != 1 or not {part.compression for part in parts} <= {"SNAPPY", "UNCOMPRESSED"}:
+            raise ValueError("it is no cell of a sweep")
+        table = file.read()
+    if table.schema != _schema():
+        raise ValueError("its columns are not those of a cell of a sweep")
+    return table
 
 
 def _schema() -> pa.Schema:

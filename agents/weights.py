@@ -20,9 +20,10 @@ from agents.blocks import BlockPolicy
 from agents.policy import DESCRIPTION, TENSORS, policy_files
 from agents.sb3 import require_spaces
 from safe_envs.env import action_box, observation_box
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shortened, shown
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
+from safe_envs.reading import MOST_BYTES_OF_TEXT, read_bytes
 
 _FORMAT = 2
 _PACKAGES = ("safe-envs", "numpy", "stable-baselines3", "torch", "safetensors")
@@ -39,6 +40,9 @@ _OUTPUTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {"tanh": np.tanh, "cli
 
 # What json and safetensors raise on damaged files, and Python on JSON of another shape.
 _DAMAGED = (ArithmeticError, AttributeError, LookupError, RecursionError, SafetensorError, TypeError, ValueError)
+
+_MOST_BYTES = 100_000_000
+"""Of the numbers of a policy; they are in memory a few times."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,7 @@ class NetworkPolicy(BlockPolicy):
         super().__init__(weights[0].shape[1])
         for what, name, allowed in (("activation", activation, _ACTIVATIONS), ("output", output, _OUTPUTS)):
             if name not in allowed:
-                raise ConfigurationError(f"{what} = {name!r}; {nearest(str(name), allowed)}")
+                raise ConfigurationError(f"{what} = {shown(name)}; {nearest(str(name), allowed)}")
         _require_finite([*weights, *biases])
         self._layers = [(np.ascontiguousarray(w.T, dtype=float), b.astype(float)) for w, b in zip(weights, biases, strict=True)]
         self._activation, self._output = _ACTIVATIONS[activation], _OUTPUTS[output]
@@ -187,8 +191,10 @@ def load_policy(folder: str | Path, problem: SafetyProblem) -> NetworkPolicy:
     """
     files = policy_files(str(folder))
     if len(files) < 2:
-        raise ConfigurationError(f"{folder} is no folder; name one with {TENSORS} and {DESCRIPTION}, as `safe-envs train` writes them")
-    content, text = (_read(file) for file in files)
+        raise ConfigurationError(
+            f"{shortened(folder)} is no folder; name one with {TENSORS} and {DESCRIPTION}, as `safe-envs train` writes them"
+        )
+    content, text = _read(files[0], _MOST_BYTES), _read(files[1], MOST_BYTES_OF_TEXT)
     try:
         description = json.loads(text)
         _require_format(files[1], description)
@@ -199,7 +205,8 @@ def load_policy(folder: str | Path, problem: SafetyProblem) -> NetworkPolicy:
         if isinstance(error, ConfigurationError):
             raise
         raise ConfigurationError(
-            f"the policy in {files[0].parent} cannot be read ({type(error).__name__}: {error}); it is damaged or altered: copy it again"
+            f"the policy in {files[0].parent} cannot be read ({type(error).__name__}: {shortened(error)}); it is damaged or altered: "
+            "copy it again"
         ) from error
 
 
@@ -270,7 +277,7 @@ def _require_problem(folder: Path, trained: Mapping[str, Any], problem: SafetyPr
 def _require_format(path: Path, description: Mapping[str, Any]) -> None:
     if description["format"] != _FORMAT:
         raise ConfigurationError(
-            f"{path} has the format {description['format']!r}; this version reads {_FORMAT}. Use the version that wrote it, or train again"
+            f"{path} has the format {shown(description['format'])}; this version reads {_FORMAT}: use the one that wrote it, or train again"
         )
 
 
@@ -286,11 +293,11 @@ def _checksum(description: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
 
 
-def _read(path: Path) -> bytes:
+def _read(path: Path, most: int) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path, most)
     except OSError as error:
-        if (path.parent / "config.json").exists():
+        if isinstance(error, FileNotFoundError) and (path.parent / "config.json").exists():
             raise ConfigurationError(
                 f"the training in {path.parent} is not finished: go on with it by `safe-envs train ... --resume`, or give the best policy "
                 f"so far, {path.parent / 'best'}, which is there after the first evaluation"

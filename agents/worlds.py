@@ -11,7 +11,7 @@ import numpy as np
 from agents.episodes import Env
 from agents.policy import POLICIES, Policy, make_policy, policy_files
 from agents.problems import full_id, load_problem, title_of
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.integrate import Integrator
 from safe_envs.problem import SafetyProblem
 from safe_envs.simulation import center_and_half_width
@@ -138,7 +138,7 @@ class ForeignWorld:
     def env(self, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int) -> Env:
         """A batch of envs behind the filter of conditions, or bare."""
         if knowledge != "model":
-            raise ConfigurationError(f"knowledge = {knowledge!r}: of an env of somebody else nothing is known but the model")
+            raise ConfigurationError(f"knowledge = {shown(knowledge)}: of an env of somebody else nothing is known but the model")
         env = SafetyMonitorVector(gym.make_vec(self.env_id, num_envs=min(num_envs, _MOST_ENVS), vectorization_mode="sync"), self.spec)
         return SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
 

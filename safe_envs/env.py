@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, nearest
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, nearest, shown
 from safe_envs.info import Info, safety_info
 from safe_envs.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
@@ -52,7 +52,7 @@ def make_problem(name: str, factory: Any, barrier: Mapping[str, Any] | None, opt
     for what, allowed, given in (("barrier argument", of_factory, shape), ("argument", (*of_problem, *of_factory), settings)):
         for key in given:
             if key not in allowed:
-                raise ConfigurationError(f"{name} has no {what} {key!r}; {nearest(key, allowed)}")
+                raise ConfigurationError(f"{name} has no {what} {shown(key)}; {nearest(key, allowed)}")
     return factory(**shape).configured(**settings)
 
 

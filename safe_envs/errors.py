@@ -40,10 +40,27 @@ class WorkersLostError(SafeEnvsError, RuntimeError):
     """Processes end before they have computed what they were given."""
 
 
+def shown(given: Any) -> str:
+    """Return what was given as a message shows it, texts in quotes: without its middle where that is long."""
+    try:
+        return shortened(repr(given))
+    except ValueError:  # Python writes no whole number of more than 4300 digits.
+        return f"a {type(given).__name__} with too many digits"
+
+
+def shortened(given: Any, most: int = 120) -> str:
+    """Return a text, a path or an error as text, without its middle where it is longer than about so many characters."""
+    text = str(given)
+    if len(text) <= most:
+        return text
+    half = most // 2
+    return f"{text[:half]}...({len(text) - 2 * half} more characters)...{text[-half:]}"
+
+
 def nearest(name: str, allowed: Iterable[str]) -> str:
     """Return a phrase that lists the allowed names, the nearest one to `name` first."""
     names = list(allowed)
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.4)
+    close = difflib.get_close_matches(shortened(name), names, n=1, cutoff=0.4)
     listing = ", ".join(names) if names else "none"
     return f"did you mean {close[0]!r}? (allowed: {listing})" if close else f"allowed: {listing}"
 
@@ -51,4 +68,4 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
 def require_whole(name: str, value: Any, least: int) -> None:
     """Raise ConfigurationError unless a value is a whole number from `least`; NumPy's integers are such, truth values are not."""
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or int(value) < least:
-        raise ConfigurationError(f"{name} = {value!r}; give a whole number from {least}")
+        raise ConfigurationError(f"{name} = {shown(value)}; give a whole number from {least}")

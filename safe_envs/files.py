@@ -10,24 +10,35 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shortened
+
+_STEM = 40
 
 
 def require_writable(path: Path) -> None:
     """Raise ConfigurationError unless a file can be created at `path`: asked before a long run, not after it."""
-    folder = path.absolute().parent
-    if path.is_dir():
-        raise ConfigurationError(f"cannot write {path}: it is a folder; name a file in it")
-    if not folder.is_dir():
-        there = next(place for place in (folder, *folder.parents) if place.exists())
+    folder, name = path.absolute().parent, shortened(path)
+    # The functions of os.path take any text for a path, also one that is too long to be one.
+    if os.path.isdir(path):
+        raise ConfigurationError(f"cannot write {name}: it is a folder; name a file in it")
+    if not os.path.isdir(folder):
+        there = next(place for place in (folder, *folder.parents) if os.path.exists(place))
         if not there.is_dir():
-            raise ConfigurationError(f"cannot write {path}: {there} is a file and no folder; choose another folder")
-        raise ConfigurationError(f"cannot write {path}: the folder {folder} does not exist; create it or choose another")
+            raise ConfigurationError(f"cannot write {name}: {there} is a file and no folder; choose another folder")
+        raise ConfigurationError(f"cannot write {name}: the folder {shortened(folder)} does not exist; create it or choose another")
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise ConfigurationError(f"cannot write {name}: it is a pipe or a device, which a file would replace; name a file")
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        pass
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"cannot write {name}: {getattr(error, 'strerror', error)}; choose another name") from error
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise ConfigurationError(f"cannot write {path}: no file can be created in {folder} ({error.strerror})") from error
+        raise ConfigurationError(f"cannot write {name}: no file can be created in {folder} ({error.strerror})") from error
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -43,7 +54,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """
     require_writable(path)
     with writing(path):
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=path.suffix, dir=path.absolute().parent)
+        # With more of its name, the temporary one could be too long.
+        handle, name = tempfile.mkstemp(prefix=f".{path.stem[:_STEM]}.", suffix=path.suffix[-_STEM:], dir=path.absolute().parent)
         os.close(handle)
         temporary = Path(name)
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
+import os
 import sys
 import zlib
 from collections.abc import Callable, Iterator
@@ -16,7 +17,10 @@ from typing import Any
 
 import cloudpickle
 
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shortened, shown
+from safe_envs.reading import MOST_BYTES_OF_TEXT, open_regular
+
+_ADVICE = "give the path of a Python file, as in my_system.py:problem"
 
 
 def load_object(place: str) -> Any:
@@ -32,17 +36,17 @@ def load_object(place: str) -> Any:
     """
     source, colon, name = place.rpartition(":")
     if not (colon and source and name):
-        raise ConfigurationError(f"{place!r} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like my_system.py:problem")
+        raise ConfigurationError(f"{shown(place)} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like my_system.py:problem")
     module = _of_file(Path(source)) if source.endswith(".py") else _of_module(source)
     if not hasattr(module, name):
-        raise ConfigurationError(f"{source} has no {name!r}; {nearest(name, _stated_in(module))}")
+        raise ConfigurationError(f"{shortened(source)} has no {shown(name)}; {nearest(name, _stated_in(module))}")
     return getattr(module, name)
 
 
 def resolved(place: str) -> str:
     """The same place with the whole path of its file, so that it holds in any folder."""
     source, _, name = place.rpartition(":")
-    return f"{Path(source).resolve()}:{name}" if source.endswith(".py") else place
+    return f"{os.path.realpath(source)}:{name}" if source.endswith(".py") else place
 
 
 def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) -> Any:
@@ -73,9 +77,14 @@ def _stated_in(module: ModuleType) -> list[str]:
 
 
 def _of_file(path: Path) -> ModuleType:
-    if not path.is_file():
-        raise ConfigurationError(f"there is no file {path}; give the path of a Python file, as in my_system.py:problem")
-    return _loaded(path.resolve(), path.stat().st_mtime_ns)
+    try:
+        with open_regular(path, MOST_BYTES_OF_TEXT) as stream:
+            changed = os.fstat(stream.fileno()).st_mtime_ns
+    except FileNotFoundError as error:
+        raise ConfigurationError(f"there is no file {shortened(path)}; {_ADVICE}") from error
+    except OSError as error:
+        raise ConfigurationError(f"{shortened(path)} cannot be read: {error.strerror}; {_ADVICE}") from error
+    return _loaded(path.resolve(), changed)
 
 
 @lru_cache(maxsize=32)
@@ -101,7 +110,7 @@ def _loaded(path: Path, _changed: int) -> ModuleType:
 def _of_module(name: str) -> ModuleType:
     if name in sys.modules:
         return sys.modules[name]
-    with _running(None, f"module {name} (a file is named with .py)"):
+    with _running(None, f"module {shortened(name)} (a file is named with .py)"):
         return importlib.import_module(name)
 
 
@@ -117,7 +126,8 @@ def _running(path: Path | None, what: str) -> Iterator[None]:
     except SafeEnvsError as error:
         raise type(error)(f"{what}{_line(error, path)}: {error}") from error
     except (Exception, SystemExit) as error:
-        raise ConfigurationError(f"{what} ended with an error{_line(error, path)}: {type(error).__name__}: {error}") from error
+        reason = f"{type(error).__name__}: {shortened(error, 400)}"
+        raise ConfigurationError(f"{what} ended with an error{_line(error, path)}: {reason}") from error
     finally:
         if folder is not None:
             sys.path.remove(folder)

@@ -13,7 +13,7 @@ import sympy as sp
 
 from safe_envs.barrier import Barrier
 from safe_envs.clf import CLF
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
 from safe_envs.exploration import Exploration
 from safe_envs.sde import ControlAffineSDE, finite_number
 
@@ -185,7 +185,7 @@ class SafetyProblem:
         if not math.isfinite(self.horizon / self.dt) or round(self.horizon / self.dt) < 1:
             raise ConfigurationError(f"horizon = {self.horizon} s; it must hold at least one control period of {self.dt} s")
         if not isinstance(self.substeps, int) or self.substeps < 1:
-            raise ConfigurationError(f"substeps = {self.substeps!r}; give a whole number from 1")
+            raise ConfigurationError(f"substeps = {shown(self.substeps)}; give a whole number from 1")
 
     def gains_of(self, barrier: int) -> tuple[float, ...]:
         """Rates p_1..p_r for a barrier, by its index."""
@@ -248,7 +248,7 @@ class SafetyProblem:
             changes["inputs"] = self._boxed(box)
         if isinstance(start, str):
             if start not in self.starts:
-                raise ConfigurationError(f"unknown start {start!r}; {nearest(start, self.starts)}, or {len(self.states)} numbers")
+                raise ConfigurationError(f"unknown start {shown(start)}; {nearest(start, self.starts)}, or {len(self.states)} numbers")
             changes["start"] = start
         elif start is not None:
             changes["starts"] = {**self.starts, "given": self._fixed(start)}
@@ -263,14 +263,16 @@ class SafetyProblem:
             raise ConfigurationError(f"{self.name} has no noise channels{advice}")
         given = _numbers(noise)
         if given.shape not in ((1,), (len(self.noise),)) or not np.isfinite(given).all() or (given < 0).any():
-            raise ConfigurationError(f"noise = {noise!r}; give one number >= 0, or {len(self.noise)} of them ({', '.join(self.noise)})")
+            raise ConfigurationError(
+                f"noise = {shown(noise)}; give one number >= 0, or {len(self.noise)} of them ({', '.join(self.noise)})"
+            )
         return dict(zip(self.noise, np.broadcast_to(given, len(self.noise)).tolist(), strict=True))
 
     def _boxed(self, box: Sequence[Any]) -> tuple[Variable, ...]:
         pairs = _numbers(box)
         pairs = np.broadcast_to(pairs, (len(self.inputs), 2)) if pairs.shape == (2,) else pairs
         if pairs.shape != (len(self.inputs), 2):
-            raise ConfigurationError(f"box = {box!r}; give (low, high), or one such pair for each of the {len(self.inputs)} inputs")
+            raise ConfigurationError(f"box = {shown(box)}; give (low, high), or one such pair for each of the {len(self.inputs)} inputs")
         bounds = [(float(low), float(high)) for low, high in pairs]
         return tuple(replace(i, low=low, high=high) for i, (low, high) in zip(self.inputs, bounds, strict=True))
 
@@ -289,8 +291,10 @@ class SafetyProblem:
 def _numbers(given: Any) -> np.ndarray:
     """What the user gave as an array of at least one axis; empty if it holds no numbers."""
     try:
-        return np.atleast_1d(np.asarray(given, dtype=float))
-    except (TypeError, ValueError):
+        found = np.asarray(given)
+        # NumPy would read numbers out of texts.
+        return np.empty(0) if found.dtype.kind in "US" else np.atleast_1d(found.astype(float))
+    except (TypeError, ValueError, OverflowError):
         return np.empty(0)
 
 

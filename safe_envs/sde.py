@@ -10,8 +10,9 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
 from safe_envs.identities import is_zero
+from safe_envs.numerals import real
 
 _REAL = sp.Symbol("real", real=True).assumptions0
 
@@ -33,9 +34,9 @@ def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.Immuta
 def finite_number(name: str, value: Any) -> float:
     """Return `value` as a float, or say why it cannot be one."""
     try:
-        number = float(value)
-    except (TypeError, ValueError) as error:
-        raise ConfigurationError(f"{name} = {value!r} is not a number") from error
+        number = real(value) if isinstance(value, str) else float(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ConfigurationError(f"{name} = {shown(value)} is not a number") from error
     if not math.isfinite(number):
         raise ConfigurationError(f"{name} = {number} is not finite")
     return number
@@ -233,7 +234,7 @@ class ControlAffineSDE:
         by_name = {p.name: p for p in self.parameters}
         for name in values:
             if name not in by_name:
-                raise ConfigurationError(f"unknown parameter {name!r}; {nearest(name, by_name)}")
+                raise ConfigurationError(f"unknown parameter {shown(name)}; {nearest(name, by_name)}")
         return replace(self, parameters={**self.parameters, **{by_name[k]: v for k, v in values.items()}})
 
     def numeric(self, expression: Any) -> Any:

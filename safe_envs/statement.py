@@ -11,7 +11,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.barrier import Barrier, formula
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
 from safe_envs.mistakes import degree_of, require_sound
 from safe_envs.problem import SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE, finite_number
@@ -132,7 +132,7 @@ def _require_known(rest: Mapping[str, Any], system: ControlAffineSDE) -> None:
     allowed = [f.name for f in fields(SafetyProblem) if f.init and f.name not in _STATED]
     for name in rest:
         if name not in allowed:
-            raise ConfigurationError(f"a problem has no further {name!r}; {nearest(name, allowed)}")
+            raise ConfigurationError(f"a problem has no further {shown(name)}; {nearest(name, allowed)}")
     parameters, states = [p.name for p in system.parameters], [s.name for s in system.states]
     for name, known, what in (("noise", parameters, "parameters of the diffusion"), ("plane", states, "states, two of them")):
         given = rest.get(name)
@@ -176,7 +176,7 @@ def _boxes(system: ControlAffineSDE, box: Any) -> list[Range]:
     given = box.tolist() if isinstance(box, np.ndarray) else box
     pairs = list(given) if isinstance(given, list | tuple) and given and isinstance(given[0], list | tuple) else [given] * system.m
     if len(pairs) != system.m:
-        raise ConfigurationError(f"box = {box!r}; give (low, high), or one such pair for each of the {system.m} inputs")
+        raise ConfigurationError(f"box = {shown(box)}; give (low, high), or one such pair for each of the {system.m} inputs")
     return [_ends(f"box of {u}", pair) for u, pair in zip(system.inputs, pairs, strict=True)]
 
 
@@ -185,9 +185,9 @@ def _ends(what: str, given: Any) -> Range:
     try:
         low, high = (float(v) for v in given)
     except (TypeError, ValueError) as error:
-        raise ConfigurationError(f"{what} = {given!r}; give (low, high)") from error
+        raise ConfigurationError(f"{what} = {shown(given)}; give (low, high)") from error
     if not low <= high:
-        raise ConfigurationError(f"{what} = {given!r}; give (low, high) with low <= high")
+        raise ConfigurationError(f"{what} = {shown(given)}; give (low, high) with low <= high")
     return low, high
 
 

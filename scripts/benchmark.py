@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import mmap
 import os
 import time
@@ -21,6 +20,7 @@ import safe_envs
 from agents.problems import load_problem
 from safe_envs import Barrier, ControlAffineSDE
 from safe_envs.errors import ConfigurationError
+from safe_envs.reading import read_json
 from scripts.console import require_result, stdout, write_result
 from wrappers import (
     CBF,
@@ -281,10 +281,7 @@ def read_figures(path: Path) -> Figures:
     Raises:
         ConfigurationError: there is no such file, or something else is in it.
     """
-    try:
-        found = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise ConfigurationError(f"--compare {path} cannot be read: {error}; give what `safe-envs benchmark --json FILE` wrote") from error
+    found = read_json(path, "give what `safe-envs benchmark --json FILE` wrote as --compare")
     if not isinstance(found, dict) or _FUSED not in found or not all(isinstance(value, int | float) for value in found.values()):
         raise ConfigurationError(f"--compare {path} holds no figures; give what `safe-envs benchmark --json FILE` wrote")
     return found

@@ -23,11 +23,15 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from safe_envs.errors import SafeEnvsError
+from safe_envs.errors import SafeEnvsError, shortened
 from safe_envs.files import require_writable, write_json
+from scripts.number_options import strict
 
 _LEAST_WIDTH = 104
 _PIPE_WIDTH = 240
+_LONGEST = 2000
+"""Characters of an error, at most: what somebody else's code or file says in it may be of any length."""
+
 _TOO_LARGE = ("can't allocate memory", "Maximum allowed dimension exceeded", "Maximum allowed size exceeded", "array is too big")
 """What PyTorch and NumPy say of sizes beyond the memory, where it is no MemoryError."""
 
@@ -94,7 +98,7 @@ def quietly(quiet: bool, silent: bool = False) -> Iterator[None]:
 
 
 def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
-    """The function of a command with the option --quiet, and without other output where its --json goes to stdout."""
+    """The function of a command with the option --quiet, strict numbers, and no other output where its --json goes to stdout."""
 
     @functools.wraps(command)
     def wrapped(*, quiet: bool = False, **arguments: Any) -> None:
@@ -102,7 +106,7 @@ def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
             command(**arguments)
 
     option = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Quiet)
-    return with_signature(wrapped, [*inspect.signature(command, eval_str=True).parameters.values(), option])
+    return with_signature(wrapped, [*map(strict, inspect.signature(command, eval_str=True).parameters.values()), option])
 
 
 def with_signature(function: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
@@ -202,7 +206,7 @@ def _terminable() -> Iterator[None]:
 
 
 def _fail(message: str) -> NoReturn:
-    Console(stderr=True).print(f"[bold red]Error:[/] [red]{escape(message)}[/]", soft_wrap=True, highlight=False)
+    Console(stderr=True).print(f"[bold red]Error:[/] [red]{escape(shortened(message, _LONGEST))}[/]", soft_wrap=True, highlight=False)
     sys.exit(2)
 
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from agents.evaluation import BARE, Evaluation
 from agents.policy import DESCRIPTION, TENSORS
 from safe_envs.codegen import compile_function
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
 from scripts.rates import percent
@@ -49,7 +49,7 @@ def require_format(path: Path) -> None:
     formats = sorted(set(Figure().canvas.get_supported_filetypes()) - {"pgf"})
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in formats:
-        raise ConfigurationError(f"--plot {path}: unknown format {suffix!r}; {nearest(suffix, formats)}")
+        raise ConfigurationError(f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, formats)}")
 
 
 def draw(evaluation: Evaluation, path: Path) -> None:

@@ -12,7 +12,8 @@ from typing import Annotated, Any
 
 import typer
 
-from safe_envs.errors import ConfigurationError, nearest, require_whole
+from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
+from safe_envs.numerals import real
 from scripts import completion, options
 from scripts.console import progress_bar, stdout, write_result
 from scripts.env_options import EnvOptions, with_env
@@ -119,7 +120,8 @@ def read_settings(method: str, learner: Callable[..., Any], texts: Sequence[str]
     found = options.parameters("--set", texts, words=True)
     for name, value in found.items():
         if name not in allowed:
-            raise ConfigurationError(f"--set {name}={value}: {method} has no setting {name!r}; {nearest(name, allowed)}")
+            given = shortened(f"{name}={value}")
+            raise ConfigurationError(f"--set {given}: {method} has no setting {shown(name)}; {nearest(name, allowed)}")
         found[name] = _of_kind(name, value, hints[name])
     return found
 
@@ -145,11 +147,12 @@ def _of_kind(name: str, value: float | str, hint: Any) -> Any:
         return str(value)
     if Sequence in origins:
         try:
-            return [_whole(float(entry)) for entry in str(value).split(",")]
+            return [_whole(real(entry)) for entry in str(value).split(",")]
         except ValueError as error:
-            raise ConfigurationError(f"--set {name}={value}: give whole numbers with commas between, such as {name}=100,30") from error
+            given = shortened(f"{name}={value}")
+            raise ConfigurationError(f"--set {given}: give whole numbers with commas between, such as {name}=100,30") from error
     if isinstance(value, str):
-        raise ConfigurationError(f"--set {name}={value}: {value!r} is not a number")
+        raise ConfigurationError(f"--set {shortened(name)}={shortened(value)}: {shown(value)} is not a number")
     # A whole number may be written as 1e3; what is not whole, the method refuses.
     return int(value) if int in parts and float(value).is_integer() else value
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,8 +12,9 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from safe_envs import ENV_IDS
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.files import write_json
+from safe_envs.reading import read_json
 from scripts import completion
 from scripts.console import Json, progress_bar, require_result, stdout, write_result
 from scripts.rates import percent_in
@@ -23,6 +24,9 @@ _QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes
 _QUICK_EPISODES, _EPISODES = 100, 1000
 _KNOWLEDGE = "plant"
 """Of the filters: with a wrong model they are to be learned first, which is another comparison."""
+
+_NAMES = ("env_id", "policy", "filter")
+_FIGURES = ("safety_rate", "ci_low", "ci_high", "return_mean", "intervention_rate")
 
 Row = dict[str, Any]
 
@@ -101,18 +105,29 @@ def _evaluated(env_id: str, name: str, policy: str, filters: Sequence[str], know
     from agents import evaluate
 
     found = evaluate(env_id, policy, filters, episodes=known["episodes"], seed=known["seed"], knowledge=_KNOWLEDGE, bounds=False)
-    keys = ("filter", "safety_rate", "ci_low", "ci_high", "return_mean", "intervention_rate")
-    return [{"env_id": env_id, "policy": name, **{key: row[key] for key in keys}, "trained_in": seconds} for row in found.rows]
+    figures = [{name: row[name] for name in ("filter", *_FIGURES)} for row in found.rows]
+    return [{"env_id": env_id, "policy": name, **row, "trained_in": seconds} for row in figures]
 
 
 def _read(path: Path, known: dict[str, Any]) -> list[Row]:
     """The rows that are there already, of the same settings."""
-    if not path.exists():
+    if not os.path.exists(path):
         return []
-    document = json.loads(path.read_text())
+    document = read_json(path, "give another --out")
+    rows = document.get("rows") if isinstance(document, dict) else None
+    if not isinstance(rows, list) or "settings" not in document or not all(map(_is_row, rows)):
+        raise ConfigurationError(f"{path} is not what `safe-envs leaderboard` writes; give another --out")
     if document["settings"] != known:
-        raise ConfigurationError(f"{path} has the settings {document['settings']}, not {known}; give another --out")
-    return document["rows"]
+        raise ConfigurationError(f"{path} has the settings {shown(document['settings'])}, not {known}; give another --out")
+    return rows
+
+
+def _is_row(row: Any) -> bool:
+    """Whether something in a file has the form of `_evaluated`."""
+    if not isinstance(row, dict) or row.keys() != {*_NAMES, *_FIGURES, "trained_in"}:
+        return False
+    numbers = [row[name] for name in _FIGURES] + [row["trained_in"] or 0.0]
+    return all(isinstance(row[name], str) for name in _NAMES) and all(isinstance(number, int | float) for number in numbers)
 
 
 def _write(path: Path, known: dict[str, Any], rows: Sequence[Row]) -> None:

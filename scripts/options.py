@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -9,8 +10,9 @@ from typing import Annotated, Any
 
 import typer
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.files import require_writable
+from safe_envs.numerals import real, whole_or_real
 from scripts.console import STDOUT
 
 Knowledge = Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")]
@@ -28,9 +30,9 @@ def numbers(option: str, text: str) -> list[float]:
         ConfigurationError: an entry is no number.
     """
     try:
-        return [float(entry) for entry in text.split(",")]
+        return [real(entry) for entry in text.split(",")]
     except ValueError as error:
-        raise ConfigurationError(f"{option} {text!r} is no number or list of numbers with commas between") from error
+        raise ConfigurationError(f"{option} {shown(text)} is no number or list of numbers with commas between") from error
 
 
 def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = None, inputs: Iterable[tuple[str, Path]] = ()) -> None:
@@ -45,12 +47,12 @@ def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = 
     Raises:
         ConfigurationError: one cannot.
     """
-    taken = {path.resolve(): f"{option} {path}" for option, path in inputs}
+    taken = {os.path.realpath(path): f"{option} {path}" for option, path in inputs}
     for option, path in (("--out", out), ("--json", json), ("--plot", plot)):
         if path is None or (option == "--json" and path == STDOUT):
             continue
         require_writable(path)
-        place = path.resolve()
+        place = os.path.realpath(path)
         if place in taken:
             raise ConfigurationError(f"{option} {path} would overwrite the file of {taken[place]}; name another file")
         taken[place] = f"{option} {path}"
@@ -107,7 +109,7 @@ def read_box(texts: Sequence[str]) -> list[float] | list[list[float]]:
     pairs = [numbers("--box", text) for text in texts]
     for text, pair in zip(texts, pairs, strict=True):
         if len(pair) != 2:
-            raise ConfigurationError(f"--box {text!r} has {len(pair)} numbers; give LO,HI")
+            raise ConfigurationError(f"--box {shown(text)} has {len(pair)} numbers; give LO,HI")
     return pairs[0] if len(pairs) == 1 else pairs
 
 
@@ -127,15 +129,15 @@ def parameters(option: str, texts: Sequence[str], words: bool = False) -> dict[s
         name, equals, value = text.partition("=")
         if not name or not equals or not value or name in found:
             problem = "comes twice" if name in found else "is not of this form"
-            raise ConfigurationError(f"{option} {text!r} {problem}; give NAME=VALUE, once for each parameter")
+            raise ConfigurationError(f"{option} {shown(text)} {problem}; give NAME=VALUE, once for each parameter")
         found[name] = _value(option, text, value, words)
     return found
 
 
 def _value(option: str, text: str, value: str, words: bool) -> float | str:
     try:
-        return int(value) if value.lstrip("+-").isdecimal() else float(value)
+        return whole_or_real(value)
     except ValueError as error:
         if words:
             return value
-        raise ConfigurationError(f"{option} {text!r}: {value!r} is not a number") from error
+        raise ConfigurationError(f"{option} {shown(text)}: {shown(value)} is not a number") from error

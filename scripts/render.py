@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 import typer
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from scripts import options
 from scripts.console import Json, progress_bar, stdout, write_result
 from scripts.env_options import EnvOptions, with_env
@@ -96,7 +96,7 @@ def split_filters(text: str) -> list[str]:
     names = "|".join(sorted((BARE, *CONDITIONS, *LEARNED), key=len, reverse=True))
     found = [part.strip() for part in re.split(rf",(?=\s*(?:{names})\s*(?:[:+,]|$))", text)]
     if not all(found):
-        raise ConfigurationError(f"--compare {text!r} names no filter at one place; give names with commas between: none,scbf")
+        raise ConfigurationError(f"--compare {shown(text)} names no filter at one place; give names with commas between: none,scbf")
     return list(dict.fromkeys(found))
 
 
@@ -180,13 +180,13 @@ def make_runs(
 
     require_whole("seed", seed, 0)
     if knowledge not in ("model", "plant"):
-        raise ConfigurationError(f"knowledge = {knowledge!r}; {nearest(knowledge, ('model', 'plant'))}")
+        raise ConfigurationError(f"knowledge = {shown(knowledge)}; {nearest(knowledge, ('model', 'plant'))}")
     known = (BARE, *CONDITIONS, *LEARNED)
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.
         for word in re.split("[:+]", name)[0].split(","):
             if word.strip() not in known:
-                raise ConfigurationError(f"unknown filter {word.strip()!r}; {nearest(word.strip(), known)}")
+                raise ConfigurationError(f"unknown filter {shown(word.strip())}; {nearest(word.strip(), known)}")
         if name != BARE:
             require_readable(name, problem)
     actors = [make_policy(policy, problem, trust) for _ in names]

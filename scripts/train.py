@@ -11,17 +11,12 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.numerals import real
 from scripts import completion, options
 from scripts.console import Json, progress_bar, stdout, write_result
 from scripts.env_options import EnvOptions, with_env
 from scripts.rates import percent_in
-
-_LONGEST = 2000
-"""Characters of a hyperparameter, at most: few are longer than a word."""
-
-_SHOWN = 100
-"""Characters of a text, at most, that a message repeats."""
 
 
 @with_env
@@ -117,41 +112,29 @@ def train(
 
 def _settings(texts: list[str]) -> dict[str, Any]:
     """NAME=VALUE entries, the values read as YAML."""
+    import yaml
+
+    from agents.sweep_document import value_of
+
     found = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not name:
-            raise ConfigurationError(f"--set {text[:_SHOWN]}: give NAME=VALUE, such as learning_rate=0.001")
-        found[name] = _value(name, value)
+            raise ConfigurationError(f"--set {shortened(text)}: give NAME=VALUE, such as learning_rate=0.001")
+        if not value.isascii():
+            raise ConfigurationError(f"--set {shortened(text)} has characters beyond ASCII; write numbers with the digits 0 to 9")
+        try:
+            found[name] = _number(value_of(value, "--set"))
+        except yaml.YAMLError as error:
+            problem = shortened(getattr(error, "problem", error))
+            raise ConfigurationError(f"--set {shortened(text)} is no YAML that a setting may have: {problem}") from error
     return found
-
-
-def _value(name: str, text: str) -> Any:
-    import yaml
-
-    what = f"--set {name[:_SHOWN]}: {text[:_SHOWN]!r}"
-    if len(text) > _LONGEST:
-        raise ConfigurationError(f"{what} has {len(text)} characters; give {_LONGEST} at most")
-    try:
-        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
-            raise ConfigurationError(f"{what} repeats a part of itself by an alias; write it out")
-        value = yaml.safe_load(text)
-    except (RecursionError, yaml.YAMLError) as error:
-        raise ConfigurationError(f"{what} is no YAML") from error
-    except ValueError as error:
-        if isinstance(error, ConfigurationError):
-            raise
-        raise ConfigurationError(f"{what} is no YAML, or a number out of range") from error
-    number = _number(value)
-    if isinstance(number, int | float) and ("_" in text or not text.isascii()):
-        raise ConfigurationError(f"{what}: write numbers with the digits 0 to 9, and nothing between them")
-    return number
 
 
 def _number(value: Any) -> Any:
     """What YAML takes for a text although it is a number, such as 3e-4."""
     try:
-        return float(value) if isinstance(value, str) else value
+        return real(value) if isinstance(value, str) else value
     except ValueError:
         return value
 

@@ -9,7 +9,7 @@ import sympy as sp
 from safe_envs.barrier import Barrier
 from safe_envs.clf import CLF
 from safe_envs.env import SystemEnv
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.exploration import Exploration
 from safe_envs.problem import Feature, SafetyProblem, Start, Variable
 from safe_envs.sde import ControlAffineSDE
@@ -133,7 +133,7 @@ def acc_gap(*, distance: float = 10.0, power: int = 5, rate: float = 1.0, slack_
     Source: thesis Sec. 6.3.2.
     """
     if not isinstance(power, int) or power < 1 or power % 2 == 0:
-        raise ConfigurationError(f"power = {power!r}; give an odd whole number from 1, so that h changes its sign at the distance")
+        raise ConfigurationError(f"power = {shown(power)}; give an odd whole number from 1, so that h changes its sign at the distance")
     return _cruise(
         "ACCGap",
         system=gap_system(),

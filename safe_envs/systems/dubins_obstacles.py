@@ -8,7 +8,7 @@ import sympy as sp
 
 from safe_envs.barrier import Barrier
 from safe_envs.env import SystemEnv
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem import Feature, SafetyProblem, Start, Variable
 from safe_envs.systems._common import around, positive, uniforms
 from safe_envs.systems.dubins import omega, theta, x, y
@@ -37,7 +37,7 @@ def centers(count: int) -> list[tuple[sp.Expr, sp.Expr]]:
 
 def _number_of_obstacles(given: object) -> int:
     if not isinstance(given, int) or isinstance(given, bool) or not 1 <= given <= _MOST_OBSTACLES:
-        raise ConfigurationError(f"num_obstacles = {given!r}; give a whole number from 1 to {_MOST_OBSTACLES}")
+        raise ConfigurationError(f"num_obstacles = {shown(given)}; give a whole number from 1 to {_MOST_OBSTACLES}")
     return given
 
 

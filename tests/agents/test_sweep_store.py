@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
@@ -164,3 +165,21 @@ def test_without_pyarrow_the_extra_is_named(tmp_path: Path, sweep: Sweep, monkey
     monkeypatch.setattr("agents.sweep_store.find_spec", lambda name: None)
     with pytest.raises(ConfigurationError, match=r"safe-envs\[sweep\]"):
         Store(tmp_path, sweep)
+
+
+def test_a_cell_that_is_a_bomb_or_no_file_is_not_read(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+    Store(tmp_path, sweep).keep(outcomes[0])
+    (path,) = (tmp_path / "cells").iterdir()
+    row = pq.read_table(path)
+    pq.write_table(pa.concat_tables([row] * 2), path)
+    with pytest.raises(ConfigurationError, match="no cell of a sweep"):
+        read(tmp_path)
+    # A text of 10 MB, in a file of a few kB.
+    pq.write_table(row.set_column(row.schema.get_field_index("row"), "row", pa.array(["x" * 10**7])), path, compression="zstd")
+    assert path.stat().st_size < 100_000
+    with pytest.raises(ConfigurationError, match="no cell of a sweep"):
+        read(tmp_path)
+    assert len(Store(tmp_path, sweep).missing) == len(sweep.cells)
+    path.unlink()
+    os.mkfifo(path)
+    assert read(tmp_path).num_rows == 0

@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.numerals import real_or_complex
 from safe_envs.problem import SafetyProblem
 from wrappers.conditions.base import AffineConstraint, Condition
 from wrappers.conditions.cbf import CBF, ECBF, HOCBF
@@ -48,6 +49,9 @@ __all__ = [
     "spec_of",
 ]
 
+_MOST_ENTRIES = 12
+"""Of a parameter, as for the longest chain of integrators that anybody filters: the poles of a dozen gains take a second."""
+
 # A class-K function or a complex pole may hold a "+" too.
 _BETWEEN = re.compile(rf"\+(?=(?:{'|'.join((*CONDITIONS, *LEARNED))})(?:[:+]|$))")
 
@@ -80,7 +84,7 @@ def _parsed(text: str, problem: SafetyProblem, learned_for: Callable[[Any, str |
     count = len(problem.barriers)
     if len(texts) not in (1, count):
         allowed = "one" if count == 1 else f"one for all {count} barriers, or one for each"
-        raise ConfigurationError(f"filter {text!r} has {len(texts)} conditions; {problem.name} takes {allowed}")
+        raise ConfigurationError(f"filter {shown(text)} has {len(texts)} conditions; {problem.name} takes {allowed}")
     found: list[Condition] = []
     for i, part in enumerate(texts * count if len(texts) == 1 else texts):
         if part.split(":")[0] in LEARNED:
@@ -95,7 +99,8 @@ def _learned_for(text: str, condition: Any, path: str | None, problem: SafetyPro
     model = learned.get(condition.method) if path is None else load_learned(path, problem, condition.method)
     if model is None:
         raise ConfigurationError(
-            f"filter {text!r} rests on something learned: learn it by `safe-envs identify`, and name the file as {condition.name}:file=FILE"
+            f"filter {shown(text)} rests on something learned: learn it by `safe-envs identify`, and name the file as "
+            f"{condition.name}:file=FILE"
         )
     return model
 
@@ -127,7 +132,7 @@ def _settings(text: str) -> tuple[Any, dict[str, Any]]:
     name, *settings = text.split(":")
     known = {**CONDITIONS, **LEARNED}
     if name not in known:
-        raise ConfigurationError(f"unknown filter {name!r}; {nearest(name, known)}")
+        raise ConfigurationError(f"unknown filter {shown(name)}; {nearest(name, known)}")
     condition = known[name]
     allowed = {key: p for key, p in inspect.signature(condition).parameters.items() if key != "learned"}
     names = [*allowed, "file"] if name in LEARNED else list(allowed)
@@ -135,7 +140,8 @@ def _settings(text: str) -> tuple[Any, dict[str, Any]]:
     for setting in settings:
         key, _, value = setting.partition("=")
         if key not in names or key in given:
-            reason = f"{text!r} names {key!r} twice" if key in given else f"{name} has no parameter {key!r}; {_hint(key, names, given)}"
+            hint = f"{name} has no parameter {shown(key)}; {_hint(key, names, given)}"
+            reason = f"{shown(text)} names {shown(key)} twice" if key in given else hint
             raise ConfigurationError(f"filter {reason}")
         given[key] = value if key == "file" else _value(text, key, value, _takes_one(name, allowed[key].default))
     return condition, given
@@ -155,17 +161,17 @@ def _takes_one(name: str, default: Any) -> bool:
 
 
 def _value(text: str, key: str, value: str, single: bool) -> Any:
-    entries = tuple(_entry(entry) for entry in value.split(","))
-    if single and len(entries) != 1:
-        raise ConfigurationError(f"filter {text!r}: {key} takes one value; {len(entries)} were given")
+    texts, most = value.split(","), 1 if single else _MOST_ENTRIES
+    if len(texts) > most:
+        allowed = "one value" if single else f"at most {most} values"
+        raise ConfigurationError(f"filter {shown(text)}: {key} takes {allowed}; {len(texts)} were given")
+    entries = tuple(_entry(entry) for entry in texts)
     return entries[0] if single else entries
 
 
 def _entry(text: str) -> Any:
     """A number, where it is one; the condition says what else it takes."""
-    for kind in (float, complex):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
+    try:
+        return real_or_complex(text)
+    except ValueError:
+        return text

@@ -14,7 +14,7 @@ import sympy as sp
 from safe_envs.barrier import Barrier
 from safe_envs.calculus import Derivative, drift_derivative, generator, has_kinks, input_derivative, relative_degree, tidied
 from safe_envs.codegen import Components
-from safe_envs.errors import ConfigurationError, RelativeDegreeError, SystemDefinitionError
+from safe_envs.errors import ConfigurationError, RelativeDegreeError, SystemDefinitionError, shown
 from safe_envs.identities import pieces_fit
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.class_k import ClassK, Rate, applied
@@ -106,7 +106,7 @@ class Condition(ABC):
         if margin in ("none", FIRST_ORDER):
             return
         if isinstance(margin, bool) or not isinstance(margin, int | float) or not 0 <= margin < math.inf:
-            raise ConfigurationError(f"sampling_margin = {margin!r}; allowed: none, {FIRST_ORDER}, or a number >= 0")
+            raise ConfigurationError(f"sampling_margin = {shown(margin)}; allowed: none, {FIRST_ORDER}, or a number >= 0")
 
     @property
     def derivative(self) -> Derivative:

@@ -13,10 +13,13 @@ from mpmath.libmp import NoConvergence  # pyright: ignore[reportMissingImports]
 
 from safe_envs.barrier import Barrier
 from safe_envs.calculus import derivatives, drift_derivative, relative_degree
-from safe_envs.errors import ConfigurationError, RelativeDegreeError
+from safe_envs.errors import ConfigurationError, RelativeDegreeError, shortened, shown
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.base import AffineConstraint, Condition, chain_of
 from wrappers.conditions.class_k import ClassK, Rate, positive_rates, rates
+
+_STEPS = 100
+"""Of the search for poles. Gains of real negative ones need fewer; others could keep it busy for seconds."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +169,7 @@ def gains_of_poles(poles: Sequence[float]) -> tuple[float, ...]:
 
 def _real_negative_poles(given: Any) -> tuple[float, ...]:
     entries = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
-    listing = ", ".join(map(str, entries)) or "none"
+    listing = shortened(", ".join(map(str, entries)) or "none")
     if not all(isinstance(pole, Number) and not isinstance(pole, bool) for pole in entries):
         raise ConfigurationError(f"poles = {listing}; give numbers in 1/s, one for each relative degree")
     poles = [complex(pole) for pole in entries]
@@ -179,11 +182,11 @@ def _real_negative_roots(gains: Sequence[float]) -> tuple[float, ...]:
     polynomial = sp.Poly([1, *(sp.Rational(repr(k)) for k in reversed(gains))], sp.Symbol("s"))
     try:
         # A factor that is repeated exactly is solved once: the iteration does not converge at multiple roots.
-        roots = [root for factor, count in polynomial.sqf_list()[1] for root in factor.nroots(n=50, maxsteps=1000) * count]
+        roots = [root for factor, count in polynomial.sqf_list()[1] for root in factor.nroots(n=50, maxsteps=_STEPS) * count]
     except NoConvergence as error:
-        raise ConfigurationError(f"the poles of k = {gains} cannot be computed; give poles in place of gains") from error
+        raise ConfigurationError(f"the poles of k = {shown(gains)} cannot be computed; give poles in place of gains") from error
     # Rounding of the gains splits a multiple pole into a ring about it: what oscillates so slowly is real.
     if any(sp.re(root) >= 0 or abs(sp.im(root)) > 1e-3 * abs(root) for root in roots):
         listing = ", ".join(str(sp.N(root, 4)) for root in roots)
-        raise ConfigurationError(f"k = {gains} has its poles at {listing}: {_WHY}")
+        raise ConfigurationError(f"k = {shown(gains)} has its poles at {shortened(listing)}: {_WHY}")
     return tuple(float(sp.re(root)) for root in roots)

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import ast
-import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -13,28 +11,44 @@ import mpmath
 import sympy as sp
 from sympy.printing.str import StrPrinter
 
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, shortened, shown
 from safe_envs.sde import finite_number
+from wrappers.conditions.class_k_text import S, parsed
 
-S = sp.Symbol("s", real=True)
-"""The argument of a class-K function."""
-
-_FUNCTIONS: dict[str, Any] = {
-    name: getattr(sp, name) for name in ("Abs", "asinh", "atan", "cos", "cosh", "erf", "exp", "log", "sin", "sinh", "sqrt", "tanh")
-}
-_CONSTANTS: dict[str, Any] = {"s": S, "pi": sp.pi, "E": sp.E}
-_OPERATORS: dict[type[ast.AST], Any] = {
-    ast.Add: operator.add,
-    ast.Sub: operator.sub,
-    ast.Mult: operator.mul,
-    ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
-    ast.USub: operator.neg,
-    ast.UAdd: operator.pos,
-}
-_LARGEST_EXPONENT = 100
 _DIGITS = 150
 _NEAR = 1e-12
+
+_MOST_BITS = 20_000
+"""Of the arguments of exponentials and sines: exp(exp(1e4)) is computed at once, and the exponential of that never."""
+
+_SATURATED = 20
+"""Bits of arguments beyond which tanh is 1, to all digits."""
+
+
+def _guarded(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A function of mpmath that refuses arguments at which it would take long."""
+
+    def value(argument: Any) -> Any:
+        if mpmath.mag(argument) > _MOST_BITS:
+            raise OverflowError("a number gets too large")
+        return function(argument)
+
+    return value
+
+
+def _tanh(argument: Any) -> Any:
+    return mpmath.sign(argument) if mpmath.mag(argument) > _SATURATED else mpmath.tanh(argument)
+
+
+def _modulus(argument: Any) -> Any:
+    """The modulus of a real number. That of a complex one is real, but floats have no complex number on the way there."""
+    if isinstance(argument, mpmath.mpc):
+        raise ValueError("the modulus of a number that is not real")
+    return abs(argument)
+
+
+_GUARDED = {name: _guarded(getattr(mpmath, name)) for name in ("cos", "cosh", "exp", "sin", "sinh")}
+_MODULES: list[Any] = [{"abs": _modulus, "tanh": _tanh, **_GUARDED}, "mpmath"]
 
 
 @dataclass(frozen=True)
@@ -55,16 +69,20 @@ class ClassK:
     def __post_init__(self) -> None:
         given = self.expression
         try:
-            expression = _parsed(given) if isinstance(given, str) else given
+            expression = parsed(given) if isinstance(given, str) else given
             expression = expression.subs({s: S for s in expression.free_symbols if s.name == S.name})
         except AttributeError:
-            raise ConfigurationError(f"class-K function {given!r} is no expression of s, like 2*s**3 or tanh(s)") from None
+            raise ConfigurationError(f"class-K function {shown(given)} is no expression of s, like 2*s**3 or tanh(s)") from None
         if expression.free_symbols != {S} or expression.has(sp.zoo, sp.nan, sp.oo):
-            raise ConfigurationError(f"class-K function {given}: give a finite expression of s alone, like 2*s**3")
+            raise ConfigurationError(f"class-K function {shortened(given)}: give a finite expression of s alone, like 2*s**3")
         object.__setattr__(self, "expression", expression)
+        # Before its values are computed: what can be read is small.
+        if parsed(str(self)) != expression:
+            texts = f"{shortened(given)} cannot be written and read again as {shortened(self)}"
+            raise ConfigurationError(f"class-K function {texts}; write numbers as floats")
         _require_increasing(expression)
-        if _parsed(str(self)) != expression:
-            raise ConfigurationError(f"class-K function {given} cannot be written and read again as {self}; write numbers as floats")
+        if sp.diff(expression, S).has(sp.Derivative, sp.Subs):
+            raise ConfigurationError(f"class-K function {shortened(self)}: sympy cannot tell its slope; write it without that Abs")
 
     def __call__(self, value: sp.Expr) -> sp.Expr:
         """Return alpha(value)."""
@@ -73,7 +91,9 @@ class ClassK:
     def is_smooth(self, order: int) -> bool:
         """Whether the derivatives up to an order are finite and continuous at 0, the one place where s |s| and the like are not."""
         slopes = [sp.diff(self.expression, S, i).replace(sp.DiracDelta, lambda *_: sp.Integer(0)) for i in range(order + 1)]
-        value = sp.lambdify(S, slopes, "mpmath")
+        if any(slope.has(sp.Derivative, sp.Subs) for slope in slopes):
+            return False
+        value = sp.lambdify(S, slopes, _MODULES)
         try:
             with mpmath.workdps(_DIGITS):
                 middle, below, above, wide = [value(mpmath.mpf(s)) for s in (0, -_NEAR, _NEAR, 1e6 * _NEAR)]
@@ -141,12 +161,13 @@ def positive_rates(name: str, given: Any) -> tuple[float, ...]:
     """
     entries = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
     try:
-        values = tuple(float(r) for r in entries)
-    except (TypeError, ValueError):
+        # A text that is a number is one already.
+        values = () if any(isinstance(r, str) for r in entries) else tuple(float(r) for r in entries)
+    except (TypeError, ValueError, OverflowError):
         values = ()
     if not values or not all(0 < v < float("inf") for v in values):
-        listing = ", ".join(map(str, entries)) or "none"
-        raise ConfigurationError(f"{name} = {listing}; give positive numbers")
+        listing = ", ".join(r if isinstance(r, str) else shown(r) for r in entries) or "none"
+        raise ConfigurationError(f"{name} = {shortened(listing)}; give positive numbers")
     return values
 
 
@@ -156,47 +177,20 @@ def applied(rate: Rate, value: sp.Expr) -> sp.Expr:
 
 
 def _require_increasing(alpha: sp.Expr) -> None:
-    value = sp.lambdify(S, alpha, "mpmath")
+    value = sp.lambdify(S, alpha, _MODULES)
+    name = shortened(alpha)
     near, far = [k / 100 for k in range(1, 201)], [10 ** (k / 25) for k in range(9, 101)]
     with mpmath.workdps(_DIGITS):
         try:
             at_zero = value(mpmath.mpf(0))
             values = [value(mpmath.mpf(s)) for s in (*(-s for s in reversed(near + far)), 0, *near, *far)]
         except (ArithmeticError, TypeError, ValueError) as error:
-            raise ConfigurationError(f"class-K function {alpha} has no value somewhere in [-1e4, 1e4]: {error}") from error
+            raise ConfigurationError(f"class-K function {name} has no value somewhere in [-1e4, 1e4]: {error}") from error
         if any(not isinstance(v, mpmath.mpf) or not mpmath.isfinite(v) for v in values):
-            raise ConfigurationError(f"class-K function {alpha} is not real and finite everywhere; for even powers write s*Abs(s)")
+            raise ConfigurationError(f"class-K function {name} is not real and finite everywhere; for even powers write s*Abs(s)")
         if at_zero != 0:
-            raise ConfigurationError(f"class-K function {alpha} is {mpmath.nstr(at_zero, 4)} at 0; it has to go through 0")
+            raise ConfigurationError(f"class-K function {name} is {mpmath.nstr(at_zero, 4)} at 0; it has to go through 0")
         middle = slice(len(far), len(values) - len(far))
         rising = all(a < b for a, b in pairwise(values[middle]))
         if not rising or any(a > b for a, b in pairwise(values)):
-            raise ConfigurationError(f"class-K function {alpha} is not strictly increasing; for even powers write s*Abs(s)")
-
-
-def _parsed(text: str) -> Any:
-    """Evaluate arithmetic of s without Python's eval, which would run whatever stands in a spec."""
-    try:
-        return _evaluated(ast.parse(text.replace("^", "**"), mode="eval").body)
-    except (SyntaxError, TypeError, ZeroDivisionError) as error:
-        raise ConfigurationError(f"class-K function {text!r} is no expression of s, like 2*s**3 or tanh(s)") from error
-
-
-def _evaluated(node: ast.AST) -> Any:
-    match node:
-        case ast.Name(name) if name in _CONSTANTS:
-            return _CONSTANTS[name]
-        case ast.Constant(int() | float() as number):
-            return sp.sympify(number)
-        case ast.BinOp(left, kind, right) if type(kind) in _OPERATORS:
-            first, second = _evaluated(left), _evaluated(right)
-            if isinstance(kind, ast.Pow) and not (second.is_number and abs(second) <= _LARGEST_EXPONENT):
-                raise ConfigurationError(f"class-K function: the exponent {ast.unparse(right)} is no number up to {_LARGEST_EXPONENT}")
-            return _OPERATORS[type(kind)](first, second)
-        case ast.UnaryOp(kind, operand) if type(kind) in _OPERATORS:
-            return _OPERATORS[type(kind)](_evaluated(operand))
-        case ast.Call(ast.Name(name), [argument], []):
-            if name not in _FUNCTIONS:
-                raise ConfigurationError(f"class-K function: unknown function {name!r}; {nearest(name, _FUNCTIONS)}")
-            return _FUNCTIONS[name](_evaluated(argument))
-    raise ConfigurationError(f"class-K function: {ast.unparse(node)!r} is not allowed; write arithmetic of s, like 2*s**3 or tanh(s)")
+            raise ConfigurationError(f"class-K function {name} is not strictly increasing; for even powers write s*Abs(s)")

@@ -13,7 +13,7 @@ import sympy as sp
 
 from safe_envs.barrier import Barrier
 from safe_envs.calculus import derivatives, drift_derivative, generator, gradient, input_derivative, ito_term, relative_degree, tidied
-from safe_envs.errors import ConfigurationError, RelativeDegreeError
+from safe_envs.errors import ConfigurationError, RelativeDegreeError, shown
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.base import FIRST_ORDER, AffineConstraint, Condition, chain_of
 from wrappers.conditions.cbf import gains_of_poles
@@ -81,12 +81,12 @@ class LearnedCondition(Condition):
 
 def _at_least_zero(name: str, value: Any) -> None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
-        raise ConfigurationError(f"{name} = {value!r}; give a number >= 0")
+        raise ConfigurationError(f"{name} = {shown(value)}; give a number >= 0")
 
 
 def _share(name: str, value: Any) -> None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1:
-        raise ConfigurationError(f"{name} = {value!r}; give a number above 0 and below 1")
+        raise ConfigurationError(f"{name} = {shown(value)}; give a number above 0 and below 1")
 
 
 @dataclass(frozen=True)
@@ -259,6 +259,8 @@ class BayesianSCBF(LearnedCondition):
         Raises:
             RelativeDegreeError: there is no relative degree, or it is not 1 and the robust form is asked for.
         """
+        if self.learned.pruned.all():
+            raise RelativeDegreeError("no input acts on the identified system: learn from more data, or under larger inputs")
         if not self.robust:
             return AffineConstraint.after(model, *chain_of(model, barrier, None, generator))
         degree = relative_degree(model, barrier.expression, generator)

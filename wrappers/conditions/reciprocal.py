@@ -9,7 +9,7 @@ import sympy as sp
 
 from safe_envs.barrier import Barrier
 from safe_envs.calculus import relative_degree, spread
-from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest
+from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest, shown
 from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions.base import AffineConstraint, Condition, resolved
 from wrappers.conditions.class_k import positive_rates
@@ -37,7 +37,7 @@ class _Reciprocal(Condition):
         super().__post_init__()
         object.__setattr__(self, "gamma", positive_rates("gamma", (self.gamma,))[0])
         if self.form not in _FORMS:
-            raise ConfigurationError(f"form = {self.form!r}; {nearest(str(self.form), _FORMS)}")
+            raise ConfigurationError(f"form = {shown(self.form)}; {nearest(str(self.form), _FORMS)}")
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint.

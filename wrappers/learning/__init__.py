@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from safe_envs.errors import nearest
+from safe_envs.errors import nearest, shown
 from safe_envs.problem import SafetyProblem
 from wrappers.learning.base import LearnedModel, Progress, Record
 from wrappers.learning.checks import require_problem
@@ -58,5 +58,5 @@ def load_learned(path: Path | str, problem: SafetyProblem, method: str | None = 
 
 def _module(method: str) -> Any:
     if method not in METHODS:
-        raise LearnedFileError(f"unknown method {method!r}; {nearest(method, METHODS)}")
+        raise LearnedFileError(f"unknown method {shown(method)}; {nearest(method, METHODS)}")
     return import_module(f"wrappers.learning.{METHODS[method][0]}")

@@ -11,8 +11,9 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from safe_envs.errors import require_whole, shortened
 from safe_envs.problem import SafetyProblem
-from wrappers.learning.files import Content, LearnedFileError, Signature, checksum, save
+from wrappers.learning.files import Content, LearnedFileError, Signature, checksum, require_finite, require_text, save
 
 Progress = Callable[[float], None]
 """Told which part of the work is done, from 0 to 1."""
@@ -39,6 +40,23 @@ class Record:
     errors: dict[str, float] = field(default_factory=dict)
     settings: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Record:
+        """Read what `asdict` and JSON made of one.
+
+        Raises:
+            TypeError, ValueError: it is something else.
+        """
+        found = dict(data)
+        for name in ("transitions", "seed"):
+            if found[name] is not None or name != "seed":
+                require_whole(name, found[name], 0)
+        for name in ("observed", "seconds"):
+            found[name] = require_finite(found[name])
+        found["errors"] = {name: require_finite(error) for name, error in found["errors"].items()}
+        found["settings"], found["warnings"] = dict(found["settings"]), tuple(map(require_text, found["warnings"]))
+        return cls(**found)
 
 
 class LearnedModel(ABC):
@@ -103,12 +121,12 @@ class LearnedModel(ABC):
         cls.check(content.signature, problem)
         try:
             details = dict(content.details)
-            record = details.pop("record")
-            model = cls.restored(problem, Record(**{**record, "warnings": tuple(record["warnings"])}), details, content.arrays)
+            record = Record.from_json(details.pop("record"))
+            model = cls.restored(problem, record, details, content.arrays)
         except LearnedFileError:
             raise
-        except (KeyError, TypeError, ValueError) as error:
-            raise LearnedFileError(f"the file of {content.kind} is incomplete: {error}. Learn again") from error
+        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+            raise LearnedFileError(f"the file of {content.kind} is incomplete or altered: {shortened(error)}. Learn again") from error
         # What may differ from the problem, such as its noise, stays that of the data. The models are frozen.
         object.__setattr__(model, "signature", content.signature)
         return model

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.stats import chi2, norm
 from scipy.stats import f as fisher
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem import SafetyProblem
 from wrappers.learning.base import Progress, Record
 from wrappers.learning.checks import Purpose, random_stream, require_kind, require_problem
@@ -280,10 +280,10 @@ def identify(
 
 def _require_prior(prior: float, alpha: float, beta: float) -> None:
     if not 0 < prior < math.inf:
-        raise ConfigurationError(f"prior = {prior!r}; the variance of the weights is positive and finite")
+        raise ConfigurationError(f"prior = {shown(prior)}; the variance of the weights is positive and finite")
     for name, value in (("alpha", alpha), ("beta", beta)):
         if not 0 <= value < math.inf:
-            raise ConfigurationError(f"{name} = {value!r}; the prior of sigma needs a finite number from 0")
+            raise ConfigurationError(f"{name} = {shown(value)}; the prior of sigma needs a finite number from 0")
 
 
 def _degree(problem: SafetyProblem, rows: int) -> int:

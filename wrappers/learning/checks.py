@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.errors import ConfigurationError, require_whole
+from safe_envs.calculus import relative_degree
+from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.problem import SafetyProblem
 
 _MOST_BYTES = 2e9
@@ -63,6 +64,13 @@ def require_kind(name: str, value: Any, kind: type, source: str) -> None:
     """
     if not isinstance(value, kind):
         raise ConfigurationError(f"{name} = {reprlib.repr(value)}, a {type(value).__name__}; give a {kind.__name__}, as {source} makes it")
+
+
+def require_degrees(problem: SafetyProblem, given: Any) -> None:
+    """Raise ValueError unless these are the relative degrees of a problem's barriers: what a file says is to be so before it is used."""
+    wanted = [relative_degree(problem.model, b.expression) for b in problem.barriers]
+    if given != wanted:
+        raise ValueError(f"the degrees {shown(given)}, where the barriers have {wanted}")
 
 
 def require_problem(problem: Any) -> None:

@@ -15,6 +15,7 @@ from safe_envs.sde import ControlAffineSDE
 from wrappers.learning.checks import Purpose, random_stream
 from wrappers.learning.estimators import by_parts, rounding
 from wrappers.learning.features import Features
+from wrappers.learning.files import array_of
 from wrappers.learning.transitions import Transitions
 
 _DEGREES = (0, 1, 2)
@@ -130,13 +131,13 @@ class LearnedDiffusion:
             KeyError: a part is missing.
             ValueError: the parts do not fit.
         """
-        entries = []
+        entries, places = [], {(i, j) for j in range(len(states)) for i in range(j + 1)}
         for d in details:
-            features = Features(states, tuple((low, high) for low, high in d["region"]), d["degree"], tuple(d["angles"]))
-            weights = arrays[_name(d["row"], d["column"])]
-            if weights.shape != (features.count,):
-                raise ValueError(f"{weights.shape} weights for {features.count} features")
-            entries.append(Entry(d["row"], d["column"], features, weights))
+            # Each place once.
+            places.remove((d["row"], d["column"]))
+            features = Features.from_json(states, d["region"], d["degree"], d["angles"])
+            weights = array_of(arrays, _name(d["row"], d["column"]), (features.count,))
+            entries.append(Entry(int(d["row"]), int(d["column"]), features, weights))
         return cls(states, tuple(entries))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.codegen import Components, compile_function, filled, stacked
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
 from wrappers.learning.network import Network
@@ -214,7 +214,7 @@ def in_bulk(network: Network, inputs: Sequence[np.ndarray]) -> np.ndarray:
 def require_estimator(name: str) -> None:
     """Raise ConfigurationError unless there is an estimator of this name."""
     if name not in get_args(Estimator):
-        raise ConfigurationError(f"estimator = {name!r}; allowed: {', '.join(get_args(Estimator))}")
+        raise ConfigurationError(f"estimator = {shown(name)}; allowed: {', '.join(get_args(Estimator))}")
 
 
 def ito_part(data: Transitions, rate: np.ndarray, value: Values, slopes: Slopes, estimator: Estimator = "martingale") -> Estimate:

@@ -13,8 +13,9 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.codegen import compile_function, stacked
-from safe_envs.errors import ConfigurationError, require_whole
+from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.problem import SafetyProblem
+from wrappers.learning.files import require_finite, require_text
 
 _MOST = 300
 """Features; a regression holds the square of some multiple of their number, and their symbols take minutes to write out."""
@@ -64,6 +65,19 @@ class Features:
         """
         require_whole(name, degree, 0)
         return cls(problem.plant.states, problem.exploration.region, degree, _angles(problem))
+
+    @classmethod
+    def from_json(cls, states: tuple[sp.Symbol, ...], region: Any, degree: Any, angles: Any) -> Features:
+        """Features as a file describes them.
+
+        Raises:
+            TypeError, ValueError: it describes none.
+        """
+        ranges = tuple((require_finite(low), require_finite(high)) for low, high in region)
+        found = cls(states, ranges, degree, tuple(map(require_text, angles)))
+        if not all(math.isfinite(half) and half > 0 for half in (0.5 * (high - low) for low, high in ranges)):
+            raise ValueError(f"the ranges {shown(ranges)}")
+        return found
 
     @classmethod
     def allowed(cls, problem: SafetyProblem, degree: int) -> bool:

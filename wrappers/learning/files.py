@@ -15,9 +15,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shortened, shown
 from safe_envs.files import write_atomically
 from safe_envs.problem import SafetyProblem
+from safe_envs.reading import MOST_BYTES, MOST_BYTES_OF_TEXT, open_archive, open_regular
 from safe_envs.sde import ControlAffineSDE
 
 DATA = "transitions"
@@ -28,19 +29,26 @@ _HEADER = "header"
 _PACKAGES = ("safe-envs", "numpy", "sympy", "torch")
 
 
-# What NumPy, zipfile and json are seen to raise on damaged files.
+# What zipfile, NumPy, json and Python raise on damaged files, and on JSON of another shape.
 _DAMAGED = (
-    OSError,
     EOFError,
-    ValueError,
-    KeyError,
-    TypeError,
+    ArithmeticError,
     AttributeError,
-    RuntimeError,
+    LookupError,
     MemoryError,
-    zlib.error,
+    NotImplementedError,
+    RecursionError,
+    RuntimeError,
+    TypeError,
+    ValueError,
     zipfile.BadZipFile,
+    zlib.error,
 )
+
+_MOST_PARTS = 1000
+LARGEST = 1e100
+"""Number in a file: a product of a few is a number still."""
+_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class LearnedFileError(ConfigurationError):
@@ -117,15 +125,49 @@ class Signature:
 
     @classmethod
     def from_json(cls, data: Mapping[str, Any]) -> Signature:
-        """Read what `asdict` and JSON made of one."""
+        """Read what `asdict` and JSON made of one.
+
+        Raises:
+            TypeError, ValueError: it is something else.
+        """
         found = dict(data)
-        for name in ("states", "state_units", "inputs", "input_units", "barriers"):
-            found[name] = tuple(found[name])
-        for name in ("model", "plant"):
-            found[name] = tuple((parameter, float(value)) for parameter, value in found[name])
         if set(found) != {f.name for f in fields(cls)}:
-            raise KeyError("signature")
+            raise ValueError("the entries of a signature are others")
+        found["system"], found["dt"] = require_text(found["system"]), require_finite(found["dt"])
+        for name in ("states", "state_units", "inputs", "input_units", "barriers"):
+            found[name] = tuple(map(require_text, found[name]))
+        for name in ("model", "plant"):
+            found[name] = tuple((require_text(parameter), require_finite(value)) for parameter, value in found[name])
         return cls(**found)
+
+
+def require_text(given: Any) -> str:
+    """Return a text of JSON; raise TypeError where it is none."""
+    if not isinstance(given, str):
+        raise TypeError(f"{shown(given)} is no text")
+    return given
+
+
+def require_finite(given: Any) -> float:
+    """Return a number of JSON as a float; raise TypeError where it is none, ValueError where it is not finite."""
+    if isinstance(given, bool) or not isinstance(given, int | float):
+        raise TypeError(f"{shown(given)} is no number")
+    if not math.isfinite(given):
+        raise ValueError(f"{given} is not finite")
+    return float(given)
+
+
+def array_of(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the array of a name, as floats.
+
+    Raises:
+        KeyError: there is none.
+        ValueError: its shape is another, or a number is not finite or too large.
+    """
+    array = arrays[name].astype(float, copy=False)
+    if array.shape != shape or not (np.abs(array) <= LARGEST).all():
+        raise ValueError(f"{name} has the shape {array.shape}, not {shape}, or a number that is not finite or above {LARGEST:g}")
+    return array
 
 
 def _parameters(system: ControlAffineSDE) -> tuple[tuple[str, float], ...]:
@@ -157,7 +199,7 @@ def checksum(kind: str, signature: Signature, details: Mapping[str, Any], arrays
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
         digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
-        digest.update(array.tobytes())
+        digest.update(array.reshape(-1).data)
     return digest.hexdigest()
 
 
@@ -172,8 +214,11 @@ def save(path: Path, kind: str, signature: Signature, details: Mapping[str, Any]
         arrays: numbers by name; none may be called "header".
 
     Raises:
-        ConfigurationError: it cannot be written there.
+        ConfigurationError: it cannot be written there, or would be too large to be read.
     """
+    size = sum(np.asarray(array).nbytes for array in arrays.values())
+    if size > MOST_BYTES:
+        raise ConfigurationError(f"{path} would take {size / 1e6:.3g} MB; at most {MOST_BYTES / 1e6:g} MB are read: save less in a file")
     header = {
         "format": _FORMAT,
         "kind": kind,
@@ -208,24 +253,49 @@ def load(path: Path) -> Content:
     Raises:
         LearnedFileError: it is missing, a folder, no such file, truncated or altered.
     """
-    if path.is_dir():
-        raise LearnedFileError(f"{path} is a folder; name a file in it that `safe-envs identify` wrote")
+    name = shortened(path)
     try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        header = json.loads(arrays.pop(_HEADER).tobytes().decode())
-        if header["format"] != _FORMAT:
-            raise LearnedFileError(f"{path} has the format {header['format']}; this version reads {_FORMAT}. Learn again")
-        signature = Signature.from_json(header["signature"])
-        content = Content(header["kind"], signature, header["details"], arrays, header["sha256"])
+        with open_regular(path) as stream, open_archive(stream) as archive:
+            content = _content(name, archive)
     except FileNotFoundError as error:
-        raise LearnedFileError(f"{path} does not exist; `safe-envs identify` writes such files") from error
+        raise LearnedFileError(f"{name} does not exist; `safe-envs identify` writes such files") from error
+    except IsADirectoryError as error:
+        raise LearnedFileError(f"{name} is a folder; name a file in it that `safe-envs identify` wrote") from error
+    except OSError as error:
+        raise LearnedFileError(f"{name} cannot be read: {error.strerror}; name a file that `safe-envs identify` wrote") from error
     except _DAMAGED as error:
         if isinstance(error, LearnedFileError):
             raise
         raise LearnedFileError(
-            f"{path} is no file of `safe-envs identify`, or it is truncated or altered ({type(error).__name__})"
+            f"{name} is no file of `safe-envs identify`, or it is truncated or altered ({type(error).__name__})"
         ) from error
-    if content.sha256 != checksum(content.kind, signature, content.details, arrays):
-        raise LearnedFileError(f"{path} was altered: its content does not match its checksum. Learn again")
+    if content.sha256 != checksum(content.kind, content.signature, content.details, content.arrays):
+        raise LearnedFileError(f"{name} was altered: its content does not match its checksum. Learn again")
     return content
+
+
+def _content(name: str, archive: zipfile.ZipFile) -> Content:
+    """What an archive holds; of what is no file of this project, nothing but the header is read."""
+    parts = {part.filename.removesuffix(".npy"): part for part in archive.infolist()}
+    if len(parts) != len(archive.infolist()) or len(parts) > _MOST_PARTS:
+        raise ValueError("too many parts, or two of one name")
+    # Ours are as large in the file as in memory.
+    if any(part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size for part in parts.values()):
+        raise ValueError("a part is compressed")
+    if parts[_HEADER].file_size > MOST_BYTES_OF_TEXT:
+        raise ValueError("the header is too large")
+    header = json.loads(_array(archive, parts.pop(_HEADER)).tobytes())
+    if header["format"] != _FORMAT:
+        raise LearnedFileError(f"{name} has the format {shown(header['format'])}; this version reads {_FORMAT}. Learn again")
+    kind, signature, details = require_text(header["kind"]), Signature.from_json(header["signature"]), dict(header["details"])
+    return Content(kind, signature, details, {key: _array(archive, part) for key, part in parts.items()}, require_text(header["sha256"]))
+
+
+def _array(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> np.ndarray:
+    """An array of numbers, for which no more memory is taken than the part has bytes."""
+    with archive.open(part) as stream:
+        shape, _, kind = _HEADERS[np.lib.format.read_magic(stream)](stream)
+        if kind.kind not in "biuf" or math.prod(shape) * kind.itemsize != part.file_size - stream.tell():
+            raise ValueError("it holds no numbers, or others than its header says")
+        stream.seek(0)
+        return np.lib.format.read_array(stream, allow_pickle=False)

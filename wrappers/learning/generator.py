@@ -15,10 +15,10 @@ import sympy as sp
 from safe_envs.barrier import Barrier
 from safe_envs.calculus import derivatives, drift_derivative, generator, gradient, relative_degree
 from safe_envs.codegen import Components, compile_function, filled, stacked
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem import SafetyProblem
 from wrappers.learning.base import LearnedModel, Progress, Record
-from wrappers.learning.checks import require_kind, require_problem
+from wrappers.learning.checks import require_degrees, require_kind, require_problem
 from wrappers.learning.collect import Step, collect
 from wrappers.learning.diffusion import LearnedDiffusion
 from wrappers.learning.estimators import (
@@ -153,7 +153,10 @@ class GeneratorModel(LearnedModel):
         if details["way"] == "direct":
             return cls(Signature.of(problem), record, diffusion=LearnedDiffusion.restored(states, details["entries"], arrays))
         if details["coordinates"] != [str(c) for c in coordinates]:
-            raise LearnedFileError(f"what was learned takes the coordinates {details['coordinates']}, not {coordinates}; learn again")
+            raise LearnedFileError(
+                f"what was learned takes the coordinates {shown(details['coordinates'])}, not {coordinates}; learn again"
+            )
+        require_degrees(problem, details["degrees"])
         orders = [[f"barrier_{i}_order_{j}" for j in range(1, degree + 1)] for i, degree in enumerate(details["degrees"])]
         networks = [tuple(Network.from_arrays(arrays, prefix, _ACTIVATION) for prefix in prefixes) for prefixes in orders]
         generators = tuple(LearnedGenerator(states, coordinates, found) for found in networks)
@@ -230,7 +233,7 @@ def learn_generator(
     require_problem(problem)
     require_estimator(estimator)
     if way not in (None, *get_args(Way)):
-        raise ConfigurationError(f"way = {way!r}; allowed: {', '.join(get_args(Way))}")
+        raise ConfigurationError(f"way = {shown(way)}; allowed: {', '.join(get_args(Way))}")
     begin, told = time.perf_counter(), progress or (lambda _: None)
     degrees = [relative_degree(problem.model, b.expression) for b in problem.barriers]
     if data is None:

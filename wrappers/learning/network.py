@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from safe_envs.codegen import finite
-from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.errors import ConfigurationError, nearest, shown
 
 Activation = Literal["relu", "tanh"]
 
@@ -54,7 +54,10 @@ class Network:
         for name in _VECTORS:
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         self._check()
-        object.__setattr__(self, "_folded", self._fold())
+        with np.errstate(over="ignore", invalid="ignore"):
+            object.__setattr__(self, "_folded", self._fold())
+        if not all(np.isfinite(part).all() for layer in self._folded for part in layer):
+            raise ConfigurationError("the numbers of a network are too large to be multiplied")
 
     def _check(self) -> None:
         require_activation(self.activation)
@@ -153,7 +156,7 @@ class Network:
 def require_activation(name: str) -> None:
     """Raise ConfigurationError unless there is an activation of this name."""
     if name not in get_args(Activation):
-        raise ConfigurationError(f"activation = {name!r}; {nearest(name, get_args(Activation))}")
+        raise ConfigurationError(f"activation = {shown(name)}; {nearest(name, get_args(Activation))}")
 
 
 def _one(inputs: Sequence[float]) -> np.ndarray:

@@ -17,13 +17,16 @@ from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
 from wrappers.learning.base import LearnedModel, Record
 from wrappers.learning.features import Features
-from wrappers.learning.files import Signature
+from wrappers.learning.files import LARGEST, LearnedFileError, Signature, array_of, require_finite
 from wrappers.learning.regression import Gaussian, sigma_map, sigma_samples
 
 _SIGNIFICANT = 0.999
 _POINTS = 256
 _SLOPE = 1e-6
 """Part of its range by which a state is moved to see how f and g change."""
+
+_ROUNDING = 1e-9
+"""Of the entries of a matrix of correlations."""
 
 _ROUNDED = 1e-3
 """Part of its mean within which a regressed variance is rounded off towards 0, so that it stays positive and smooth."""
@@ -154,7 +157,7 @@ class Posterior(LearnedModel):
         for j in range(len(self.inputs)):
             block = slice((j + 1) * count, (j + 2) * count)
             weights = self.mean[:, block, None]
-            size = (weights * np.linalg.solve(self.covariance[:, block, block], weights)).sum(axis=(1, 2))
+            size = (weights * _solved(self.covariance[:, block, block], weights)).sum(axis=(1, 2))
             small[:, j] = size <= chi2.ppf(_SIGNIFICANT, count)
         return small
 
@@ -181,7 +184,7 @@ class Posterior(LearnedModel):
         for i, row in enumerate(self.pruned):
             zero = np.flatnonzero(np.repeat([False, *row], self.features.count))
             if zero.size:
-                gain = np.linalg.solve(covariance[i][np.ix_(zero, zero)], covariance[i][zero]).T
+                gain = _solved(covariance[i][np.ix_(zero, zero)], covariance[i][zero]).T
                 mean[i] -= gain @ mean[i][zero]
                 covariance[i] -= gain @ covariance[i][zero]
                 mean[i][zero], covariance[i][zero], covariance[i][:, zero] = 0.0, 0.0, 0.0
@@ -274,31 +277,31 @@ class Posterior(LearnedModel):
     @classmethod
     def restored(cls, problem: SafetyProblem, record: Record, details: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Self:
         """See `LearnedModel.restored`. The region is the one in which was learned."""
-        region = tuple((float(low), float(high)) for low, high in details["region"])
 
         def features(degree: int) -> Features:
-            return Features(problem.plant.states, region, degree, tuple(details["angles"]))
+            return Features.from_json(problem.plant.states, details["region"], degree, details["angles"])
 
-        degree = details["diffusion_degree"]
+        def numbers(name: str, *shape: int) -> np.ndarray:
+            return array_of(arrays, name, shape)
+
+        n, m, phi = problem.plant.n, problem.plant.m, features(details["degree"])
+        count, degree = phi.count * (1 + m), details["diffusion_degree"]
+        varying = features(degree) if degree else None
         noise = Diffusion(
-            **{name: arrays[name] for name in ("squares", "correlation")},
-            **{name: details[name] for name in ("count", "alpha", "beta")},
-            features=features(degree) if degree else None,
-            variance=Gaussian(arrays["variance_mean"], arrays["variance_covariance"]) if degree else None,
+            numbers("squares", n),
+            correlation=numbers("correlation", n, n),
+            **{name: require_finite(details[name]) for name in ("count", "alpha", "beta")},
+            features=varying,
+            variance=varying
+            and Gaussian(numbers("variance_mean", n, varying.count), numbers("variance_covariance", n, varying.count, varying.count)),
         )
-        return cls(
-            Signature.of(problem),
-            record,
-            features(details["degree"]),
-            problem.plant.inputs,
-            arrays["input_scale"],
-            arrays["mean"],
-            arrays["covariance"],
-            noise,
-            details["dt"],
-            arrays["misfit"],
-            arrays["variation"],
-        )
+        _require_noise(noise)
+        weights = numbers("mean", n, count), numbers("covariance", n, count, count)
+        scale, dt = numbers("input_scale", m), require_finite(details["dt"])
+        if not (0 < dt <= LARGEST and (scale > 0).all()):
+            raise ValueError("a step or the scale of an input is not positive, or too large")
+        rest = dt, numbers("misfit", n), numbers("variation", n)
+        return cls(Signature.of(problem), record, phi, problem.plant.inputs, scale, *weights, noise, *rest)
 
     @classmethod
     def check(cls, signature: Signature, problem: SafetyProblem) -> None:
@@ -309,6 +312,23 @@ class Posterior(LearnedModel):
         """See `LearnedModel.compare`: f_i and g_ij in the units of the states per s, and the entries of sigma sigma'."""
         truth, estimate = _entries(problem.plant, x), _entries(self.system, x)
         return {name: (truth[name], estimate[name]) for name in truth}
+
+
+def _solved(covariance: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The solution of a system with a covariance of weights; what is learned has a regular one."""
+    try:
+        return np.linalg.solve(covariance, right)
+    except np.linalg.LinAlgError as error:
+        raise LearnedFileError("the covariance of the weights is singular: the file was altered. Learn again") from error
+
+
+def _require_noise(noise: Diffusion) -> None:
+    """Raise ValueError where noise has a variance, a correlation or a prior that there is not."""
+    correlation = noise.correlation
+    fits = (noise.squares >= 0).all() and 0 < noise.count <= LARGEST and max(noise.alpha, noise.beta) <= LARGEST
+    fits = fits and min(noise.alpha, noise.beta) >= 0
+    if not (fits and np.allclose(correlation, correlation.T, atol=_ROUNDING) and (abs(correlation) <= 1.0 + _ROUNDING).all()):
+        raise ValueError("the noise has a negative variance, a correlation above 1, or no degrees of freedom")
 
 
 def _entries(system: ControlAffineSDE, x: np.ndarray) -> dict[str, np.ndarray]:

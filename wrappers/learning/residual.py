@@ -17,11 +17,11 @@ import sympy as sp
 
 from safe_envs.calculus import derivatives, drift_derivative, input_derivative, relative_degree
 from safe_envs.codegen import Components, compile_function, stacked
-from safe_envs.errors import ConfigurationError, require_whole
+from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE, finite_number
 from wrappers.learning.base import LearnedModel, Progress, Record
-from wrappers.learning.checks import Purpose, random_stream, require_problem
+from wrappers.learning.checks import Purpose, random_stream, require_degrees, require_problem
 from wrappers.learning.collect import Step, collect_paths, draw_states
 from wrappers.learning.files import Signature
 from wrappers.learning.network import Network
@@ -91,12 +91,12 @@ class LearnedResidual:
         Source: split conformal prediction, Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005.
         """
         if not 0 <= level <= 1:
-            raise ConfigurationError(f"level = {level!r}; give a share from 0 to 1")
+            raise ConfigurationError(f"level = {shown(level)}; give a share from 0 to 1")
         n = len(self.heldout)
         # A level such as .95 is no binary number: 20 times it has to count as 19.
         rank = max(1, math.ceil(level * (n + 1) - _ROUNDING * n))
         if rank > n:
-            raise ConfigurationError(f"level = {level!r} is more than {n} held-out states can tell; {_remedy(level, n)}")
+            raise ConfigurationError(f"level = {shown(level)} is more than {n} held-out states can tell; {_remedy(level, n)}")
         return np.sort(self.heldout, axis=0)[rank - 1]
 
 
@@ -137,13 +137,14 @@ class ResidualModel(LearnedModel):
         """
         coordinates = problem.exploration.coordinates
         if [str(c) for c in coordinates] != details["coordinates"]:
-            raise ConfigurationError(f"it has the coordinates {details['coordinates']}, those of {problem.name} are {coordinates}")
-        parts = [
-            LearnedResidual(
-                problem.plant.states, coordinates, degree, Network.from_arrays(arrays, f"part_{i}", activation), arrays[f"part_{i}_heldout"]
-            )
-            for i, (degree, activation) in enumerate(zip(details["degrees"], details["activations"], strict=True))
-        ]
+            raise ConfigurationError(f"it has the coordinates {shown(details['coordinates'])}, those of {problem.name} are {coordinates}")
+        require_degrees(problem, details["degrees"])
+        parts = []
+        for i, (degree, activation) in enumerate(zip(details["degrees"], details["activations"], strict=True)):
+            network, heldout = Network.from_arrays(arrays, f"part_{i}", activation), arrays[f"part_{i}_heldout"].astype(float)
+            if heldout.shape != (len(heldout), degree + problem.plant.m) or not heldout.size or not (heldout >= 0).all():
+                raise ValueError(f"errors of the shape {heldout.shape}, or below 0")
+            parts.append(LearnedResidual(problem.plant.states, coordinates, degree, network, heldout))
         return cls(Signature.of(problem), record, tuple(parts))
 
     @classmethod

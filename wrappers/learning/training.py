@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole
+from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole, shown
 from wrappers.learning.base import Progress
 from wrappers.learning.checks import Purpose, random_stream
 from wrappers.learning.network import Activation, Network, require_activation
@@ -95,7 +95,7 @@ def train(
     rows = random_stream(seed, Purpose.TRAINING).permutation(len(inputs))
     require_activation(activation)
     if not 0 < rate < 1:
-        raise ConfigurationError(f"rate = {rate!r}; give a number between 0 and 1")
+        raise ConfigurationError(f"rate = {shown(rate)}; give a number between 0 and 1")
     fitted, validated = int(_TRAINED * len(rows)), int(_VALIDATED * len(rows))
     parts = np.split(rows, [fitted, fitted + validated])
     ends = (*_standardisation(inputs), *_standardisation(targets, sizes))
@@ -120,7 +120,7 @@ def hidden_widths(hidden: Any) -> tuple[int, ...]:
     try:
         widths = tuple(hidden)
     except TypeError as error:
-        raise ConfigurationError(f"hidden = {hidden!r}; give the width of each hidden layer, such as (100, 30) or (100,)") from error
+        raise ConfigurationError(f"hidden = {shown(hidden)}; give the width of each hidden layer, such as (100, 30) or (100,)") from error
     for width in widths:
         require_whole("the width of a hidden layer", width, 1)
     return tuple(map(int, widths))

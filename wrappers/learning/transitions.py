@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole
+from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole, shortened, shown
 from safe_envs.problem import SafetyProblem
 from wrappers.learning.checks import require_kind, require_problem
 from wrappers.learning.files import DATA, LearnedFileError, Signature, load, save
@@ -72,18 +72,18 @@ class Transitions:
 
     def _refuse_copies(self) -> None:
         # Rows can be very long; almost always the first successor tells them apart.
-        labels = _labels(np.hstack((self.x, self.u, self.successors[:, 0])))
+        labels = _labels(np.column_stack((self.dt, self.x, self.u, self.successors[:, 0])))
         suspects = np.flatnonzero(np.bincount(labels)[labels] > 1)
         if not suspects.size:
             return
-        rows = [self.x[suspects], self.u[suspects], self.successors[suspects].reshape(len(suspects), -1)]
-        labels = _labels(np.hstack(rows))
+        rows = [self.dt[suspects], self.x[suspects], self.u[suspects], self.successors[suspects].reshape(len(suspects), -1)]
+        labels = _labels(np.column_stack(rows))
         copied = np.bincount(labels)[labels] > 1
         if copied.any():
             first, second = suspects[labels == labels[copied.argmax()]][:2].tolist()
             raise InvalidInputError(
-                f"rows {first} and {second} are the same: x = {self.x[first]}, u = {self.u[first]}, and all successors. A copy tells "
-                "nothing new and makes estimates look surer than they are; drop the copies"
+                f"rows {first} and {second} are the same: x = {self.x[first]}, u = {self.u[first]}, dt, and all successors. A copy "
+                "tells nothing new and makes estimates look surer than they are; drop the copies"
             )
 
     @classmethod
@@ -155,7 +155,7 @@ class Transitions:
     def held_out(self, share: float, rng: np.random.Generator) -> np.ndarray:
         """Which rows `split` holds out, shape (P,); arguments and errors are the same."""
         if not 0 < share < 1:
-            raise ConfigurationError(f"share = {share!r}; give the part of the data to be held out, between 0 and 1")
+            raise ConfigurationError(f"share = {shown(share)}; give the part of the data to be held out, between 0 and 1")
         labels = _labels(self.x)
         states = int(labels.max()) + 1
         if states < 2:
@@ -184,11 +184,11 @@ class Transitions:
         """
         content = load(path)
         if content.kind != DATA:
-            raise LearnedFileError(f"{path} holds {content.kind!r}, not {DATA!r}; give a file that `Transitions.save` wrote")
+            raise LearnedFileError(f"{path} holds {shown(content.kind)}, not {shown(DATA)}; give a file that `Transitions.save` wrote")
         try:
             return cls(content.signature, **{name: content.arrays[name] for name in _ARRAYS}, seed=content.details["seed"])
         except (KeyError, TypeError, ValueError) as error:
-            raise LearnedFileError(f"the data in {path} are incomplete: {error}. Collect them again") from error
+            raise LearnedFileError(f"the data in {path} are incomplete: {shortened(error)}. Collect them again") from error
 
 
 def numbers(name: str, given: Any) -> np.ndarray:

@@ -219,6 +219,16 @@ def test_noise_that_varies_with_the_state(tmp_path: Path):
     assert values([drawn.diffusion[1, 1] ** 2], drawn.states, x)[:, 0] == pytest.approx(truth, abs=1e-3)
 
 
+def test_rounding_is_no_noise():
+    # Of the two states x_2 has noise. But the mean of three equal numbers is rounded, and they deviate from it.
+    problem = cubic_sde()
+    assert problem.plant.diffusion.row(0).is_zero_matrix
+    rows = Rows.of(collect(problem, 200, 3))
+    assert (rows.deviation[:, 0] != 0.0).any()
+    found = fit(rows, rows.design(Features.of(problem, 1), np.ones(1)), None, FLAT).diffusion
+    assert found.squares[0] == found.sigma[0] == 0.0 < found.sigma[1]
+
+
 def test_noise_that_drives_two_states_together():
     rng, x = np.random.default_rng(0), draw_states(CUBIC, 2000, np.random.default_rng(1))
     u, w = rng.choice([-1.0, 1.0], (2000, 1)), rng.standard_normal(2000)

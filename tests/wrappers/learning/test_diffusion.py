@@ -83,6 +83,13 @@ def test_covariances_have_their_law():
     assert (np.abs((scores**2).mean(axis=0) - 1) < 5 * np.sqrt(2 / 400) + 12 / 100).all()
 
 
+def test_covariances_of_repeated_steps_are_those_of_the_sample():
+    data = collect(made_up(CORRELATED), 20, 3, [(-1.0,)])
+    expected = [np.cov(successors.T, ddof=1) / dt for successors, dt in zip(data.successors, data.dt, strict=True)]
+    # What is subtracted is about a hundred times as large as what is left.
+    np.testing.assert_allclose(covariances(data, np.zeros_like(data.x)), expected, rtol=1e-11, atol=1e-13)
+
+
 @pytest.mark.parametrize("diffusion", [CORRELATED, VARYING, [[0.3], [0.2]]], ids=["constant", "varying", "one channel"])
 def test_the_factor_of_the_system_returns_the_covariance(diffusion):
     problem = made_up(diffusion)
@@ -142,7 +149,7 @@ def test_restored_is_the_same():
     again = LearnedDiffusion.restored(problem.plant.states, found.details(), found.to_arrays())
     assert again.covariance == found.covariance
     damaged = {name: weights[1:] for name, weights in found.to_arrays().items()}
-    with pytest.raises(ValueError, match="weights for"):
+    with pytest.raises(ValueError, match="has the shape"):
         LearnedDiffusion.restored(problem.plant.states, found.details(), damaged)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError, InvalidInputError
+from wrappers.learning.checks import Purpose, random_stream
 from wrappers.learning.network import Network
 from wrappers.learning.training import train
 
@@ -193,6 +194,19 @@ def test_training_stops_when_the_validation_loss_does_not_fall():
     rng = np.random.default_rng(0)
     trained = train(rng.normal(size=(60, 2)), rng.normal(size=(60, 1)), hidden=(60, 30), epochs=2000, rate=1e-2)
     assert 60 < trained.epochs < 1000
+
+
+def test_the_weights_are_those_of_the_least_validation_loss():
+    # Noise cannot be learned: the loss of other rows soon rises.
+    rng = np.random.default_rng(0)
+    x, y = rng.normal(size=(100, 2)), rng.normal(size=(100, 1))
+    trained = train(x, y, hidden=(20,), rate=0.01, batch=10)
+    assert trained.epochs > 60
+    validation = random_stream(0, Purpose.TRAINING).permutation(100)[70:85]
+    predicted = trained.network.arrays(tuple(x[validation].T))[0]
+    loss = np.mean((predicted - y[validation, 0]) ** 2) / trained.network.output_scale[0] ** 2
+    # The loss was computed in single precision.
+    assert loss == pytest.approx(trained.validation_loss, rel=1e-5)
 
 
 def test_ten_rows_are_enough_to_run():

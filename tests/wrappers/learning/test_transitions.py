@@ -82,8 +82,9 @@ def test_copied_rows_are_refused():
     successors[2] = successors[0]
     with pytest.raises(InvalidInputError, match=r"rows 0 and 2 are the same.*drop the copies"):
         logged(x=x, u=u, successors=successors)
-    # Another input, or another second successor, is another row.
+    # Another input, another duration, or another second successor is another row.
     assert logged(x=x, successors=successors, u=[[1.0], [1.0], [-1.0]]).points == 3
+    assert logged(x=x, successors=successors, u=u, dt=[0.01, 0.01, 0.02]).points == 3
     successors[2, 1, 1] += 1e-9
     assert logged(x=x, u=u, successors=successors).points == 3
 

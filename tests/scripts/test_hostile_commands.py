@@ -1,0 +1,67 @@
+"""Command lines of whoever wants to do harm: status 2 and a short message, at once and without a traceback."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+
+SCALAR = ("evaluate", "Scalar-v0", "--episodes", 2)
+TRAIN = ("train", "Scalar-v0", "--algo", "ppo", "--n-timesteps", 64, "--out", "run", "--set")
+LONG = "x" * 100_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((*SCALAR, "--seed", "1_0"), "'1_0' is not a valid integer"),
+        ((*SCALAR, "--seed", "٣"), "'٣' is not a valid integer"),
+        ((*SCALAR, "--seed", "9" * 5000), "is not a valid integer"),
+        ((*SCALAR, "--dt", "1_0"), "'1_0' is not a valid float"),
+        (("demo", "--episodes", 0), "0 is not in the range x>=1"),
+        ((*SCALAR, "--noise", "1_0"), "'1_0' is no number"),
+        ((*SCALAR, "--noise", "٣"), "'٣' is no number"),
+        ((*SCALAR, "--box=-1_0,1"), "is no number"),
+        ((*SCALAR, "--plant", "sigma=1_0"), "'1_0' is not a number"),
+        ((*SCALAR, "--plant", f"sigma={'9' * 5000}"), "sigma = inf is not finite"),
+        ((*SCALAR, "--barrier", "limit=1_0"), "limit = '1_0' is not a number"),
+        ((*SCALAR, "--start", "1_0"), "unknown start '1_0'"),
+        ((*SCALAR, "--filter", "cbf:alpha=1_0"), "'1_0' is no decimal number"),
+        (("identify", "Scalar-v0", "--method", "ddscbf", "--out", "l.npz", "--set", "points=1_0"), "'1_0' is not a number"),
+        ((*TRAIN, "n_steps=6_4"), "6_4 is no plain number"),
+        ((*TRAIN, f"n_steps={'[' * 3000}"), "nested more than"),
+        ((*TRAIN, "n_steps=[&a [1], *a]"), "an alias is not allowed"),
+        ((*TRAIN, f"n_steps=[{'? ,' * 30_000}]"), "it has 90002 characters"),
+        ((*TRAIN, f"n_steps={'9' * 5000}"), "n_steps = inf; give a whole number"),
+        ((*SCALAR, "--filter", LONG), "unknown filter"),
+        ((*SCALAR, "--policy", LONG), "unknown policy"),
+        ((*SCALAR, "--monitoring", LONG), "monitoring ="),
+        ((*SCALAR, "--learned", LONG), "cannot be read: File name too long"),
+        ((*SCALAR, "--json", LONG), "File name too long"),
+        ((*SCALAR, "--json", "pipe"), "it is a pipe or a device"),
+        ((*SCALAR, "--learned", "pipe"), "it is a pipe or a device"),
+        ((*SCALAR, "--learned", "loop"), "Too many levels of symbolic links"),
+        (("evaluate", LONG), "unknown env"),
+        (("evaluate", "--system", f"{LONG}.py:problem"), "File name too long"),
+        (("evaluate", "--system", f"{LONG}:problem"), "ended with an error"),
+        (("evaluate", "--system", "pipe.py:problem"), "it is a pipe or a device"),
+        (("evaluate", "Pendulum-v1", "--filter-spec", "pipe.py:spec"), "it is a pipe or a device"),
+        (("sweep", "pipe", "--out", "found"), "it is a pipe or a device"),
+        (("sweep-report", "."), "holds no sweep"),
+        (("benchmark", "--compare", "pipe"), "it is a pipe or a device"),
+        (("benchmark", "--compare", "deep.json"), "is no JSON"),
+        (("leaderboard", "Scalar-v0", "--out", "."), "is not what `safe-envs leaderboard` writes"),
+    ],
+    ids=lambda given: " ".join(map(str, given))[:40] if isinstance(given, tuple) else "",
+)
+def test_what_no_command_can_take_ends_with_status_2_and_a_short_message(safe_envs_command, tmp_path, arguments, message):
+    for name in ("pipe", "pipe.py", "sweep.json"):
+        os.mkfifo(tmp_path / name)
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    (tmp_path / "results.json").write_text(json.dumps({"settings": {}, "rows": [{"env_id": "safe_envs/Scalar-v0"}]}))
+    status, out, err = safe_envs_command(*arguments)
+    assert (status, out) == (2, "")
+    assert message in " ".join(err.replace("│", " ").split())
+    assert len(err) < 2500
