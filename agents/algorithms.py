@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from agents.hyperparameters import scheduled
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
 from safe_envs.problem import SafetyProblem
 
 if TYPE_CHECKING:
@@ -78,11 +78,15 @@ def new_model(name: str, envs: VecEnv, problem: SafetyProblem, settings: Mapping
 
 def _require_known(name: str, settings: Mapping[str, Any]) -> None:
     given = ("self", "env", "seed", "device", "_init_setup_model")
-    allowed = [key for key in inspect.signature(algorithm_class(name)).parameters if key not in given]
+    parameters = inspect.signature(algorithm_class(name)).parameters
+    allowed = [key for key in parameters if key not in given]
     allowed += [*_OF_THE_ENV, *(_OF_THE_NOISE if name in OFF_POLICY else ())]
-    for key in settings:
+    for key, value in settings.items():
         if key not in allowed:
-            raise ConfigurationError(f"{name} does not take the hyperparameter {key!r}; {nearest(key, allowed)}")
+            raise ConfigurationError(f"{name} does not take the hyperparameter {shown(key)}; {nearest(key, allowed)}")
+        # Stable-Baselines3 would fail after the first rollout only.
+        if isinstance(value, str) and key in parameters and type(parameters[key].default) in (int, float):
+            raise ConfigurationError(f"{key} = {shown(value)}; give a number")
 
 
 def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:

@@ -60,7 +60,7 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
         (("--algo", "ppo", "--set", f"gamma={'[' * 3000}"), "nested more than 10 deep"),
         (("--algo", "ppo", "--set", "x" * 3000), "xxx: give NAME=VALUE"),
         (("--algo", "ppo", "--set", "policy_kwargs={a: &a [1, 1], b: &b [*a, *a], c: [*b, *b]}"), "an alias is not allowed"),
-        (("--algo", "ppo", "--set", "gamma=2020-13-45"), "2020-13-45"),
+        (("--algo", "ppo", "--set", "gamma=2020-13-45"), "gamma = '2020-13-45'; give a number"),
         (("--algo", "ppo", "--set", "n_steps=1_000"), "1_000 is no plain number"),
         (("--algo", "ppo", "--set", "gamma=\u0661"), "the digits 0 to 9"),
         (("--algo", "ppo", "--n-timesteps", 0), "n_timesteps = 0"),
