@@ -36,6 +36,7 @@ from agents.weights import save_policy
 from safe_envs.errors import ConfigurationError, SafeEnvsError
 from safe_envs.files import write_atomically, write_json, writing
 from safe_envs.problem import SafetyProblem
+from safe_envs.reading import open_regular, read_bytes
 
 if TYPE_CHECKING:
     from agents.figures import SafetyFigures
@@ -133,7 +134,7 @@ def restore_model(checkpoint: Path, model: Any, figures: SafetyFigures, n_timest
         ConfigurationError: the checkpoint cannot be read, or is that of another model.
     """
     with _reading(checkpoint):
-        document = json.loads(_content(checkpoint / _STATE, _MOST_TEXT))
+        document = json.loads(read_bytes(checkpoint / _STATE, _MOST_TEXT))
         if document.get("format") != _FORMAT:
             raise ConfigurationError(
                 f"{checkpoint} was written by another version, whose checkpoints this one does not read; "
@@ -175,36 +176,19 @@ def _reading(checkpoint: Path) -> Iterator[None]:
         ) from error
 
 
-def _content(path: Path, most: int) -> bytes:
-    """Return the content of a file of at most so many bytes.
-
-    Raises:
-        ValueError: it is no file, or larger.
-    """
-    _require_size(path, most)
-    return path.read_bytes()
-
-
 def _arrays(path: Path, most: int) -> Arrays:
     """Return the arrays of a file, which together have at most so many bytes.
 
     Raises:
-        ValueError: it is no file, or larger.
+        OSError: it is no regular file, or larger.
     """
-    _require_size(path, most + _HEADER)
+    open_regular(path, most + _HEADER).close()
     return load_file(path)
 
 
 def _size(arrays: Arrays) -> int:
     """The bytes of arrays."""
     return sum(array.nbytes for array in arrays.values())
-
-
-def _require_size(path: Path, most: int) -> None:
-    if not path.is_file():
-        raise ValueError(f"there is no file {path.name}")
-    if (size := path.stat().st_size) > most:
-        raise ValueError(f"{path.name} has {size} bytes, and {most} at most where it is not altered")
 
 
 def _contiguous(arrays: Arrays) -> Arrays:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
@@ -31,9 +32,10 @@ from agents.checkpoints import (
 from agents.evaluation import BARE, evaluate, package_versions
 from agents.problems import load_problem
 from agents.training import Training
-from safe_envs.errors import ConfigurationError, SafeEnvsError
+from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened
 from safe_envs.files import write_json, writing
 from safe_envs.locks import locked
+from safe_envs.reading import read_bytes
 
 _OF_EVALUATIONS = 2**32 - 1
 """Key of their seeds, which no number of steps is."""
@@ -85,7 +87,7 @@ def train(training: Training, folder: Path, *, resume: bool = False, tensorboard
         try:
             wanted.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigurationError(f"the folder {wanted} cannot be made: {error.strerror}; give another one") from error
+            raise ConfigurationError(f"the folder {shortened(wanted)} cannot be made: {error.strerror}; give another one") from error
     with locked(folder / _LOCK, f"another training is writing to {folder} just now; wait until it has ended, or give another folder"):
         # Another training may have begun in it since.
         _require_folder(folder, training, resume)
@@ -111,15 +113,15 @@ def _require_folder(folder: Path, training: Training, resume: bool) -> None:
     """Raise ConfigurationError unless the folder is new, or that of the same training."""
     if not resume:
         # A training that did not reach its first checkpoint leaves nothing that could be lost.
-        if folder.is_dir() and {path.name for path in folder.iterdir()} <= {_CONFIG, _EVALUATIONS, _PROGRESS, _LOCK}:
+        if os.path.isdir(folder) and {path.name for path in folder.iterdir()} <= {_CONFIG, _EVALUATIONS, _PROGRESS, _LOCK}:
             return
-        if folder.exists():
-            what = "is not empty" if folder.is_dir() else "is a file"
+        if os.path.exists(folder):
+            what = "is not empty" if os.path.isdir(folder) else "is a file"
             raise ConfigurationError(f"--out {folder} {what}; give a new folder, or go on with the training in one by --resume")
         return
     path = folder / _CONFIG
-    if not path.is_file():
-        raise ConfigurationError(f"--resume: {folder} holds no training; start it without --resume")
+    if not os.path.isfile(path):
+        raise ConfigurationError(f"--resume: {shortened(folder)} holds no training; start it without --resume")
     try:
         known = _flat(_read(path)["training"])
     except (LookupError, OSError, RecursionError, TypeError, ValueError) as error:
@@ -293,7 +295,5 @@ def _read_evaluations(path: Path) -> list[dict[str, Any]]:
 
 
 def _read(path: Path) -> Any:
-    """The content of a JSON file that is no larger than a training's can be."""
-    if not path.is_file() or path.stat().st_size > _MOST_TEXT:
-        raise ValueError(f"it is no file, or larger than {_MOST_TEXT} bytes")
-    return json.loads(path.read_text())
+    """Return the content of a JSON file that is no larger than a training's can be."""
+    return json.loads(read_bytes(path, _MOST_TEXT))

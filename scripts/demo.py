@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from agents.evaluation import evaluate
@@ -55,7 +56,7 @@ def _train(policy: Path, steps: int) -> None:
     console = stdout()
     console.print(f"Training PPO on {ENV_ID}, {steps} steps without any filter ...", highlight=False)
     with progress_bar("Training PPO") as tell:
-        seconds = train(Training.of(ENV_ID, "ppo", n_timesteps=steps, eval_freq=steps), policy, resume=policy.exists(), tell=tell)
+        seconds = train(Training.of(ENV_ID, "ppo", n_timesteps=steps, eval_freq=steps), policy, resume=os.path.exists(policy), tell=tell)
     console.print(f"Trained in {seconds:.0f} s of processor time and saved in {policy}\n", highlight=False, markup=False)
 
 

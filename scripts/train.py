@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -91,7 +92,7 @@ def train(
         threads=threads,
     )
     # The policy itself is written at the very end.
-    finished = resume and (out / DESCRIPTION).exists()
+    finished = resume and os.path.exists(out / DESCRIPTION)
     with progress_bar("Training") as tell:
         try:
             train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)

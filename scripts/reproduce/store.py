@@ -22,6 +22,7 @@ from matplotlib.figure import Figure
 from agents.evaluation import package_versions
 from safe_envs.errors import ConfigurationError
 from safe_envs.files import write_atomically, write_json
+from safe_envs.reading import read_bytes
 from scripts.figure import STYLE
 from scripts.reproduce.artefact import Artefact, Outcome, Sample
 
@@ -86,7 +87,7 @@ def read(folder: Path, artefact: Artefact, sample: Sample) -> tuple[Outcome, flo
             picture = folder / f"{artefact.name}{suffix}"
             if not picture.exists():
                 return None
-            if _checksum(_content(picture)) != pictures[suffix]:
+            if _checksum(read_bytes(picture, _MOST)) != pictures[suffix]:
                 raise ValueError(f"{picture.name} is another picture")
     return outcome, seconds
 
@@ -124,7 +125,7 @@ def _document(folder: Path, artefact: Artefact) -> dict[str, Any] | None:
     if not path.exists():
         return None
     with _reading(path):
-        document = json.loads(_content(path), parse_constant=_refuse)
+        document = json.loads(read_bytes(path, _MOST), parse_constant=_refuse)
         if not isinstance(document["configuration"], dict):
             raise ValueError("it has no configuration")
         digest = document.get("sha256")
@@ -147,13 +148,6 @@ def _reading(path: Path) -> Iterator[None]:
 
 def _path(folder: Path, artefact: Artefact) -> Path:
     return folder / f"{artefact.name}.json"
-
-
-def _content(path: Path) -> bytes:
-    """The content of a file that is no larger than a result's can be."""
-    if not path.is_file() or path.stat().st_size > _MOST:
-        raise ValueError(f"{path.name} is no file, or larger than {_MOST} bytes")
-    return path.read_bytes()
 
 
 def _refuse(name: str) -> NoReturn:

@@ -159,10 +159,15 @@ def test_a_checkpoint_with_a_pickle_is_of_another_version(copied):
 def test_files_that_are_not_there_or_endless_or_too_large_are_refused_before_they_are_read(name, copied):
     folder, checkpoint = copied
     path = checkpoint / name
-    for damage in (lambda: None, lambda: path.symlink_to("/dev/zero"), lambda: os.mkfifo(path), lambda: enlarge(path)):
+    for damage, reason in (
+        (lambda: None, "No such file"),
+        (lambda: path.symlink_to("/dev/zero"), "pipe or a device"),
+        (lambda: os.mkfifo(path), "pipe or a device"),
+        (lambda: enlarge(path), "larger than"),
+    ):
         path.unlink(missing_ok=True)
         damage()
-        with pytest.raises(ConfigurationError, match=rf"cannot be read .*({name} has 50000000000 bytes|no file {name})"):
+        with pytest.raises(ConfigurationError, match=f"cannot be read .*{reason}"):
             train(WHOLE, folder, resume=True)
 
 

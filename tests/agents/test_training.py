@@ -192,7 +192,7 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
         ("sac", {"noise_std": 0.1}, "noise_type"),
         ("sac", {"replay_buffer_kwargs": {}}, "replay buffer"),
         ("sac", {"use_sde": True}, "saved"),
-        ("sac", {"learning_starts": "soon"}, "failed after"),
+        ("sac", {"learning_starts": "soon"}, "learning_starts = 'soon'; give a number"),
         ("ppo", {"learning_rate": 1e12}, "diverged|not all finite"),
         ("ppo", {"stats_window_size": 10**400}, "does not take|failed after"),
         ("ppo", {"gamma": 10**400}, "does not take|failed after"),
