@@ -7,6 +7,8 @@ import os
 # Before NumPy and torch are imported, and for processes that tests start: on small matrices, threads that wait for each other
 # take most of the processors from the other tests.
 os.environ["OMP_NUM_THREADS"] = "1"
+# Before SymPy is imported: it would forget what one test has differentiated before the next one needs it.
+os.environ["SYMPY_CACHE_SIZE"] = "None"
 
 import gymnasium as gym
 import hypothesis
