@@ -43,6 +43,7 @@ def test_variance_is_that_of_the_beginning_of_the_period():
     assert bridge.barriers(x)[:, 0] == pytest.approx([float(h.subs(point)) for point in points])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dt", "episodes"), [(0.05, 4000), (0.02, 6000)])
 def test_discrete_rate_flatters_and_continuous_rate_is_exact(dt, episodes):
     drift, sigma, horizon = 0.4, 0.5, 1.0
@@ -94,6 +95,7 @@ def test_without_noise_in_h_nothing_changes_and_a_note_says_so():
     assert bridge_notes(load_problem("safe_envs/ACC-v0")) == []
 
 
+@pytest.mark.slow
 def test_several_barriers_have_bridges_of_their_own():
     # Two walls, so far apart that a path does not meet both: the probabilities add.
     problem = brownian(0.1, 1.0, 0.0, 0.5, [1 - X, 1 + X])

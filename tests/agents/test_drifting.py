@@ -81,6 +81,7 @@ def test_violations_on_another_way_count_against_a_drift():
     assert best_length(climbed, found.shares, 1.0)[1] > 30 * good
 
 
+@pytest.mark.slow
 def test_two_ways_to_fail_in_different_units_are_both_found():
     x, y, u, v = sp.symbols("x y u v", real=True)
     system = ControlAffineSDE(

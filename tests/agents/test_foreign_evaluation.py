@@ -47,6 +47,7 @@ def test_the_rate_is_that_of_episodes_played_by_hand():
     assert row["return_mean"] == pytest.approx(np.mean(returns))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["nominal", "random"])
 def test_the_answer_does_not_depend_on_the_size_of_the_batch(policy):
     one, many = (evaluate("Pendulum-v1", policy, num_envs=n, **FEW) for n in (1, 3))

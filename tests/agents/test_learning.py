@@ -41,6 +41,7 @@ def test_what_several_filters_rest_on_is_learned_once():
     assert learning.models() == [first.learned]
 
 
+@pytest.mark.slow
 def test_each_repeat_has_a_seed_of_its_own(posterior):
     learning = Learning(DISK, LEARNED, (), 4, 0)
     for repeat in range(4):
@@ -81,6 +82,7 @@ def test_what_does_not_fit_is_refused(posterior):
             Learning(DISK, LEARNED, (), repeats, 0)
 
 
+@pytest.mark.slow
 def test_the_filter_from_a_file_gives_the_same_as_from_memory(posterior, tmp_path):
     posterior.save(tmp_path / "disk.npz")
     names = ["bayesian-scbf", "bayesian-scbf:simultaneous=0.9"]
@@ -125,6 +127,7 @@ def test_the_answer_is_the_same_for_every_num_envs_and_from_a_file(env_id, name,
     assert all(other == first for other in others)
 
 
+@pytest.mark.slow
 def test_rows_of_repeats_are_sums_means_and_wider_intervals(repeated):
     once = evaluate(DISK, filters=["none", "scbf", *LEARNED], episodes=60, bounds=False)
     for row, single in zip(repeated.rows, once.rows, strict=True):
@@ -145,6 +148,7 @@ def test_rows_of_repeats_are_sums_means_and_wider_intervals(repeated):
         assert row["ci_high"] - row["ci_low"] > 2 * half
 
 
+@pytest.mark.slow
 def test_comparisons_of_repeats_have_no_p_value(repeated):
     for comparison in repeated.comparisons:
         learned = any(name in LEARNED for name in (comparison["first"], comparison["second"]))
@@ -154,11 +158,13 @@ def test_comparisons_of_repeats_have_no_p_value(repeated):
         assert comparison["ci_low"] <= comparison["difference"] <= comparison["ci_high"]
 
 
+@pytest.mark.slow
 def test_it_is_repeatable(repeated):
     again = evaluate(DISK, filters=LEARNED[:1], episodes=60, repeats=3, num_envs=7, bounds=False)
     assert again.rows[0] in repeated.rows
 
 
+@pytest.mark.slow
 def test_certificates_stand_beside_the_rates():
     name = "bayesian-scbf:simultaneous=0.9"
     found = evaluate(DISK, filters=["bayesian-scbf", name], episodes=30, repeats=2)

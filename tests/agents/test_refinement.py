@@ -16,6 +16,7 @@ from tests.agents.laws import survival
 SCALAR = {"start": [0.5], "noise": 0.8, "box": [-100.0, 100.0]}
 
 
+@pytest.mark.slow
 def test_rates_are_those_of_evaluations_with_smaller_periods():
     options = {"horizon": 1.0, "noise": 0.4, "dt": 0.1}
     answer = refine("StochasticDubins-v0", filters=["none", "scbf"], options=options, episodes=24, seed=2, confidence=0.8, num_envs=16)
@@ -63,6 +64,7 @@ def test_verdicts(low, high, wanted):
     assert verdict(low, high) == wanted
 
 
+@pytest.mark.slow
 def test_a_rate_that_still_changes_is_said_to():
     # dh = -h dt + sigma dW: the less often one looks, the fewer of its violations are seen.
     options = {**SCALAR, "dt": 0.4, "horizon": 1.6}

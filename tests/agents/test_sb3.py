@@ -87,6 +87,7 @@ def test_every_algorithm_with_continuous_actions_is_loaded(tmp_path, algorithm, 
     assert_predicts_like(model, make_policy(path, load_problem(ENV_ID), trust=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_evaluation_is_the_same_for_every_num_envs(trained, name):
     _, path = trained[name]

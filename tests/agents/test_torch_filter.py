@@ -154,6 +154,7 @@ def test_contradicting_rows_on_many_inputs_have_a_finite_slope_or_a_flag():
     assert 0 < torch.count_nonzero(result.differentiable) < 400
 
 
+@pytest.mark.slow
 def test_the_flag_of_gradients_does_not_hang_on_whether_one_was_asked_for():
     module = TorchFilter(planar(4, 2, contradicting=True, seed=3))
     rng = np.random.default_rng(0)
