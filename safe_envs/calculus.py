@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import sympy as sp
@@ -25,7 +26,13 @@ _MOST_TERMS = 200
 
 def gradient(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
     """Row of partial derivatives with respect to the states, shape (1, n)."""
-    return sp.ImmutableMatrix([[sp.diff(expression, s) for s in system.states]])
+    return _gradient(system.states, expression)
+
+
+@lru_cache(maxsize=512)
+def _gradient(states: tuple[sp.Symbol, ...], expression: sp.Expr) -> sp.ImmutableMatrix:
+    """Remembered: the drift, the input and the noise each ask for the gradient of the same link of a chain."""
+    return sp.ImmutableMatrix([[sp.diff(expression, s) for s in states]])
 
 
 def drift_derivative(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import os
 
 # Before NumPy and torch are imported, and for processes that tests start: on small matrices, threads that wait for each other
 # take most of the processors from the other tests.
 os.environ["OMP_NUM_THREADS"] = "1"
+# Before SymPy is imported: it would forget what one test has differentiated before the next one needs it.
+os.environ["SYMPY_CACHE_SIZE"] = "None"
 
 import gymnasium as gym
 import hypothesis
@@ -15,6 +18,8 @@ import pytest
 import safe_envs
 from safe_envs.problem import SafetyProblem
 
+# The expressions that SymPy keeps are many: to look through all of them for garbage as often as usual takes a tenth of the time.
+gc.set_threshold(10_000, 20, 50)
 # The same examples on every machine, and no deadline: a busy machine is no failure.
 hypothesis.settings.register_profile("project", derandomize=True, database=None, deadline=None, print_blob=False)
 hypothesis.settings.load_profile("project")

@@ -13,6 +13,7 @@ from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.problem import Start, Variable
 
 
+@pytest.mark.slow
 def test_bounds_stand_beside_the_rates_or_say_why_not():
     cubic = evaluate("CubicSDEDisk-v0", filters=["none", "scbf", "szcbf", "cbf"], options={"start": [0.3, 0.4]}, episodes=20)
     bare, scbf, szcbf, cbf = cubic.rows

@@ -45,13 +45,14 @@ def test_variance_is_that_of_the_beginning_of_the_period():
     assert bridge.barriers(x)[:, 0] == pytest.approx([float(h.subs(point)) for point in points])
 
 
-@pytest.mark.parametrize("dt", [0.05, 0.01])
-def test_discrete_rate_flatters_and_continuous_rate_is_exact(dt):
+@pytest.mark.slow
+@pytest.mark.parametrize(("dt", "episodes"), [(0.05, 4000), (0.02, 6000)])
+def test_discrete_rate_flatters_and_continuous_rate_is_exact(dt, episodes):
     drift, sigma, horizon = 0.4, 0.5, 1.0
     problem = brownian(dt, horizon, drift, sigma)
     exact = 1 - first_passage(1.0, drift, sigma, horizon)
     seen = 1 - walk_passage(1.0, round(horizon / dt), drift * dt, sigma * math.sqrt(dt))
-    arguments = {"filters": ["none"], "episodes": 12_000, "seed": 2, "confidence": 0.99, "bounds": False}
+    arguments = {"filters": ["none"], "episodes": episodes, "seed": 2, "confidence": 0.99, "bounds": False}
     discrete, continuous = (evaluate(problem, monitoring=m, **arguments).rows[0] for m in ("discrete", "continuous"))
     assert exact < discrete["ci_low"] < seen < discrete["ci_high"]
     assert continuous["ci_low"] < exact < continuous["ci_high"] < seen
@@ -104,12 +105,13 @@ def test_without_noise_in_h_nothing_changes_and_a_note_says_so():
     assert bridge_notes(load_problem("safe_envs/ACC-v0")) == []
 
 
+@pytest.mark.slow
 def test_several_barriers_have_bridges_of_their_own():
     # Two walls, so far apart that a path does not meet both: the probabilities add.
     problem = brownian(0.1, 1.0, 0.0, 0.5, [1 - X, 1 + X])
     (note,) = bridge_notes(problem)
     assert "independently" in note
-    row = evaluate(problem, filters=["none"], episodes=20_000, monitoring="continuous", confidence=0.99, bounds=False).rows[0]
+    row = evaluate(problem, filters=["none"], episodes=6000, monitoring="continuous", confidence=0.99, bounds=False).rows[0]
     assert row["ci_low"] < 1 - 2 * first_passage(1.0, 0.0, 0.5, 1.0) < row["ci_high"]
 
 

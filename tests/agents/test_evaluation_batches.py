@@ -26,10 +26,10 @@ def assert_same_to_the_bit(first, second):
 
 def test_answer_is_the_same_for_every_num_envs(env_id):
     problem = load_problem(env_id, {"noise": 0.2})
-    problem = problem.configured(horizon=12 * problem.dt)
+    problem = problem.configured(horizon=6 * problem.dt)
     # The mean of a bound over the starts goes the same way for all ids.
-    arguments = {"episodes": 10, "seed": 3, "record": True, "bounds": env_id.endswith("CubicSDEDisk-v0")}
-    answers = [evaluate(problem, num_envs=n, **arguments) for n in (1000, 7, 1)]
+    arguments = {"episodes": 5, "seed": 3, "record": True, "bounds": env_id.endswith("CubicSDEDisk-v0")}
+    answers = [evaluate(problem, num_envs=n, **arguments) for n in (100, 3, 1)]
     for other in answers[1:]:
         assert_same_to_the_bit(answers[0], other)
     assert len(answers[0].rows) == 2
@@ -49,8 +49,8 @@ def test_answer_is_the_same_for_every_num_envs(env_id):
 )
 def test_long_and_ending_episodes_are_the_same_for_every_num_envs(policy, env_id, filters, options):
     problem = load_problem(env_id, options)
-    given = {"episodes": 5, "seed": 1, "record": True, "bounds": False}
-    answers = [evaluate(problem, policy, filters, num_envs=n, **given) for n in (5, 1, 3)]
+    given = {"episodes": 3, "seed": 1, "record": True, "bounds": False}
+    answers = [evaluate(problem, policy, filters, num_envs=n, **given) for n in (3, 1, 2)]
     for other in answers[1:]:
         assert_same_to_the_bit(answers[0], other)
 
@@ -112,7 +112,7 @@ def test_config_is_enough_to_run_it_again():
 
 
 def test_a_problem_gives_the_same_as_its_id_and_defaults_are_the_natural_filter(env_id):
-    options = {"horizon": 10 * load_problem(env_id).dt}
+    options = {"horizon": 5 * load_problem(env_id).dt}
     problem = load_problem(env_id, options)
     # The bounds go the same way for all ids.
     arguments = {"episodes": 5, "bounds": env_id.endswith(("CubicSDEDisk-v0", "Pendulum-v0"))}
@@ -139,21 +139,21 @@ def test_recorder_keeps_a_bounded_number_of_episodes():
 
 
 def test_memory_does_not_grow_with_the_episodes():
-    problem = load_problem("Scalar-v0", {"horizon": 0.1})
+    problem = load_problem("Scalar-v0", {"horizon": 0.02})
 
     def peak(episodes):
         tracemalloc.start()
         try:
-            evaluate(problem, filters=["none"], episodes=episodes, num_envs=512, record=True, bounds=False)
+            evaluate(problem, filters=["none"], episodes=episodes, num_envs=128, record=True, bounds=False)
             return tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
 
-    peak(512)
-    few, many = peak(512), peak(5120)
+    peak(128)
+    few, many = peak(128), peak(1280)
     # Of an episode nothing but the smallest h is kept (of the first 65536, and copied twice for their quantiles):
     # that is far less than its steps or even its statistics.
-    assert many - few < 4 * 8 * (5120 - 512)
+    assert many - few < 4 * 8 * (1280 - 128)
 
 
 def test_progress_goes_from_nothing_to_all():

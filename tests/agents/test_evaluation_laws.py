@@ -15,6 +15,7 @@ from tests.agents.evaluated import Constant, Levelling
 from tests.agents.laws import survival
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "tolerance"), [("policy", 0.999), ("filter", 0.999)])
 def test_gaussian_law_of_adaptive_cruise_control(scheme, tolerance):
     # A h = 0 makes h_t = h_0 - tau sigma_1 W_t; an Euler-Maruyama step keeps that exactly. In one case a policy holds
@@ -39,6 +40,7 @@ def test_gaussian_law_of_adaptive_cruise_control(scheme, tolerance):
         assert (row["intervention_rate"], row["infeasible_rate"]) == (1.0, 0.0)
 
 
+@pytest.mark.slow
 def test_law_of_the_scalar_system():
     # The nominal controller makes dh = -h dt + sigma dW, symmetric about the edge: P(safe) = 2 Phi(mean/deviation) - 1
     # in continuous time by reflection, and by quadrature at the control instants.

@@ -16,13 +16,14 @@ from tests.agents.laws import survival
 SCALAR = {"start": [0.5], "noise": 0.8, "box": [-100.0, 100.0]}
 
 
+@pytest.mark.slow
 def test_rates_are_those_of_evaluations_with_smaller_periods():
     options = {"horizon": 1.0, "noise": 0.4, "dt": 0.1}
-    answer = refine("StochasticDubins-v0", filters=["none", "scbf"], options=options, episodes=40, seed=2, confidence=0.8, num_envs=16)
+    answer = refine("StochasticDubins-v0", filters=["none", "scbf"], options=options, episodes=24, seed=2, confidence=0.8, num_envs=16)
     assert answer.periods == [0.1, 0.05, 0.025]
     assert [e.problem.steps for e in answer.evaluations] == [10, 20, 40]
     for i, dt in enumerate(answer.periods):
-        arguments = {"options": {**options, "dt": dt}, "episodes": 40, "seed": 2, "confidence": 0.8}
+        arguments = {"options": {**options, "dt": dt}, "episodes": 24, "seed": 2, "confidence": 0.8}
         wanted = evaluate("StochasticDubins-v0", filters=["none", "scbf"], bounds=i == 0, **arguments)
         assert wanted.rows == answer.evaluations[i].rows
         for row, refined in zip(wanted.rows, answer.rows, strict=True):
@@ -30,7 +31,7 @@ def test_rates_are_those_of_evaluations_with_smaller_periods():
             for key in ("safe", "safety_rate", "ci_low", "ci_high"):
                 assert refined[key][i] == row[key]
     for row in answer.rows:
-        assert row["change"] == pytest.approx((row["safe"][2] - row["safe"][1]) / 40)
+        assert row["change"] == pytest.approx((row["safe"][2] - row["safe"][1]) / 24)
         table = answer.evaluations[2].flags[row["filter"]][0].table(answer.evaluations[1].flags[row["filter"]][0])
         assert table[0] + table[1] == row["safe"][2]
         assert table[0] + table[2] == row["safe"][1]
@@ -63,6 +64,7 @@ def test_verdicts(low, high, wanted):
     assert verdict(low, high) == wanted
 
 
+@pytest.mark.slow
 def test_a_rate_that_still_changes_is_said_to():
     # dh = -h dt + sigma dW: the less often one looks, the fewer of its violations are seen.
     options = {**SCALAR, "dt": 0.4, "horizon": 1.6}

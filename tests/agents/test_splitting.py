@@ -47,6 +47,7 @@ def assert_near(row, exact, within):
     assert row["ci_high"] / row["ci_low"] < within
 
 
+@pytest.mark.slow
 def test_gaussian_walk_of_probability_1e_8():
     exact = walk_passage(1.0, 40, -0.005, 0.15 * math.sqrt(0.05))
     assert 1e-8 < exact < 2e-8
@@ -62,6 +63,7 @@ def test_gaussian_walk_of_probability_1e_8():
     assert row["probability"] == pytest.approx(np.mean(row["estimates"]))
 
 
+@pytest.mark.slow
 def test_first_passage_of_probability_1e_8_with_continuous_monitoring():
     exact = first_passage(1.0, -0.1, 0.15, 2.0)
     row = row_of(brownian(0.1, 2.0, -0.1, 0.15), monitoring="continuous", seed=1)
@@ -70,6 +72,7 @@ def test_first_passage_of_probability_1e_8_with_continuous_monitoring():
     assert walk_passage(1.0, 20, -0.01, 0.15 * math.sqrt(0.1)) < row["ci_low"]
 
 
+@pytest.mark.slow
 def test_geometric_martingale_of_probability_1e_8():
     problem = replace(attaining_problem(1e-4), dt=0.1, horizon=14.0)
     exact = martingale_passage(1e-4, 140, 0.1)
@@ -78,6 +81,7 @@ def test_geometric_martingale_of_probability_1e_8():
     assert_near(row["check"] if "drift" in row["method"] else row, exact, 4.0)
 
 
+@pytest.mark.slow
 def test_cruise_control_under_its_filter_has_the_gaussian_law():
     # At 10 m/s the desired speed is far off, so that the filter acts all the time and A h = 0: h is a walk.
     exact = walk_passage(32.0, 100, 0.0, 1.8 * math.sqrt(0.1))
@@ -86,6 +90,7 @@ def test_cruise_control_under_its_filter_has_the_gaussian_law():
     assert_holds(row_of("safe_envs/ACC-v0", "scbf", options=options, particles=120), exact, 3.0)
 
 
+@pytest.mark.slow
 def test_splitting_is_unbiased_and_its_interval_covers():
     problem, exact = brownian(0.1, 1.0, 0.0, 0.3), walk_passage(1.0, 10, 0.0, 0.3 * math.sqrt(0.1))
     found = splitting_of(problem).estimate(0.5, 60, 400)
@@ -121,6 +126,7 @@ def test_pilots_and_estimates_have_noise_of_their_own():
     assert len(set.union(*seeds)) == sum(len(each) for each in seeds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("policy", "monitoring"), [("nominal", "discrete"), ("random", "discrete"), ("nominal", "continuous")])
 def test_agrees_with_plain_episodes_where_these_do(policy, monitoring):
     # Random starts, and a box that is too small for some of them.

@@ -27,6 +27,7 @@ from wrappers import (
 from wrappers.learning.regression import Gaussian
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["cubic", "gap"])
 def test_the_most_probable_system_is_filtered_as_if_it_were_known(request, name):
     problem = request.getfixturevalue(name)
@@ -75,6 +76,7 @@ def least_ito(learned, barrier, x, intervals):
     return np.min([0.5 * curvatures @ np.square(corner) for corner in itertools.product(*intervals)], axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", ["disk", "curved"])
 def test_the_robust_row_is_mean_less_deviations(cubic, posterior, which):
     problem = cubic if which == "disk" else replace(cubic, barriers=(curved_barrier(cubic),))

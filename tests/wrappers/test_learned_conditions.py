@@ -114,6 +114,7 @@ def test_a_learned_row_stands_beside_a_plain_one(disk, errors):
         assert_same_decisions(both, SafetyFilter.for_problem(both, ours), known)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["network", "posterior"])
 def test_learned_rows_stand_beside_reciprocal_ones(request, top, cubic, name):
     model = request.getfixturevalue(name)

@@ -54,6 +54,7 @@ def share_below(problem, x, u, **design):
     return below / TIMES
 
 
+@pytest.mark.slow
 def test_the_numbers_are_those_of_the_symbols():
     posterior = identify(DISK, starts=100, repetitions=30, degree=3)
     for condition in (BayesianSCBF(posterior, confidence=0.95), BayesianSCBF(posterior, confidence=0.3)):
@@ -64,6 +65,7 @@ def test_the_numbers_are_those_of_the_symbols():
             assert a * u + b - math.sqrt(q0 + 2 * q1 * u + q2 * u * u) == pytest.approx(robust_row(posterior, condition, x, u), abs=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.0, 0.04])
 def test_an_effect_that_the_data_do_not_show_is_kept_in_mind(gain):
     # The most probable system takes it for 0, which a large input makes much of.
@@ -71,6 +73,7 @@ def test_an_effect_that_the_data_do_not_show_is_kept_in_mind(gain):
     assert share_below(problem, (0.8, 0.2), 10.0, starts=100, repetitions=30) >= LEAST
 
 
+@pytest.mark.slow
 def test_correlated_noise_makes_the_row_less_sure():
     root = np.linalg.cholesky(0.04 * np.array([[1.0, 0.95], [0.95, 1.0]]))
     problem = changed(diffusion=sp.Matrix(root))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -162,22 +160,6 @@ def test_endless_boxes_of_three_inputs_hide_no_row(half):
     )
     np.testing.assert_allclose(contradicting[0], [1.6, 0.8, 0.0], atol=1e-4)
     assert not contradicting[3]
-
-
-def test_solvers_are_not_imported_until_they_are_needed():
-    script = """
-import sys
-from wrappers.qp import several_rows
-box = ([0.0, 0.0], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0], [1.0, 1.0])
-assert not several_rows.project_floats([[1.0, 0.2], [-1.0, 0.1]], [-0.5, 0.1], *box)[3]
-assert not {"proxsuite", "qpsolvers", "scipy"} & set(sys.modules), "too early"
-box = ([0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0, 1.0])
-assert several_rows.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.1], *box)[2] == [True, False]
-assert "proxsuite" not in sys.modules, "one row binds"
-assert several_rows.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.5], *box)[2] == [True, True]
-assert {"proxsuite", "qpsolvers"} <= set(sys.modules)
-"""
-    subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
 
 
 def test_flat_rows_of_many_inputs_are_exact():

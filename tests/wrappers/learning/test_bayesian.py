@@ -75,6 +75,7 @@ def test_the_paired_form_of_the_thesis_is_the_same_posterior():
     assert abs(found.covariance[:, :count, count:]).max() < 1e-10
 
 
+@pytest.mark.slow
 def test_credible_intervals_cover_and_those_of_the_print_do_not():
     covered, printed, level = [], [], norm.ppf(0.95)
     phi = np.hstack((Features.of(CUBIC, 3).matrix(PLACES), np.zeros((3, 10))))
