@@ -170,12 +170,12 @@ import sys
 from wrappers.qp import several_rows
 box = ([0.0, 0.0], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0], [1.0, 1.0])
 assert not several_rows.project_floats([[1.0, 0.2], [-1.0, 0.1]], [-0.5, 0.1], *box)[3]
-assert not {"proxsuite", "qpsolvers", "scipy"} & set(sys.modules), "too early"
+assert not {"proxsuite", "scipy"} & set(sys.modules), "too early"
 box = ([0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0, 1.0])
 assert several_rows.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.1], *box)[2] == [True, False]
 assert "proxsuite" not in sys.modules, "one row binds"
 assert several_rows.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.5], *box)[2] == [True, True]
-assert {"proxsuite", "qpsolvers"} <= set(sys.modules)
+assert "proxsuite" in sys.modules
 """
     subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from wrappers.qp.one_row import project_arrays as project_onto_row
-from wrappers.qp.rows import ROUNDING, stack, total
+from wrappers.qp.rows import stack, tolerance, total
 
 Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -35,7 +35,7 @@ def project_arrays(
         are left for a solver.
     """
     u = np.minimum(np.maximum(v, low), high)
-    margin, active, feasible = _margins(a, b, u)[0], np.zeros(b.shape, dtype=bool), np.ones(b.shape[1], dtype=bool)
+    margin, active, feasible = _margins(a, b, u), np.zeros(b.shape, dtype=bool), np.ones(b.shape[1], dtype=bool)
     missed = margin < 0.0
     left = np.flatnonzero(missed.any(axis=0))
     weights = stack(w, b.shape[1])
@@ -46,17 +46,18 @@ def project_arrays(
         found, _, _, met = project_onto_row(
             list(row[:, tried]), b[i, tried], list(v[:, tried]), list(low[:, tried]), list(high[:, tried]), list(weights[:, tried])
         )
-        reached, terms = _margins([r[:, tried] for r in a], b[:, tried], np.array(found))
-        allowed = met & (reached >= -ROUNDING * terms).all(axis=0)
+        rows = [r[:, tried] for r in a]
+        reached = _margins(rows, b[:, tried], np.array(found))
+        rounding = np.array([tolerance(r, offset, found) for r, offset in zip(rows, b[:, tried], strict=True)])
+        allowed = met & (reached >= -rounding).all(axis=0)
         solved = tried[allowed]
         u[:, solved] = np.array(found)[:, allowed]
         margin[:, solved] = reached[:, allowed]
-        active[:, solved] = (reached <= ROUNDING * terms)[:, allowed]
+        active[:, solved] = (reached <= rounding)[:, allowed]
         left = np.setdiff1d(left, solved, assume_unique=True)
     return (u, margin, active, feasible), left
 
 
-def _margins(a: Sequence[np.ndarray], b: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Margins a u + b of each row, and the sum of the sizes of their terms, which bounds their rounding."""
-    products = [row * u for row in a]
-    return np.array([total(p) for p in products]) + b, np.array([total(np.abs(p)) for p in products]) + np.abs(b)
+def _margins(a: Sequence[np.ndarray], b: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Margins a u + b of each row, shape (k, B)."""
+    return np.array([total(row * u) for row in a]) + b

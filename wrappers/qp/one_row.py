@@ -5,6 +5,9 @@
 The minimiser is u(l) = clip(v + l a / w) for the smallest multiplier l >= 0 at which phi(l) = a . u(l) + b reaches 0.
 phi is nondecreasing and piecewise linear, with a kink wherever a component enters or leaves its interval. If phi stays
 negative, no action meets the row; u(infinity), which maximises a . u + b over the box, violates it least.
+
+u(l) carries the rounding of v, which a proposal far beyond the box makes large. So the row is evaluated at the result, and what
+it misses or exceeds there is divided among the components that may still move along a / w.
 """
 
 from __future__ import annotations
@@ -13,6 +16,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+
+from wrappers.qp.rows import tolerance, total
+
+_CORRECTIONS = 3
+"""How often more than once for each component a row is corrected: each time its miss shrinks to rounding."""
 
 
 def project_floats(
@@ -32,8 +40,35 @@ def project_floats(
         return u, margin, False, True
     u = _follow_multiplier(a, b, v, low, high, w)
     margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])
-    reach = b + sum([max(aj * lo, aj * hi) for aj, lo, hi in zip(a, low, high, strict=True)])
-    return u, margin, True, reach >= 0.0
+    allowed = tolerance(a, b, u)
+    if not -allowed <= margin <= allowed:
+        u, margin, allowed = _corrected(a, b, v, u, low, high, w)
+    return u, margin, True, margin >= -allowed
+
+
+def _corrected(
+    a: Sequence[float], b: float, v: Sequence[float], u: list[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
+) -> tuple[list[float], float, float]:
+    """The inputs moved until the row holds with equality, as far as their ways from the clipped proposal to the far bounds allow."""
+    size = max([abs(aj) for aj in a]) or 1.0
+    ways = [
+        (aj / size, aj / size / wj, min(max(vj, lo), hi), hi if aj > 0.0 else lo)
+        for aj, vj, lo, hi, wj in zip(a, v, low, high, w, strict=True)
+    ]
+    for _ in range(len(a) + _CORRECTIONS):
+        margin, allowed = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]), tolerance(a, b, u)
+        if -allowed <= margin <= allowed:
+            break
+        moving = [dj if uj != (far if margin < 0.0 else near) else 0.0 for (_, dj, near, far), uj in zip(ways, u, strict=True)]
+        slope = sum([aj * dj for (aj, *_), dj in zip(ways, moving, strict=True)])
+        if not slope > 0.0:
+            break
+        step = -(margin / size) / slope
+        u = [
+            min(max(uj + step * dj, min(near, far)), max(near, far)) if dj else uj
+            for uj, dj, (*_, near, far) in zip(u, moving, ways, strict=True)
+        ]
+    return u, b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]), tolerance(a, b, u)
 
 
 def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tuple[list[float], float, bool, bool]:
@@ -42,11 +77,11 @@ def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tu
     margin = a * u + b
     if margin >= 0.0:
         return [u], margin, False, True
-    if a == 0.0:
-        return [u], margin, True, False
-    root = -b / a
-    u = low if root < low else high if root > high else root
-    return [u], a * u + b, True, u == root
+    if a != 0.0:
+        root = -b / a
+        u = low if root < low else high if root > high else root
+        margin = a * u + b
+    return [u], margin, True, margin >= 0.0 or margin >= -tolerance((a,), b, (u,))
 
 
 def _follow_multiplier(
@@ -62,7 +97,8 @@ def _follow_multiplier(
             enter[j], leave[j] = max((near - vj) / dj, 0.0), max((far - vj) / dj, 0.0)
 
     def inputs(multiplier: float) -> list[float]:
-        return [min(max(vj + multiplier * dj, lo), hi) for vj, dj, lo, hi in zip(v, d, low, high, strict=True)]
+        # An input without a say stays where it is, also where the multiplier is infinite.
+        return [min(max(vj + multiplier * dj if dj else vj, lo), hi) for vj, dj, lo, hi in zip(v, d, low, high, strict=True)]
 
     kink, phi = max(
         [(k, p) for k in (0.0, *enter, *leave) if (p := b + sum([aj * uj for aj, uj in zip(a, inputs(k), strict=True)])) < 0.0],
@@ -99,8 +135,8 @@ def project_arrays(
     if not np.count_nonzero(active):
         return u, margin, active, ~active
     u = _follow_multipliers(a, b, v, u, low, high, w, np.flatnonzero(active))
-    reach = sum([np.maximum(aj * lo, aj * hi) for aj, lo, hi in zip(a, low, high, strict=True)]) + b
-    return u, _dot(a, u) + b, active, ~active | (reach >= 0.0)
+    margin = _dot(a, u) + b
+    return u, margin, active, ~active | (margin >= -tolerance(a, b, u))
 
 
 def _project_scalars(a: Any, b: Any, v: np.ndarray, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -109,12 +145,11 @@ def _project_scalars(a: Any, b: Any, v: np.ndarray, low: Any, high: Any) -> tupl
     active = margin < 0.0
     if not np.count_nonzero(active):
         return u, margin, active, ~active
-    root = -b / a
-    nearest = np.minimum(np.maximum(root, low), high)
-    feasible = (nearest == root) | ~active
+    nearest = np.minimum(np.maximum(-b / a, low), high)
     moving = active if np.count_nonzero(a) == np.size(a) else active & (a != 0.0)
     u = np.where(moving, nearest, u)
-    return u, a * u + b, active, feasible
+    margin = a * u + b
+    return u, margin, active, ~active | (margin >= -tolerance((a,), b, (u,)))
 
 
 def _dot(a: Sequence[Any], u: Sequence[np.ndarray]) -> np.ndarray:
@@ -146,7 +181,8 @@ def _follow_multipliers(
     enter = np.maximum(np.divide(near - vr, d, out=np.zeros_like(d), where=free), 0.0)
     leave = np.maximum(np.divide(far - vr, d, out=np.zeros_like(d), where=free), 0.0)
     kinks = np.concatenate([np.zeros((1, rows.size)), enter, leave]).T
-    at_kinks = np.clip(vr[:, :, None] + kinks * d[:, :, None], lo[:, :, None], hi[:, :, None])
+    ways = np.where(free[:, :, None], kinks * d[:, :, None], 0.0)
+    at_kinks = np.clip(vr[:, :, None] + ways, lo[:, :, None], hi[:, :, None])
     phi = (ar[:, :, None] * at_kinks).sum(axis=0) + br[:, None]
     last = np.where(phi < 0.0, kinks, -1.0).argmax(axis=1)[:, None]
     kink = np.take_along_axis(kinks, last, axis=1)[:, 0]
@@ -154,9 +190,25 @@ def _follow_multipliers(
     slope = np.where((enter <= kink) & (kink < leave), ar * d, 0.0).sum(axis=0)
     rises = slope > 0.0
     multiplier = kink - np.divide(phi, slope, out=np.zeros_like(phi), where=rises)
-    solved = np.clip(vr + multiplier * d, lo, hi)
-    least = np.where(free, far, np.clip(vr, lo, hi))
+    start = np.clip(vr, lo, hi)
+    solved = np.where(free & rises, np.clip(vr + multiplier * d, lo, hi), np.where(free, far, start))
+    found = _all_corrected(ar, br, start, solved, far, d)
     result = [uj.copy() for uj in u]
-    for j, component in enumerate(np.where(rises, solved, least)):
+    for j, component in enumerate(found):
         result[j][rows] = component
     return result
+
+
+def _all_corrected(a: np.ndarray, b: np.ndarray, near: np.ndarray, u: np.ndarray, far: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """`_corrected` for the components in front, shape (m, R); `near` and `far` are the ends of their ways."""
+    lower, upper = np.minimum(near, far), np.maximum(near, far)
+    for _ in range(len(a) + _CORRECTIONS):
+        margin, allowed = total(a * u) + b, tolerance(a, b, u)
+        moving = np.where(u != np.where(margin < 0.0, far, near), d, 0.0)
+        slope = total(a * moving)
+        wrong = ~(np.abs(margin) <= allowed) & (slope > 0.0)
+        if not np.count_nonzero(wrong):
+            break
+        step = np.where(wrong, -margin / slope, 0.0)
+        u = np.where(moving != 0.0, np.minimum(np.maximum(u + step * moving, lower), upper), u)
+    return u
