@@ -75,7 +75,9 @@ def _proved(a, b, v, low, high, w, priority, missed, binding, held):
         fixed = {j: low[j] if side < 0 else high[j] for j, side in held.items()}
         # Least squares over the missed rows, with the binding ones as equations: a point that has the right slacks.
         offset = [b[i] + sum((a[i][j] * fixed[j] for j in held), Fraction(0)) for i in range(k)]
-        normal = [[sum((priority[i] * a[i][p] * a[i][q] for i in rows), Fraction(0)) for q in free] + [a[i][p] for i in walls] for p in free]
+        normal = [
+            [sum((priority[i] * a[i][p] * a[i][q] for i in rows), Fraction(0)) for q in free] + [a[i][p] for i in walls] for p in free
+        ]
         normal += [[a[i][q] for q in free] + [Fraction(0)] * len(walls) for i in walls]
         right = [-sum((priority[i] * a[i][p] * offset[i] for i in rows), Fraction(0)) for p in free] + [-offset[i] for i in walls]
         point = eliminated(normal, right) if normal else []

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from wrappers.qp.bounded_least_squares import least_violating
-from wrappers.qp.rows import tolerance
+from wrappers.qp.rows import tolerances
 
 _STEPS = 20
 """Steps for each row and input: many times more than were ever seen."""
@@ -61,7 +61,7 @@ def _project(
 ) -> np.ndarray:
     start = least_violating(a, b, low, high, priority, np.clip(v, low, high))
     margin = a @ start + b
-    slack = np.where(margin < -_tolerances(a, b, start), -margin, 0.0)
+    slack = np.where(margin < -tolerances(a.T, b, start), -margin, 0.0)
     unit, roots = np.abs(a).max(axis=1), np.sqrt(w)
     normals = a / unit[:, None] / roots
     lengths = np.linalg.norm(normals, axis=1)
@@ -73,10 +73,6 @@ def _project(
         excess = (a @ u + b + slack)[binding] / unit[binding]
         u[free] -= np.linalg.lstsq(normals[np.ix_(binding, free)], excess)[0] / roots[free]
     return np.clip(u, low, high)
-
-
-def _tolerances(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
-    return np.array([tolerance(row, offset, u) for row, offset in zip(a, b, strict=True)])
 
 
 class _Held(NamedTuple):

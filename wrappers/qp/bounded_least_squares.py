@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrappers.qp.rows import ROUNDING, tolerance
+from wrappers.qp.rows import ROUNDING, tolerances
 
 _STEPS = 20
 """Steps for each row and input: many times more than were ever seen."""
@@ -28,9 +28,8 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
         start: an action inside the box, shape (m,).
     """
     units = np.sqrt(priority)
-    # Over the largest coefficient, so that squares neither overflow nor vanish.
-    units = units / ((units[:, None] * np.abs(a)).max() or 1.0)
-    a, b, u = units[:, None] * a, units * b, start.copy()
+    size = (units[:, None] * np.abs(a)).max() or 1.0  # so that squares neither overflow nor vanish
+    a, b, u = units[:, None] * a / size, units * b / size, start.copy()
     margin = a @ u + b
     missed, held = margin < 0.0, np.zeros(len(u), dtype=bool)
     for _ in range(_STEPS * (len(b) + len(u))):
@@ -47,7 +46,7 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
         if length < 1.0:
             held, missed = held | stops, missed | (to_rows <= length)
             continue
-        doubt = np.array([tolerance(row, offset, u) for row, offset in zip(a, b, strict=True)])
+        doubt = tolerances(a.T, b, u)
         force = np.where(u >= high, 1.0, -1.0) * (margin[missed] @ a[missed])
         force[~held | (force <= (doubt + ROUNDING * np.abs(margin))[missed] @ np.abs(a[missed]))] = 0.0
         spare = np.where(missed & (margin > doubt), margin, 0.0)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from wrappers.qp.one_row import project_arrays as project_onto_row
-from wrappers.qp.rows import stack, tolerance, total
+from wrappers.qp.rows import ROUNDING, stack, total
 
 Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -35,7 +35,7 @@ def project_arrays(
         are left for a solver.
     """
     u = np.minimum(np.maximum(v, low), high)
-    margin, active, feasible = _margins(a, b, u), np.zeros(b.shape, dtype=bool), np.ones(b.shape[1], dtype=bool)
+    margin, active, feasible = np.array([total(r * u) for r in a]) + b, np.zeros(b.shape, dtype=bool), np.ones(b.shape[1], dtype=bool)
     missed = margin < 0.0
     left = np.flatnonzero(missed.any(axis=0))
     weights = stack(w, b.shape[1])
@@ -46,18 +46,15 @@ def project_arrays(
         found, _, _, met = project_onto_row(
             list(row[:, tried]), b[i, tried], list(v[:, tried]), list(low[:, tried]), list(high[:, tried]), list(weights[:, tried])
         )
-        rows = [r[:, tried] for r in a]
-        reached = _margins(rows, b[:, tried], np.array(found))
-        rounding = np.array([tolerance(r, offset, found) for r, offset in zip(rows, b[:, tried], strict=True)])
+        at = np.array(found)
+        products = [r[:, tried] * at for r in a]
+        reached = np.array([total(p) for p in products]) + b[:, tried]
+        # As `tolerances`, from the same products.
+        rounding = ROUNDING * np.abs(b[:, tried]) + np.array([total(ROUNDING * np.abs(p)) for p in products])
         allowed = met & (reached >= -rounding).all(axis=0)
         solved = tried[allowed]
-        u[:, solved] = np.array(found)[:, allowed]
+        u[:, solved] = at[:, allowed]
         margin[:, solved] = reached[:, allowed]
         active[:, solved] = (reached <= rounding)[:, allowed]
         left = np.setdiff1d(left, solved, assume_unique=True)
     return (u, margin, active, feasible), left
-
-
-def _margins(a: Sequence[np.ndarray], b: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Margins a u + b of each row, shape (k, B)."""
-    return np.array([total(row * u) for row in a]) + b

@@ -12,13 +12,17 @@ it misses or exceeds there is divided among the components that may still move a
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from wrappers.qp.rows import tolerance, total
+from wrappers.qp.rows import ROUNDING, tolerance, tolerances, total
 
+_LARGEST = sys.float_info.max
+_EXCESS = 1e3
+"""A row that holds with so many times its rounding to spare is not on the nearest action: the proposal's rounding was larger."""
 _CORRECTIONS = 3
 """How often more than once for each component a row is corrected: each time its miss shrinks to rounding."""
 
@@ -41,7 +45,7 @@ def project_floats(
     u = _follow_multiplier(a, b, v, low, high, w)
     margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])
     allowed = tolerance(a, b, u)
-    if not -allowed <= margin <= allowed:
+    if not -allowed <= margin <= _EXCESS * allowed:
         u, margin, allowed = _corrected(a, b, v, u, low, high, w)
     return u, margin, True, margin >= -allowed
 
@@ -77,11 +81,13 @@ def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tu
     margin = a * u + b
     if margin >= 0.0:
         return [u], margin, False, True
-    if a != 0.0:
-        root = -b / a
-        u = low if root < low else high if root > high else root
-        margin = a * u + b
-    return [u], margin, True, margin >= 0.0 or margin >= -tolerance((a,), b, (u,))
+    if a == 0.0:
+        return [u], margin, True, False
+    root = -b / a
+    u = low if root < low else high if root > high else root
+    product = a * u
+    margin = product + b
+    return [u], margin, True, margin >= -ROUNDING * abs(b) - ROUNDING * abs(product)
 
 
 def _follow_multiplier(
@@ -134,9 +140,17 @@ def project_arrays(
     active = margin < 0.0
     if not np.count_nonzero(active):
         return u, margin, active, ~active
-    u = _follow_multipliers(a, b, v, u, low, high, w, np.flatnonzero(active))
-    margin = _dot(a, u) + b
-    return u, margin, active, ~active | (margin >= -tolerance(a, b, u))
+    states = np.flatnonzero(active)
+    u, movable = _follow_multipliers(a, b, v, u, low, high, w, states)
+    margin, allowed = _dot(a, u) + b, tolerances(a, b, u)
+    feasible = margin >= -allowed
+    wrong = states[(~feasible[states] & movable) | (margin[states] > _EXCESS * allowed[states])]
+    if wrong.size:
+        part = [np.array([np.broadcast_to(cj, active.shape)[wrong] for cj in c]) for c in (a, (b,), v, u, low, high, w)]
+        found, margin[wrong], feasible[wrong] = _all_corrected(*part)
+        for uj, component in zip(u, found, strict=True):
+            uj[wrong] = component
+    return u, margin, active, feasible
 
 
 def _project_scalars(a: Any, b: Any, v: np.ndarray, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -148,8 +162,13 @@ def _project_scalars(a: Any, b: Any, v: np.ndarray, low: Any, high: Any) -> tupl
     nearest = np.minimum(np.maximum(-b / a, low), high)
     moving = active if np.count_nonzero(a) == np.size(a) else active & (a != 0.0)
     u = np.where(moving, nearest, u)
-    margin = a * u + b
-    return u, margin, active, ~active | (margin >= -tolerance((a,), b, (u,)))
+    product = a * u
+    margin = product + b
+    # As `tolerances`, in place.
+    np.abs(product, out=product)
+    product *= ROUNDING
+    product += ROUNDING * np.abs(b)
+    return u, margin, active, margin >= -product
 
 
 def _dot(a: Sequence[Any], u: Sequence[np.ndarray]) -> np.ndarray:
@@ -168,8 +187,11 @@ def _follow_multipliers(
     high: Sequence[Any],
     w: Sequence[Any],
     rows: np.ndarray,
-) -> list[np.ndarray]:
-    """The general case for the states in `rows`, components in front: shape (m, R), kinks in a third axis (m, R, 2m + 1)."""
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """The inputs, and which of the states in `rows` have components that can still move (R,).
+
+    Components are in front: shape (m, R), kinks in a third axis (m, R, 2m + 1).
+    """
     batch = u[0].shape
     ar, vr, lo, hi, wr = [np.array([np.broadcast_to(cj, batch)[rows] for cj in c]) for c in (a, v, low, high, w)]
     size = np.abs(ar).max(axis=0)
@@ -178,11 +200,11 @@ def _follow_multipliers(
     d = ar / wr
     near, far = np.where(d > 0.0, lo, hi), np.where(d > 0.0, hi, lo)
     free = d != 0.0
-    enter = np.maximum(np.divide(near - vr, d, out=np.zeros_like(d), where=free), 0.0)
-    leave = np.maximum(np.divide(far - vr, d, out=np.zeros_like(d), where=free), 0.0)
+    # Finite, for an input without a say stays where it is.
+    enter = np.clip(np.divide(near - vr, d, out=np.zeros_like(d), where=free), 0.0, _LARGEST)
+    leave = np.clip(np.divide(far - vr, d, out=np.zeros_like(d), where=free), 0.0, _LARGEST)
     kinks = np.concatenate([np.zeros((1, rows.size)), enter, leave]).T
-    ways = np.where(free[:, :, None], kinks * d[:, :, None], 0.0)
-    at_kinks = np.clip(vr[:, :, None] + ways, lo[:, :, None], hi[:, :, None])
+    at_kinks = np.clip(vr[:, :, None] + kinks * d[:, :, None], lo[:, :, None], hi[:, :, None])
     phi = (ar[:, :, None] * at_kinks).sum(axis=0) + br[:, None]
     last = np.where(phi < 0.0, kinks, -1.0).argmax(axis=1)[:, None]
     kink = np.take_along_axis(kinks, last, axis=1)[:, 0]
@@ -190,25 +212,29 @@ def _follow_multipliers(
     slope = np.where((enter <= kink) & (kink < leave), ar * d, 0.0).sum(axis=0)
     rises = slope > 0.0
     multiplier = kink - np.divide(phi, slope, out=np.zeros_like(phi), where=rises)
-    start = np.clip(vr, lo, hi)
-    solved = np.where(free & rises, np.clip(vr + multiplier * d, lo, hi), np.where(free, far, start))
-    found = _all_corrected(ar, br, start, solved, far, d)
+    solved = np.clip(vr + np.where(free, multiplier * d, 0.0), lo, hi)
     result = [uj.copy() for uj in u]
-    for j, component in enumerate(found):
+    for j, component in enumerate(np.where(rises | ~free, solved, far)):
         result[j][rows] = component
-    return result
+    return result, rises
 
 
-def _all_corrected(a: np.ndarray, b: np.ndarray, near: np.ndarray, u: np.ndarray, far: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """`_corrected` for the components in front, shape (m, R); `near` and `far` are the ends of their ways."""
+def _all_corrected(
+    a: np.ndarray, b: np.ndarray, v: np.ndarray, u: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`_corrected` for components in front, shape (m, R), and b of the shape (1, R): inputs, margins and whether the row is met."""
+    size = np.abs(a).max(axis=0)
+    unit, ways = a / size, a / size / w
+    near, far = np.clip(v, low, high), np.where(a > 0.0, high, low)
     lower, upper = np.minimum(near, far), np.maximum(near, far)
     for _ in range(len(a) + _CORRECTIONS):
-        margin, allowed = total(a * u) + b, tolerance(a, b, u)
-        moving = np.where(u != np.where(margin < 0.0, far, near), d, 0.0)
-        slope = total(a * moving)
+        margin, allowed = total(a * u) + b[0], tolerances(a, b[0], u)
+        moving = np.where(u != np.where(margin < 0.0, far, near), ways, 0.0)
+        slope = total(unit * moving)
         wrong = ~(np.abs(margin) <= allowed) & (slope > 0.0)
         if not np.count_nonzero(wrong):
             break
-        step = np.where(wrong, -margin / slope, 0.0)
+        step = np.where(wrong, -(margin / size) / slope, 0.0)
         u = np.where(moving != 0.0, np.minimum(np.maximum(u + step * moving, lower), upper), u)
-    return u
+    margin = total(a * u) + b[0]
+    return u, margin, margin >= -tolerances(a, b[0], u)

@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wrappers.qp.least_violating import is_unique, least_violating
-from wrappers.qp.rows import ROUNDING, stack, tolerance
+from wrappers.qp.rows import ROUNDING, stack, tolerances
+
 
 class Plane(NamedTuple):
     """Problems of B states; pairs of inputs in front.
@@ -53,7 +54,7 @@ class Plane(NamedTuple):
 
     def met(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
         """Whether all rows are met (B,)."""
-        return (margin >= -tolerance(self.a, self.b, u)).all(axis=0)
+        return (margin >= -tolerances(self.a, self.b, u)).all(axis=0)
 
     def binds(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
         """Whether a row's margin exceeds zero by no more than rounding."""

@@ -15,7 +15,7 @@ import numpy as np
 from proxsuite import proxqp  # pyright: ignore[reportMissingImports]  (it lives in a prefix of its own)
 
 from wrappers.qp import active_set
-from wrappers.qp.rows import ROUNDING, tolerance, total
+from wrappers.qp.rows import ROUNDING, tolerances, total
 
 _PRECISION = {"eps_abs": 1e-9, "eps_rel": 0.0, "check_duality_gap": True, "eps_duality_gap_abs": 1e-9}
 _SETTINGS = {**_PRECISION, "eps_primal_inf": 1e-14, "max_iter": 200, "max_iter_in": 50}
@@ -75,7 +75,7 @@ class _Problem(NamedTuple):
 
     def tolerance(self, u: np.ndarray) -> np.ndarray:
         """By how much the rows may miss there (B, k)."""
-        return tolerance(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
+        return tolerances(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
 
     def certified(self, rows: np.ndarray, below: np.ndarray, above: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The minimisers (B, m) that some rows (B, k) and bounds (B, m) hold, and where they are those of the whole problem (B,)."""

@@ -6,7 +6,7 @@ A row a . u + b >= 0 is met by an input u if
 
 A sum of n floating-point products differs from the exact one by at most n eps times the sum of their sizes; ROUNDING leaves
 room for the coefficients, which were rounded themselves. The sizes are those of the terms at u, so that neither the unit of a
-row nor that of an input matters. Where a term is denormal its rounding is absolute: the smallest normal number stands for it.
+row nor that of an input matters.
 
 Every solver, for one state and for a batch, says `feasible` where the action that it returns meets all rows in this sense.
 """
@@ -22,22 +22,19 @@ import numpy as np
 ROUNDING = 16.0 * sys.float_info.epsilon
 """Relative error of a row's value."""
 
-_SMALLEST = sys.float_info.min
-"""The smallest normal number: below it, rounding is absolute."""
+
+def tolerance(a: Sequence[float], b: float, u: Sequence[float]) -> float:
+    """Return by how much a row of m coefficients may miss at m inputs and be met all the same."""
+    # Each term is scaled by itself, so that their sum does not overflow.
+    return ROUNDING * abs(b) + sum([ROUNDING * abs(aj * uj) for aj, uj in zip(a, u, strict=True)])
 
 
-def tolerance(a: Sequence[Any], b: Any, u: Sequence[Any]) -> Any:
-    """Return by how much a row may miss at an input and be met all the same.
-
-    Args:
-        a: m coefficients, each a float or an array (B,).
-        b: the offset, likewise.
-        u: m inputs, likewise.
-    """
-    size = abs(b) * ROUNDING + _SMALLEST * ROUNDING
+def tolerances(a: Sequence[Any], b: Any, u: Sequence[Any]) -> Any:
+    """`tolerance` for arrays, the m coefficients and inputs in front."""
+    found = ROUNDING * np.abs(b)
     for aj, uj in zip(a, u, strict=True):
-        size = size + abs(aj) * ROUNDING * (abs(uj) + _SMALLEST)  # scaled first, so that no product overflows
-    return size
+        found = found + ROUNDING * np.abs(aj * uj)
+    return found
 
 
 def stack(entries: Sequence[Any], size: int) -> np.ndarray:
