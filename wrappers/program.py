@@ -20,6 +20,7 @@ from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions import AffineConstraint
 from wrappers.conditions.base import Terms
 from wrappers.qp import concave, one_row, several_rows
+from wrappers.qp.rows import ROUNDING
 
 _FAR = 1e4
 """How many times further than the box reaches is far away."""
@@ -198,7 +199,7 @@ class Solver:
                 raise UndefinedRowError(int(bad[0]), what)
 
     def _split(self, values: Components) -> tuple[list[Any], list[Any], Sequence[Any], Sequence[Any], dict[int, Components]]:
-        """The rows' a and b, the goal's offset and coefficients, h of the reciprocal conditions, and Q of the uncertain rows."""
+        """The rows' a and b, the goal's offset and coefficients, h of reciprocal conditions less its rounding, Q of uncertain rows."""
         width, count, entries = self._m + 1, self._count, (self._m + 1) * (self._m + 2) // 2
         rows = [values[i * width : (i + 1) * width] for i in range(count)]
         forms_at = len(values) - entries * len(self._uncertain)
@@ -316,7 +317,7 @@ class Solver:
         if p.clf is not None:
             growth, along = p.clf.growth(p.model)
             expressions += [growth, *along]
-        expressions += [p.constraints[i].chain[0] for i in self._reciprocal]
+        expressions += [_beyond_rounding(p.constraints[i].chain[0]) for i in self._reciprocal]
         return self._compiled([*expressions, *(e for i in self._uncertain for e in p.constraints[i].uncertainty or ())])
 
     @cached_property
@@ -330,6 +331,20 @@ class Solver:
     def _compiled(self, expressions: Sequence[Any], more: Sequence[sp.Symbol] = ()) -> Any:
         model = self._program.model
         return compile_function((*self._symbols, *more), [model.numeric(e) for e in expressions], self._flavour)
+
+
+def _beyond_rounding(h: sp.Expr) -> sp.Expr:
+    """What h is more than its own rounding: where that is not positive, a state and a batch may find h on either side of 0."""
+    return h - sp.Float(ROUNDING, 17) * _size(h)
+
+
+def _size(expression: sp.Expr) -> sp.Expr:
+    """The sum of the sizes of an expression's terms."""
+    if expression.is_Add or expression.is_Mul:
+        return expression.func(*map(_size, expression.args))
+    if isinstance(expression, sp.Max | sp.Min):
+        return sp.Max(*map(_size, expression.args))
+    return sp.Abs(expression)
 
 
 def _choose(condition: bool, chosen: Any, other: Any) -> Any:

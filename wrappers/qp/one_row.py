@@ -6,8 +6,8 @@ The minimiser is u(l) = clip(v + l a / w) for the smallest multiplier l >= 0 at 
 phi is nondecreasing and piecewise linear, with a kink wherever a component enters or leaves its interval. If phi stays
 negative, no action meets the row; u(infinity), which maximises a . u + b over the box, violates it least.
 
-u(l) carries the rounding of v, which a proposal far beyond the box makes large. So the row is evaluated at the result, and what
-it misses or exceeds there is divided among the components that may still move along a / w.
+A component whose proposal lies beyond its near bound stays there until l enters, and is measured from there: a proposal of 1e16
+does not drown it. What rounding leaves of the miss at the result is divided among the components that are free.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from wrappers.qp.rows import ROUNDING, tolerance, tolerances, total
+from wrappers.qp.rows import ROUNDING, tolerance, tolerances
 
-_LARGEST = sys.float_info.max
 _EXCESS = 1e3
-"""A row that holds with so many times its rounding to spare is not on the nearest action: the proposal's rounding was larger."""
+"""A row that holds with so many times its rounding to spare is not on the nearest action: the rounding of the way there was larger.
+Then, and where that makes it miss, a state of a batch is solved by itself."""
 _CORRECTIONS = 3
-"""How often more than once for each component a row is corrected: each time its miss shrinks to rounding."""
+"""How often the rounding of a long way is taken back: each time it shrinks by a factor of 1e16."""
 
 
 def project_floats(
@@ -42,37 +42,16 @@ def project_floats(
     margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])
     if margin >= 0.0:
         return u, margin, False, True
-    u = _follow_multiplier(a, b, v, low, high, w)
-    margin = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)])
-    allowed = tolerance(a, b, u)
-    if not -allowed <= margin <= _EXCESS * allowed:
-        u, margin, allowed = _corrected(a, b, v, u, low, high, w)
-    return u, margin, True, margin >= -allowed
-
-
-def _corrected(
-    a: Sequence[float], b: float, v: Sequence[float], u: list[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
-) -> tuple[list[float], float, float]:
-    """The inputs moved until the row holds with equality, as far as their ways from the clipped proposal to the far bounds allow."""
-    size = max([abs(aj) for aj in a]) or 1.0
-    ways = [
-        (aj / size, aj / size / wj, min(max(vj, lo), hi), hi if aj > 0.0 else lo)
-        for aj, vj, lo, hi, wj in zip(a, v, low, high, w, strict=True)
-    ]
-    for _ in range(len(a) + _CORRECTIONS):
-        margin, allowed = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]), tolerance(a, b, u)
-        if -allowed <= margin <= allowed:
-            break
-        moving = [dj if uj != (far if margin < 0.0 else near) else 0.0 for (_, dj, near, far), uj in zip(ways, u, strict=True)]
-        slope = sum([aj * dj for (aj, *_), dj in zip(ways, moving, strict=True)])
+    u, ways = _follow_multiplier(a, b, v, low, high, w)
+    margin, allowed = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]), tolerance(a, b, u)
+    for _ in range(_CORRECTIONS):
+        slope = 0.0 if -allowed <= margin <= allowed else sum([aj * way for aj, way in zip(a, ways, strict=True)])
         if not slope > 0.0:
             break
-        step = -(margin / size) / slope
-        u = [
-            min(max(uj + step * dj, min(near, far)), max(near, far)) if dj else uj
-            for uj, dj, (*_, near, far) in zip(u, moving, ways, strict=True)
-        ]
-    return u, b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]), tolerance(a, b, u)
+        step = margin / slope
+        u = [min(max(uj - step * way, lo), hi) if way else uj for uj, way, lo, hi in zip(u, ways, low, high, strict=True)]
+        margin, allowed = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]), tolerance(a, b, u)
+    return u, margin, True, margin >= -allowed
 
 
 def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tuple[list[float], float, bool, bool]:
@@ -92,28 +71,33 @@ def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tu
 
 def _follow_multiplier(
     a: Sequence[float], b: float, v: Sequence[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
-) -> list[float]:
+) -> tuple[list[float], list[float]]:
+    """The minimiser, and the way of each component along a / w, 0 for those that are not free."""
     size = max([abs(aj) for aj in a]) or 1.0
     a, b = [aj / size for aj in a], b / size  # so that products neither overflow nor vanish
     d = [aj / wj for aj, wj in zip(a, w, strict=True)]
-    enter, leave = [0.0] * len(a), [0.0] * len(a)
+    start = [min(max(vj, lo), hi) for vj, lo, hi in zip(v, low, high, strict=True)]
+    far, enter, leave = start.copy(), [0.0] * len(a), [0.0] * len(a)
     for j, (dj, vj, lo, hi) in enumerate(zip(d, v, low, high, strict=True)):
         if dj != 0.0:
-            near, far = (lo, hi) if dj > 0.0 else (hi, lo)
-            enter[j], leave[j] = max((near - vj) / dj, 0.0), max((far - vj) / dj, 0.0)
+            near, far[j] = (lo, hi) if dj > 0.0 else (hi, lo)
+            enter[j], leave[j] = max((near - vj) / dj, 0.0), max((far[j] - vj) / dj, 0.0)
+    parts = list(zip(start, far, d, enter, leave, strict=True))
 
     def inputs(multiplier: float) -> list[float]:
-        # An input without a say stays where it is, also where the multiplier is infinite.
-        return [min(max(vj + multiplier * dj if dj else vj, lo), hi) for vj, dj, lo, hi in zip(v, d, low, high, strict=True)]
+        return [s if multiplier <= e else f if multiplier >= x else s + (multiplier - e) * dj for s, f, dj, e, x in parts]
 
     kink, phi = max(
         [(k, p) for k in (0.0, *enter, *leave) if (p := b + sum([aj * uj for aj, uj in zip(a, inputs(k), strict=True)])) < 0.0],
         default=(0.0, -0.0),
     )
-    slope = sum([aj * dj for aj, dj, e, x in zip(a, d, enter, leave, strict=True) if e <= kink < x])
-    if slope > 0.0:
-        return inputs(kink - phi / slope)
-    return [hi if aj > 0.0 else lo if aj < 0.0 else u for aj, lo, hi, u in zip(a, low, high, inputs(0.0), strict=True)]
+    # Where a component is so far off that it enters and leaves at the same multiplier, up to rounding, it is free there.
+    ways = [dj if s != f and (e <= kink < x or e == kink == x) else 0.0 for s, f, dj, e, x in parts]
+    slope = sum([aj * way for aj, way in zip(a, ways, strict=True)])
+    if not slope > 0.0:
+        return far, ways
+    step = phi / slope
+    return [min(max(uj - step * way, lo), hi) if way else uj for uj, way, lo, hi in zip(inputs(kink), ways, low, high, strict=True)], ways
 
 
 def project_arrays(
@@ -146,10 +130,11 @@ def project_arrays(
     feasible = margin >= -allowed
     wrong = states[(~feasible[states] & movable) | (margin[states] > _EXCESS * allowed[states])]
     if wrong.size:
-        part = [np.array([np.broadcast_to(cj, active.shape)[wrong] for cj in c]) for c in (a, (b,), v, u, low, high, w)]
-        found, margin[wrong], feasible[wrong] = _all_corrected(*part)
-        for uj, component in zip(u, found, strict=True):
-            uj[wrong] = component
+        problems = [np.array([np.broadcast_to(cj, active.shape)[wrong] for cj in c]).T.tolist() for c in (a, (b,), v, low, high, w)]
+        for i, aj, (bi,), *rest in zip(wrong.tolist(), *problems, strict=True):
+            found, margin[i], _, feasible[i] = project_floats(aj, bi, *rest)
+            for uj, component in zip(u, found, strict=True):
+                uj[i] = component
     return u, margin, active, feasible
 
 
@@ -201,8 +186,8 @@ def _follow_multipliers(
     near, far = np.where(d > 0.0, lo, hi), np.where(d > 0.0, hi, lo)
     free = d != 0.0
     # Finite, for an input without a say stays where it is.
-    enter = np.clip(np.divide(near - vr, d, out=np.zeros_like(d), where=free), 0.0, _LARGEST)
-    leave = np.clip(np.divide(far - vr, d, out=np.zeros_like(d), where=free), 0.0, _LARGEST)
+    enter = np.clip(np.divide(near - vr, d, out=np.zeros_like(d), where=free), 0.0, sys.float_info.max)
+    leave = np.clip(np.divide(far - vr, d, out=np.zeros_like(d), where=free), 0.0, sys.float_info.max)
     kinks = np.concatenate([np.zeros((1, rows.size)), enter, leave]).T
     at_kinks = np.clip(vr[:, :, None] + kinks * d[:, :, None], lo[:, :, None], hi[:, :, None])
     phi = (ar[:, :, None] * at_kinks).sum(axis=0) + br[:, None]
@@ -217,24 +202,3 @@ def _follow_multipliers(
     for j, component in enumerate(np.where(rises | ~free, solved, far)):
         result[j][rows] = component
     return result, rises
-
-
-def _all_corrected(
-    a: np.ndarray, b: np.ndarray, v: np.ndarray, u: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`_corrected` for components in front, shape (m, R), and b of the shape (1, R): inputs, margins and whether the row is met."""
-    size = np.abs(a).max(axis=0)
-    unit, ways = a / size, a / size / w
-    near, far = np.clip(v, low, high), np.where(a > 0.0, high, low)
-    lower, upper = np.minimum(near, far), np.maximum(near, far)
-    for _ in range(len(a) + _CORRECTIONS):
-        margin, allowed = total(a * u) + b[0], tolerances(a, b[0], u)
-        moving = np.where(u != np.where(margin < 0.0, far, near), ways, 0.0)
-        slope = total(unit * moving)
-        wrong = ~(np.abs(margin) <= allowed) & (slope > 0.0)
-        if not np.count_nonzero(wrong):
-            break
-        step = np.where(wrong, -(margin / size) / slope, 0.0)
-        u = np.where(moving != 0.0, np.minimum(np.maximum(u + step * moving, lower), upper), u)
-    margin = total(a * u) + b[0]
-    return u, margin, margin >= -tolerances(a, b[0], u)

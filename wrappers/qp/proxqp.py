@@ -55,6 +55,7 @@ def project(
     u, certain = problem.certified(*_solve(_Scaled.of(problem)))
     for i in np.flatnonzero(~certain).tolist():
         u[i] = active_set.project(a[i], b[i], v[i], low[i], high[i], w[i], priority)
+    u = problem.tidied(u)
     margin, allowed = problem.margin(u), problem.tolerance(u)
     return Projection(u, margin, margin <= allowed, (margin >= -allowed).all(axis=1))
 
@@ -77,6 +78,13 @@ class _Problem(NamedTuple):
         """By how much the rows may miss there (B, k)."""
         return tolerances(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
 
+    def tidied(self, u: np.ndarray) -> np.ndarray:
+        """The inputs, with 0 for what is nothing but rounding of the way from the proposal: a row of this input alone may ask for 0."""
+        roots = np.sqrt(self.w)
+        way = (np.abs(u - self.v) * roots).max(axis=1, keepdims=True)
+        nothing = (np.abs(u) <= ROUNDING * way / roots) & (u != np.clip(self.v, self.low, self.high))
+        return np.where(nothing, np.clip(0.0, self.low, self.high), u)
+
     def certified(self, rows: np.ndarray, below: np.ndarray, above: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The minimisers (B, m) that some rows (B, k) and bounds (B, m) hold, and where they are those of the whole problem (B,)."""
         roots, held = np.sqrt(self.w), below | above
@@ -91,7 +99,7 @@ class _Problem(NamedTuple):
         # The second time takes back the rounding of a long way.
         for _ in range(2):
             u = u - _dot(inverse, np.where(rows, self.margin(u) / lengths, 0.0)) / roots
-        u = np.clip(u, self.low, self.high)
+        u = self.tidied(np.clip(u, self.low, self.high))
         way = (u - self.v) * roots
         pressures = _dot(np.swapaxes(inverse, 1, 2), np.where(held, 0.0, way))
         rest = way - _dot(np.swapaxes(normals, 1, 2), np.where(rows, pressures, 0.0))
