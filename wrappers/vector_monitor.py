@@ -143,7 +143,8 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         violation = h < 0.0
         cost = violation.astype(np.float64)
         self._episode_cost += cost * counted
-        np.minimum(self._h_min, h, out=self._h_min, where=counted)
+        # What was counted before cannot lower the smallest h again.
+        np.minimum(self._h_min, h, out=self._h_min)
         return safety_info(violation, cost, barrier, self._h_min.copy(), self._episode_cost.copy())
 
     def _forget(self, envs: np.ndarray) -> None:

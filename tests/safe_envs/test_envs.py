@@ -225,11 +225,17 @@ def test_parameters_that_divide_by_zero_are_errors():
         gym.make("safe_envs/QuadrotorAltitude-v0", plant={"m": 0.0})
 
 
-def test_huge_actions_are_clipped():
+@pytest.mark.parametrize("size", [1.5, 1e200, 1.7e308])
+def test_huge_actions_are_clipped(size):
     for make in (gym.make, gym.make_vec):
-        env = make("safe_envs/Scalar-v0", noise=0.0)
-        env.reset(seed=0)
-        env.step(np.full(env.action_space.shape, 1e200))
+        env = make("safe_envs/ACC-v0", noise=0.0)
+        for sign, end in zip((-1, 1), env.unwrapped.problem.box[0], strict=True):
+            seen = []
+            for action in (sign * size, sign):
+                env.reset(seed=0)
+                seen.append(env.step(np.full(env.action_space.shape, float(action)))[0])
+                np.testing.assert_allclose(np.ravel(env.unwrapped.executed), [end], rtol=1e-15)
+            np.testing.assert_array_equal(*seen)
 
 
 def test_steps_before_a_reset_are_errors():
