@@ -296,7 +296,7 @@ class Solver:
         """The active row whose half-space is furthest from the proposed input; one that means nothing is further than any."""
         cause, furthest = -1, -math.inf
         for i, (ai, bi, acts) in enumerate(zip(a, b, active, strict=True)):
-            if acts is False:
+            if acts is False or (acts is not True and not np.count_nonzero(acts)):
                 continue
             size = functools.reduce(self._larger, [abs(aj) for aj in ai])
             unit = self._choose(size > 0.0, size, 1.0)  # so that squares neither overflow nor vanish

@@ -273,12 +273,13 @@ def test_cause_is_measured_in_the_weighted_distance():
 
 
 def test_cause_is_a_distance_and_not_a_miss_of_the_row():
-    # The first row is half as steep: missed by 1 at the proposal it lies 2 off, further than the other, whose miss is 1.5.
-    rows = [(Barrier(1 - 0.5 * x), CBF(1.0)), (Barrier(0.5 - y), CBF(1.0))]
-    safety_filter = SafetyFilter(plane(), rows, [(-9.0, 9.0)] * 2)
-    for proposal, cause in (([4.0, 2.0], 0), ([4.0, 2.9], 1), ([2.8, 1.5], 1)):
-        assert safety_filter.filter(np.zeros(2), proposal).cause == cause
-        assert safety_filter.filter(np.zeros((1, 2)), [proposal]).cause.tolist() == [cause]
+    # u + w <= 1 is missed by 3 and lies 3/sqrt(2) = 2.1 off, w <= .5 by 2; and with a row half as steep, 1 and 2 against 1.5.
+    for first, proposals in ((1 - x - y, ([1.5, 2.5], [1.0, 2.5])), (1 - 0.5 * x, ([4.0, 2.0], [4.0, 2.9]))):
+        safety_filter = SafetyFilter(plane(), [(Barrier(first), CBF(1.0)), (Barrier(0.5 - y), CBF(1.0))], [(-9.0, 9.0)] * 2)
+        for cause, proposal in enumerate(proposals):
+            assert safety_filter.filter(np.zeros(2), proposal).active.all()
+            assert safety_filter.filter(np.zeros(2), proposal).cause == cause
+            assert safety_filter.filter(np.zeros((1, 2)), [proposal]).cause.tolist() == [cause]
 
 
 @dataclass(frozen=True)

@@ -87,11 +87,15 @@ def project_arrays(
     if acting.size:
         part = plane.take(acting)
         moved, met = _nearest(part)
-        unmet = np.flatnonzero(~(met & part.met(moved, part.margin(moved))))
-        if unmet.size:
-            moved[:, unmet] = _nearest_of_least_violating(part.take(unmet), np.asarray(priority))
         reached = part.margin(moved)
-        u[:, acting], margin[:, acting], feasible[acting] = moved, reached, part.met(moved, reached)
+        met &= part.met(moved, reached)
+        unmet = np.flatnonzero(~met)
+        if unmet.size:
+            lost = part.take(unmet)
+            moved[:, unmet] = least = _nearest_of_least_violating(lost, np.asarray(priority))
+            reached[:, unmet] = lost.margin(least)
+            met[unmet] = lost.met(least, lost.margin(least))
+        u[:, acting], margin[:, acting], feasible[acting] = moved, reached, met
         active[:, acting] = part.binds(moved, reached)
     return u, margin, active, feasible
 
