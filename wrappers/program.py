@@ -340,10 +340,11 @@ def _beyond_rounding(h: sp.Expr) -> sp.Expr:
 
 def _size(expression: sp.Expr) -> sp.Expr:
     """The sum of the sizes of an expression's terms."""
+    parts: Any = expression.args
     if expression.is_Add or expression.is_Mul:
-        return expression.func(*map(_size, expression.args))
+        return expression.func(*map(_size, parts))
     if isinstance(expression, sp.Max | sp.Min):
-        return sp.Max(*map(_size, expression.args))
+        return sp.Max(*map(_size, parts))
     return sp.Abs(expression)
 
 

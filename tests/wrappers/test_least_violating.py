@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.wrappers.rational_oracle import nearest_of_least_violating
+from wrappers.qp import proxqp
 from wrappers.qp.rows import ROUNDING
 from wrappers.qp.several_rows import project_arrays, project_floats
 
@@ -120,6 +121,40 @@ def test_sides_of_the_box_that_differ_by_a_million_hide_nothing():
     u, _, active, feasible = project_floats(rows, offsets, [0.0] * 3, [-1.0, -1e6, -1.0], [1.0, 1e6, 1.0], [1.0, 1e-12, 1.0], [1.0] * 2)
     np.testing.assert_allclose(u, [0.75, 7.5e5, 0.25], rtol=1e-12)
     assert (active, feasible) == ([True, True], True)
+
+
+def test_a_wrong_guess_of_what_binds_gets_no_certificate():
+    # u_1 >= .5 and u_2 >= -.5 from the origin: the first row binds, the second does not, and no input is held.
+    a, b = np.array([[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]]), np.array([[-0.5, 0.5]])
+    problem = proxqp._Problem(a, b, np.zeros((1, 3)), -np.ones((1, 3)), np.ones((1, 3)), np.ones((1, 3)))
+    nothing = np.zeros((1, 3), dtype=bool)
+    for rows, held, certain in (
+        ([True, False], -1, True),
+        ([True, True], -1, False),
+        ([False, False], -1, False),
+        ([True, False], 2, False),
+    ):
+        bound = nothing.copy()
+        bound[0, held] = held >= 0
+        for below, above in ((bound, nothing), (nothing, bound)):
+            u, found = problem.certified(np.array([rows]), below, above)
+            assert found.tolist() == [certain]
+        assert not certain or u[0].tolist() == [0.5, 0.0, 0.0]
+
+
+@pytest.mark.parametrize("steep", [1e3, 1e6, 1e9])
+def test_steep_row_is_a_wall_to_flat_ones(steep):
+    # u_1 + u_2 <= 0 is dear, and the other two ask for u_1: along the wall u_2 = -u_1 up to the corner of the box.
+    rows, offsets = [[-steep, -steep, 0.0], [1e-3, -1e-3, 0.0], [1e-3, 0.0, 0.0]], [0.0, -2.2e-3, -5e-3]
+    u, margin, active, feasible = project_floats(rows, offsets, [0.0, 0.0, 0.2], [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
+    np.testing.assert_allclose(u, [1.0, -1.0, 0.2], atol=1e-9 + 5e-3 / steep**2)
+    assert margin[1:] == pytest.approx([-2e-4, -4e-3], rel=1e-5)
+    assert active[1:] == [True, True]
+    assert not feasible
+    # Turned round, the row is met with room to spare, and has no part.
+    rows[0] = [steep, steep, 0.0]
+    u, *_ = project_floats(rows, offsets, [-0.3, 0.2, 0.2], [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
+    np.testing.assert_allclose(u, [1.0, -1.0, 0.2], atol=1e-9)
 
 
 def test_oracle_finds_what_is_clear():

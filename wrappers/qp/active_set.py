@@ -46,11 +46,10 @@ def project(
     u = np.clip(v, low, high)
     # An input on which no row depends keeps its proposal, and a row that depends on no input has no say.
     rows, inputs = (a != 0.0).any(axis=1), (a != 0.0).any(axis=0)
-    part = [entry[inputs] for entry in (v, low, high, w)]
     if not rows.any():
         return u
     try:
-        u[inputs] = _project(a[np.ix_(rows, inputs)], b[rows], *part, priority[rows])
+        u[inputs] = _project(a[np.ix_(rows, inputs)], b[rows], v[inputs], low[inputs], high[inputs], w[inputs], priority[rows])
     except np.linalg.LinAlgError:
         u[inputs] = np.nan
     return u

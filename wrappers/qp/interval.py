@@ -79,7 +79,7 @@ def project_arrays(
     if acting.size:
         box = [np.broadcast_to(end, size)[acting] for end in (low, high)]
         slope, offset = slope[:, acting], offset[:, acting]
-        u[acting], margin[:, acting], active[:, acting], feasible[acting] = _project(slope, offset, v[acting], *box, priority)
+        u[acting], margin[:, acting], active[:, acting], feasible[acting] = _project(slope, offset, v[acting], box[0], box[1], priority)
     return u, margin, active, feasible
 
 

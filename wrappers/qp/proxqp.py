@@ -9,7 +9,7 @@ all with contradicting rows, go to `wrappers.qp.active_set` one by one.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from proxsuite import proxqp  # pyright: ignore[reportMissingImports]  (it lives in a prefix of its own)
@@ -70,11 +70,11 @@ class _Problem(NamedTuple):
     high: np.ndarray
     w: np.ndarray
 
-    def margin(self, u: np.ndarray) -> np.ndarray:
+    def margin(self, u: np.ndarray) -> Any:
         """Values (B, k) of the rows at inputs (B, m)."""
         return _dot(self.a, u) + self.b
 
-    def tolerance(self, u: np.ndarray) -> np.ndarray:
+    def tolerance(self, u: np.ndarray) -> Any:
         """By how much the rows may miss there (B, k)."""
         return tolerances(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
 
@@ -92,7 +92,7 @@ class _Problem(NamedTuple):
         lengths = np.abs(normals).max(axis=2)
         lengths = np.where(lengths > 0.0, lengths, 1.0)
         normals = normals / lengths[:, :, None]
-        working = np.where(rows[:, :, None] & ~held[:, None, :], normals, 0.0)
+        working: Any = np.where(rows[:, :, None] & ~held[:, None, :], normals, 0.0)
         usable = np.isfinite(working).all(axis=(1, 2))
         inverse = np.linalg.pinv(np.where(usable[:, None, None], working, 0.0))
         u = np.where(below, self.low, np.where(above, self.high, self.v))

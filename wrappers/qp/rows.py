@@ -29,7 +29,7 @@ def tolerance(a: Sequence[float], b: float, u: Sequence[float]) -> float:
     return ROUNDING * abs(b) + sum([ROUNDING * abs(aj * uj) for aj, uj in zip(a, u, strict=True)])
 
 
-def tolerances(a: Sequence[Any], b: Any, u: Sequence[Any]) -> Any:
+def tolerances(a: Sequence[Any] | np.ndarray, b: Any, u: Sequence[Any] | np.ndarray) -> Any:
     """`tolerance` for arrays, the m coefficients and inputs in front."""
     found = ROUNDING * np.abs(b)
     for aj, uj in zip(a, u, strict=True):
