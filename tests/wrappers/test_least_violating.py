@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from tests.wrappers.rational_oracle import nearest_of_least_violating
 from wrappers.qp import proxqp
-from wrappers.qp.rows import ROUNDING
+from wrappers.qp.rows import ROUNDING, tolerance
 from wrappers.qp.several_rows import project_arrays, project_floats
 
 KINDS = ["plain", "flat", "integers", "parallel", "sides", "sizes", "far", "weights", "endless"]
@@ -215,6 +215,47 @@ def test_one_state_equals_a_batch_at_any_scale(program):
             terms = [*(Fraction(x) * Fraction(y) for x, y in zip(row, found, strict=True)), Fraction(offset)]
             # Twice: once for the rounding of the margin itself. Below the normal numbers rounding is absolute.
             assert not met or sum(terms) >= -2 * Fraction(ROUNDING) * sum(map(abs, terms)) - Fraction(1e-307)
+
+
+def test_a_miss_is_never_called_feasible_on_the_way_there():
+    # Exact enough for most rows, the single-state methods look at the result, and leave to the batch what rounding made of it.
+    skew = [[58.587457063119814, 160571986.1745277], [-8650.462775442928, -1255103405.2969155]]
+    skew += [[-0.49231216962370533, -44.42495682814076], [5.894081711817454e-08, 0.033354829041236]]
+    offsets = [0.04911269124857201, 0.2976744556968492, -0.49194699507253264, 0.1995416648164488]
+    tiny = [[1e300], [1.0]], [-1e-20, 1.0]  # the root is denormal, and known to four digits
+    for (a, b), v in (((skew, offsets), [395911001.8559354, 439281258.9179358]), (tiny, [0.0])):
+        m, k = len(v), len(b)
+        ends = [-1.0] * m, [1.0] * m, [1.0] * m, [1.0] * k
+        u, margin, active, feasible = project_floats(a, b, v, *ends)
+        allowed = [tolerance(row, offset, u) for row, offset in zip(a, b, strict=True)]
+        assert feasible == all(g >= -t for g, t in zip(margin, allowed, strict=True))
+        *parts, met = project_arrays(
+            [[np.array([c]) for c in row] for row in a], list(np.array(b)[:, None]), list(np.array(v)[:, None]), *ends
+        )
+        assert ([c.item() for c in parts[0]], [c.item() for c in parts[2]], met.item()) == (u, active, feasible)
+
+
+def test_a_long_way_inside_the_box_ends_on_the_row():
+    for m in (2, 3):
+        rest = [0.0] * (m - 1)
+        u, margin, _, feasible = project_floats([[-1.0, *rest]], [1e-3], [1e6, *rest], [-1e7] * m, [1e7] * m, [1.0] * m, [1.0])
+        assert feasible
+        assert u == pytest.approx([1e-3, *rest], rel=1e-14)
+        assert abs(margin[0]) <= 2e-3 * ROUNDING
+
+
+def test_a_steep_row_met_with_room_to_spare_lets_go():
+    # It is violated at first, and its pull is below its rounding from then on.
+    a = [[208.26152489751715, 478.81823232530795, 473.39052954289167], [-0.50984162908369, 0.56405661689997, 0.47190637789455]]
+    a += [[-1.49283308835e-3, 7.5841902551e-4, -5.8054635124e-4], [-5.2353039445e-3, -2.4708513022e-2, 3.7908425575e-2]]
+    b, v = [-412.768911191307, 0.114749375170422, -1.4806099082e-3, -1.9471364240e-2], [1.46724946406, 3.1629908946, -0.83154555956]
+    low, high = [-0.8957285648, -1.0963488786775, -0.6095237162], [0.9434476957, 0.534211151, 1.52364823926]
+    priority = [6.183767680033, 0.904524468956, 0.291185329034, 7.892208614194]
+    u, *_, feasible = project_floats(a, b, v, low, high, [1.0] * 3, priority)
+    exact = nearest_of_least_violating(*map(np.array, (a, b, v, low, high, [1.0] * 3, priority)), np.array([low[0], high[1], 0.7381]))
+    assert exact is not None
+    assert (exact[1], feasible) == (False, False)
+    np.testing.assert_allclose(u, [float(c) for c in exact[0]], rtol=1e-9)
 
 
 def test_a_proposal_of_1e16_drowns_no_row():
