@@ -258,6 +258,20 @@ def test_a_steep_row_met_with_room_to_spare_lets_go():
     np.testing.assert_allclose(u, [float(c) for c in exact[0]], rtol=1e-9)
 
 
+def test_three_rows_that_only_just_leave_a_point_are_met_there():
+    # The rounding of the way to that point is more than the rows allow.
+    a = [[0.8530395251505041, 0.5640897604155453, -0.1396720580915406], [-0.41619647049596814, -0.25731974387250817, -0.09059072542196216]]
+    a += [[-0.59398866764953, 0.4108195384411644, 0.20037768514203794], [2.132358585619215, 0.020169464737283215, 2.381309779418478]]
+    b, v = [0.0991436869259339, 0.13192861508388803, -0.1286668795022684, -0.8702941358655643], [0.758, -2.193, 1.446]
+    low, high = [-1.306314545588532, -0.721720867455587, -1.0126002653172121], [0.5838973433930883, 1.2549031025313506, 1.762047758535018]
+    w, priority = [0.056790010519241152, 1001.8042542271351, 0.083674208114819057], [5.99, 0.42, 1.2, 7.7]
+    u, _, active, feasible = project_floats(a, b, v, low, high, w, priority)
+    exact = nearest_of_least_violating(*map(np.array, (a, b, v, low, high, w, priority)), np.array(u))
+    assert exact is not None
+    assert (exact[1], feasible, sum(active)) == (True, True, 3)
+    np.testing.assert_allclose(u, [float(c) for c in exact[0]], rtol=1e-12)
+
+
 def test_a_proposal_of_1e16_drowns_no_row():
     for m in (2, 3):
         rest = [0.0] * (m - 2)

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from wrappers.qp.rows import tolerances
-
 _STEPS = 20
 """Steps for each row and input: many times more than were ever seen."""
 
@@ -49,11 +47,11 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
         if length < 1.0:
             held, missed = held | stops, missed | (to_rows <= length)
             continue
-        press = _pressures(a[:, ~held], margin, missed, tolerances(a.T, b, u))
+        press = np.where(missed, -margin, 0.0)
         forces = press[:, None] * a
         inwards = np.where(u >= high, -1.0, 1.0) * forces.sum(axis=0)
         inwards[~held | (inwards <= _NOTHING * np.abs(forces).sum(axis=0))] = 0.0
-        pulls = np.where(missed, -press, 0.0) * np.abs(a).max(axis=1)
+        pulls = -press * np.abs(a).max(axis=1)
         pulls[pulls <= _NOTHING * np.abs(forces).max()] = 0.0
         if pulls.any():
             missed[pulls.argmax()] = False
@@ -64,16 +62,3 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
     # The margins are those of a long way; a last step along the same rows takes back its rounding.
     u[~held] += np.linalg.lstsq(a[np.ix_(missed, ~held)], -margin[missed])[0]
     return np.clip(u, low, high)
-
-
-def _pressures(a: np.ndarray, margin: np.ndarray, missed: np.ndarray, doubt: np.ndarray) -> np.ndarray:
-    """How strongly each row (k,) pushes, from what it misses, where the inputs that are free, with coefficients (k, f), are at rest.
-
-    A row may be 1e9 times as steep as another. What it misses is below its rounding then, and it acts as a wall: it pushes as
-    strongly as the balance of the free inputs asks for.
-    """
-    press = np.where(missed, -margin, 0.0)
-    walls = missed & (np.abs(margin) <= doubt)
-    press[walls] = 0.0
-    press[walls] = np.linalg.lstsq(a[walls].T, -(press @ a))[0]
-    return press
