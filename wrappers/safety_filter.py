@@ -54,7 +54,9 @@ class SafetyFilter:
     Where the rows cannot all be met, the sum of their squared slacks is as small as can be, weighted by the priorities.
 
     One row has a closed form for any number of inputs, and any number of rows an exact solution for one and two inputs;
-    others go to ProxQP.
+    others go to ProxQP and an active-set method, which make their answers exact to rounding.
+
+    A row counts as met where it misses by no more than the rounding of its terms; see `wrappers.qp.rows`.
 
     With a control Lyapunov function the objective is its joint program instead, min w_u |u|^2 + w_d d^2 subject to
     AV + rate V <= d, the rows and the box (thesis Sec. 4.3.1, 5.4.2): the filter pursues the goal by itself, and whatever is
