@@ -64,7 +64,7 @@ def off(problem, priority, u, feasible):
     _, _, v, low, high, w = problem
     way = np.sqrt(w) * np.abs(np.subtract(best, v))
     reach = np.minimum(high - low, way.max() / np.sqrt(w) + np.abs(best))
-    return float((np.abs(u - best) / reach).max()), met != feasible
+    return float((np.abs(u - best) / np.where(reach > 0.0, reach, 1.0)).max()), met != feasible
 
 
 def assert_nearest(kind, size, ks, ms):

@@ -79,11 +79,15 @@ class _Problem(NamedTuple):
         return tolerances(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
 
     def tidied(self, u: np.ndarray) -> np.ndarray:
-        """The inputs, with 0 for what is nothing but rounding of the way from the proposal: a row of this input alone may ask for 0."""
-        roots = np.sqrt(self.w)
+        """The inputs without the rounding that other inputs brought in.
+
+        An input on which no row depends keeps its proposal. One that is nothing but rounding of the way from the proposal is 0,
+        for a row of this input alone may ask for that.
+        """
+        roots, start = np.sqrt(self.w), np.clip(self.v, self.low, self.high)
         way = (np.abs(u - self.v) * roots).max(axis=1, keepdims=True)
-        nothing = (np.abs(u) <= ROUNDING * way / roots) & (u != np.clip(self.v, self.low, self.high))
-        return np.where(nothing, np.clip(0.0, self.low, self.high), u)
+        u = np.where(np.abs(u) <= ROUNDING * way / roots, np.clip(0.0, self.low, self.high), u)
+        return np.where((self.a == 0.0).all(axis=1), start, u)
 
     def certified(self, rows: np.ndarray, below: np.ndarray, above: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The minimisers (B, m) that some rows (B, k) and bounds (B, m) hold, and where they are those of the whole problem (B,)."""
