@@ -128,12 +128,8 @@ def test_a_wrong_guess_of_what_binds_gets_no_certificate():
     a, b = np.array([[[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]]), np.array([[-0.5, 0.5]])
     problem = proxqp._Problem(a, b, np.zeros((1, 3)), -np.ones((1, 3)), np.ones((1, 3)), np.ones((1, 3)))
     nothing = np.zeros((1, 3), dtype=bool)
-    for rows, held, certain in (
-        ([True, False], -1, True),
-        ([True, True], -1, False),
-        ([False, False], -1, False),
-        ([True, False], 2, False),
-    ):
+    guesses = ([True, False], -1), ([True, True], -1), ([False, False], -1), ([True, False], 1)
+    for (rows, held), certain in zip(guesses, (True, False, False, False), strict=True):
         bound = nothing.copy()
         bound[0, held] = held >= 0
         for below, above in ((bound, nothing), (nothing, bound)):
