@@ -20,7 +20,7 @@ from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions import AffineConstraint
 from wrappers.conditions.base import Terms
 from wrappers.qp import concave, one_row, several_rows
-from wrappers.qp.rows import ROUNDING
+from wrappers.qp.rows import ROUNDING, tolerance, tolerances
 
 _FAR = 1e4
 """How many times further than the box reaches is far away."""
@@ -109,6 +109,7 @@ class Solver:
         self._weights = program.weights
         self._choose: Any = np.where if arrays else _choose
         self._larger: Any = np.maximum if arrays else max
+        self._tolerance: Any = tolerances if arrays else tolerance
         self._project: Any = several_rows.project_arrays if arrays else several_rows.project_floats
         if program.clf is not None:
             program.clf.require_known(program.model)
@@ -267,8 +268,13 @@ class Solver:
         low, high = (*self._low, 0.0), (*self._high, self._choose(most > 0.0, 2.0 * most / unit, 1.0))
         w = (*self._weights, self._weights[0])
         priorities = [*p.priorities[: len(a)], 1.0]
-        action, margin, active, feasible = self._project(rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities)
-        return action[: self._m], margin[: len(a)], active[: len(a)], feasible
+        action, margin, active, _ = self._project(rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities)
+        action, margin, active = action[: self._m], margin[: len(a)], active[: len(a)]
+        # The goal's row, which can always be met, has no say in that, nor has its rounding.
+        feasible: Any = True
+        for ai, bi, g in zip(a, b, margin, strict=True):
+            feasible = feasible & (g >= -self._tolerance(ai, bi, action))
+        return action, margin, active, feasible
 
     def _on_the_safe_side(self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components]) -> tuple[list[Any], list[Any]]:
         """Affine rows that are met only where the uncertain ones are, in the box."""

@@ -110,13 +110,13 @@ def test_answers_of_every_filter_are_sound_or_errors():
             except ValueError:
                 continue  # of another relative degree, or without a goal
             n, (low, high) = safety_filter.model.n, map(np.array, (safety_filter.program.low, safety_filter.program.high))
-            for top in rng.choice([3, 8, 60, 90, 170, 300], 600):
+            for top in rng.choice([3, 8, 60, 90, 170, 300], 200):
                 x = rng.choice([-1, 1], n) * 10.0 ** rng.uniform(rng.choice([-5, -320]), top, n)
                 x = np.where(rng.random(n) < 0.2, rng.choice([0.0, 1.0, 2.0, 5e-324], n), x)
                 far = rng.choice([-1, 1], len(low)) * 10.0 ** rng.uniform(-300, 300, len(low))
                 assert_sound(safety_filter, x, np.where(rng.random() < 0.7, low + (high - low) * rng.uniform(-1, 2, len(low)), far))
                 tried += 1
-    assert tried > 60_000
+    assert tried > 20_000
 
 
 @pytest.mark.parametrize(
