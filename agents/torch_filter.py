@@ -27,15 +27,14 @@ from wrappers.safety_filter import SafetyFilter
 _RANK = 1e-9
 """Singular values below this share of the largest are the rounding of rows that depend on each other."""
 
-_EXACT, _SOLVED, _PRESSED = 1e-11, 1e-5, 1e-2
-"""How near an input at its bound is, as a share of its way there or of the box: by a formula, by a solver, and where rows press it
-there that the solver lets miss a little more."""
+_EXACT = 1e-11
+"""How near an input at its bound is, as a share of its way there or of the box."""
 
-_AGREED = 1e-2
-"""How far apart, as a share of the box, an action and its formula are, at most: the solver of contradicting rows is no better."""
+_AGREED = 1e-6
+"""How far apart, as a share of the box, an action and its formula are, at most."""
 
 _NOTHING = 1e-8
-"""Share of a force that is the rounding of a solver."""
+"""Share of a force that is rounding."""
 
 
 class TorchResult(NamedTuple):
@@ -59,9 +58,8 @@ class TorchFilter(torch.nn.Module):
     """A safety filter in physical units, differentiable in the proposed input and in the state. It has no parameters.
 
     Where the rows cannot all be met, the action is the least-violating one, and its gradient is that of this action: zero
-    along the inputs that stay in a corner of the box, and with several rows that of their weighted compromise. From three inputs
-    on, a solver may return a compromise that is not the nearest one to the proposal: there the gradient is zero, and the result
-    says so.
+    along the inputs that stay in a corner of the box, and with several rows that of their weighted compromise. Where the formula
+    does not give the action, as it may not where its equations are nearly dependent, the gradient is zero, and the result says so.
 
     It runs on the CPU and in double precision, whatever the tensors are.
 
@@ -110,6 +108,8 @@ class TorchFilter(torch.nn.Module):
             InvalidInputError: a shape or a type does not fit, or an entry is not finite.
             NumericalError: a row has no finite value at a state.
         """
+        if not (isinstance(x, torch.Tensor) and isinstance(u, torch.Tensor)):
+            raise InvalidInputError(f"state {type(x).__name__} and input {type(u).__name__}; give tensors, such as torch.as_tensor(x)")
         if not (x.is_floating_point() and u.is_floating_point()):
             raise InvalidInputError(f"state {x.dtype} and input {u.dtype}; give real floating-point tensors, such as x.double()")
         given = [part.detach().to("cpu", torch.float64).numpy() for part in (x, u)]
@@ -161,11 +161,11 @@ class TorchFilter(torch.nn.Module):
         # A single row presses every input on which it depends.
         pressed = (way != 0.0) | ((a != 0.0) & active[:, :, None]).any(axis=1)
         held = pressed & ((u - self._low <= _EXACT * near) | (self._high - u <= _EXACT * near))
-        # Several rows may not all be needed; and where some cannot be met, the action may come from a solver.
+        # Several rows may not all be needed.
         several = (np.count_nonzero(active, axis=1) > 1) | (missed.any(axis=1) & (a.shape[1] > 1))
         for i in np.flatnonzero(several):
             forced = self._forced(a[i], u[i], slack[i])
-            low, high = [~forced & (gap <= _SOLVED * near[i]) for gap in (u[i] - self._low, self._high - u[i])]
+            low, high = [~forced & (gap <= _EXACT * near[i]) for gap in (u[i] - self._low, self._high - u[i])]
             also, binding[i] = _held_and_binding(a[i] / self._roots, way[i], low, high, forced, missed[i], binding[i])
             held[i] = forced | also
         return held, missed, binding
@@ -175,7 +175,7 @@ class TorchFilter(torch.nn.Module):
         forces = (self._priorities * slack)[:, None] * a
         force, size = forces.sum(axis=0), np.abs(forces).sum(axis=0)
         gap = np.where(force > 0.0, self._high - u, u - self._low)
-        return (np.abs(force) > _SOLVED * size) & (gap <= _PRESSED * (self._high - self._low))
+        return (np.abs(force) > _NOTHING * size) & (gap <= _EXACT * (self._high - self._low))
 
 
 def _held_and_binding(

@@ -16,6 +16,7 @@ from safe_envs.info import Info, safety_info
 from safe_envs.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 from safe_envs.simulation import NoiseStream, Simulation, center_and_half_width, steps_until
+from safe_envs.validators import real_array
 
 
 def observation_box(problem: SafetyProblem) -> gym.spaces.Box:
@@ -129,9 +130,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         """Map an action in [-1, 1] to the physical box; what lies beyond is clipped.
 
         Raises:
-            InvalidInputError: the action has another shape than (m,) or is not finite.
+            InvalidInputError: the action has another shape than (m,), or does not hold finite real numbers.
         """
-        given = np.asarray(action)
+        given = action if type(action) is np.ndarray and action.dtype.char in "fd" else real_array("action", action)
         if given.shape != self._action_shape:
             raise InvalidInputError(f"action has shape {given.shape}; the env takes {self._action_shape}")
         physical = []

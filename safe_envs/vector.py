@@ -18,6 +18,7 @@ from safe_envs.info import Info, safety_info, with_masks
 from safe_envs.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 from safe_envs.simulation import NoiseStreams, Simulation, center_and_half_width, steps_until
+from safe_envs.validators import real_array
 
 _LOWEST, _HIGHEST = constants((-1.0, 1.0))
 
@@ -118,9 +119,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """Map actions in [-1, 1], shape (num_envs, m), to the components of the physical inputs, clipped to the box.
 
         Raises:
-            InvalidInputError: the actions have another shape or are not finite.
+            InvalidInputError: the actions have another shape, or are not finite real numbers.
         """
-        given = np.asarray(actions, dtype=np.float64)
+        given = np.asarray(real_array("array of actions", actions), dtype=np.float64)
         if given.shape != self.action_space.shape:
             raise InvalidInputError(f"actions have shape {given.shape}; the envs take {self.action_space.shape}")
         with np.errstate(over="ignore"):

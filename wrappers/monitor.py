@@ -14,6 +14,7 @@ from safe_envs.codegen import Components, Flavour, compile_function, stacked
 from safe_envs.errors import InvalidInputError, NumericalError, SystemDefinitionWarning
 from safe_envs.info import Info, safety_info
 from safe_envs.rendering.viewer import Viewer
+from safe_envs.validators import real_array
 from wrappers.filter_spec import FilterSpec
 
 _CHANGE_SIGHT = (gym.ObservationWrapper, gym.wrappers.NormalizeObservation, gym.wrappers.FrameStackObservation)
@@ -65,9 +66,9 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         """The model's input for an action; what lies beyond the action space is clipped.
 
         Raises:
-            InvalidInputError: the action has another shape or is not finite.
+            InvalidInputError: the action has another shape, or does not hold finite real numbers.
         """
-        given = np.asarray(action, dtype=np.float64)
+        given = np.asarray(real_array("action", action), dtype=np.float64)
         if given.shape != self._low.shape or not np.isfinite(given).all():
             raise InvalidInputError(f"action {given.tolist()}: the env takes finite numbers of shape {self._low.shape}")
         return self._spec.inputs(np.clip(given, self._low, self._high)).tolist()

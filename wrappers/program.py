@@ -20,9 +20,7 @@ from safe_envs.sde import ControlAffineSDE
 from wrappers.conditions import AffineConstraint
 from wrappers.conditions.base import Terms
 from wrappers.qp import concave, one_row, several_rows
-
-_LEAST_SCALE = 1e-100
-"""A slack scaled by less would have a weight that vanishes."""
+from wrappers.qp.rows import ROUNDING, tolerance, tolerances
 
 _FAR = 1e4
 """How many times further than the box reaches is far away."""
@@ -111,6 +109,7 @@ class Solver:
         self._weights = program.weights
         self._choose: Any = np.where if arrays else _choose
         self._larger: Any = np.maximum if arrays else max
+        self._tolerance: Any = tolerances if arrays else tolerance
         self._project: Any = several_rows.project_arrays if arrays else several_rows.project_floats
         if program.clf is not None:
             program.clf.require_known(program.model)
@@ -163,18 +162,18 @@ class Solver:
         self._require_finite([*b, *[aj for ai in a for aj in ai]])
         asked = [self._choose(inside[i], b[i] - self._demand(i, x, inside[i]), 0.0) if i in inside else b[i] for i in range(self._count)]
         held = [[self._choose(inside[i], aj, 0.0) for aj in a[i]] if i in inside else a[i] for i in range(self._count)]
-        self._require_finite(asked)
         aim = self._outwards(a, inside, target)
         action, margin, active, feasible = self._minimise(held, asked, aim, goal, forms)
         if self._sampled:
             for i in self._sampled:
                 asked[i] = asked[i] - self._program.dt * self._loss(i, x, action, inside.get(i))
-            self._require_finite(asked)
             action, margin, active, feasible = self._minimise(held, asked, aim, goal, forms)
         for i, defined in inside.items():
             margin[i] = self._choose(defined, margin[i], _dot(a[i], action) + b[i])
             active[i] = self._choose(defined, active[i], True)
             feasible = feasible & defined
+        # A demand or a loss without a value shows here, and so does what overflows on the way to the action.
+        self._require_finite([*action, *margin])
         slack = [self._choose(feasible, 0.0, self._larger(-value, 0.0)) for value in margin]
         return Decision(action, margin, active, feasible, slack, self._cause(a, asked, u, active, inside), u)
 
@@ -201,7 +200,7 @@ class Solver:
                 raise UndefinedRowError(int(bad[0]), what)
 
     def _split(self, values: Components) -> tuple[list[Any], list[Any], Sequence[Any], Sequence[Any], dict[int, Components]]:
-        """The rows' a and b, the goal's offset and coefficients, h of the reciprocal conditions, and Q of the uncertain rows."""
+        """The rows' a and b, the goal's offset and coefficients, h of reciprocal conditions less its rounding, Q of uncertain rows."""
         width, count, entries = self._m + 1, self._count, (self._m + 1) * (self._m + 2) // 2
         rows = [values[i * width : (i + 1) * width] for i in range(count)]
         forms_at = len(values) - entries * len(self._uncertain)
@@ -231,15 +230,19 @@ class Solver:
             return u
         rise = [0.0] * self._m
         for i, defined in inside.items():
-            size = functools.reduce(self._larger, [abs(aj) for aj in a[i]])
-            scale = self._choose(defined, 0.0, 1.0 / self._choose(size > 0.0, size, 1.0))
-            rise = [rj + aj * scale for rj, aj in zip(rise, a[i], strict=True)]
+            rise = [rj + self._choose(defined, 0.0, aj) for rj, aj in zip(rise, self._over_largest(a[i]), strict=True)]
+        rise = self._over_largest(rise)
         steepness = sum([rj * rj / wj for rj, wj in zip(rise, self._weights, strict=True)])
         ends = list(zip(self._low, self._high, strict=True))
         span = sum([abs(rj) * (hi - lo) for rj, (lo, hi) in zip(rise, ends, strict=True)])
         far = _FAR * span / self._choose(steepness > 0.0, steepness, 1.0)
         corner = [self._choose(rj > 0.0, hi, self._choose(rj < 0.0, lo, uj)) for rj, (lo, hi), uj in zip(rise, ends, u, strict=True)]
         return [c + far * rj / wj for c, rj, wj in zip(corner, rise, self._weights, strict=True)]
+
+    def _over_largest(self, entries: Sequence[Any]) -> list[Any]:
+        """Entries over the largest of their sizes, whose inverse may overflow."""
+        size = functools.reduce(self._larger, [abs(entry) for entry in entries])
+        return [entry / self._choose(size > 0.0, size, 1.0) for entry in entries]
 
     def _minimise(
         self, a: Sequence[Any], b: Sequence[Any], u: Sequence[Any], goal: Sequence[Any], forms: dict[int, Components] | None = None
@@ -256,15 +259,22 @@ class Solver:
             a, b = self._on_the_safe_side(a, b, forms)
         if not goal:
             return self._project(a, b, u, self._low, self._high, self._weights, p.priorities)
-        # The goal's slack d = D e, with D the most that the box can make it, so that e in [0, 1] always meets the goal's row.
+        # The goal's slack d = unit e, in a unit in which it weighs as much as an input: its square would overflow before d does.
+        # Twice the most that the box can make d always meets the goal's row, also after rounding.
         growth, along = goal[0], goal[1:]
         most = growth + sum([self._larger(bj * lo, bj * hi) for bj, lo, hi in zip(along, self._low, self._high, strict=True)])
-        scale = self._choose(most > _LEAST_SCALE, most, 1.0)
-        rows = [*[(*ai, 0.0) for ai in a], (*[-bj for bj in along], scale)]
-        low, high, w = (*self._low, 0.0), (*self._high, 1.0), (*self._weights, self._slack_weight * scale * scale)
+        unit = math.sqrt(self._weights[0] / self._slack_weight)
+        rows = [*[(*ai, 0.0) for ai in a], (*[-bj for bj in along], unit)]
+        low, high = (*self._low, 0.0), (*self._high, self._choose(most > 0.0, 2.0 * most / unit, 1.0))
+        w = (*self._weights, self._weights[0])
         priorities = [*p.priorities[: len(a)], 1.0]
-        action, margin, active, feasible = self._project(rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities)
-        return action[: self._m], margin[: len(a)], active[: len(a)], feasible
+        action, margin, active, _ = self._project(rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities)
+        action, margin, active = action[: self._m], margin[: len(a)], active[: len(a)]
+        # The goal's row, which can always be met, has no say in that, nor has its rounding.
+        feasible: Any = True
+        for ai, bi, g in zip(a, b, margin, strict=True):
+            feasible = feasible & (g >= -self._tolerance(ai, bi, action))
+        return action, margin, active, feasible
 
     def _on_the_safe_side(self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components]) -> tuple[list[Any], list[Any]]:
         """Affine rows that are met only where the uncertain ones are, in the box."""
@@ -292,11 +302,15 @@ class Solver:
         """The active row whose half-space is furthest from the proposed input; one that means nothing is further than any."""
         cause, furthest = -1, -math.inf
         for i, (ai, bi, acts) in enumerate(zip(a, b, active, strict=True)):
-            square = sum([aj * aj / wj for aj, wj in zip(ai, self._weights, strict=True)])
-            distance = -(_dot(ai, u) + bi) / self._choose(square > 0.0, square, 1.0) ** 0.5
+            if acts is False or (acts is not True and not np.count_nonzero(acts)):
+                continue
+            size = functools.reduce(self._larger, [abs(aj) for aj in ai])
+            unit = self._choose(size > 0.0, size, 1.0)  # so that squares neither overflow nor vanish
+            square = sum([p * p / wj for p, wj in zip([aj / unit for aj in ai], self._weights, strict=True)])
+            distance = -(_dot(ai, u) + bi) / unit / self._choose(size > 0.0, square, 1.0) ** 0.5
             if i in inside:
                 distance = self._choose(inside[i], distance, math.inf)
-            distance = self._choose(acts & (square > 0.0), distance, -math.inf)
+            distance = self._choose(acts & (size > 0.0), distance, -math.inf)
             cause = self._choose(distance > furthest, i, cause)
             furthest = self._larger(furthest, distance)
         return cause
@@ -309,7 +323,7 @@ class Solver:
         if p.clf is not None:
             growth, along = p.clf.growth(p.model)
             expressions += [growth, *along]
-        expressions += [p.constraints[i].chain[0] for i in self._reciprocal]
+        expressions += [_beyond_rounding(p.constraints[i].chain[0]) for i in self._reciprocal]
         return self._compiled([*expressions, *(e for i in self._uncertain for e in p.constraints[i].uncertainty or ())])
 
     @cached_property
@@ -323,6 +337,21 @@ class Solver:
     def _compiled(self, expressions: Sequence[Any], more: Sequence[sp.Symbol] = ()) -> Any:
         model = self._program.model
         return compile_function((*self._symbols, *more), [model.numeric(e) for e in expressions], self._flavour)
+
+
+def _beyond_rounding(h: sp.Expr) -> sp.Expr:
+    """What h is more than its own rounding: where that is not positive, a state and a batch may find h on either side of 0."""
+    return h - sp.Float(ROUNDING, 17) * _size(h)
+
+
+def _size(expression: sp.Expr) -> sp.Expr:
+    """The sum of the sizes of an expression's terms."""
+    parts: Any = expression.args
+    if expression.is_Add or expression.is_Mul:
+        return expression.func(*map(_size, parts))
+    if isinstance(expression, sp.Max | sp.Min):
+        return sp.Max(*map(_size, parts))
+    return sp.Abs(expression)
 
 
 def _choose(condition: bool, chosen: Any, other: Any) -> Any:

@@ -11,12 +11,17 @@ import numpy as np
 
 from safe_envs.barrier import Barrier
 from safe_envs.clf import CLF
-from safe_envs.codegen import Components, Flavour, compile_function, stacked
+from safe_envs.codegen import Components, Flavour, compile_function, filled, finite, stacked
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, SystemDefinitionError, nearest
 from safe_envs.problem import SafetyProblem
 from safe_envs.sde import ControlAffineSDE
+from safe_envs.validators import real_array
 from wrappers.conditions import AffineConstraint, Condition, parse_conditions
 from wrappers.program import Decision, Program, Solver, UndefinedRowError
+
+_DOUBLE = np.dtype(np.float64)
+_NO_VALUE = (ArithmeticError, ValueError, TypeError)
+"""What formulas in plain floats raise: by overflow, beyond a function's domain, or comparing a root that is complex there."""
 
 
 class FilterResult(NamedTuple):
@@ -49,7 +54,9 @@ class SafetyFilter:
     Where the rows cannot all be met, the sum of their squared slacks is as small as can be, weighted by the priorities.
 
     One row has a closed form for any number of inputs, and any number of rows an exact solution for one and two inputs;
-    others go to ProxQP.
+    others go to ProxQP and an active-set method, which make their answers exact to rounding.
+
+    A row counts as met where it misses by no more than the rounding of its terms; see `wrappers.qp.rows`.
 
     With a control Lyapunov function the objective is its joint program instead, min w_u |u|^2 + w_d d^2 subject to
     AV + rate V <= d, the rows and the box (thesis Sec. 4.3.1, 5.4.2): the filter pursues the goal by itself, and whatever is
@@ -100,6 +107,7 @@ class SafetyFilter:
             clf=clf,
         )
         self._floats, self._arrays = Solver(self.program, "floats"), Solver(self.program, "arrays")
+        self._state_shape, self._input_shape = (model.n,), (model.m,)
         self._single = len(self.rows) == 1 and self.program.plain
 
     @classmethod
@@ -162,35 +170,59 @@ class SafetyFilter:
         """Decide for one state (n,) and input (m,), or for batches (..., n) and (..., m).
 
         Raises:
-            InvalidInputError: a shape does not fit, or an entry is not finite.
+            InvalidInputError: a shape does not fit, or an entry is no finite real number.
             NumericalError: the constraint has no finite value at a state.
         """
-        x, u = np.asarray(x, dtype=np.float64), np.asarray(u_nominal, dtype=np.float64)
+        x, u = _doubles("state", x), _doubles("nominal input", u_nominal)
+        if x.shape == self._state_shape and u.shape == self._input_shape:
+            return self._filter_one(x, u)
         n, m = self.model.n, self.model.m
         if x.shape[-1:] != (n,) or u.shape[-1:] != (m,) or x.shape[:-1] != u.shape[:-1]:
             raise InvalidInputError(
                 f"state {x.shape} and input {u.shape} do not fit; give (..., {n}) and (..., {m}) with the same leading axes"
             )
-        if x.ndim == 1:
-            return self._filter_one(x, u)
-        _require_finite(x, u)
         batch = x.shape[:-1]
         states, inputs = (tuple(np.ascontiguousarray(part.reshape(-1, part.shape[-1]).T)) for part in (x, u))
-        decision = self.decide_arrays(states, inputs)
-        parts = (decision.action, self._barriers_arrays(*states), *decision[1:3], decision.slack)
-        action, barrier, margin, active, slack = [stacked(part, len(inputs[0])).reshape(*batch, len(part)) for part in parts]
+        with np.errstate(all="ignore"):
+            _require_finite(x, u)
+            decision = self._decide(states, inputs)
+            barriers = self._barriers_arrays(*states)
+            parts = (decision.action, barriers, *decision[1:3], decision.slack)
+            action, barrier, margin, active, slack = [stacked(part, len(inputs[0])).reshape(*batch, len(part)) for part in parts]
+            if not finite(barrier.T):
+                self._require_values(barrier.reshape(-1, len(barriers)), states)
         cause = np.where(active.any(axis=-1), np.broadcast_to(decision.cause, len(inputs[0])).reshape(batch), -1)
         return FilterResult(action, barrier, margin, active > 0.0, decision.feasible.reshape(batch), slack, cause)
 
     def _filter_one(self, x: np.ndarray, u: np.ndarray) -> FilterResult:
         state, inputs = x.tolist(), u.tolist()
         if not math.isfinite(sum(state) + sum(inputs)):
-            _require_finite(x, u)
+            with np.errstate(over="ignore"):
+                _require_finite(x, u)
         action, margin, active, feasible, slack, cause, _ = self.decide_floats(state, inputs)
-        barrier = self._barriers_floats(*state)
+        try:
+            barrier = self._barriers_floats(*state)
+        except _NO_VALUE:
+            barrier = (math.nan,)
+        if not math.isfinite(sum(barrier)):
+            with np.errstate(all="ignore"):
+                barrier = stacked(self._barriers_arrays(*[np.array([c]) for c in state]), 1)[0]
+            self._require_values(barrier[None], state)
         return FilterResult(
-            np.array(action), np.array(barrier), np.array(margin), np.array(active), feasible, np.array(slack), cause if any(active) else -1
+            np.array(action),
+            np.array(barrier),
+            np.array(margin),
+            np.array(active),
+            feasible,
+            np.array(slack),
+            cause if True in active else -1,
         )
+
+    def _require_values(self, barrier: np.ndarray, x: Sequence[Any]) -> None:
+        """Raise NumericalError where a barrier (B, k) at states, given by components, is not finite."""
+        bad = np.flatnonzero(~np.isfinite(barrier).all(axis=1))
+        if bad.size:
+            raise self._undefined("the barrier", [float(np.atleast_1d(c)[bad[0]]) for c in x])
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> Decision:
         """Decide for one state, given and returned component by component; the components must be finite."""
@@ -198,19 +230,28 @@ class SafetyFilter:
             found = self._floats.one_row(x, u) if self._single else self._floats.solve(x, u)
         except UndefinedRowError as error:
             raise self._undefined(error.what, x) from error
-        except (ArithmeticError, ValueError) as error:
-            raise self._undefined("the constraint" if self._clf is None else "the constraint or the goal", x) from error
+        except _NO_VALUE:
+            # Plain floats raise where arrays overflow to a number or go on without: what is right for the batch is right here.
+            found = self._decide_one_of_batch(x, u)
         return found
+
+    def _decide_one_of_batch(self, x: Sequence[float], u: Sequence[float]) -> Decision:
+        found = self.decide_arrays(*[tuple(np.array([c]) for c in part) for part in (x, u)])
+        *parts, cause, proposed = [[filled(c, (1,)).item() for c in (part if isinstance(part, Sequence) else (part,))] for part in found]
+        action, margin, active, (feasible,), slack = parts
+        return Decision(action, margin, active, feasible, slack, cause[0], proposed)
 
     def decide_arrays(self, x: Components, u: Components) -> Decision:
         """Decide for a batch, given and returned component by component, each an array (B,) of finite numbers."""
         # What overflows or has no value is found below, which says where.
+        with np.errstate(all="ignore"):
+            return self._decide(x, u)
+
+    def _decide(self, x: Components, u: Components) -> Decision:
         try:
-            with np.errstate(all="ignore"):
-                found = self._arrays.one_row(x, u) if self._single else self._arrays.solve(x, u)
+            return self._arrays.one_row(x, u) if self._single else self._arrays.solve(x, u)
         except UndefinedRowError as error:
             raise self._undefined(error.what, [float(c[error.index]) for c in x]) from error
-        return found
 
     def _undefined(self, what: str, x: Sequence[float]) -> NumericalError:
         at = ", ".join(f"{s} = {value:.6g}" for s, value in zip(self.model.states, x, strict=True))
@@ -218,11 +259,14 @@ class SafetyFilter:
         return NumericalError(f"{what}{names} has no finite value at {at}; check it and the model there")
 
 
+def _doubles(what: str, given: Any) -> np.ndarray:
+    return given if type(given) is np.ndarray and given.dtype is _DOUBLE else real_array(what, given).astype(np.float64)
+
+
 def _require_finite(x: np.ndarray, u: np.ndarray) -> None:
     for what, values in (("state", x), ("nominal input", u)):
-        finite = np.isfinite(values)
-        if not finite.all():
-            where = np.argwhere(~finite)[0].tolist()
+        if not (finite(values) or np.isfinite(values).all()):
+            where = np.argwhere(~np.isfinite(values))[0].tolist()
             raise InvalidInputError(f"the {what} has the entry {values[tuple(where)]} at {where}; a filter needs finite numbers")
 
 

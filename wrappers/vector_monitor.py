@@ -13,6 +13,7 @@ from safe_envs.codegen import Components
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.info import Info, safety_info, with_masks
 from safe_envs.rendering.viewer import Viewer
+from safe_envs.validators import real_array
 from safe_envs.vector import VectorStep
 from wrappers.filter_spec import FilterSpec
 from wrappers.monitor import barrier_table, barriers_of, doubt_layers, ends_of, named_and_limited
@@ -72,7 +73,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         Raises:
             InvalidInputError: the actions have another shape or are not finite.
         """
-        given = np.asarray(actions, dtype=np.float64)
+        given = np.asarray(real_array("array of actions", actions), dtype=np.float64)
         if given.shape != self.action_space.shape or not np.isfinite(given).all():
             raise InvalidInputError(f"actions of shape {given.shape}: the envs take finite numbers of shape {self.action_space.shape}")
         return _columns(self._spec.inputs(np.clip(given, self._low, self._high)))
@@ -142,7 +143,8 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         violation = h < 0.0
         cost = violation.astype(np.float64)
         self._episode_cost += cost * counted
-        np.minimum(self._h_min, h, out=self._h_min, where=counted)
+        # What was counted before cannot lower the smallest h again.
+        np.minimum(self._h_min, h, out=self._h_min)
         return safety_info(violation, cost, barrier, self._h_min.copy(), self._episode_cost.copy())
 
     def _forget(self, envs: np.ndarray) -> None:

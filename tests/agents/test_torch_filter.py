@@ -10,7 +10,7 @@ import pytest
 import sympy as sp
 import torch
 
-from agents import load_problem
+from agents import load_problem, torch_filter
 from agents.torch_filter import TorchFilter
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, InvalidInputError
 from wrappers import CBF, SafetyFilter, parse_conditions
@@ -129,13 +129,11 @@ def test_slopes_are_the_differences_of_the_filter(m, k):
     rng = np.random.default_rng(0)
     x, u = rng.normal(size=(60, 2)), 1.5 * rng.normal(size=(60, m))
     decided = module.safety_filter.filter(x, u)
-    # Contradicting rows on many inputs are left to a solver, whose tolerance the differences would show.
-    exact = decided.feasible | (m <= 2) | (k == 1)
-    assert np.count_nonzero(exact & decided.active.any(axis=-1)) > 10
-    assert assert_slopes(module, x[exact], u[exact]) > 0.9 * np.count_nonzero(exact)
+    assert np.count_nonzero(decided.active.any(axis=-1)) > 10
+    assert assert_slopes(module, x, u) > 0.9 * len(x)
 
 
-@pytest.mark.parametrize("m", [1, 2])
+@pytest.mark.parametrize("m", [1, 2, 4])
 def test_slopes_of_a_compromise(m):
     module = TorchFilter(planar(m, 3, contradicting=True, seed=3))
     rng = np.random.default_rng(0)
@@ -144,7 +142,7 @@ def test_slopes_of_a_compromise(m):
     assert assert_slopes(module, x, u) > 30
 
 
-def test_contradicting_rows_on_many_inputs_have_a_finite_slope_or_a_flag():
+def test_contradicting_rows_on_many_inputs_have_a_finite_slope():
     module = TorchFilter(planar(4, 2, contradicting=True, seed=3))
     rng = np.random.default_rng(0)
     x, u = (torch.tensor(rng.normal(size=(400, size)), requires_grad=True) for size in (2, 4))
@@ -152,20 +150,24 @@ def test_contradicting_rows_on_many_inputs_have_a_finite_slope_or_a_flag():
     assert not result.feasible.any()
     slopes = torch.cat(torch.autograd.grad(result.action.sum(), (x, u)), dim=1)
     assert slopes.isfinite().all()
-    assert torch.count_nonzero(slopes[~result.differentiable]) == 0
-    assert 0 < torch.count_nonzero(result.differentiable) < 400
+    assert result.differentiable.all()
 
 
 @pytest.mark.slow
-def test_the_flag_of_gradients_does_not_hang_on_whether_one_was_asked_for():
+def test_the_flag_of_gradients_does_not_hang_on_whether_one_was_asked_for(monkeypatch):
+    # No formula is exact to the last bit: so some are said not to agree.
+    monkeypatch.setattr(torch_filter, "_AGREED", 0.0)
     module = TorchFilter(planar(4, 2, contradicting=True, seed=3))
     rng = np.random.default_rng(0)
     x, u = (torch.tensor(rng.normal(size=(400, size))) for size in (2, 4))
-    wanted = module(x, u.clone().requires_grad_(), return_result=True)
+    given = x.clone().requires_grad_(), u.clone().requires_grad_()
+    wanted = module(*given, return_result=True)
     plain = module(x, u, return_result=True)
     with torch.no_grad():
         unasked = module(x, u.clone().requires_grad_(), return_result=True)
-    assert not wanted.differentiable.all()
+    assert 0 < torch.count_nonzero(wanted.differentiable) < 400
+    slopes = torch.cat(torch.autograd.grad(wanted.action.sum(), given), dim=1)
+    assert torch.count_nonzero(slopes[~wanted.differentiable]) == 0
     for found in (plain, unasked):
         assert torch.equal(found.differentiable, wanted.differentiable)
         assert torch.equal(found.action, wanted.action)
@@ -201,6 +203,11 @@ def test_floats_of_less_precision_are_computed_in_double():
         module(x[:2], u)
     with pytest.raises(InvalidInputError, match="finite"):
         module(x * torch.nan, u)
+    for wrong in (None, "text", [0.5, 2.5, 1.2], x.numpy(), x.to(torch.complex64)):
+        with pytest.raises(InvalidInputError, match="give"):
+            module(wrong, u)
+        with pytest.raises(InvalidInputError, match="give"):
+            module(x, wrong)
 
 
 def test_a_state_where_no_row_acts_has_a_gradient_of_zero():

@@ -263,3 +263,15 @@ def test_actions_that_are_no_numbers_are_refused():
     for action in ([np.nan], [0.0, 0.0]):
         with pytest.raises(InvalidInputError):
             env.step(action)
+
+
+def test_an_episode_begins_without_the_cost_of_the_last():
+    env = SafetyMonitor(gym.make("Pendulum-v1"), FilterSpec(**PENDULUM))
+    observation, _ = env.reset(seed=0)
+    info = {}
+    for _ in range(100):
+        observation, _, _, _, info = env.step(spun(observation))
+    assert info["episode_cost"] > 0.0
+    _, info = env.reset(seed=0)
+    assert info["episode_cost"] == info["cost"]
+    assert info["h_min"] == info["barrier"][0]

@@ -77,7 +77,7 @@ def test_unmet_rows_give_the_least_sum_and_then_the_nearest_action(kind, k, size
         assert np.all(found <= least * (1 + 1e-9))
         assert np.all(least <= found * (1 + 1e-9))
     for i, value in zip(unmet, found, strict=True):
-        fit = bounded_least_squares.least_violating(a[i], b[i], low[i], high[i], priority)
+        fit = bounded_least_squares.least_violating(a[i], b[i], low[i], high[i], priority, np.clip(v[i], low[i], high[i]))
         assert value <= (priority * np.minimum(a[i] @ fit + b[i], 0.0) ** 2).sum() * (1 + 1e-9)
     assert np.all(active[unmet][slack > 1e-9])
     nearest = nearest_oracle(a[unmet], b[unmet] + slack, v[unmet], low[unmet], high[unmet], w[unmet])

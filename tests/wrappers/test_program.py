@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.optimize
@@ -267,6 +270,52 @@ def test_cause_is_measured_in_the_weighted_distance():
     alone = SafetyFilter(plane(), rows[:1], [(-9.0, 9.0)] * 2)
     assert alone.filter(np.zeros(2), np.zeros(2)).cause == -1
     assert alone.filter(np.zeros((2, 2)), np.array([[0.0, 0.0], [4.0, 0.0]])).cause.tolist() == [-1, 0]
+
+
+def test_cause_is_a_distance_and_not_a_miss_of_the_row():
+    # u + w <= 1 is missed by 3 and lies 3/sqrt(2) = 2.1 off, w <= .5 by 2; and with a row half as steep, 1 and 2 against 1.5.
+    for first, proposals in ((1 - x - y, ([1.5, 2.5], [1.0, 2.5])), (1 - 0.5 * x, ([4.0, 2.0], [4.0, 2.9]))):
+        safety_filter = SafetyFilter(plane(), [(Barrier(first), CBF(1.0)), (Barrier(0.5 - y), CBF(1.0))], [(-9.0, 9.0)] * 2)
+        for cause, proposal in enumerate(proposals):
+            assert safety_filter.filter(np.zeros(2), proposal).active.all()
+            assert safety_filter.filter(np.zeros(2), proposal).cause == cause
+            assert safety_filter.filter(np.zeros((1, 2)), [proposal]).cause.tolist() == [cause]
+
+
+@dataclass(frozen=True)
+class Doubtful(CBF):
+    """A row that is known up to an error, whose form is as given."""
+
+    form: tuple[Any, ...] = ()
+
+    def derived(self, model, barrier):
+        return replace(super().derived(model, barrier), uncertainty=tuple(map(sp.sympify, self.form)))
+
+
+def test_an_uncertainty_with_constant_entries_follows_the_state_all_the_same():
+    # 1 - x - u >= |x| in the box of u, and w has no part: entries (0, 0), (0, u), (0, w), (u, u), (u, w), (w, w).
+    safety_filter = SafetyFilter(plane(), [(Barrier(1 - x), Doubtful(1.0, form=(x**2, 0, 0, 0, 0, 0)))], [(-9.0, 9.0)] * 2)
+    for state, largest in ((0.0, 1.0), (0.5, 0.0), (-0.5, 1.0), (0.25, 0.5)):
+        np.testing.assert_allclose(safety_filter.filter([state, 0.0], [5.0, 0.3]).action, [largest, 0.3], atol=1e-14)
+        np.testing.assert_allclose(safety_filter.filter([[state, 0.0]], [[5.0, 0.3]]).action, [[largest, 0.3]], atol=1e-14)
+
+
+def test_a_loss_without_a_value_is_an_error():
+    # psi = sqrt(x) - u with x' = u has the rate u/(2 sqrt(x)) - ..., which is infinite at 0, where the row itself is finite.
+    row = [(Barrier(1 - x), Rooted(1.0, sampling_margin="first-order"))]
+    safety_filter = SafetyFilter(integrator(), row, [(-9.0, 9.0)], dt=0.1)
+    for state in ([0.0], [[0.25], [0.0]]):
+        with pytest.raises(NumericalError, match="no finite value at x = 0"):
+            safety_filter.filter(state, np.full_like(state, -1.0))
+
+
+@dataclass(frozen=True)
+class Rooted(CBF):
+    """A row with a root of the state in it."""
+
+    def derived(self, model, barrier):
+        found = super().derived(model, barrier)
+        return replace(found, offset=sp.sqrt(x))
 
 
 def test_goals_are_checked_for_their_symbols():

@@ -299,10 +299,11 @@ class BayesianSCBF(LearnedCondition):
             z = max(stats.t.ppf(self.confidence, noise.count), 0.0)
             correlated = np.linalg.eigvalsh(noise.correlation[np.ix_(outputs, outputs)])[-1]
             return np.full(len(outputs), z**2 * correlated)
-        # The variance of the weights is that of the noise, which may be as large as its interval allows.
+        # The variance of the weights is that of the noise, which may be as large as its interval allows: more than estimated, since
+        # the interval leaves out a quarter at most of what is smaller, and the median of a chi^2 lies below its mean.
         largest, estimated = noise.sigma_intervals(self.delta_sigma)[:, 1] ** 2, noise.squares / noise.count
         allowed = np.divide(largest, estimated, out=np.ones(len(largest)), where=estimated > 0)
-        return stats.chi2.ppf(1.0 - self.delta_theta, outputs.sum() * self.learned.mean.shape[1]) * np.maximum(allowed, 1.0)
+        return stats.chi2.ppf(1.0 - self.delta_theta, outputs.sum() * self.learned.mean.shape[1]) * allowed
 
     @property
     def delta_theta(self) -> float:

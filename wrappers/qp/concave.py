@@ -44,12 +44,12 @@ def project_floats(
     elif feasible:
         u = max(min(max(v, lo), hi), low)
     else:
-        found, margins, binding, _ = project_arrays(a, b, q, np.array([v]), low, high, priority)
-        return found.item(), margins[:, 0].tolist(), binding[:, 0].tolist(), False
-    margin = [_margin(*row, u) for row in rows]
+        found, margins, binding, met = project_arrays(a, b, q, np.array([v]), low, high, priority)
+        return found.item(), margins[:, 0].tolist(), binding[:, 0].tolist(), met.item()
+    margin, allowed = [_margin(*row, u) for row in rows], [_tolerance(*row, u) for row in rows]
     # An end may be rounded by more than the margin that is nothing but rounding.
-    active = [m <= ROUNDING * _size(*row, u) or u in ends for row, m, ends in zip(rows, margin, intervals, strict=True)]
-    return u, margin, active, feasible
+    active = [g <= t or u in ends for g, t, ends in zip(margin, allowed, intervals, strict=True)]
+    return u, margin, active, all([g >= -t for g, t in zip(margin, allowed, strict=True)])  # noqa: C419  (a list is faster here)
 
 
 def _in_unit(a: float, b: float, q: Quadratic) -> tuple[float, float, Quadratic]:
@@ -84,8 +84,11 @@ def _margin(a: float, b: float, q: Quadratic, u: float) -> float:
     return a * u + b - math.sqrt(max(q[0] + u * (2.0 * q[1] + u * q[2]), 0.0))
 
 
-def _size(a: float, b: float, q: Quadratic, u: float) -> float:
-    return abs(a * u) + abs(b) + math.sqrt(abs(q[0]) + abs(2.0 * q[1] * u) + q[2] * u * u)
+def _tolerance(a: float, b: float, q: Quadratic, u: float) -> float:
+    """As `wrappers.qp.rows.tolerance`, and what the rounding of the form makes of its root."""
+    linear, terms = 2.0 * q[1] * u, q[2] * u * u
+    form, terms = max(q[0] + linear + terms, 0.0), ROUNDING * (abs(q[0]) + abs(linear) + terms)
+    return ROUNDING * abs(b) + ROUNDING * abs(a * u) + math.sqrt(form + terms) - math.sqrt(form)
 
 
 def _interval(a: float, b: float, q: Quadratic) -> tuple[float, float]:
@@ -145,7 +148,7 @@ def project_arrays(
         in_unit = _all_in_unit(slope, offset, form)
         starts, ends = _intervals(*in_unit)
         lo, hi = np.maximum(starts.max(axis=0), low), np.minimum(ends.min(axis=0), high)
-        feasible[acting] = met = lo - hi <= ROUNDING * np.minimum(abs(lo), abs(hi))
+        met = lo - hi <= ROUNDING * np.minimum(abs(lo), abs(hi))
         found = np.maximum(np.minimum(np.maximum(wish, lo), hi), low)
         apart = np.flatnonzero(~met)
         if apart.size:
@@ -155,14 +158,21 @@ def project_arrays(
             found[apart] = nearest[0] if len(slope) == 1 else _least_violating(*lost, nearest, wish[apart], priority)
         u[acting] = found
         margin[:, acting] = reached = _margins(slope, offset, form, found)
-        spread = np.sqrt(abs(form[0]) + abs(2.0 * form[1] * found) + form[2] * found * found)
-        rounded = reached <= ROUNDING * (abs(slope * found) + abs(offset) + spread)
-        active[:, acting] = rounded | (found == starts) | (found == ends)
+        allowed = _tolerances(slope, offset, form, found)
+        active[:, acting] = (reached <= allowed) | (found == starts) | (found == ends)
+        feasible[acting] = (reached >= -allowed).all(axis=0)
     return u, margin, active, feasible
 
 
 def _margins(a: np.ndarray, b: np.ndarray, q: np.ndarray, u: np.ndarray) -> np.ndarray:
     return a * u + b - np.sqrt(np.maximum(q[0] + u * (2.0 * q[1] + u * q[2]), 0.0))
+
+
+def _tolerances(a: np.ndarray, b: np.ndarray, q: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """`_tolerance` for arrays (k, B), with the same formulas."""
+    linear, terms = 2.0 * q[1] * u, q[2] * u * u
+    form, terms = np.maximum(q[0] + linear + terms, 0.0), ROUNDING * (np.abs(q[0]) + np.abs(linear) + terms)
+    return ROUNDING * np.abs(b) + ROUNDING * np.abs(a * u) + np.sqrt(form + terms) - np.sqrt(form)
 
 
 def _all_in_unit(a: np.ndarray, b: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

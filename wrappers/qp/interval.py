@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from wrappers.qp.rows import ROUNDING, stack, total
+from wrappers.qp.rows import ROUNDING, stack, tolerance, tolerances, total
 
 
 def project_floats(
@@ -40,7 +40,10 @@ def project_floats(
         return _one_of_batch(a, b, v, low, high, priority)
     u = lo if v < lo else hi if v > hi else v
     margin = [ai * u + bi for ai, bi in zip(a, b, strict=True)]
-    return u, margin, [g <= 0.0 or g <= ROUNDING * (abs(ai * u) + abs(bi)) for ai, bi, g in zip(a, b, margin, strict=True)], True
+    if min(margin) < 0.0 and any(g < -tolerance((ai,), bi, (u,)) for ai, bi, g in zip(a, b, margin, strict=True) if g < 0.0):
+        return _one_of_batch(a, b, v, low, high, priority)
+    active = [g <= 0.0 or g <= ROUNDING * abs(ai * u) + ROUNDING * abs(bi) for ai, bi, g in zip(a, b, margin, strict=True)]
+    return u, margin, active, True
 
 
 def _one_of_batch(
@@ -76,28 +79,29 @@ def project_arrays(
     if acting.size:
         box = [np.broadcast_to(end, size)[acting] for end in (low, high)]
         slope, offset = slope[:, acting], offset[:, acting]
-        found, feasible[acting] = _project(slope, offset, v[acting], box[0], box[1], priority)
-        u[acting] = found
-        product = slope * found
-        reached = product + offset
-        margin[:, acting] = reached
-        active[:, acting] = reached <= ROUNDING * (np.abs(product) + np.abs(offset))
+        u[acting], margin[:, acting], active[:, acting], feasible[acting] = _project(slope, offset, v[acting], box[0], box[1], priority)
     return u, margin, active, feasible
 
 
 def _project(
     a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, priority: Sequence[float]
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What `project_arrays` returns, for states that violate a row."""
     root = -b / a
     lo = np.maximum(low, np.where(a > 0.0, root, -np.inf).max(axis=0))
     hi = np.minimum(high, np.where(a < 0.0, root, np.inf).min(axis=0))
     # Two rows that meet in one point may miss each other by the rounding of their roots.
-    touch = lo - hi <= ROUNDING * np.minimum(np.abs(lo), np.abs(hi))
-    u = np.maximum(np.minimum(np.maximum(v, lo), hi), low)
-    apart = np.flatnonzero(~touch)
+    u = np.minimum(np.maximum(np.minimum(np.maximum(v, lo), hi), low), high)
+    margin, allowed = a * u + b, tolerances((a,), b, (u,))
+    missed = margin < -allowed
+    apart = np.flatnonzero((missed & (a != 0.0)).any(axis=0))
     if apart.size:
-        u[apart] = least_violating(a[:, apart], b[:, apart], low[apart], high[apart], priority)
-    return u, touch & ~((a == 0.0) & (b < 0.0)).any(axis=0)
+        a, b = a[:, apart], b[:, apart]
+        u[apart] = found = least_violating(a, b, low[apart], high[apart], priority)
+        margin[:, apart] = reached = a * found + b
+        allowed[:, apart] = rounding = tolerances((a,), b, (found,))
+        missed[:, apart] = reached < -rounding
+    return u, margin, margin <= allowed, ~missed.any(axis=0)
 
 
 def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, priority: Sequence[float] | np.ndarray) -> np.ndarray:

@@ -15,10 +15,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from wrappers.qp import interval
+from wrappers.qp import bounded_least_squares, interval
 from wrappers.qp.rows import ROUNDING, total
 
 _STEPS = 20
+_FAR = 1e150
+"""A line further off than this meets no box. How far does not matter, and its square would overflow."""
 
 
 class _Rows(NamedTuple):
@@ -51,9 +53,9 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
     """
     units = np.sqrt(priority)[:, None]
     size = (units * np.abs(a)).max(axis=(0, 1))
-    scale = units / np.where(size > 0.0, size, 1.0)  # so that squares neither overflow nor vanish
+    size = np.where(size > 0.0, size, 1.0)  # so that squares neither overflow nor vanish
     u, left = start.copy(), np.arange(start.shape[1])
-    rows = _Rows(a[0] * scale, a[1] * scale, b * scale, low, high, u)
+    rows = _Rows(a[0] * units / size, a[1] * units / size, np.clip(b * units / size, -_FAR, _FAR), low, high, u)
     for _ in range(_STEPS):
         margin, error = _margin(rows)
         # The smallest and the largest slack of each row that rounding allows.
@@ -64,11 +66,8 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
         left, rows = left[moving], rows.take(moving)
         u[:, left] = _newton(rows, margin[:, moving], error[:, moving], least[:, moving], most[:, moving])
         rows = rows._replace(u=u[:, left])
-    # Imported here, since few states, if any, need SciPy.
-    from wrappers.qp import bounded_least_squares
-
     for i in left.tolist():
-        fit = bounded_least_squares.least_violating(a[:, :, i].T, b[:, i], low[:, i], high[:, i], priority)
+        fit = bounded_least_squares.least_violating(a[:, :, i].T, b[:, i], low[:, i], high[:, i], priority, start[:, i])
         missed = [np.linalg.norm(units[:, 0] * np.minimum(a[:, :, i].T @ end + b[:, i], 0.0)) for end in (u[:, i], fit)]
         u[:, i] = u[:, i] if missed[0] <= missed[1] else fit
     return u

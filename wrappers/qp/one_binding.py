@@ -35,7 +35,7 @@ def project_arrays(
         are left for a solver.
     """
     u = np.minimum(np.maximum(v, low), high)
-    margin, active, feasible = _margins(a, b, u)[0], np.zeros(b.shape, dtype=bool), np.ones(b.shape[1], dtype=bool)
+    margin, active, feasible = np.array([total(r * u) for r in a]) + b, np.zeros(b.shape, dtype=bool), np.ones(b.shape[1], dtype=bool)
     missed = margin < 0.0
     left = np.flatnonzero(missed.any(axis=0))
     weights = stack(w, b.shape[1])
@@ -46,17 +46,15 @@ def project_arrays(
         found, _, _, met = project_onto_row(
             list(row[:, tried]), b[i, tried], list(v[:, tried]), list(low[:, tried]), list(high[:, tried]), list(weights[:, tried])
         )
-        reached, terms = _margins([r[:, tried] for r in a], b[:, tried], np.array(found))
-        allowed = met & (reached >= -ROUNDING * terms).all(axis=0)
+        at = np.array(found)
+        products = [r[:, tried] * at for r in a]
+        reached = np.array([total(p) for p in products]) + b[:, tried]
+        # As `tolerances`, from the same products.
+        rounding = ROUNDING * np.abs(b[:, tried]) + np.array([total(ROUNDING * np.abs(p)) for p in products])
+        allowed = met & (reached >= -rounding).all(axis=0)
         solved = tried[allowed]
-        u[:, solved] = np.array(found)[:, allowed]
+        u[:, solved] = at[:, allowed]
         margin[:, solved] = reached[:, allowed]
-        active[:, solved] = (reached <= ROUNDING * terms)[:, allowed]
+        active[:, solved] = (reached <= rounding)[:, allowed]
         left = np.setdiff1d(left, solved, assume_unique=True)
     return (u, margin, active, feasible), left
-
-
-def _margins(a: Sequence[np.ndarray], b: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Margins a u + b of each row, and the sum of the sizes of their terms, which bounds their rounding."""
-    products = [row * u for row in a]
-    return np.array([total(p) for p in products]) + b, np.array([total(np.abs(p)) for p in products]) + np.abs(b)

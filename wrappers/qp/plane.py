@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from wrappers.qp import plane_batch
-from wrappers.qp.rows import ROUNDING
+from wrappers.qp.rows import ROUNDING, tolerance
 
 Row = tuple[float, float, float]
 """(a_1, a_2, b) of a row a . u + b >= 0; on a line, the second and first input are the pivot and the free one."""
@@ -60,6 +60,8 @@ def project_floats(
             return _one_of_batch(a, b, v, low, high, w, priority)
         u1, u2 = u
     margin = [a1 * u1 + a2 * u2 + bi for a1, a2, bi in rows]
+    if not all([g >= 0.0 or g >= -tolerance((a1, a2), bi, u) for (a1, a2, bi), g in zip(rows, margin, strict=True)]):  # noqa: C419
+        return _one_of_batch(a, b, v, low, high, w, priority)
     reach = r1 * abs(u1) + r2 * abs(u2)
     s1, s2 = min(e1, reach / r1), min(e2, reach / r2)
     active = [g <= 0.0 or g <= ROUNDING * (abs(bi) + abs(a1) * s1 + abs(a2) * s2) for (a1, a2, bi), g in zip(rows, margin, strict=True)]
@@ -74,8 +76,6 @@ def _onto_line(
     if ap == 0.0:
         return None
     alpha, beta = -b / ap, -af / ap
-    if not abs(alpha) <= plane_batch.FAR:
-        return None
     lo, hi = lf, hf
     before = [*before, (1.0, 0.0, -lp), (-1.0, 0.0, hp)]
     for rp, rf, rb in before:

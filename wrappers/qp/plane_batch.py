@@ -12,10 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from wrappers.qp.least_violating import is_unique, least_violating
-from wrappers.qp.rows import ROUNDING, stack
-
-FAR = 1e150
-"""A line further off than this meets no box, and its products could overflow."""
+from wrappers.qp.rows import ROUNDING, stack, tolerances
 
 
 class Plane(NamedTuple):
@@ -55,6 +52,10 @@ class Plane(NamedTuple):
         reach = root[0] * np.abs(u[0]) + root[1] * np.abs(u[1]) + away
         return np.minimum(np.maximum(-self.low, self.high), reach / root)
 
+    def met(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
+        """Whether all rows are met (B,)."""
+        return (margin >= -tolerances(self.a, self.b, u)).all(axis=0)
+
     def binds(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
         """Whether a row's margin exceeds zero by no more than rounding."""
         s1, s2 = self.scale(u)
@@ -86,10 +87,14 @@ def project_arrays(
     if acting.size:
         part = plane.take(acting)
         moved, met = _nearest(part)
+        reached = part.margin(moved)
+        met &= part.met(moved, reached)
         unmet = np.flatnonzero(~met)
         if unmet.size:
-            moved[:, unmet] = _nearest_of_least_violating(part.take(unmet), np.asarray(priority))
-        reached = part.margin(moved)
+            lost = part.take(unmet)
+            moved[:, unmet] = least = _nearest_of_least_violating(lost, np.asarray(priority))
+            reached[:, unmet] = lost.margin(least)
+            met[unmet] = lost.met(least, lost.margin(least))
         u[:, acting], margin[:, acting], feasible[acting] = moved, reached, met
         active[:, acting] = part.binds(moved, reached)
     return u, margin, active, feasible
@@ -149,7 +154,7 @@ def _onto_line(plane: Plane, u: np.ndarray, miss: np.ndarray) -> tuple[np.ndarra
         lo, hi = before.interval(lf, hf, ROUNDING)
         free = np.where(met, free, np.minimum(np.maximum(between, lo), hi))
         met |= (lo <= hi) & before.holds(free)
-    met &= before.crosses & (np.abs(alpha) <= FAR)
+    met &= before.crosses
     pivot = np.minimum(np.maximum(alpha + beta * free, lp), hp)
     return np.array([np.where(steep, pivot, free), np.where(steep, free, pivot)]), met
 

@@ -1,27 +1,27 @@
-"""Several constraint rows and a box: ProxQP, batched, and never wrong silently.
+"""Several constraint rows and a box: ProxQP for the batch, made exact, and never wrong silently.
 
 ProxQP's defaults return feasible points that are not the minimisers, and an infeasible problem ends at the iteration
-limit. So the settings ask for the duality gap and cap the iterations, and every answer is checked against the rows. What
-is left is solved in two exact steps, which serve contradicting rows too: the smallest sum of squared slacks first, then
-the action nearest to the proposed one that needs no more than these.
+limit. So the settings ask for the duality gap and cap the iterations. Of its answer only the rows and bounds that hold it are
+taken: the minimiser is the point of these equations nearest to the proposal, if it meets all rows, and if what holds it presses
+in the right direction. So it is exact, whatever the precision of the solver was. States without such a certificate, among them
+all with contradicting rows, go to `wrappers.qp.active_set` one by one.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import qpsolvers
 from proxsuite import proxqp  # pyright: ignore[reportMissingImports]  (it lives in a prefix of its own)
 
-from wrappers.qp.bounded_least_squares import least_violating
-from wrappers.qp.rows import total
+from wrappers.qp import active_set
+from wrappers.qp.rows import ROUNDING, tolerances, total
 
 _PRECISION = {"eps_abs": 1e-9, "eps_rel": 0.0, "check_duality_gap": True, "eps_duality_gap_abs": 1e-9}
 _SETTINGS = {**_PRECISION, "eps_primal_inf": 1e-14, "max_iter": 200, "max_iter_in": 50}
 _INFINITY = 1e20
-_ACCEPTED = 1e-7
-"""Largest violation of a normalised row that counts as met: a hundred times what the solver is asked for."""
+_PRESSES = 1e-7
+"""The row or bound of a multiplier binds from this share of the largest."""
 _WIDE = 1e3
 """A box that reaches this many times further than the violated rows is too wide to be a unit of length."""
 _REACH = 10.0
@@ -40,7 +40,7 @@ class Projection(NamedTuple):
 def project(
     a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray, priority: np.ndarray
 ) -> Projection:
-    """Project proposed inputs onto k rows a u + b >= 0 and a box.
+    """Project proposed inputs, which violate a row, onto k rows a u + b >= 0 and a box.
 
     Args:
         a: rows, shape (B, k, m).
@@ -51,19 +51,68 @@ def project(
         w: positive weights, shape (B, m).
         priority: positive weights of the squared slacks, shape (k,).
     """
-    u = np.clip(v, low, high)
-    margin = _dot(a, u) + b
-    feasible = np.ones(len(u), dtype=bool)
-    active = np.zeros(margin.shape, dtype=bool)
-    acting = np.flatnonzero((margin < 0.0).any(axis=1))
-    if acting.size:
-        scaled = _Scaled.of(a[acting], b[acting], v[acting], low[acting], high[acting], w[acting])
-        z, met = scaled.solve(priority)
-        feasible[acting] = met
-        u[acting] = np.clip(scaled.center + scaled.half * z, low[acting], high[acting])
-        margin[acting] = _dot(a[acting], u[acting]) + b[acting]
-        active[acting] = margin[acting] <= _ACCEPTED * scaled.lengths
-    return Projection(u, margin, active, feasible)
+    problem = _Problem(a, b, v, low, high, w)
+    u, certain = problem.certified(*_solve(_Scaled.of(problem)))
+    for i in np.flatnonzero(~certain).tolist():
+        u[i] = active_set.project(a[i], b[i], v[i], low[i], high[i], w[i], priority)
+    u = problem.tidied(u)
+    margin, allowed = problem.margin(u), problem.tolerance(u)
+    return Projection(u, margin, margin <= allowed, (margin >= -allowed).all(axis=1))
+
+
+class _Problem(NamedTuple):
+    """The arguments of `project`, over the batch."""
+
+    a: np.ndarray
+    b: np.ndarray
+    v: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    w: np.ndarray
+
+    def margin(self, u: np.ndarray) -> Any:
+        """Values (B, k) of the rows at inputs (B, m)."""
+        return _dot(self.a, u) + self.b
+
+    def tolerance(self, u: np.ndarray) -> Any:
+        """By how much the rows may miss there (B, k)."""
+        return tolerances(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
+
+    def tidied(self, u: np.ndarray) -> np.ndarray:
+        """The inputs without the rounding that other inputs brought in.
+
+        An input on which no row depends keeps its proposal. One that is nothing but rounding of the way from the proposal is 0,
+        for a row of this input alone may ask for that.
+        """
+        roots, start = np.sqrt(self.w), np.clip(self.v, self.low, self.high)
+        way = (np.abs(u - self.v) * roots).max(axis=1, keepdims=True)
+        u = np.where(np.abs(u) <= ROUNDING * way / roots, np.clip(0.0, self.low, self.high), u)
+        return np.where((self.a == 0.0).all(axis=1), start, u)
+
+    def certified(self, rows: np.ndarray, below: np.ndarray, above: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The minimisers (B, m) that some rows (B, k) and bounds (B, m) hold, and where they are those of the whole problem (B,)."""
+        roots, held = np.sqrt(self.w), below | above
+        normals = self.a / roots[:, None, :]
+        lengths = np.abs(normals).max(axis=2)
+        lengths = np.where(lengths > 0.0, lengths, 1.0)
+        normals = normals / lengths[:, :, None]
+        working: Any = np.where(rows[:, :, None] & ~held[:, None, :], normals, 0.0)
+        usable = np.isfinite(working).all(axis=(1, 2))
+        inverse = np.linalg.pinv(np.where(usable[:, None, None], working, 0.0))
+        u = np.where(below, self.low, np.where(above, self.high, self.v))
+        # The second time takes back the rounding of a long way.
+        for _ in range(2):
+            u = u - _dot(inverse, np.where(rows, self.margin(u) / lengths, 0.0)) / roots
+        u = self.tidied(np.clip(u, self.low, self.high))
+        way = (u - self.v) * roots
+        pressures = _dot(np.swapaxes(inverse, 1, 2), np.where(held, 0.0, way))
+        rest = way - _dot(np.swapaxes(normals, 1, 2), np.where(rows, pressures, 0.0))
+        rest = np.where(below, np.minimum(rest, 0.0), np.where(above, np.maximum(rest, 0.0), rest))
+        nothing = ROUNDING * np.abs(way).max(axis=1)
+        pressed = (np.abs(rest).max(axis=1) <= nothing) & (pressures >= -nothing[:, None]).all(axis=1)
+        margin, allowed = self.margin(u), self.tolerance(u)
+        met = (margin >= -allowed) & (~rows | (margin <= allowed))
+        return u, usable & pressed & met.all(axis=1)
 
 
 def _dot(a: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -88,16 +137,14 @@ class _Scaled(NamedTuple):
 
     rows: np.ndarray
     offsets: np.ndarray
-    lengths: np.ndarray
     target: np.ndarray
     curvature: np.ndarray
-    center: np.ndarray
-    half: np.ndarray
     low: np.ndarray
     high: np.ndarray
 
     @classmethod
-    def of(cls, a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray) -> _Scaled:
+    def of(cls, problem: _Problem) -> _Scaled:
+        a, b, v, low, high, w = problem
         center, half = _units(a, b, v, low, high, w)
         rows = a * half[:, None, :]
         offsets = b + _dot(a, center)
@@ -108,59 +155,34 @@ class _Scaled(NamedTuple):
         return cls(
             rows / lengths[:, :, None],
             offsets / lengths,
-            lengths,
             (v - center) / half,
             curvature / curvature.max(axis=1, keepdims=True),
-            center,
-            half,
             np.maximum((low - center) / half, -_INFINITY),
             np.minimum((high - center) / half, _INFINITY),
         )
 
-    def solve(self, priority: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Minimisers (B, m), and whether the rows are met (B,)."""
-        z, met = self._in_batch()
-        for i in np.flatnonzero(~met).tolist():
-            # Slacks count in the rows' own units.
-            weights = priority * (self.lengths[i] / self.lengths[i].max()) ** 2
-            least = least_violating(self.rows[i], self.offsets[i], self.low[i], self.high[i], weights)
-            slack = np.maximum(-(self.rows[i] @ least + self.offsets[i]), 0.0)
-            nearest = self._nearest(i, slack + _ACCEPTED)
-            z[i] = least if nearest is None else nearest
-            # Without a certified minimiser the rows may be met, but the step is flagged all the same.
-            met[i] = nearest is not None and bool((slack <= _ACCEPTED).all())
-        return z, met
-
-    def _in_batch(self) -> tuple[np.ndarray, np.ndarray]:
-        count, k, m = self.rows.shape
-        batch = proxqp.dense.BatchQP(count)
-        for i in range(count):
-            qp = batch.init_qp_in_place(m, 0, k + m)
-            for name, value in _SETTINGS.items():
-                setattr(qp.settings, name, value)
-            rows = np.vstack([self.rows[i], np.eye(m)])
-            lower, upper = np.concatenate([-self.offsets[i], self.low[i]]), np.concatenate([np.full(k, _INFINITY), self.high[i]])
-            qp.init(*self._objective(i), None, None, rows, lower, upper)
-        proxqp.dense.solve_in_parallel(batch, 1)
-        z, met = np.zeros((count, m)), np.zeros(count, dtype=bool)
-        for i in range(count):
-            results = batch.get(i).results
-            if results.info.status == proxqp.PROXQP_SOLVED and self._meets(i, results.x, 0.0):
-                z[i], met[i] = results.x, True
-        return z, met
-
-    def _objective(self, i: int) -> tuple[np.ndarray, np.ndarray]:
+    def objective(self, i: int) -> tuple[np.ndarray, np.ndarray]:
         """Hessian and gradient, scaled down where the proposal lies far outside the box."""
         size = max(1.0, float(np.abs(self.target[i]).max()))
         return np.diag(self.curvature[i] / size), -self.curvature[i] * self.target[i] / size
 
-    def _meets(self, i: int, z: np.ndarray, slack: np.ndarray | float) -> bool:
-        rows_met = self.rows[i] @ z + self.offsets[i] + slack >= -_ACCEPTED
-        return bool(rows_met.all() and (z >= self.low[i] - _ACCEPTED).all() and (z <= self.high[i] + _ACCEPTED).all())
 
-    def _nearest(self, i: int, slack: np.ndarray) -> np.ndarray | None:
-        """The minimiser with the rows relaxed until they can be met, without a guess; None where it is not found."""
-        problem = qpsolvers.Problem(*self._objective(i), -self.rows[i], self.offsets[i] + slack, lb=self.low[i], ub=self.high[i])
-        solution = qpsolvers.solve_problem(problem, solver="proxqp", initial_guess=proxqp.NO_INITIAL_GUESS, **_PRECISION)
-        z = solution.x
-        return z if solution.found and z is not None and self._meets(i, z, slack) else None
+def _solve(scaled: _Scaled) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The rows (B, k) and the lower and upper bounds (B, m) that hold the minimisers, according to ProxQP."""
+    count, k, m = scaled.rows.shape
+    # The solver does not come back from numbers that are not finite.
+    solvable = np.flatnonzero(np.all([np.isfinite(part).reshape(count, -1).all(axis=1) for part in scaled], axis=0)).tolist()
+    batch = proxqp.dense.BatchQP(len(solvable))
+    for i in solvable:
+        qp = batch.init_qp_in_place(m, 0, k + m)
+        for name, value in _SETTINGS.items():
+            setattr(qp.settings, name, value)
+        rows = np.vstack([scaled.rows[i], np.eye(m)])
+        lower = np.concatenate([-scaled.offsets[i], scaled.low[i]])
+        qp.init(*scaled.objective(i), None, None, rows, lower, np.concatenate([np.full(k, _INFINITY), scaled.high[i]]))
+    proxqp.dense.solve_in_parallel(batch, 1)
+    pressures = np.zeros((count, k + m))
+    for place, i in enumerate(solvable):
+        pressures[i] = batch.get(place).results.z
+    share = _PRESSES * np.abs(pressures).max(axis=1, keepdims=True)
+    return (pressures < -share)[:, :k], (pressures < -share)[:, k:], (pressures > share)[:, k:]

@@ -1,14 +1,40 @@
-"""What the solvers share: rows of a batch as one array, and when a number differs from zero by rounding only."""
+"""What the solvers share: rows of a batch as one array, and the one tolerance with which a row counts as met.
+
+A row a . u + b >= 0 is met by an input u if
+
+    a . u + b >= -ROUNDING (|b| + sum_j |a_j u_j|)
+
+A sum of n floating-point products differs from the exact one by at most n eps times the sum of their sizes; ROUNDING leaves
+room for the coefficients, which were rounded themselves. The sizes are those of the terms at u, so that neither the unit of a
+row nor that of an input matters.
+
+Every solver, for one state and for a batch, says `feasible` where the action that it returns meets all rows in this sense.
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-ROUNDING = 16.0 * float(np.finfo(float).eps)
-"""Relative error that a sum of three products may have, with room for coefficients that were rounded themselves."""
+ROUNDING = 16.0 * sys.float_info.epsilon
+"""Relative error of a row's value."""
+
+
+def tolerance(a: Sequence[float], b: float, u: Sequence[float]) -> float:
+    """Return by how much a row of m coefficients may miss at m inputs and be met all the same."""
+    # Each term is scaled by itself, so that their sum does not overflow.
+    return ROUNDING * abs(b) + sum([ROUNDING * abs(aj * uj) for aj, uj in zip(a, u, strict=True)])
+
+
+def tolerances(a: Sequence[Any] | np.ndarray, b: Any, u: Sequence[Any] | np.ndarray) -> Any:
+    """`tolerance` for arrays, the m coefficients and inputs in front."""
+    found = ROUNDING * np.abs(b)
+    for aj, uj in zip(a, u, strict=True):
+        found = found + ROUNDING * np.abs(aj * uj)
+    return found
 
 
 def stack(entries: Sequence[Any], size: int) -> np.ndarray:

@@ -5,7 +5,7 @@
 Where the rows cannot be met together, the answer is the least-violating action, flagged: it minimises sum_i priority_i
 slack_i^2 with slack_i = max(0, -(a_i . u + b_i)), and among the minimisers it is the one nearest to v. One row, one input and
 two inputs have exact methods of their own, and so has a single row that binds; the rest goes to ProxQP, which is imported on
-first use.
+first use. Rows can be met where the action that is returned meets them by the tolerance of `wrappers.qp.rows`.
 """
 
 from __future__ import annotations

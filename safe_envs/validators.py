@@ -1,0 +1,44 @@
+"""What comes from outside as numbers: converted in one place, or refused by an error of this project's own."""
+
+from __future__ import annotations
+
+import numbers
+import reprlib
+from typing import Any
+
+import numpy as np
+
+from safe_envs.errors import InvalidInputError
+
+
+def real_array(what: str, given: Any) -> np.ndarray:
+    """Return a state, an action or a batch of them as an array of floats; float32 and float64 come back as they are.
+
+    Args:
+        what: name of the argument, for the error.
+        given: an array, a number, or nested sequences of numbers.
+
+    Raises:
+        InvalidInputError: it is no array of real numbers: text, None, complex, masked, ragged, or beyond the range of floats.
+    """
+    if type(given) is np.ndarray and given.dtype.char in "fd":
+        return given
+    try:
+        if np.ma.is_masked(given):
+            raise ValueError("some entries are masked")
+        array = np.asarray(given)
+        if array.dtype.kind == "O" and all(isinstance(entry, numbers.Real) for entry in array.flat):
+            return array.astype(np.float64)
+        if array.dtype.kind not in "fiub":
+            raise TypeError(f"its entries are of the type {array.dtype}")
+        return array.astype(np.float64)
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise InvalidInputError(f"the {what} is {_shown(given)}: {error}; give an array of real numbers, such as np.zeros(2)") from error
+
+
+def _shown(given: Any) -> str:
+    """The beginning of what was given; Python refuses to write integers of more than 4300 digits."""
+    try:
+        return reprlib.repr(given)
+    except ValueError:
+        return f"a {type(given).__name__}"
