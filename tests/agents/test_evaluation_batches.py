@@ -149,11 +149,11 @@ def test_memory_does_not_grow_with_the_episodes():
         finally:
             tracemalloc.stop()
 
-    peak(128)
-    few, many = peak(128), peak(1280)
+    peak(256)
+    few, many = peak(256), peak(2560)
     # Of an episode nothing but the smallest h is kept (of the first 65536, and copied twice for their quantiles):
     # that is far less than its steps or even its statistics.
-    assert many - few < 4 * 8 * (1280 - 128)
+    assert many - few < 4 * 8 * (2560 - 256)
 
 
 def test_progress_goes_from_nothing_to_all():
