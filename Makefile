@@ -2,6 +2,7 @@
 # make test   the test suite
 # make check  the quick part of it, for every edit
 # make oracle the long comparisons with exact answers, which the suite holds in small
+# make clusters   sweeps on a Dask and on a Ray cluster that are started for it
 # make mutants   wrong versions of the code, each of which the tests must notice
 # make lint   style, formatting and types
 # make wheel-test   a wheel, installed without extras in an environment of its own, and used there
@@ -13,7 +14,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 DOCS_READY := .venv/.docs-ready
 
-.PHONY: demo test check oracle mutants lint wheel-test docs clean
+.PHONY: demo test check oracle clusters mutants lint wheel-test docs clean
 
 demo: $(READY)
 	$(BIN)/safe-envs demo
@@ -22,10 +23,13 @@ test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 check: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not oracle"
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not oracle and not cluster"
 
 oracle: $(READY)
 	$(BIN)/python -m pytest -n 2 -m oracle
+
+clusters: $(READY)
+	$(BIN)/python -m pytest -m cluster
 
 mutants: $(READY)
 	$(BIN)/python tests/mutants/run.py

@@ -201,6 +201,7 @@ def test_the_processes_of_a_sweep_watch_their_parent():
         assert settings["backend"].backend_kwargs["initargs"] == (os.getpid(),)
 
 
+@pytest.mark.cluster
 def test_dask_with_a_killed_worker_and_with_none(tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch):
     document = with_end(document)
     monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
@@ -238,6 +239,7 @@ def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         yield Path(folder)
 
 
+@pytest.mark.cluster
 def test_ray_with_a_killed_worker(tmp_path: Path, document: Document, ray_folder: Path):
     document = with_end(document)
     log = tmp_path / "log"
