@@ -47,24 +47,27 @@ def levels_of(problem, system):
             phi = generated
 
 
-@pytest.mark.parametrize("side", ["plant", "model"])
-def test_derivatives_equal_finite_differences(env_id, side):
+def test_derivatives_equal_finite_differences(env_id):
     problem = problem_of(env_id, noise=0.3)
-    system = getattr(problem, side)
-    step = mpmath.mpf("1e-12")
     with mpmath.workdps(60):
-        f, g, sigma = (in_fifty_digits(system, m) for m in (system.drift, system.input_matrix, system.diffusion))
-        for level, x in itertools.product(levels_of(problem, system), states_near_starts(problem)):
-            columns = [[f(x)[i] for i in range(system.n)]]
-            columns += [[g(x)[i, j] for i in range(system.n)] for j in range(system.m)]
-            noises = [[sigma(x)[i, j] for i in range(system.n)] for j in range(system.diffusion.cols)]
-            at, exact, generated = level
-            slopes = [(at(moved(x, d, step)) - at(moved(x, d, -step))) / (2 * step) for d in columns]
-            curvature = sum((at(moved(x, s, step)) - 2 * at(x) + at(moved(x, s, -step))) / step**2 for s in noises)
-            for slope, derivative in zip(slopes, exact, strict=True):
-                assert abs(slope - derivative(x)) < mpmath.mpf("1e-9") * (1 + abs(slope))
-            a_phi = slopes[0] + curvature / 2
-            assert abs(a_phi - generated(x)) < mpmath.mpf("1e-9") * (1 + abs(a_phi))
+        for system in dict.fromkeys((problem.plant, problem.model)):
+            assert_derivatives(problem, system)
+
+
+def assert_derivatives(problem, system):
+    step = mpmath.mpf("1e-12")
+    f, g, sigma = (in_fifty_digits(system, m) for m in (system.drift, system.input_matrix, system.diffusion))
+    states = states_near_starts(problem)
+    directions = [[[values[:, j] for j in range(values.cols)] for values in (m(x) for m in (f, g, sigma))] for x in states]
+    for (at, exact, generated), (x, (drift, effects, noises)) in itertools.product(
+        levels_of(problem, system), zip(states, directions, strict=True)
+    ):
+        slopes = [(at(moved(x, d, step)) - at(moved(x, d, -step))) / (2 * step) for d in (*drift, *effects)]
+        curvature = sum((at(moved(x, s, step)) - 2 * at(x) + at(moved(x, s, -step))) / step**2 for s in noises)
+        for slope, derivative in zip(slopes, exact, strict=True):
+            assert abs(slope - derivative(x)) < mpmath.mpf("1e-9") * (1 + abs(slope))
+        a_phi = slopes[0] + curvature / 2
+        assert abs(a_phi - generated(x)) < mpmath.mpf("1e-9") * (1 + abs(a_phi))
 
 
 def correlated() -> ControlAffineSDE:

@@ -40,7 +40,7 @@ def assert_same(ours, theirs, where):
                 assert_same(mine, other, where)
     elif ours.dtype == bool or np.issubdtype(ours.dtype, np.integer):
         np.testing.assert_array_equal(ours, theirs, err_msg=where)
-    else:
+    elif not np.array_equal(ours, theirs):
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9, err_msg=where)
 
 
