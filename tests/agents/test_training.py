@@ -27,13 +27,13 @@ SMALL = {"num_envs": 4, "eval_episodes": 8, "options": {"horizon": 0.5}}
 
 
 # Three evaluations; sac learns at every step, which takes long.
-LENGTHS = {"ppo": (768, 256), "sac": (384, 128)}
+LENGTHS = {"ppo": (768, 256), "sac": (192, 64)}
 
 
 def training(algorithm="ppo", steps=None, every=None, **changes):
     length = LENGTHS.get(algorithm, LENGTHS["ppo"])
     steps, every = steps or length[0], every or length[1]
-    settings = {"learning_starts": 100} if algorithm in ("sac", "td3") else {}
+    settings = {"learning_starts": 40} if algorithm in ("sac", "td3") else {}
     given = {"filter": "scbf", "n_timesteps": steps, "eval_freq": every, **SMALL, **changes}
     given["settings"] = settings | given.get("settings", {})
     return Training.of(DUBINS, algorithm, **given)
