@@ -97,7 +97,8 @@ def tidied(expression: Any) -> sp.Expr:
     """An equal expression with fewer operations, if sin^2 + cos^2 = 1 and common factors give one quickly."""
     if expression.count_ops() > _LARGEST_TIDIED or _expanded_terms(expression) > _MOST_TERMS:
         return expression
-    expanded = sp.expand(TR5(sp.expand(expression)))
+    # An exponential that is taken apart may overflow in one factor and vanish in the other.
+    expanded = sp.expand(TR5(sp.expand(expression, power_exp=False)), power_exp=False)
     return min((expression, sp.factor_terms(expression), sp.factor_terms(expanded)), key=sp.count_ops)
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 from sympy.printing.numpy import NumPyPrinter
+from sympy.printing.precedence import PRECEDENCE
 from sympy.printing.pycode import PythonCodePrinter
 
 SUPPORTED = (
@@ -15,6 +16,8 @@ SUPPORTED = (
     *(sp.Abs, sp.sign, sp.Heaviside, sp.Piecewise, sp.floor, sp.ceiling, sp.frac, sp.Mod),
 )
 """Functions that have the same values as floats and as arrays; besides sums, products, powers, Max and Min."""
+
+_BASE = sp.Symbol("_base_of_a_power_")
 
 _SETTINGS = {"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": False, "strict": True}
 
@@ -60,8 +63,11 @@ class ArrayPrinter(NumPyPrinter):
     _print_Float = _print_Integer = _print_Rational = _print_Pi = _named_constant  # noqa: N815
 
     def _print_Pow(self, expr: Any, rational: bool = False) -> str:  # noqa: N802  (sympy's dispatch by name)
-        # NumPy's power has short cuts for exponents that are literal.
-        return NumPyPrinter(_SETTINGS)._print_Pow(expr, rational)
+        if not expr.exp.is_number:
+            return super()._print_Pow(expr, rational)
+        # NumPy's power has short cuts for exponents that are literal. The base is printed here: in it Max and Min may stand.
+        code = NumPyPrinter(_SETTINGS)._print_Pow(sp.Pow(_BASE, expr.exp, evaluate=False), rational)
+        return code.replace(_BASE.name, self.parenthesize(expr.base, PRECEDENCE["Pow"]))
 
     def _nested(self, function: str, expression: Any) -> str:
         first, *others = expression.args

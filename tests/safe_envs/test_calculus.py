@@ -11,7 +11,8 @@ import sympy as sp
 
 import safe_envs
 from safe_envs import ControlAffineSDE, RelativeDegreeError, SystemDefinitionError
-from safe_envs.calculus import derivatives, drift_derivative, generator, input_derivative, relative_degree, spread
+from safe_envs.calculus import derivatives, drift_derivative, generator, input_derivative, relative_degree, spread, tidied
+from safe_envs.codegen import compile_function
 from safe_envs.simulation import Simulation
 from tests.conftest import problem_of
 
@@ -295,3 +296,12 @@ def test_scalar_generator():
     problem = problem_of("safe_envs/Scalar-v0")
     system = problem.model
     assert same(system, generator(system, problem.barriers[0].expression), -system.states[0])
+
+
+def test_an_exponential_is_not_taken_apart():
+    # exp(10000 x) exp(-10000 x^2) has no finite value where the bump has one.
+    x, v, u = sp.symbols("x v u", real=True)
+    bump = 1 - sp.exp(-10_000 * (x - sp.Rational(1, 2)) ** 2)
+    system = ControlAffineSDE((x, v), (u,), [v, 0], [0, bump], [[0], [0]])
+    effect = compile_function((x, v), [tidied(input_derivative(system, 1 - v**2)[0])], "floats")
+    assert effect(0.0840945, 0.158771)[0] == pytest.approx(-2 * 0.158771, rel=1e-15)

@@ -126,6 +126,16 @@ def test_powers_of_either_sign(power, flavour):
         assert value == pytest.approx(expected, rel=1e-14)
 
 
+@pytest.mark.parametrize("power", [sp.Rational(1, 2), sp.Rational(-1, 2), -1, -3, sp.Rational(3, 2), 9, sp.Float(0.7), sp.pi])
+@pytest.mark.parametrize("base", [lambda x, y: sp.Max(x, y), lambda x, y: x + sp.Min(x, y, 2), lambda x, y: sp.Abs(x - 5) * sp.Max(x, y)])
+def test_powers_of_kinks(base, power):
+    x, y = symbol("x"), symbol("y")
+    points = [(1.0, 3.0), (2.0, 1.0)]
+    arrays = compile_function((x, y), [base(x, y) ** power], "arrays")(*np.array(points).T)[0]
+    for value, point in zip(arrays, points, strict=True):
+        assert value == pytest.approx(float((base(x, y) ** power).subs(dict(zip((x, y), point, strict=True)))), rel=1e-14)
+
+
 @pytest.mark.parametrize("flavour", ["floats", "arrays"])
 def test_constants_have_all_their_digits(flavour):
     x = symbol("x")

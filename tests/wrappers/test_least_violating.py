@@ -1,4 +1,4 @@
-"""Three and more inputs against rational arithmetic: the nearest of the least-violating actions, whatever the scales."""
+"""Three and more inputs against rational arithmetic: the nearest of the least-violating actions, with scales up to a million apart."""
 
 from __future__ import annotations
 
@@ -113,6 +113,37 @@ def test_an_input_that_no_row_mentions_keeps_its_proposal():
     # The slacks share .3 - .1 u_3 + u_1 evenly wherever the rows' common line meets the box; nearest to the proposal is its corner.
     assert (u, active, feasible) == ([-1.0, 1.0, 1.0], [True, True], False)
     assert margin == pytest.approx([-0.1, -0.2])
+
+
+def squares(a, b, u, priority):
+    """The weighted sum of squared slacks."""
+    return float(np.sum(np.array(priority) * np.minimum(np.array(a) @ np.array(u) + np.array(b), 0.0) ** 2))
+
+
+def test_a_steep_row_is_not_missed_for_a_flat_one():
+    # The force of a row 1e9 times as steep as the other is its rounding; the input that it frees comes back at once.
+    rows = [[0.00095467, 0.00083554, 0.00115792, -0.00130886], [306403.5, -982680.2, -1361077.7, -301636.4]]
+    offsets, box = [-0.001293006, -1338006.1], ([-1.02, -1, -1.4467, -0.5496], [0.785, 0.7545, 0.5675, 0.8436])
+    u, margin, _, feasible = project_floats(rows, offsets, [1.16465, 2.15, 2.3758, -1.2736], *box, [1.0] * 4, [1.0, 1.0])
+    assert not feasible
+    # Where the steep row is met exactly, the flat one is missed least at a vertex of the box but for one input, by 6.2e-4.
+    corner = [0.785, -1.0, (1338006.1 - 306403.5 * 0.785 - 982680.2 - 301636.4 * 0.5496) / -1361077.7, -0.5496]
+    assert squares(rows, offsets, u, [1.0, 1.0]) <= squares(rows, offsets, corner, [1.0, 1.0]) * (1 + 1e-9)
+    assert u == pytest.approx(corner, abs=1e-9)
+    assert margin[1] == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("half", [0, 6])
+def test_no_corner_of_wild_scales_is_better(half):
+    rng = np.random.default_rng(half)
+    for _ in range(40):
+        (a,), (b,), (v,), (low,), (high,), (w,) = random_batch(rng, 1, 3, 4, "plain", 1.8)
+        scale, side = 10.0 ** rng.uniform(half - 6, 6 - half, 3), 10.0 ** rng.uniform(-half, half, 4)
+        a, b, v, low, high = a * scale[:, None], b * scale, v * side, low * side, high * side
+        u = project_floats(a.tolist(), b.tolist(), v.tolist(), low.tolist(), high.tolist(), w.tolist(), [1.0] * 3)[0]
+        corners = [np.where(bits, high, low) for bits in np.ndindex(2, 2, 2, 2)]
+        least = min(squares(a, b, corner, [1.0] * 3) for corner in (*corners, np.clip(v, low, high)))
+        assert squares(a, b, u, [1.0] * 3) <= least * (1 + 1e-9) + np.sum((1e-14 * (np.abs(a) @ np.abs(u) + np.abs(b))) ** 2)
 
 
 def test_sides_of_the_box_that_differ_by_a_million_hide_nothing():

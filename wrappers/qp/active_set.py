@@ -25,6 +25,9 @@ _PARALLEL = 1e-13
 _NOTHING = 1e-13
 """Part of the way to the proposal that is rounding."""
 
+_LOST = 4.0
+"""How many tolerances of a row the way to the nearest action may cost."""
+
 _CORRECTIONS = 2
 """How often the rows that hold the action are evaluated there: the first time takes back the rounding of the way to it."""
 
@@ -71,7 +74,10 @@ def _project(
     for _ in range(_CORRECTIONS):
         excess = (a @ u + b + slack)[binding] / unit[binding]
         u[free] -= np.linalg.lstsq(normals[np.ix_(binding, free)], excess)[0] / roots[free]
-    return np.clip(u, low, high)
+    u = np.clip(u, low, high)
+    # Where rows or inputs differ by many orders of magnitude, rounding may lead astray: then the least-violating action itself is safer.
+    worse = np.maximum(-(a @ u + b), 0.0) - np.maximum(-margin, 0.0)
+    return u if (worse <= _LOST * (tolerances(a.T, b, u) + tolerances(a.T, b, start))).all() else start
 
 
 class _Held(NamedTuple):

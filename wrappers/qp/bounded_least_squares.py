@@ -32,8 +32,11 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
     size = (units[:, None] * np.abs(a)).max() or 1.0  # so that squares neither overflow nor vanish
     a, b, u = units[:, None] * a / size, units * b / size, start.copy()
     margin = a @ u + b
-    missed, held = margin < 0.0, np.zeros(len(u), dtype=bool)
-    for _ in range(_STEPS * (len(b) + len(u))):
+    k, m = a.shape
+    missed, held = margin < 0.0, np.zeros(m, dtype=bool)
+    # What was let go last, rows first and then inputs; and what came back at once, because the force on it was rounding.
+    freed, barred = -1, np.zeros(k + m, dtype=bool)
+    for _ in range(_STEPS * (k + m)):
         step = np.zeros(len(u))
         step[~held] = np.linalg.lstsq(a[np.ix_(missed, ~held)], -margin[missed])[0]
         ends = np.where(step > 0.0, high, low)
@@ -45,20 +48,27 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
         u = np.where(stops, ends, np.clip(u + length * step, low, high))
         margin = a @ u + b
         if length < 1.0:
-            held, missed = held | stops, missed | (to_rows <= length)
+            meets = to_rows <= length
+            barred &= length == 0.0
+            if length == 0.0 and freed >= 0:
+                barred[freed] |= np.concatenate([meets, stops])[freed]
+            held, missed, freed = held | stops, missed | meets, -1
             continue
         press = np.where(missed, -margin, 0.0)
         forces = press[:, None] * a
         inwards = np.where(u >= high, -1.0, 1.0) * forces.sum(axis=0)
-        inwards[~held | (inwards <= _NOTHING * np.abs(forces).sum(axis=0))] = 0.0
+        inwards[~held | barred[k:] | (inwards <= _NOTHING * np.abs(forces).sum(axis=0))] = 0.0
         pulls = -press * np.abs(a).max(axis=1)
-        pulls[pulls <= _NOTHING * np.abs(forces).max()] = 0.0
+        pulls[barred[:k] | (pulls <= _NOTHING * np.abs(forces).max())] = 0.0
         if pulls.any():
-            missed[pulls.argmax()] = False
+            freed = int(pulls.argmax())
+            missed[freed] = False
         elif inwards.any():
-            held[inwards.argmax()] = False
+            freed = k + int(inwards.argmax())
+            held[freed - k] = False
         else:
             break
-    # The margins are those of a long way; a last step along the same rows takes back its rounding.
-    u[~held] += np.linalg.lstsq(a[np.ix_(missed, ~held)], -margin[missed])[0]
-    return np.clip(u, low, high)
+    # The margins are those of a long way; a last step along the same rows takes back its rounding, or leads astray.
+    last = u.copy()
+    last[~held] += np.linalg.lstsq(a[np.ix_(missed, ~held)], -margin[missed])[0]
+    return min(u, np.clip(last, low, high), key=lambda q: float((np.minimum(a @ q + b, 0.0) ** 2).sum()))
