@@ -111,7 +111,7 @@ def test_a_quick_run_is_told_its_horizon():
 
 
 @EACH
-def test_is_kept_and_drawn(outcomes, name, tmp_path):
+def test_is_kept_and_drawn(outcomes, name, tmp_path, pictures):
     artefact, outcome = ARTEFACTS[name], Outcome.from_document(json.loads(json.dumps(outcomes[name].document())))
     store.keep(tmp_path, artefact, SAMPLE, outcome, 1.0)
     assert (tmp_path / f"{name}.png").exists() == (artefact.draw is not None)
