@@ -195,7 +195,7 @@ def with_checksum(document):
 
 
 @given(data=st.data())
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_digit_that_was_changed_is_not_taken_for_a_result(data, kept, coin, tmp_path):
     content = kept.read_text()
     try:
@@ -217,7 +217,7 @@ json_values = st.recursive(
 
 
 @given(data=st.data())
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_result_of_another_shape_is_refused_or_shown(data, kept, coin, tmp_path):
     """Even with a checksum that is right."""
     content = kept.read_text()
