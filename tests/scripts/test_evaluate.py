@@ -186,7 +186,7 @@ def test_refinement_says_which_rates_have_converged(safe_envs_command):
     assert f"scbf: converged, +0.0 points [{100 * row['change_low']:.1f}, {100 * row['change_high']:.1f}]" in refined
     few = safe_envs_command(*arguments, "--episodes", "10", "--refine")[1]
     assert "  scbf: not resolved, +0.0 points [-27.8, 27.8]: more episodes are needed" in few
-    coarse = ("--dt", ".4", "--horizon", "1.6", "--start", ".5", "--noise", ".8", "--episodes", "2000")
+    coarse = ("--dt", ".4", "--horizon", "1.6", "--start", ".5", "--noise", ".8", "--episodes", "500")
     changing = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", *coarse, "--refine")[1]
     assert "  none: still changing by -" in changing
     picture = Path("out.svg").read_text()
@@ -235,14 +235,12 @@ def test_the_plants_mass_saves_the_quadrotor(safe_envs_command):
 @pytest.mark.parametrize(
     ("env_id", "name", "options"),
     [
-        (DUBINS, "a.png", ()),
         (DUBINS, "a.SVG", ("--policy", "random", "--filter", "none", "--filter", "hocbf", "--filter", "scbf")),
         ("DubinsObstacle-v0", "a.png", ()),
         ("Quadrotor-v0", "a.pdf", ()),
         ("ACC-v0", "a.png", ()),
-        ("Scalar-v0", "a.jpg", ()),
         # h is the same number throughout: there is no range to draw.
-        ("Scalar-v0", "flat.png", ("--noise", "0", "--start", "1")),
+        ("Scalar-v0", "flat.jpg", ("--noise", "0", "--start", "1")),
     ],
 )
 def test_plot_writes_a_picture(safe_envs_command, env_id, name, options):

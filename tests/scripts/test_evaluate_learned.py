@@ -43,7 +43,9 @@ def test_without_a_file_it_learns_first_and_says_for_how_long(evaluate):
 
 def test_a_file_is_used_in_its_place(evaluate, learned):
     filters = ("--filter", "bayesian-scbf", "--filter", "bayesian-scbf:confidence=0.9")
-    assert evaluate(*filters, "--learned", learned, "--json", "out.json")[0] == 0
+    status, out, _ = evaluate(*filters, "--learned", learned, "--json", "out.json")
+    assert status == 0
+    assert "bayesian-scbf was learned before, from 2,000 transitions: " in " ".join(out.split())
     assert (
         evaluate(
             "--filter", f"bayesian-scbf:file={learned}", "--filter", f"bayesian-scbf:file={learned}:confidence=0.9", "--json", "named.json"
@@ -54,9 +56,6 @@ def test_a_file_is_used_in_its_place(evaluate, learned):
     for row, other in zip(given, named, strict=True):
         assert {**row, "filter": None} == {**other, "filter": None}
         assert (row["learning"]["seeds"], row["learning"]["files"], row["learning"]["transitions"]) == ([7], [str(learned)], 2000)
-    status, out, _ = evaluate(*filters, "--learned", learned)
-    assert status == 0
-    assert "bayesian-scbf was learned before, from 2,000 transitions: " in " ".join(out.split())
 
 
 def test_repeats_give_the_worst_identification_and_intervals_over_them(evaluate):
