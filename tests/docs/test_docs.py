@@ -21,6 +21,7 @@ from matplotlib import pyplot as plt
 import agents
 import safe_envs
 import wrappers
+from agents.rare import estimate_rare
 from safe_envs import ENV_IDS
 from wrappers import CONDITIONS, LEARNED
 
@@ -98,7 +99,10 @@ def test_page_of_the_command_line_has_every_option(hook: Any):
 
 
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
-def test_python_runs(page: Path, hook: Any):
+def test_python_runs(page: Path, hook: Any, monkeypatch: pytest.MonkeyPatch):
+    # What is printed is looked at when the site is built; here it is to run.
+    for size, few in (("particles", 50), ("repetitions", 10)):
+        monkeypatch.setitem(estimate_rare.__kwdefaults__, size, few)
     hook("runs").run_python(page.read_text())
 
 

@@ -16,6 +16,7 @@ from agents.contradiction import judged
 from scripts.table import print_evaluation
 from tests.scripts.conftest import strictly
 
+pytestmark = pytest.mark.usefixtures("coarse_bounds")
 DUBINS = "safe_envs/StochasticDubins-v0"
 QUICK = ("--episodes", "8", "--horizon", "0.3")
 ROW_KEYS = [

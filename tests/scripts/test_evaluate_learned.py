@@ -8,6 +8,7 @@ import pytest
 
 from tests.scripts.conftest import strictly
 
+pytestmark = pytest.mark.usefixtures("coarse_bounds")
 DISK = ("CubicSDEDisk-v0", "--start=-0.1,0.7")
 QUICK = ("--episodes", 20)
 SMALL = ("--set", "starts=50", "--set", "repetitions=20")
