@@ -79,6 +79,7 @@ def test_json_is_strict_where_no_step_counts(safe_envs_command):
         assert row["effort_mean"] is row["intervention_rate"] is row["infeasible_rate"] is None
 
 
+@pytest.mark.slow
 def test_all_but_timing_is_the_same_for_every_num_envs(safe_envs_command):
     documents = []
     for num_envs in (1000, 1, 7):
@@ -151,6 +152,7 @@ def test_table_shows_the_rows(safe_envs_command):
     assert "Note: nothing is random" not in out
 
 
+@pytest.mark.slow
 def test_filters_are_compared_under_the_table(safe_envs_command):
     filters = [argument for name in ("none", "hocbf", "scbf", "hocbf:p=1,1") for argument in ("--filter", name)]
     _, out, _ = safe_envs_command("evaluate", DUBINS, *filters, "--episodes", 200, "--noise", 0.4, "--json", "out.json")
@@ -172,6 +174,7 @@ def test_all_safe_shows_the_exact_interval(safe_envs_command):
     assert "100.0 % [96.4, 100.0]" in out
 
 
+@pytest.mark.slow
 def test_refinement_says_which_rates_have_converged(safe_envs_command):
     arguments = ("evaluate", "ACC-v0", "--filter", "none", "--filter", "scbf", "--episodes", "200", "--horizon", "0.2")
     status, out, err = safe_envs_command(*arguments, "--refine", "--confidence", ".9", "--json", "out.json", "--plot", "out.svg")

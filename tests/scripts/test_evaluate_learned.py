@@ -42,6 +42,7 @@ def test_without_a_file_it_learns_first_and_says_for_how_long(evaluate):
     assert "worst" not in out
 
 
+@pytest.mark.slow
 def test_a_file_is_used_in_its_place(evaluate, learned):
     filters = ("--filter", "bayesian-scbf", "--filter", "bayesian-scbf:confidence=0.9")
     status, out, _ = evaluate(*filters, "--learned", learned, "--json", "out.json")
@@ -59,6 +60,7 @@ def test_a_file_is_used_in_its_place(evaluate, learned):
         assert (row["learning"]["seeds"], row["learning"]["files"], row["learning"]["transitions"]) == ([7], [str(learned)], 2000)
 
 
+@pytest.mark.slow
 def test_repeats_give_the_worst_identification_and_intervals_over_them(evaluate):
     filters = ("--filter", "scbf", "--filter", "bayesian-scbf", "--filter", "bayesian-scbf:simultaneous=0.9")
     status, out, err = evaluate(*filters, "--repeats", 2, "--json", "out.json")

@@ -120,6 +120,7 @@ def test_the_same_seed_gives_the_same_file(identify, tmp_path):
     assert hashes[0] == hashes[1] != hashes[2]
 
 
+@pytest.mark.slow
 def test_learning_from_a_file_of_data(identify, tmp_path):
     path = "some data.npz"
     collect(load_problem("CubicSDEDisk-v0"), 40, 5, seed=7, dt=0.02).save(tmp_path / path)

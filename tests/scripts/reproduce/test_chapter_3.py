@@ -14,6 +14,7 @@ from scripts.reproduce.learned_runs import runs, thinned
 from scripts.reproduce.printed_differences import printed_residuals
 from wrappers import HOCBF
 
+pytestmark = pytest.mark.slow
 ARTEFACTS = {artefact.name: artefact for artefact in (*dubins_learning.ARTEFACTS, *quadrotor.ARTEFACTS)}
 QUICK = Sample(episodes=8, quick=True)
 

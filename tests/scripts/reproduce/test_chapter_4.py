@@ -19,6 +19,7 @@ from scripts.reproduce.artefact import Artefact, Outcome, Sample
 from scripts.reproduce.verdict import Verdict, judge
 from wrappers import SZCBF
 
+pytestmark = pytest.mark.slow
 ARTEFACTS = {a.name: a for module in (martingale, cruise, dubins_noise) for a in module.ARTEFACTS}
 QUICK = Sample(quick=True)
 BROWNIAN_HORIZON = 2.5

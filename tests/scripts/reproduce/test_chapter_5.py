@@ -11,6 +11,7 @@ from scripts.reproduce import cubic, cubic_paths, noise_terms, paired_rates, pen
 from scripts.reproduce.artefact import Outcome, Sample
 from scripts.reproduce.verdict import Verdict, judge
 
+pytestmark = pytest.mark.slow
 SAMPLE, FULL = Sample(quick=True), Sample()
 ARTEFACTS = {artefact.name: artefact for artefact in (*pendulum.ARTEFACTS, *cubic.ARTEFACTS, *cubic_paths.ARTEFACTS)}
 PICTURES = [f"figure-5.3{key}" for key in "abcd"]

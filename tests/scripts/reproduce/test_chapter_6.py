@@ -19,6 +19,7 @@ from scripts.reproduce.learned_controllers import Learned, known, printed_totals
 from scripts.reproduce.store import keep
 from scripts.reproduce.verdict import Verdict, judge
 
+pytestmark = pytest.mark.slow
 ARTEFACTS = {a.name: a for a in (*bayesian_cubic.ARTEFACTS, *bayesian_cruise.ARTEFACTS)}
 QUICK = Sample(quick=True)
 TIMED = "table-6.4"
