@@ -6,6 +6,7 @@ import platform
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -223,4 +224,10 @@ def _speed(name: str, totals: Sequence[Totals], seconds: float) -> dict[str, Any
 
 def package_versions() -> dict[str, str]:
     """Versions of Python and of the packages on which results depend, by name."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Read once: each is in a file of its own."""
     return {"python": platform.python_version(), **{package: version(package) for package in _PACKAGES}}

@@ -16,6 +16,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 SYSTEMS = ("cart_pole.py", "double_integrator.py", "bicycle.py")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_a_filter_keeps_an_example_safe(name):
     path = EXAMPLES / name
@@ -26,6 +27,7 @@ def test_a_filter_keeps_an_example_safe(name):
     assert found.title == f"{path}:problem"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "options"),
     [

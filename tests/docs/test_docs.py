@@ -21,6 +21,7 @@ from matplotlib import pyplot as plt
 import agents
 import safe_envs
 import wrappers
+from agents.rare import estimate_rare
 from safe_envs import ENV_IDS
 from wrappers import CONDITIONS, LEARNED
 
@@ -97,11 +98,16 @@ def test_page_of_the_command_line_has_every_option(hook: Any):
         assert all(option in section for option in known.options_of(command) - {"--help"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", WITH_PYTHON, ids=name_of)
-def test_python_runs(page: Path, hook: Any):
+def test_python_runs(page: Path, hook: Any, monkeypatch: pytest.MonkeyPatch):
+    # What is printed is looked at when the site is built; here it is to run.
+    for size, few in (("particles", 50), ("repetitions", 10)):
+        monkeypatch.setitem(estimate_rare.__kwdefaults__, size, few)
     hook("runs").run_python(page.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((DOCS / "notebooks").glob("*.ipynb")), ids=name_of)
 def test_notebook_is_kept_without_outputs_and_its_cells_run(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     text = path.read_text()
@@ -128,6 +134,7 @@ def run_cell(source: str, names: dict[str, Any]) -> Any:
     return eval(compile(last, "<cell>", "eval"), names) if last else None
 
 
+@pytest.mark.slow
 def test_notebooks_are_executed_in_a_kernel_and_shown_with_their_outputs(hook: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     notebooks, pixel = hook("notebooks"), base64.b64encode(b"\x89PNG of a pixel").decode()
     cells = [

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from scripts import cli
+from tests.wrappers.verified import hurry
 
 
 @pytest.fixture
@@ -31,3 +32,9 @@ def strictly(path):
         raise ValueError(f"{name} is not JSON")
 
     return json.loads(Path(path).read_text(), parse_constant=refuse)
+
+
+@pytest.fixture
+def coarse_bounds(monkeypatch):
+    """Has bounds estimated by a shorter search, where a test does not depend on how large they are."""
+    hurry(monkeypatch)

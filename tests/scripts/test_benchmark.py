@@ -31,6 +31,7 @@ def quick(monkeypatch):
     monkeypatch.setattr(benchmark, "_LEARNED", learned)
 
 
+@pytest.mark.slow
 def test_figures_are_finite_and_positive_and_ratios_fit(quick):
     figures = benchmark.measure()
     faults = [figures.pop(name) for name in list(figures) if name.startswith("page faults")]

@@ -79,6 +79,7 @@ def run_at_a_terminal(*command):
     return process.returncode, out, shown.decode()
 
 
+@pytest.mark.slow
 def test_the_script_gives_the_same_as_the_command_and_a_terminal_gets_a_progress_bar(safe_envs_command, tmp_path):
     arguments = ["Scalar-v0", "--filter", "none", "--filter", "cbf", *QUICK, "--json"]
     status, out, shown = run_at_a_terminal(sys.executable, ROOT / "scripts" / "evaluate.py", *arguments, tmp_path / "script.json")

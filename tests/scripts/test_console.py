@@ -15,6 +15,7 @@ from gymnasium.error import DependencyNotInstalled
 
 from scripts import cli, console
 from scripts.console import run
+from tests.wrappers.verified import verify_once
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"list": "listing.py", "reproduce": "reproduce/command.py"}
@@ -99,6 +100,8 @@ def test_errors_are_not_quiet(safe_envs_command):
 @pytest.mark.parametrize("arguments", [QUICK, ("list",), ("verify", "Scalar-v0", "--no-simulate")])
 def test_json_goes_to_stdout_by_itself(safe_envs_command, monkeypatch, arguments):
     monkeypatch.setattr("scripts.listing.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0"))
+    monkeypatch.setattr("agents.verification.STARTS", 512)
+    monkeypatch.setattr("wrappers.verify.verify", verify_once)
     status, out, err = safe_envs_command(*arguments, "--json", "-")
     assert (status, err) == (0, "")
     given = json.loads(out)

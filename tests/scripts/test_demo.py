@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
+
 from scripts import demo
 
 
+@pytest.mark.slow
 def test_demo_prints_two_tables_and_leaves_a_policy_and_two_pictures(tmp_path, capsys):
     folder = tmp_path / "new" / "results"
     demo.demo(folder, episodes=10, steps=2048)

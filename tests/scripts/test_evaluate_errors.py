@@ -10,6 +10,7 @@ import pytest
 from agents import load_problem
 from tests.scripts.conftest import strictly
 
+pytestmark = pytest.mark.usefixtures("coarse_bounds")
 DUBINS = "safe_envs/StochasticDubins-v0"
 QUICK = ("--episodes", "8", "--horizon", "0.3")
 USER_ERRORS = (

@@ -8,6 +8,7 @@ import pytest
 
 from tests.scripts.conftest import strictly
 
+pytestmark = pytest.mark.usefixtures("coarse_bounds")
 DISK = ("CubicSDEDisk-v0", "--start=-0.1,0.7")
 QUICK = ("--episodes", 20)
 SMALL = ("--set", "starts=50", "--set", "repetitions=20")
@@ -41,9 +42,12 @@ def test_without_a_file_it_learns_first_and_says_for_how_long(evaluate):
     assert "worst" not in out
 
 
+@pytest.mark.slow
 def test_a_file_is_used_in_its_place(evaluate, learned):
     filters = ("--filter", "bayesian-scbf", "--filter", "bayesian-scbf:confidence=0.9")
-    assert evaluate(*filters, "--learned", learned, "--json", "out.json")[0] == 0
+    status, out, _ = evaluate(*filters, "--learned", learned, "--json", "out.json")
+    assert status == 0
+    assert "bayesian-scbf was learned before, from 2,000 transitions: " in " ".join(out.split())
     assert (
         evaluate(
             "--filter", f"bayesian-scbf:file={learned}", "--filter", f"bayesian-scbf:file={learned}:confidence=0.9", "--json", "named.json"
@@ -54,11 +58,9 @@ def test_a_file_is_used_in_its_place(evaluate, learned):
     for row, other in zip(given, named, strict=True):
         assert {**row, "filter": None} == {**other, "filter": None}
         assert (row["learning"]["seeds"], row["learning"]["files"], row["learning"]["transitions"]) == ([7], [str(learned)], 2000)
-    status, out, _ = evaluate(*filters, "--learned", learned)
-    assert status == 0
-    assert "bayesian-scbf was learned before, from 2,000 transitions: " in " ".join(out.split())
 
 
+@pytest.mark.slow
 def test_repeats_give_the_worst_identification_and_intervals_over_them(evaluate):
     filters = ("--filter", "scbf", "--filter", "bayesian-scbf", "--filter", "bayesian-scbf:simultaneous=0.9")
     status, out, err = evaluate(*filters, "--repeats", 2, "--json", "out.json")

@@ -46,7 +46,7 @@ def bad_files(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "texts"),
+    ("arguments", "texts", "drawn"),
     [
         (
             BAYESIAN,
@@ -60,20 +60,27 @@ def bad_files(tmp_path_factory):
                 "0 in truth and estimate: g[x_1, u], covariance[x_1, x_2]",
                 "--filter bayesian-scbf --learned out.npz",
             ),
+            ("f[x_1]: error", "truth (1/s)", "sigma of x_2", "samples of the posterior"),
         ),
         (
             NETWORK,
             ("way = network", "against the labels, median; and", "M_1(h), standard error of labels", "--filter ddscbf --learned out.npz"),
+            ("M_1(h): error", "estimate at a state"),
         ),
-        (DIRECT, ("way = direct", "errors: of the covariances, root mean square\n", "C(x, x)", "m^2/s", "C(theta, theta)")),
-        (RESIDUAL, ("hidden = 8,4", "rms", "q95", "h Delta_1", "h Sigma_omega", "--filter learned-hocbf --learned out.npz")),
+        (
+            DIRECT,
+            ("way = direct", "errors: of the covariances, root mean square\n", "C(x, x)", "m^2/s", "C(theta, theta)"),
+            ("C(y, y): error", "truth 0.04<", "estimate 0.0"),
+        ),
+        (RESIDUAL, ("hidden = 8,4", "rms", "q95", "h Delta_1", "h Sigma_omega", "--filter learned-hocbf --learned out.npz"), ()),
     ],
 )
-def test_the_report_names_what_was_learned(identify, arguments, texts):
-    status, out, err = identify(*arguments, "--out", "out.npz")
+def test_the_report_names_what_was_learned_and_the_picture_shows_it(identify, arguments, texts, drawn, tmp_path):
+    status, out, err = identify(*arguments, "--out", "out.npz", *(("--plot", "out.svg") if drawn else ()))
     assert (status, err) == (0, "")
     for text in (*texts, "Learned in", "Held-out errors", "Truth against estimate", "1000 fresh states", "Written to out.npz"):
         assert text in out
+    assert all(text in (tmp_path / "out.svg").read_text() for text in drawn)
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -113,6 +120,7 @@ def test_the_same_seed_gives_the_same_file(identify, tmp_path):
     assert hashes[0] == hashes[1] != hashes[2]
 
 
+@pytest.mark.slow
 def test_learning_from_a_file_of_data(identify, tmp_path):
     path = "some data.npz"
     collect(load_problem("CubicSDEDisk-v0"), 40, 5, seed=7, dt=0.02).save(tmp_path / path)
@@ -160,10 +168,7 @@ def test_what_cannot_be_compared_is_said(identify):
 @pytest.mark.parametrize(
     ("arguments", "texts"),
     [
-        (BAYESIAN, ("f[x_1]: error", "truth (1/s)", "sigma of x_2", "samples of the posterior")),
         ((*BAYESIAN, "--set", "diffusion_degree=1"), ("covariance[x_2, x_2]: error",)),
-        (NETWORK, ("M_1(h): error", "estimate at a state")),
-        (DIRECT, ("C(y, y): error", "truth 0.04<", "estimate 0.0")),
         (("QuadrotorAltitude-v0", *RESIDUAL[1:]), ("h Delta_2: truth 0", "estimates at all states", "truth 0<", " to ")),
     ],
 )

@@ -12,6 +12,7 @@ ACC = ("evaluate", "safe_envs/ACC-v0", "--filter", "scbf", "--start=10,10,40", "
 FEW = ("--particles", "50", "--repetitions", "10")
 
 
+@pytest.mark.slow
 def test_acceptance_in_small(safe_envs_command):
     status, out, err = safe_envs_command(*ACC, "--rare", *FEW, "--json", "rare.json")
     assert (status, err) == (0, "")
@@ -59,6 +60,7 @@ def test_starts_outside_the_safe_set_are_told(safe_envs_command):
     assert "h <= 0" not in safe_envs_command(*arguments[:4], "--horizon", "0.2", "--episodes", "20")[1]
 
 
+@pytest.mark.slow
 def test_rare_violations_of_episodes_that_end_early_are_told(safe_envs_command):
     arguments = ("evaluate", "Scalar-v0", "--policy", "random", "--filter", "scbf", "--rare", *FEW, "--json", "out.json")
     out = safe_envs_command(*arguments)[1]

@@ -52,6 +52,7 @@ def test_a_still_of_two_filters(tmp_path):
     np.testing.assert_array_equal(drawn(out)[0][:, :960], bare)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::SyntaxWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning")
 def test_an_episode_as_video_and_animation(tmp_path):
     arguments = ("safe_envs/Scalar-v0", "--horizon", "0.1", "--policy", "random", "--noise", "0.5")

@@ -14,6 +14,7 @@ DUBINS = "safe_envs/StochasticDubins-v0"
 QUICK = ("--n-timesteps", 512, "--num-envs", 4, "--eval-freq", 256, "--eval-episodes", 8, "--horizon", 0.5)
 
 
+@pytest.mark.slow
 def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_path):
     arguments = (
         "train",
@@ -77,6 +78,7 @@ def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(safe_envs_com
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command, monkeypatch):
     monkeypatch.setattr("scripts.leaderboard._QUICK", {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4})
     arguments = ("leaderboard", "Scalar-v0", "safe_envs/Scalar-v0", "--quick", "--episodes", 8, "--out", "board")

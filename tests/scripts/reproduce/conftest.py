@@ -40,3 +40,9 @@ def catalogue(coin, monkeypatch):
     """A catalogue of that alone."""
     monkeypatch.setattr("scripts.reproduce.catalogue.ARTEFACTS", (coin,))
     return (coin,)
+
+
+@pytest.fixture
+def pictures(monkeypatch):
+    """Has real figures saved as PNG only, which takes half as long; those of the coin are saved as SVG, too."""
+    monkeypatch.setattr("scripts.reproduce.store._SUFFIXES", (".png",))

@@ -19,14 +19,32 @@ from scripts.reproduce.learned_controllers import Learned, known, printed_totals
 from scripts.reproduce.store import keep
 from scripts.reproduce.verdict import Verdict, judge
 
+pytestmark = pytest.mark.slow
 ARTEFACTS = {a.name: a for a in (*bayesian_cubic.ARTEFACTS, *bayesian_cruise.ARTEFACTS)}
 QUICK = Sample(quick=True)
 TIMED = "table-6.4"
 
 
+LESS = (
+    (bayesian_cubic, {"CONTROLLERS": 2, "GENERATORS": 2, "QUICK_LONG": 1}),
+    (bayesian_cruise, {"_CONTROLLERS": 2, "_IDENTIFICATIONS": 2, "_QUICK_HORIZON": 0.5}),
+    (cubic_drift, {"_PICTURED": 2}),
+    (learning_times, {"_TIMED": 2, "_ONE_BY_ONE": 50}),
+)
+"""Sizes of these tests: as much as makes an outcome whole. Intervals over identifications need two of them."""
+
+
+def compute(name: str, sample: Sample) -> Outcome:
+    with pytest.MonkeyPatch.context() as patch:
+        for module, sizes in LESS:
+            for size, value in sizes.items():
+                patch.setattr(module, size, value)
+        return ARTEFACTS[name].compute(sample)
+
+
 @cache
 def outcome(name: str) -> Outcome:
-    return ARTEFACTS[name].compute(QUICK)
+    return compute(name, QUICK)
 
 
 def number(found, name):
@@ -104,7 +122,7 @@ def test_settings_say_what_is_simulated(sample):
 
 
 @pytest.mark.parametrize("name", ARTEFACTS)
-def test_an_outcome_is_json_is_drawn_and_judged(name, tmp_path):
+def test_an_outcome_is_json_is_drawn_and_judged(name, tmp_path, pictures):
     found = outcome(name)
     text = json.dumps(found.document(), allow_nan=False)
     assert Outcome.from_document(json.loads(text)) == found
@@ -121,8 +139,8 @@ def test_an_outcome_is_json_is_drawn_and_judged(name, tmp_path):
 
 @pytest.mark.parametrize("name", ["figure-6.1", "figure-6.2", "figure-6.3"])
 def test_a_seed_gives_the_same_outcome_and_another_one_another(name):
-    assert ARTEFACTS[name].compute(QUICK) == outcome(name)
-    assert ARTEFACTS[name].compute(Sample(seed=1, quick=True)) != outcome(name)
+    assert compute(name, QUICK) == outcome(name)
+    assert compute(name, Sample(seed=1, quick=True)) != outcome(name)
 
 
 def test_the_error_of_the_drift_is_the_law_for_states_over_the_disk():

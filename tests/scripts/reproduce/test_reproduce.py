@@ -194,8 +194,9 @@ def with_checksum(document):
     return json.dumps({**document, "sha256": hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()})
 
 
+@pytest.mark.slow
 @given(data=st.data())
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_digit_that_was_changed_is_not_taken_for_a_result(data, kept, coin, tmp_path):
     content = kept.read_text()
     try:
@@ -216,8 +217,9 @@ json_values = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(data=st.data())
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_result_of_another_shape_is_refused_or_shown(data, kept, coin, tmp_path):
     """Even with a checksum that is right."""
     content = kept.read_text()
@@ -303,6 +305,7 @@ def test_the_processes_watch_their_parent(monkeypatch, tmp_path):
     assert (given["initializer"], given["initargs"]) == (end_with_parent, (os.getpid(),))
 
 
+@pytest.mark.slow
 def test_a_run_that_was_stopped_goes_on(safe_envs_command, catalogue, computed, coin, monkeypatch):
     def fail(_):
         raise ValueError("no luck")
@@ -333,6 +336,7 @@ def test_what_it_cannot_take_ends_with_status_2(safe_envs_command, catalogue, tm
     assert message in " ".join(err.split())
 
 
+@pytest.mark.slow
 def test_processes_compute_what_a_single_one_does(safe_envs_command, monkeypatch, tmp_path):
     """Over real artefacts, the quickest ones; in one process, whose start takes longer than they do."""
     from scripts.reproduce import command
