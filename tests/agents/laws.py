@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import sympy as sp
+from scipy.linalg import toeplitz
 from scipy.special import ndtr
 from scipy.stats import norm
 
@@ -38,7 +39,9 @@ def walk_passage(distance: float, steps: int, mean: float, deviation: float) -> 
     """P(a walk of Gaussian steps reaches a distance at one of its steps), by quadrature over each step."""
     spacing = deviation / 16
     grid = np.arange(spacing / 2, distance + 8 * deviation * math.sqrt(steps), spacing)
-    kernel = spacing * norm.pdf(grid[None, :], grid[:, None] - mean, deviation)
+    # On an even grid the density depends on how far apart two points are.
+    apart = spacing * np.arange(len(grid))
+    kernel = toeplitz(spacing * norm.pdf(-apart, -mean, deviation), spacing * norm.pdf(apart, -mean, deviation))
     return _passage(grid, kernel, norm.cdf(0.0, grid - mean, deviation), distance, steps)
 
 

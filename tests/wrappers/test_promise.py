@@ -18,8 +18,6 @@ from tests.wrappers.verified import (
     by_name,
     estimated,
     findings,
-    hurried,
-    hurry,
     made,
     made_bound,
     problem_with,
@@ -28,7 +26,7 @@ from tests.wrappers.verified import (
     y,
 )
 from wrappers import parse_conditions
-from wrappers.estimated import estimated_bound, from_survey
+from wrappers.estimated import estimated_bound
 from wrappers.formulas import Formulas
 from wrappers.promise import best_start, promise
 from wrappers.safe_set import draw_starts
@@ -185,15 +183,6 @@ def test_zeroing_forms_and_the_misprint():
     slow = promise(findings(CUBIC_DISK, "szcbf:alphas=0.5"), np.array([[0.5, 0.0]]), 1.0)
     assert by_name(slow, "as printed").value < by_name(slow, "corrected").value
     assert by_name(slow, "as printed").status == by_name(slow, "corrected").status
-
-
-def test_every_id_has_a_bound_or_a_note(env_id, monkeypatch):
-    hurry(monkeypatch)
-    bound, starts = from_survey(hurried(env_id).survey), draw_starts(problem_of(env_id), 16)
-    values = bound.at(starts, problem_of(env_id).horizon)
-    assert values.shape == (16,)
-    assert ((values >= 0.0) & (values <= 1.0)).all()
-    assert bound.note is None or not values.any()
 
 
 def test_the_estimated_bound_is_deterministic():

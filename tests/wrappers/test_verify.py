@@ -26,6 +26,7 @@ from tests.wrappers.verified import (
     x,
 )
 from wrappers import parse_conditions
+from wrappers.estimated import from_survey
 from wrappers.formulas import Formulas
 from wrappers.promise import promise
 from wrappers.safe_set import draw_starts
@@ -78,7 +79,7 @@ def test_conflicting_barriers_are_found_to_be_infeasible_together():
     assert verify(apart, parse_conditions("cbf:alpha=0.1", apart), samples=500).safe.infeasible == 0.0
 
 
-def test_every_id_is_verified(env_id, monkeypatch):
+def test_every_id_is_verified_and_has_a_bound_or_a_note(env_id, monkeypatch):
     hurry(monkeypatch)
     problem = problem_of(env_id)
     found = hurried(env_id)
@@ -96,12 +97,19 @@ def test_every_id_is_verified(env_id, monkeypatch):
         assert 0.0 <= part.infeasible <= 1.0
         assert 0.0 <= part.shortfall < math.inf
         assert found.formulas.barrier_level(part.worst[None])[0] >= 0.0
-    bounds = promise(found, draw_starts(problem, 16), problem.horizon)
+    starts = draw_starts(problem, 16)
+    bounds = promise(found, starts, problem.horizon)
     assert bounds
     for bound in bounds:
         assert bound.status in STATUSES
         assert bound.value is None or 0.0 <= bound.value <= 1.0
         assert bound.reason or bound.status == "estimated"
+    # The same look at the system gives the estimated bound, or a note on why there is none.
+    estimated = from_survey(found.survey)
+    values = estimated.at(starts, problem.horizon)
+    assert values.shape == (16,)
+    assert ((values >= 0.0) & (values <= 1.0)).all()
+    assert estimated.note is None or not values.any()
 
 
 def test_infeasibility_and_shortfall_are_those_of_the_filter():
