@@ -41,7 +41,7 @@ def test_answer_is_the_same_for_every_num_envs(env_id):
     ("env_id", "filters", "options"),
     [
         # Episodes that end at different times: out of the workspace, and at the goal.
-        ("Scalar-v0", ("none", "cbf:alpha=3"), {"noise": 0.9, "horizon": 1.5}),
+        ("Scalar-v0", ("none", "cbf:alpha=3"), {"noise": 0.9, "horizon": 3.0, "dt": 0.02}),
         ("DubinsObstacle-v0", ("none", "hocbf"), {"noise": 0.1, "start": [2.0, 1.3, 0.3, 0.5, 1.0], "horizon": 2.0}),
         # More control periods than the noise is drawn ahead for.
         ("StochasticDubins-v0", ("none", "scbf"), {"dt": 0.01, "horizon": 2.7, "substeps": 2}),
