@@ -34,11 +34,12 @@ def short(monkeypatch):
     monkeypatch.setattr(verification, "STARTS", 1024)
 
 
+@pytest.mark.slow
 def test_the_product_bound_of_the_stochastic_dubins_is_contradicted(monkeypatch):
     monkeypatch.setattr(verification, "_MULTIPLES", (1,))
     monkeypatch.setattr(verification, "_LONG_MULTIPLES", (30,))
     # With the default noise of .2 it takes four times as long.
-    _, at_best = measured("safe_envs/StochasticDubins-v0", episodes=60, noise=0.4)
+    _, at_best = measured("safe_envs/StochasticDubins-v0", episodes=60, noise=0.4, dt=0.1)
     assert at_best.state is not None
     first, last = at_best.horizons
     assert (first.time, last.time) == (5.0, 150.0)
@@ -53,6 +54,7 @@ def test_the_product_bound_of_the_stochastic_dubins_is_contradicted(monkeypatch)
     assert not any("repaired" in name for name in contradicted(at_best))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_the_cubic_disk_contradicts_the_bound_whose_hypothesis_fails():
     from_start, at_best = measured(CUBIC_DISK)

@@ -54,7 +54,7 @@ def test_radial_headings_leave_the_dubins_disk_without_control():
 
 @pytest.mark.parametrize(("rates", "missed"), [("1,1", 2 * 0.8**2 - 1), ("1,2", 0.0)])
 def test_the_centre_of_the_dubins_disk_needs_large_rates(rates, missed):
-    (barrier,) = findings(DUBINS, f"hocbf:p={rates}", "plant").barriers
+    (barrier,) = findings(DUBINS, f"hocbf:p={rates}", "plant", samples=1024).barriers
     np.testing.assert_allclose(barrier.deepest[:2], 0.0, atol=1e-4)
     assert barrier.deepest_shortfall == pytest.approx(missed, abs=1e-5)
 
@@ -152,7 +152,7 @@ def test_a_wide_box_hides_no_state_without_control(exponent, seed):
 
 @pytest.mark.parametrize("exponent", [12])
 def test_a_wide_box_does_not_help_at_the_centre(exponent):
-    (barrier,) = findings(DUBINS, "hocbf:p=.5,.5", plant={"v": 0.5}, box=[-(10.0**exponent), 10.0**exponent]).barriers
+    (barrier,) = findings(DUBINS, "hocbf:p=.5,.5", samples=1024, plant={"v": 0.5}, box=[-(10.0**exponent), 10.0**exponent]).barriers
     assert barrier.vanishes
     assert barrier.deepest_shortfall == pytest.approx(2 * 0.5**2 - 0.5**2, abs=1e-6)
 
@@ -214,8 +214,8 @@ def test_states_where_a_condition_is_undefined_are_reported():
 def test_a_tiny_unit_of_a_barrier_is_no_matter():
     problem = problem_with([0 * x], [1e-10 * (1 - x**2)], noise=(0.1,))
     # At the middle A h = -s^2 in these units.
-    assert made(problem).safe.shortfall == pytest.approx(1e-12, rel=1e-6)
-    assert made(problem, "srcbf").safe.points > 1000
+    assert made(problem, samples=1024).safe.shortfall == pytest.approx(1e-12, rel=1e-6)
+    assert made(problem, "srcbf", samples=1024).safe.points > 1000
 
 
 @pytest.mark.parametrize(
