@@ -36,6 +36,7 @@ def test_answer_is_the_same_for_every_num_envs(env_id):
     assert len(answers[0].comparisons) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["nominal", "random"])
 @pytest.mark.parametrize(
     ("env_id", "filters", "options"),
@@ -139,6 +140,7 @@ def test_recorder_keeps_a_bounded_number_of_episodes():
     assert evaluate("Scalar-v0", filters=["none"], episodes=2, options={"horizon": 0.05}).recorders == {}
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_episodes():
     problem = load_problem("Scalar-v0", {"horizon": 0.02})
 

@@ -109,6 +109,7 @@ def test_values_and_flags_are_those_of_the_filter(registered):
     np.testing.assert_array_equal(stacked.numpy().reshape(u.shape), wanted.action)
 
 
+@pytest.mark.slow
 def test_gradients_pass_gradcheck(registered):
     module, x, u = registered
     decided = module.safety_filter.filter(x, u)
@@ -135,6 +136,7 @@ def test_slopes_are_the_differences_of_the_filter(m, k, most):
     assert assert_slopes(module, x[chosen], u[chosen]) > 0.9 * len(chosen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [16, pytest.param(100, marks=pytest.mark.oracle)])
 @pytest.mark.parametrize("m", [1, 2, 4])
 def test_slopes_of_a_compromise(m, size):

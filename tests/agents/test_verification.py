@@ -71,6 +71,7 @@ def test_the_cubic_disk_contradicts_the_bound_whose_hypothesis_fails():
         assert estimated <= horizon.ci_high
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_the_estimated_bound_of_the_pendulum_holds(monkeypatch):
     monkeypatch.setattr(verification, "_MULTIPLES", (1, 4))
@@ -87,6 +88,7 @@ def test_without_a_bound_there_is_one_measurement_and_nothing_to_contradict():
     assert all(h.bounds == () for h in only.horizons)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_a_mismatched_model_contradicts_its_promise():
     (only,) = measured("safe_envs/DubinsDisk-v0", episodes=1, start="valid", horizon=5.0)

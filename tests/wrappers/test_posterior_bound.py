@@ -109,6 +109,7 @@ def test_plant_and_model_do_not_matter(cubic, posterior, found):
     assert (other.shortfall, other.supremum) == (found.shortfall, found.supremum)
 
 
+@pytest.mark.slow
 def test_more_data_give_a_larger_bound(cubic, found):
     few = posterior_bound(cubic, [BayesianSCBF(identify(cubic, starts=200, repetitions=50), simultaneous=0.95)])
     assert few.shortfall > 1.2 * found.shortfall
@@ -134,6 +135,7 @@ def test_what_has_no_bound_is_refused(cubic, posterior):
             posterior_bound(problem, conditions)
 
 
+@pytest.mark.slow
 def test_an_unbounded_set_has_none(cubic, posterior):
     problem = problem_of("safe_envs/CubicSDE-v0")
     # Its noise varies with the state: no intervals of sigma are known.

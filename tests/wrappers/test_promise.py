@@ -249,6 +249,7 @@ def test_a_range_that_was_chosen_establishes_nothing():
     assert made_bound(problem, "szcbf:alphas=.1").note == reason
 
 
+@pytest.mark.slow
 def test_conditions_that_share_several_inputs_have_no_bound():
     problem = system_in_a_box(count=2)
     x_1, x_2 = problem.plant.states
@@ -259,6 +260,7 @@ def test_conditions_that_share_several_inputs_have_no_bound():
     assert all(reason in b.reason and b.status != "estimated" for b in bounds)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("env_id", "text"),
     [(CUBIC_DISK, "scbf"), (CUBIC_DISK, "szcbf:alphas=2"), (STOCHASTIC, "szcbf:alphas=.1,.1")],

@@ -150,6 +150,7 @@ def test_a_wide_box_hides_no_state_without_control(exponent, seed):
     assert found.missed[0] == pytest.approx(2 * v * (v + p * rho), rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exponent", [12])
 def test_a_wide_box_does_not_help_at_the_centre(exponent):
     (barrier,) = findings(DUBINS, "hocbf:p=.5,.5", samples=1024, plant={"v": 0.5}, box=[-(10.0**exponent), 10.0**exponent]).barriers
@@ -178,6 +179,7 @@ def pockets(width, depth, offset):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [0.05, 0.01])
 def test_a_pocket_of_conflict_is_found(width):
     # At the edge of both the best common margin is the mean of the two offsets, less the depth.
