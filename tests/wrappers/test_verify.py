@@ -81,8 +81,8 @@ def test_conflicting_barriers_are_found_to_be_infeasible_together():
 
 def test_every_id_is_verified_and_has_a_bound_or_a_note(env_id, monkeypatch):
     hurry(monkeypatch)
-    problem = problem_of(env_id)
     found = hurried(env_id)
+    problem = found.formulas.problem
     assert len(found.barriers) == len(problem.barriers)
     for barrier in found.barriers:
         assert 0.0 <= barrier.leading <= barrier.typical < math.inf

@@ -63,8 +63,8 @@ def findings(env_id, text=None, knowledge="model", samples=survey.SAMPLES, **opt
 
 
 def hurried(env_id):
-    """What is found of a registered id by a search that was hurried, once for all tests."""
-    problem = problem_of(env_id)
+    """What is found of a registered id by a search that was hurried, once for all tests; of many obstacles, with two."""
+    problem = problem_of(env_id, **({"num_obstacles": 2} if "DubinsObstacles" in env_id else {}))
     return verify_once(problem, parse_conditions(problem.filter, problem), samples=128)
 
 
