@@ -103,17 +103,15 @@ def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[Any],
 
 @lru_cache(maxsize=1024)
 def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], flavour: Flavour) -> Callable[..., Components]:
-    for expression in expressions:
-        _require_computable(expression, arguments)
-    names, formulas = in_plain_names(arguments, expressions)
+    names, formulas, numbers, shared = _prepared(arguments, expressions)
     printer = ArrayPrinter() if flavour == "arrays" else FloatPrinter()
     try:
         function = sp.lambdify(
             names,
-            tuple(sp.Float(float(sp.N(e, 30)), 17) if e.is_number else e for e in formulas),
+            numbers,
             modules=[_ARRAY_FUNCTIONS, np] if flavour == "arrays" else [math],
             printer=printer,
-            cse=_shared_subexpressions,  # pyright: ignore[reportArgumentType]  (annotated as bool, documented as callable)
+            cse=lambda _: shared,  # pyright: ignore[reportArgumentType]  (annotated as bool, documented as callable)
             docstring_limit=0,
         )
     except PrintMethodNotImplementedError as error:
@@ -123,6 +121,19 @@ def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...],
     elif any(e.has(sp.Piecewise, sp.Heaviside, sp.sinc) for e in formulas):
         return _piece_by_piece(function, names, formulas)
     return function
+
+
+@lru_cache(maxsize=256)
+def _prepared(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...]) -> tuple[tuple[sp.Symbol, ...], Any, Any, Any]:
+    """What both flavours have in common: the arguments and formulas in plain names, these with rounded numbers, and what they share.
+
+    An env and a batch of it ask for the same formulas, one after the other, and to find what they share takes longest.
+    """
+    for expression in expressions:
+        _require_computable(expression, arguments)
+    names, formulas = in_plain_names(arguments, expressions)
+    numbers = tuple(sp.Float(float(sp.N(e, 30)), 17) if e.is_number else e for e in formulas)
+    return names, formulas, numbers, _shared_subexpressions(numbers)
 
 
 def _piece_by_piece(quick: Callable[..., Components], names: Sequence[sp.Symbol], formulas: Sequence[Any]) -> Callable[..., Components]:

@@ -76,6 +76,9 @@ class Simulation:
 
     def draw_starts(self, rngs: Sequence[np.random.Generator]) -> np.ndarray:
         """Draw an initial state from each generator; shape (n, len(rngs))."""
+        if rngs and not self._uniforms:
+            # Nothing is drawn for a fixed start.
+            return np.repeat(np.array([self.draw_start(rngs[0])], dtype=float).T, len(rngs), axis=1)
         return np.array([self.draw_start(rng) for rng in rngs], dtype=float).T.copy()
 
 

@@ -31,6 +31,12 @@ def env_id(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
+_PROBLEMS: dict[str, SafetyProblem] = {}
+
+
 def problem_of(env_id: str, **arguments) -> SafetyProblem:
-    """The problem behind a registered id, made with the arguments of `gym.make`."""
-    return gym.make(env_id, **arguments).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]
+    """The problem behind a registered id, made with the arguments of `gym.make`; the same object for the same numbers and texts."""
+    key = f"{env_id} {arguments!r}"
+    if key not in _PROBLEMS:
+        _PROBLEMS[key] = gym.make(env_id, **arguments).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]
+    return _PROBLEMS[key]

@@ -58,8 +58,10 @@ class Region:
 
     def inside(self, x: np.ndarray) -> np.ndarray:
         """States (B, n) moved into the box: by whole periods, and to its nearest end."""
-        wrapped = self.low + (x - self.low) % (self.high - self.low)
-        return np.where(self.periodic, wrapped, np.clip(x, self.low, self.high))
+        clipped = x.clip(self.low, self.high)
+        if not self.periodic.any():
+            return clipped
+        return np.where(self.periodic, self.low + (x - self.low) % (self.high - self.low), clipped)
 
     def draw(self, log2: int, rng: np.random.Generator) -> np.ndarray:
         """Draw 2^log2 points that fill the box evenly: a Sobol sequence, shifted at random; shape (2^log2, n)."""

@@ -74,6 +74,7 @@ def test_a_bound_over_a_posterior_sees_a_hidden_kink(monkeypatch):
     assert row["withheld"].startswith("the interval of the measured rate ends at")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("credulous")
 def test_nothing_converges_beside_a_bound_that_is_contradicted():
     answer = refine(false_bounds.kink(), filters=["none", "szcbf:alphas=0.1"], episodes=100)
@@ -84,6 +85,7 @@ def test_nothing_converges_beside_a_bound_that_is_contradicted():
     assert max(-filtered["change_low"], filtered["change_high"]) < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("credulous")
 def test_a_verification_withholds_what_its_simulation_contradicts(monkeypatch):
     monkeypatch.setattr(verification, "_MULTIPLES", (1,))

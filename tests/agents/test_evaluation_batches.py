@@ -36,12 +36,13 @@ def test_answer_is_the_same_for_every_num_envs(env_id):
     assert len(answers[0].comparisons) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("policy", ["nominal", "random"])
 @pytest.mark.parametrize(
     ("env_id", "filters", "options"),
     [
         # Episodes that end at different times: out of the workspace, and at the goal.
-        ("Scalar-v0", ("none", "cbf:alpha=3"), {"noise": 0.9, "horizon": 3.0}),
+        ("Scalar-v0", ("none", "cbf:alpha=3"), {"noise": 0.9, "horizon": 3.0, "dt": 0.02}),
         ("DubinsObstacle-v0", ("none", "hocbf"), {"noise": 0.1, "start": [2.0, 1.3, 0.3, 0.5, 1.0], "horizon": 2.0}),
         # More control periods than the noise is drawn ahead for.
         ("StochasticDubins-v0", ("none", "scbf"), {"dt": 0.01, "horizon": 2.7, "substeps": 2}),
@@ -56,12 +57,13 @@ def test_long_and_ending_episodes_are_the_same_for_every_num_envs(policy, env_id
 
 
 def test_another_seed_is_another_answer():
-    first, second = (evaluate("Scalar-v0", episodes=20, seed=s, options={"horizon": 0.5}) for s in (0, 1))
+    first, second = (evaluate("Scalar-v0", episodes=20, seed=s, options={"horizon": 0.5}, bounds=False) for s in (0, 1))
     assert first.rows[0]["return_mean"] != second.rows[0]["return_mean"]
 
 
 def test_more_episodes_begin_with_the_same_ones():
-    few, many = (evaluate("Scalar-v0", "random", episodes=n, options={"horizon": 0.5}, num_envs=8, record=True) for n in (10, 25))
+    arguments = {"options": {"horizon": 0.5}, "num_envs": 8, "record": True, "bounds": False}
+    few, many = (evaluate("Scalar-v0", "random", episodes=n, **arguments) for n in (10, 25))
     for name, recorder in few.recorders.items():
         assert recorder.barrier.tobytes() == np.ascontiguousarray(many.recorders[name].barrier[:, :10]).tobytes()
 
@@ -138,13 +140,14 @@ def test_recorder_keeps_a_bounded_number_of_episodes():
     assert evaluate("Scalar-v0", filters=["none"], episodes=2, options={"horizon": 0.05}).recorders == {}
 
 
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_episodes():
     problem = load_problem("Scalar-v0", {"horizon": 0.02})
 
     def peak(episodes):
         tracemalloc.start()
         try:
-            evaluate(problem, filters=["none"], episodes=episodes, num_envs=128, record=True, bounds=False)
+            evaluate(problem, filters=["none"], episodes=episodes, num_envs=256, record=True, bounds=False)
             return tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()

@@ -15,6 +15,7 @@ from wrappers import BayesianSCBF
 from wrappers.learning import LearnedFileError, learner_of
 
 DISK = load_problem("CubicSDEDisk-v0", {"start": [-0.1, 0.7]})
+LINE = load_problem("Scalar-v0", {"start": [0.5], "noise": 0.5, "horizon": 0.5})
 LEARNED = ("bayesian-scbf", "bayesian-scbf:confidence=0.9")
 
 
@@ -27,7 +28,7 @@ def posterior():
 @pytest.fixture(scope="module")
 def repeated():
     """Three identifications."""
-    return evaluate(DISK, filters=["none", "scbf", *LEARNED], episodes=60, repeats=3, bounds=False)
+    return evaluate(LINE, filters=["none", "scbf", *LEARNED], episodes=40, repeats=3, bounds=False)
 
 
 def test_what_several_filters_rest_on_is_learned_once():
@@ -129,22 +130,22 @@ def test_the_answer_is_the_same_for_every_num_envs_and_from_a_file(env_id, name,
 
 @pytest.mark.slow
 def test_rows_of_repeats_are_sums_means_and_wider_intervals(repeated):
-    once = evaluate(DISK, filters=["none", "scbf", *LEARNED], episodes=60, bounds=False)
+    once = evaluate(LINE, filters=["none", "scbf", *LEARNED], episodes=40, bounds=False)
     for row, single in zip(repeated.rows, once.rows, strict=True):
         if row["learning"] is None:
             assert row == single
             continue
         learning = row["learning"]
         assert (learning["repeats"], len(learning["seeds"]), len(set(learning["sha256"]))) == (3, 3, 3)
-        assert row["episodes"] == 180
-        assert row["safe"] == round(60 * sum(learning["rates"]))
+        assert row["episodes"] == 120
+        assert row["safe"] == round(40 * sum(learning["rates"]))
         assert row["safety_rate"] == pytest.approx(np.mean(learning["rates"]))
         assert learning["rates"][0] == single["safety_rate"]
         assert row["ci_low"] <= row["safety_rate"] <= row["ci_high"]
         assert row["curve"]["rate"][-1] == pytest.approx(row["safety_rate"])
         assert row["curve"]["ci_low"][-1] == pytest.approx(row["ci_low"])
-        # Three identifications on the same 60 episodes are not 180 independent ones.
-        half = 1.96 * math.sqrt(row["safety_rate"] * (1 - row["safety_rate"]) / 180)
+        # Three identifications on the same 40 episodes are not 120 independent ones.
+        half = 1.96 * math.sqrt(row["safety_rate"] * (1 - row["safety_rate"]) / 120)
         assert row["ci_high"] - row["ci_low"] > 2 * half
 
 
@@ -154,13 +155,13 @@ def test_comparisons_of_repeats_have_no_p_value(repeated):
         learned = any(name in LEARNED for name in (comparison["first"], comparison["second"]))
         assert (comparison["mcnemar_p"] is None) == learned
         pairs = sum(comparison[key] for key in ("both", "only_first", "only_second", "neither"))
-        assert pairs == (180 if learned else 60)
+        assert pairs == (120 if learned else 40)
         assert comparison["ci_low"] <= comparison["difference"] <= comparison["ci_high"]
 
 
 @pytest.mark.slow
 def test_it_is_repeatable(repeated):
-    again = evaluate(DISK, filters=LEARNED[:1], episodes=60, repeats=3, num_envs=7, bounds=False)
+    again = evaluate(LINE, filters=LEARNED[:1], episodes=40, repeats=3, num_envs=7, bounds=False)
     assert again.rows[0] in repeated.rows
 
 

@@ -84,9 +84,9 @@ def test_geometric_martingale_of_probability_1e_8():
 @pytest.mark.slow
 def test_cruise_control_under_its_filter_has_the_gaussian_law():
     # At 10 m/s the desired speed is far off, so that the filter acts all the time and A h = 0: h is a walk.
-    exact = walk_passage(32.0, 100, 0.0, 1.8 * math.sqrt(0.1))
+    exact = walk_passage(32.0, 50, 0.0, 1.8 * math.sqrt(0.2))
     assert 1e-8 < exact < 2e-8
-    options = {"start": [10.0, 10.0, 50.0], "horizon": 10.0, "dt": 0.1}
+    options = {"start": [10.0, 10.0, 50.0], "horizon": 10.0, "dt": 0.2}
     assert_holds(row_of("safe_envs/ACC-v0", "scbf", options=options, particles=120), exact, 3.0)
 
 
@@ -127,12 +127,13 @@ def test_pilots_and_estimates_have_noise_of_their_own():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("episodes", [6_000, pytest.param(100_000, marks=pytest.mark.oracle)])
 @pytest.mark.parametrize(("policy", "monitoring"), [("nominal", "discrete"), ("random", "discrete"), ("nominal", "continuous")])
-def test_agrees_with_plain_episodes_where_these_do(policy, monitoring):
+def test_agrees_with_plain_episodes_where_these_do(policy, monitoring, episodes):
     # Random starts, and a box that is too small for some of them.
     options = {"noise": 0.3, "horizon": 1.0, "dt": 0.05, "box": [-1.0, 1.0]}
     arguments = {"filters": ["szcbf"], "options": options, "monitoring": monitoring}
-    (plain,) = evaluate("Scalar-v0", policy, episodes=10_000, confidence=0.99, bounds=False, **arguments).rows
+    (plain,) = evaluate("Scalar-v0", policy, episodes=episodes, confidence=0.99, bounds=False, **arguments).rows
     (rare,) = estimate_rare("Scalar-v0", policy, seed=3, particles=100, **arguments).rows
     assert rare["ci_low"] < 1 - plain["ci_low"]
     assert rare["ci_high"] > 1 - plain["ci_high"]

@@ -109,6 +109,7 @@ def test_values_and_flags_are_those_of_the_filter(registered):
     np.testing.assert_array_equal(stacked.numpy().reshape(u.shape), wanted.action)
 
 
+@pytest.mark.slow
 def test_gradients_pass_gradcheck(registered):
     module, x, u = registered
     decided = module.safety_filter.filter(x, u)
@@ -122,30 +123,34 @@ def test_gradients_pass_gradcheck(registered):
         assert torch.autograd.gradcheck(lambda x, u: module(x, unit * u) / unit, given, eps=1e-4, atol=1e-3, rtol=1e-3)
 
 
+@pytest.mark.parametrize("most", [12, pytest.param(60, marks=pytest.mark.oracle)])
 @pytest.mark.parametrize("m", [1, 2, 3])
 @pytest.mark.parametrize("k", [1, 3])
-def test_slopes_are_the_differences_of_the_filter(m, k):
+def test_slopes_are_the_differences_of_the_filter(m, k, most):
     module = TorchFilter(planar(m, k, seed=m))
     rng = np.random.default_rng(0)
     x, u = rng.normal(size=(60, 2)), 1.5 * rng.normal(size=(60, m))
-    decided = module.safety_filter.filter(x, u)
-    assert np.count_nonzero(decided.active.any(axis=-1)) > 10
-    assert assert_slopes(module, x, u) > 0.9 * len(x)
+    acting = module.safety_filter.filter(x, u).active.any(axis=-1)
+    assert np.count_nonzero(acting) > 10
+    chosen = np.concatenate([np.flatnonzero(part)[:most] for part in (acting, ~acting)])
+    assert assert_slopes(module, x[chosen], u[chosen]) > 0.9 * len(chosen)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [16, pytest.param(100, marks=pytest.mark.oracle)])
 @pytest.mark.parametrize("m", [1, 2, 4])
-def test_slopes_of_a_compromise(m):
+def test_slopes_of_a_compromise(m, size):
     module = TorchFilter(planar(m, 3, contradicting=True, seed=3))
     rng = np.random.default_rng(0)
-    x, u = rng.normal(size=(40, 2)), 1.5 * rng.normal(size=(40, m))
+    x, u = rng.normal(size=(size, 2)), 1.5 * rng.normal(size=(size, m))
     assert not module.safety_filter.filter(x, u).feasible.any()
-    assert assert_slopes(module, x, u) > 30
+    assert assert_slopes(module, x, u) > 0.75 * size
 
 
 def test_contradicting_rows_on_many_inputs_have_a_finite_slope():
     module = TorchFilter(planar(4, 2, contradicting=True, seed=3))
     rng = np.random.default_rng(0)
-    x, u = (torch.tensor(rng.normal(size=(400, size)), requires_grad=True) for size in (2, 4))
+    x, u = (torch.tensor(rng.normal(size=(150, size)), requires_grad=True) for size in (2, 4))
     result = module(x, u, return_result=True)
     assert not result.feasible.any()
     slopes = torch.cat(torch.autograd.grad(result.action.sum(), (x, u)), dim=1)
@@ -159,13 +164,13 @@ def test_the_flag_of_gradients_does_not_hang_on_whether_one_was_asked_for(monkey
     monkeypatch.setattr(torch_filter, "_AGREED", 0.0)
     module = TorchFilter(planar(4, 2, contradicting=True, seed=3))
     rng = np.random.default_rng(0)
-    x, u = (torch.tensor(rng.normal(size=(400, size))) for size in (2, 4))
+    x, u = (torch.tensor(rng.normal(size=(150, size))) for size in (2, 4))
     given = x.clone().requires_grad_(), u.clone().requires_grad_()
     wanted = module(*given, return_result=True)
     plain = module(x, u, return_result=True)
     with torch.no_grad():
         unasked = module(x, u.clone().requires_grad_(), return_result=True)
-    assert 0 < torch.count_nonzero(wanted.differentiable) < 400
+    assert 0 < torch.count_nonzero(wanted.differentiable) < 150
     slopes = torch.cat(torch.autograd.grad(wanted.action.sum(), given), dim=1)
     assert torch.count_nonzero(slopes[~wanted.differentiable]) == 0
     for found in (plain, unasked):
@@ -260,14 +265,13 @@ def test_learning_through_the_filter():
     x = torch.tensor(0.5 * np.random.default_rng(0).normal(size=(64, 2)), dtype=torch.float32)
     wanted = module(x, x @ torch.tensor([[1.0, -0.5], [0.3, 1.0]]))
     weights = torch.zeros(2, 2, requires_grad=True)
-    optimizer = torch.optim.Adam([weights], lr=0.1)
     losses, intervened = [], False
     for _ in range(15):
         found = module(x, x @ weights, return_result=True)
         loss = (found.action - wanted).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+        (slope,) = torch.autograd.grad(loss, weights)
+        with torch.no_grad():
+            weights -= 2.0 * slope
         losses.append(loss.item())
         intervened |= bool(found.active.any())
     assert intervened

@@ -34,11 +34,12 @@ def short(monkeypatch):
     monkeypatch.setattr(verification, "STARTS", 1024)
 
 
+@pytest.mark.slow
 def test_the_product_bound_of_the_stochastic_dubins_is_contradicted(monkeypatch):
     monkeypatch.setattr(verification, "_MULTIPLES", (1,))
     monkeypatch.setattr(verification, "_LONG_MULTIPLES", (30,))
     # With the default noise of .2 it takes four times as long.
-    _, at_best = measured("safe_envs/StochasticDubins-v0", episodes=60, noise=0.4)
+    _, at_best = measured("safe_envs/StochasticDubins-v0", episodes=60, noise=0.4, dt=0.1)
     assert at_best.state is not None
     first, last = at_best.horizons
     assert (first.time, last.time) == (5.0, 150.0)
@@ -53,6 +54,7 @@ def test_the_product_bound_of_the_stochastic_dubins_is_contradicted(monkeypatch)
     assert not any("repaired" in name for name in contradicted(at_best))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_the_cubic_disk_contradicts_the_bound_whose_hypothesis_fails():
     from_start, at_best = measured(CUBIC_DISK)
@@ -69,20 +71,25 @@ def test_the_cubic_disk_contradicts_the_bound_whose_hypothesis_fails():
         assert estimated <= horizon.ci_high
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
-def test_the_estimated_bound_of_the_pendulum_holds():
+def test_the_estimated_bound_of_the_pendulum_holds(monkeypatch):
+    monkeypatch.setattr(verification, "_MULTIPLES", (1, 4))
     measurements = measured("safe_envs/Pendulum-v0")
     assert len(measurements) == 2
     assert not any(contradicted(m) for m in measurements)
     assert all(b.status == "estimated" for m in measurements for h in m.horizons for b in h.bounds)
 
 
+@pytest.mark.usefixtures("short")
 def test_without_a_bound_there_is_one_measurement_and_nothing_to_contradict():
     (only,) = measured("safe_envs/Scalar-v0", "cbf", episodes=10, horizon=2.0, start=[0.5])
     np.testing.assert_array_equal(only.state, [0.5])
     assert all(h.bounds == () for h in only.horizons)
 
 
+@pytest.mark.slow
+@pytest.mark.usefixtures("short")
 def test_a_mismatched_model_contradicts_its_promise():
     (only,) = measured("safe_envs/DubinsDisk-v0", episodes=1, start="valid", horizon=5.0)
     assert only.repeats
@@ -109,7 +116,7 @@ def test_starts_are_one_or_many():
 def test_an_unknown_policy_is_an_error():
     problem = problem_of(CUBIC_DISK)
     with pytest.raises(ConfigurationError, match="unknown policy"):
-        measure(verify_once(problem, parse_conditions("scbf", problem), samples=256), "nobody")
+        measure(verify_once(problem, parse_conditions("scbf", problem), samples=512), "nobody")
 
 
 @pytest.mark.parametrize(("trials", "error"), [(50, 0.005), (500, 0.00125)])

@@ -252,7 +252,8 @@ def test_classes_are_documented(env_id):
 
 
 def test_a_problem_is_stated_once_for_the_same_arguments():
-    first, again, other = (problem_of("safe_envs/DubinsDisk-v0", radius=radius) for radius in (2.0, 2.0, 3.0))
+    envs = [gym.make("safe_envs/DubinsDisk-v0", radius=radius) for radius in (2.0, 2.0, 3.0)]
+    first, again, other = (env.unwrapped.problem for env in envs)  # pyright: ignore[reportAttributeAccessIssue]
     assert first.barriers[0] is again.barriers[0]
     assert first.barriers != other.barriers
     # What cannot be looked up is an error of ours all the same.

@@ -8,6 +8,8 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from safe_envs import ConfigurationError
+from safe_envs.vector import SafeVectorEnv
+from tests.conftest import problem_of
 from wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
 NUM_ENVS = 5
@@ -179,3 +181,13 @@ def test_reset_masks_are_checked():
     for mask in (np.array([True]), np.array([1, 0]), np.array([False, False])):
         with pytest.raises(ConfigurationError, match="reset_mask"):
             env.reset(options={"reset_mask": mask})
+
+
+def test_a_fixed_start_is_that_of_every_env_and_draws_nothing():
+    envs = SafeVectorEnv(problem_of("safe_envs/DubinsObstacle-v0", start=[2.0, 1.3, 0.3, 0.5, 1.0]), 3)
+    envs.reset(seed=0)
+    np.testing.assert_array_equal(envs.state, [[2.0, 1.3, 0.3, 0.5, 1.0]] * 3)
+    before = [rng.bit_generator.state for rng in envs._rngs]
+    envs.reset(options={"reset_mask": np.array([True, False, True])})
+    np.testing.assert_array_equal(envs.state, [[2.0, 1.3, 0.3, 0.5, 1.0]] * 3)
+    assert [rng.bit_generator.state for rng in envs._rngs] == before

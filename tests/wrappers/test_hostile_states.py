@@ -92,6 +92,7 @@ def situations(draw, names):
     return safety_filter, x, draw(st.one_of(near, st.tuples(*[NUMBER] * safety_filter.model.m)))
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(situations([(name, text) for name, texts in FILTERS.items() for text in texts]))
 def test_answers_are_sound_or_errors(situation):

@@ -221,6 +221,7 @@ def programs(draw):
     return a, [draw(ENTRY) * scale for _ in range(k)], [draw(ENTRY) for _ in range(m)], half, draw(st.sampled_from([1.0, 1e-8, 1e8]))
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(programs())
 def test_one_state_equals_a_batch_at_any_scale(program):

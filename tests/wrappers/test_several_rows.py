@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
+from wrappers.qp import proxqp
 from wrappers.qp.several_rows import project_arrays, project_floats
 
 
@@ -170,3 +171,16 @@ def test_flat_rows_of_many_inputs_are_exact():
         assert feasible is met
         assert (margin[2], active[2]) == (flat, not met)
         np.testing.assert_allclose(u, project_floats(rows[:2], [-0.5, -0.5], *box[:4], [1.0] * 2)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("gap", [1e-6, 1.0, 100.0])
+def test_rows_that_contradict_are_not_handed_to_the_general_solver(gap, monkeypatch):
+    monkeypatch.setattr(proxqp, "_solve", lambda _: pytest.fail("ProxQP was asked"))
+    # s >= gap and -2 s >= 2 gap for s = u_1 + u_2, with the priorities 1 and 3/4, beside an input on which no row depends.
+    a, b = np.array([[[1.0, 1.0, 0.0], [-2.0, -2.0, 0.0]]]), np.array([[-gap, -2.0 * gap]])
+    ends = np.full((1, 3), 1000.0)
+    u, margin, _, feasible = proxqp.project(a, b, np.array([[0.0, 0.0, 5.0]]), -ends, ends, np.ones((1, 3)), np.array([1.0, 0.75]))
+    # The sum (gap - s)^2 + 3 (gap + s)^2 is least at s = -gap/2.
+    np.testing.assert_allclose(u, [[-gap / 4, -gap / 4, 5.0]], rtol=1e-12)
+    np.testing.assert_allclose(margin, [[-1.5 * gap, -gap]], rtol=1e-12)
+    assert not feasible.any()

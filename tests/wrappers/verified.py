@@ -56,15 +56,15 @@ def made_bound(problem, text="scbf"):
     return estimated_bound(problem, parse_conditions(text, problem))
 
 
-def findings(env_id, text=None, knowledge="model", **options):
+def findings(env_id, text=None, knowledge="model", samples=survey.SAMPLES, **options):
     """What is found of a registered id, once for all tests."""
     problem = problem_of(env_id, **options)
-    return verify_once(problem, parse_conditions(text or problem.filter, problem), knowledge)
+    return verify_once(problem, parse_conditions(text or problem.filter, problem), knowledge, samples)
 
 
 def hurried(env_id):
-    """What is found of a registered id by a search that was hurried, once for all tests."""
-    problem = problem_of(env_id)
+    """What is found of a registered id by a search that was hurried, once for all tests; of many obstacles, with two."""
+    problem = problem_of(env_id, **({"num_obstacles": 2} if "DubinsObstacles" in env_id else {}))
     return verify_once(problem, parse_conditions(problem.filter, problem), samples=128)
 
 

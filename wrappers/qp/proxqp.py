@@ -52,7 +52,12 @@ def project(
         priority: positive weights of the squared slacks, shape (k,).
     """
     problem = _Problem(a, b, v, low, high, w)
-    u, certain = problem.certified(*_solve(_Scaled.of(problem)))
+    u, certain = np.empty_like(v), np.zeros(len(v), dtype=bool)
+    # ProxQP takes long to say that rows cannot be met, and its answer is of no use then.
+    left = np.flatnonzero(~problem.contradictory())
+    if left.size:
+        part = _Problem(*[numbers[left] for numbers in problem])
+        u[left], certain[left] = part.certified(*_solve(_Scaled.of(part)))
     for i in np.flatnonzero(~certain).tolist():
         u[i] = active_set.project(a[i], b[i], v[i], low[i], high[i], w[i], priority)
     u = problem.tidied(u)
@@ -77,6 +82,22 @@ class _Problem(NamedTuple):
     def tolerance(self, u: np.ndarray) -> Any:
         """By how much the rows may miss there (B, k)."""
         return tolerances(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
+
+    def contradictory(self) -> np.ndarray:
+        """Where a row, or two rows of unit length together, miss by more than rounding at every input in the box (B,).
+
+        It finds opposite rows, not every set of rows that cannot be met.
+        """
+        with np.errstate(all="ignore"):
+            lengths = np.linalg.norm(self.a, axis=2)
+            lengths = np.where(lengths > np.finfo(float).tiny, lengths, 1.0)
+            a, b = self.a / lengths[:, :, None], self.b / lengths
+            low, high = self.low[:, None, :], self.high[:, None, :]
+            allowed = tolerances(np.moveaxis(a, 2, 0), b, np.moveaxis(np.maximum(np.abs(low), np.abs(high)), 2, 0))
+            first, second = np.triu_indices(a.shape[1])
+            sums = a[:, first] + a[:, second]
+            most = b[:, first] + b[:, second] + np.maximum(sums * low, sums * high).sum(axis=2)
+            return (most < -2.0 * (allowed[:, first] + allowed[:, second])).any(axis=1)
 
     def tidied(self, u: np.ndarray) -> np.ndarray:
         """The inputs without the rounding that other inputs brought in.

@@ -174,6 +174,7 @@ def test_the_truth_is_within_what_is_known(cubic: Posterior):
     assert pairs["covariance[x_1, x_1]"][0] == pytest.approx(0.04)
 
 
+@pytest.mark.slow
 def test_variances_of_the_drift_are_those_of_draws(gap: Posterior):
     x = draw_states(acc_gap(), 3, np.random.default_rng(0))
     variance = gap.drift_variance(x)

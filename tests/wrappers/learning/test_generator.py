@@ -74,6 +74,7 @@ def test_first_order_is_learned(top, first_order):
     assert first_order.record.errors["M_1(h), standard error of labels"] < 0.1 * np.abs(truth).max()
 
 
+@pytest.mark.slow
 def test_recursion_is_the_second_order_generator(gap, recursion):
     x = states_in(gap)
     ((truth, estimate),) = recursion.compare(gap, x).values()

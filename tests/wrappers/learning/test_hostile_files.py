@@ -178,6 +178,7 @@ def test_what_these_tests_write_is_taken_where_nothing_was_changed(request, tmp_
     assert found.sha256 == model.sha256
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=25, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
 @hypothesis.given(data=st.data())
 @LEARNED

@@ -99,6 +99,7 @@ def test_the_printed_central_difference_gives_half_of_the_gain(disk):
     assert np.polyfit(gain, model_gain + labels[:, 2], 1)[0] == pytest.approx(1.0, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_the_residuals_are_learned(disk, learned):
     x = draw_states(disk, 1000, np.random.default_rng(77))
     compared = learned.compare(disk, x)
