@@ -98,7 +98,7 @@ def tidied(expression: Any) -> sp.Expr:
     if expression.count_ops() > _LARGEST_TIDIED or _expanded_terms(expression) > _MOST_TERMS:
         return expression
     # An exponential that is taken apart may overflow in one factor and vanish in the other.
-    expanded = sp.expand(TR5(sp.expand(expression, power_exp=False)), power_exp=False)
+    expanded = expression if expression.has(sp.exp) else sp.expand(TR5(sp.expand(expression)))
     return min((expression, sp.factor_terms(expression), sp.factor_terms(expanded)), key=sp.count_ops)
 
 
