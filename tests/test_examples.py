@@ -12,6 +12,8 @@ from agents import evaluate
 from safe_envs.systems import CUSTOM_ID
 from scripts.cli import app
 
+pytestmark = pytest.mark.slow
+
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SYSTEMS = ("cart_pole.py", "double_integrator.py", "bicycle.py")
 

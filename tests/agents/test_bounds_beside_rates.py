@@ -12,6 +12,8 @@ from agents import evaluate
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.problem import Start, Variable
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.slow
 def test_bounds_stand_beside_the_rates_or_say_why_not():

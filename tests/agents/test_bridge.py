@@ -18,6 +18,8 @@ from agents.nominal import RandomPolicy
 from safe_envs import ConfigurationError
 from tests.agents.laws import X, brownian, first_passage, walk_passage
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(("before", "after"), [(1.0, 0.4), (0.2, 0.9), (0.3, 0.3), (0.1, -0.2)])
 def test_minimum_has_the_law_of_a_brownian_bridge(before, after):

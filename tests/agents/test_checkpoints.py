@@ -22,6 +22,8 @@ from agents.training import Training
 from safe_envs import ConfigurationError
 from tests.full_disk import no_file_larger_than
 
+pytestmark = pytest.mark.slow
+
 DUBINS = "safe_envs/StochasticDubins-v0"
 SAC = {"learning_starts": 16, "batch_size": 16, "train_freq": 4, "gradient_steps": 1, "policy_kwargs": {"net_arch": [8]}}
 PPO = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}

@@ -18,6 +18,8 @@ from agents.statistics import log_normal_interval
 from safe_envs import ControlAffineSDE, state_problem
 from tests.agents.laws import X, brownian, first_passage, walk_passage
 
+pytestmark = pytest.mark.slow
+
 
 def both(problem, bridge=None):
     how = (lambda lengths: DriftingEnv(problem, lengths), NominalController(problem), 0, 4096, bridge)

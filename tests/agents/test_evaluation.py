@@ -12,6 +12,8 @@ import pytest
 from agents import evaluate, load_problem
 from tests.agents.evaluated import Constant, Schedule, replay, safe_so_far
 
+pytestmark = pytest.mark.slow
+
 COUNTS = ("episodes", "safe", "violations")
 MEASURES = ("safety_rate", "ci_low", "ci_high", "min_h_median", "min_h_p05", "effort_mean", "return_mean")
 RATES = ("intervention_rate", "infeasible_rate")

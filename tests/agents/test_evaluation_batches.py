@@ -13,6 +13,8 @@ from agents.episodes import Recorder, run_episodes
 from safe_envs import ConfigurationError, RelativeDegreeError
 from safe_envs.vector import SafeVectorEnv
 
+pytestmark = pytest.mark.slow
+
 
 def assert_same_to_the_bit(first, second):
     assert json.dumps(first.rows) == json.dumps(second.rows)

@@ -11,6 +11,8 @@ from agents import evaluate, load_problem
 from agents.statistics import mcnemar_p, paired_difference_interval, rate_interval
 from safe_envs import ConfigurationError
 
+pytestmark = pytest.mark.slow
+
 
 def test_comparisons_are_of_the_same_episodes():
     filters = ["none", "hocbf:p=1,2", "scbf"]

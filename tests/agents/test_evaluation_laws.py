@@ -14,6 +14,8 @@ from agents.statistics import wilson_interval
 from tests.agents.evaluated import Constant, Levelling
 from tests.agents.laws import survival
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "tolerance"), [("policy", 0.999), ("filter", 0.999)])

@@ -15,6 +15,8 @@ from safe_envs.errors import ConfigurationError
 from scripts.cli import app
 from wrappers import FilterSpec, SafetyFilterWrapper
 
+pytestmark = pytest.mark.slow
+
 PLACE = f"{Path(__file__).parent.parent.parent / 'examples' / 'pendulum_v1.py'}:spec"
 SPEC = FilterSpec.load(PLACE)
 FEW = {"spec": SPEC, "episodes": 4}

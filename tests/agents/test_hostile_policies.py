@@ -26,6 +26,8 @@ from tests.agents.test_weights import small
 from tests.safe_envs.test_reading import damaged_by
 from tests.wrappers.learning.test_hostile_files import changed
 
+pytestmark = pytest.mark.slow
+
 ENV_ID = "safe_envs/StochasticDubins-v0"
 
 

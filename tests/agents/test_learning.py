@@ -14,6 +14,8 @@ from safe_envs import ConfigurationError
 from wrappers import BayesianSCBF
 from wrappers.learning import LearnedFileError, learner_of
 
+pytestmark = pytest.mark.slow
+
 DISK = load_problem("CubicSDEDisk-v0", {"start": [-0.1, 0.7]})
 LINE = load_problem("Scalar-v0", {"start": [0.5], "noise": 0.5, "horizon": 0.5})
 LEARNED = ("bayesian-scbf", "bayesian-scbf:confidence=0.9")

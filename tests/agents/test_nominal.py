@@ -10,6 +10,8 @@ from scipy.optimize import minimize_scalar
 from agents import NominalController, RandomPolicy, ZeroController, load_problem, make_policy
 from safe_envs import ConfigurationError, InvalidInputError, NumericalError, SafeEnv
 
+pytestmark = pytest.mark.slow
+
 NAMES = ["nominal", "zero", "random"]
 
 

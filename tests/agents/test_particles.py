@@ -10,6 +10,8 @@ from agents.drifting import DriftingEnv
 from agents.particles import Particles, Records
 from tests.agents.laws import X, brownian
 
+pytestmark = pytest.mark.slow
+
 
 class Watching(ZeroController):
     """Keeps what it sees beside the states that it is of."""

@@ -17,6 +17,8 @@ from agents import evaluate
 from agents.policy import Policy
 from safe_envs.errors import ConfigurationError, WorkersLostError
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_answer_does_not_depend_on_the_number_of_processes():
     told = []

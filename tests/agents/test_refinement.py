@@ -13,6 +13,8 @@ from agents.statistics import paired_difference_interval
 from safe_envs import ConfigurationError
 from tests.agents.laws import survival
 
+pytestmark = pytest.mark.slow
+
 SCALAR = {"start": [0.5], "noise": 0.8, "box": [-100.0, 100.0]}
 
 

@@ -19,6 +19,8 @@ from agents.sb3_env import make_sb3_env
 from safe_envs import ConfigurationError
 from wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
+pytestmark = pytest.mark.slow
+
 ENV_ID = "safe_envs/StochasticDubins-v0"
 BOX = (-3.0, 5.0)
 SETTINGS = {"buffer_size": 600, "learning_starts": 20, "batch_size": 8, "train_freq": 4, "device": "cpu", "seed": 3}

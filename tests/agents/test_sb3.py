@@ -15,6 +15,8 @@ from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from agents import evaluate, load_problem, make_policy, refine
 from safe_envs import ConfigurationError
 
+pytestmark = pytest.mark.slow
+
 ENV_ID = "safe_envs/StochasticDubins-v0"
 OPTIONS = {"horizon": 0.5}
 OFF_POLICY = {"buffer_size": 500, "learning_starts": 50, "batch_size": 16}

@@ -11,6 +11,8 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from agents.sb3_env import make_sb3_env
 from agents.sb3_speed import speeds
 
+pytestmark = pytest.mark.slow
+
 DUBINS = "safe_envs/StochasticDubins-v0"
 
 

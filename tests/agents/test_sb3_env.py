@@ -15,6 +15,8 @@ from safe_envs import ConfigurationError, InvalidInputError
 from tests.conftest import problem_of
 from wrappers import SCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 
+pytestmark = pytest.mark.slow
+
 DUBINS = "safe_envs/StochasticDubins-v0"
 NUM_ENVS = 3
 

@@ -11,6 +11,8 @@ import pytest
 
 from agents.sb3_env import make_sb3_env
 
+pytestmark = pytest.mark.slow
+
 DUBINS = "safe_envs/StochasticDubins-v0"
 
 READINGS = {

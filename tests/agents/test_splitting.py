@@ -23,6 +23,8 @@ from safe_envs.barrier import Barrier
 from scripts.reproduce.martingale import attaining_problem
 from tests.agents.laws import X, brownian, first_passage, martingale_passage, walk_passage
 
+pytestmark = pytest.mark.slow
+
 SHORT: dict[str, Any] = {"particles": 100, "repetitions": 10}
 
 

@@ -13,6 +13,8 @@ from agents import sweep_cell
 from agents.sweep import sweep_of
 from agents.sweep_cell import compute, versions
 
+pytestmark = pytest.mark.slow
+
 
 def test_versions_change_with_each_byte_and_name_of_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sweep_cell, "files", lambda package: tmp_path / package)

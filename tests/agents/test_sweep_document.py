@@ -16,6 +16,8 @@ from agents.sweep import read_sweep, sweep_of
 from agents.sweep_document import document_in, value_of
 from safe_envs.errors import ConfigurationError
 
+pytestmark = pytest.mark.slow
+
 _SECONDS = 2.0
 
 

@@ -13,6 +13,8 @@ from agents.sweep_cell import Cell, Outcome
 from agents.sweep_run import Place, run
 from safe_envs.errors import ConfigurationError, WorkersLostError
 
+pytestmark = pytest.mark.slow
+
 CELLS = [Cell({"number": k}) for k in range(8)]
 NUMBERS = {cell.key: cell.settings["number"] for cell in CELLS}
 ENDED = "the process that computed it ended: it went away"

@@ -25,6 +25,8 @@ from agents.sweep_run import Place, run
 from agents.sweep_store import Store, read
 from safe_envs.errors import ConfigurationError
 
+pytestmark = pytest.mark.slow
+
 # With "ends", the first process that simulates it is killed, in the middle of the cell; with "kills", every one but that of the tests.
 SYSTEM = """
 import os, signal

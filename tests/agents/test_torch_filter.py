@@ -15,6 +15,8 @@ from agents.torch_filter import TorchFilter
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, InvalidInputError
 from wrappers import CBF, SafetyFilter, parse_conditions
 
+pytestmark = pytest.mark.slow
+
 FILTERS = {
     "scbf, m = 1": ("StochasticDubins", "scbf"),
     "scbf, m = 4": ("Quadrotor", "scbf"),

@@ -22,6 +22,8 @@ from agents.trainer import _Session, train
 from agents.training import Training
 from safe_envs import ConfigurationError
 
+pytestmark = pytest.mark.slow
+
 DUBINS = "safe_envs/StochasticDubins-v0"
 SMALL = {"num_envs": 4, "eval_episodes": 8, "options": {"horizon": 0.5}}
 

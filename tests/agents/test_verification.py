@@ -15,6 +15,8 @@ from tests.wrappers.verified import verify_once
 from wrappers import parse_conditions
 from wrappers.promise import Bound
 
+pytestmark = pytest.mark.slow
+
 CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
 
 

@@ -23,6 +23,8 @@ from agents.weights import NetworkPolicy, load_policy, save_policy
 from safe_envs import ConfigurationError
 from safe_envs.errors import InvalidInputError
 
+pytestmark = pytest.mark.slow
+
 ENV_ID = "safe_envs/StochasticDubins-v0"
 OFF_POLICY = {"buffer_size": 10}
 NN = torch.nn

@@ -25,6 +25,8 @@ from agents.rare import estimate_rare
 from safe_envs import ENV_IDS
 from wrappers import CONDITIONS, LEARNED
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))

@@ -13,6 +13,8 @@ from tests.conftest import problem_of
 from tests.safe_envs.drawn import DUBINS, FILTER_STATUS, PANEL, SAFETY_STATUS, SCENE, shown, stepped
 from wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
+pytestmark = pytest.mark.slow
+
 
 def test_every_env_is_drawn(env_id):
     env = SafeEnv(problem_of(env_id), render_mode="rgb_array")

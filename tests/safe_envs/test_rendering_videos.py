@@ -12,6 +12,8 @@ from agents import make_sb3_env
 from tests.safe_envs.drawn import DUBINS, stepped
 from wrappers import SafetyFilterWrapper
 
+pytestmark = pytest.mark.slow
+
 
 def frames_in(path) -> list[np.ndarray]:
     import imageio_ffmpeg

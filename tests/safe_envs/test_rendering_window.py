@@ -15,6 +15,8 @@ from safe_envs import ConfigurationError, SafeEnv
 from tests.conftest import problem_of
 from tests.safe_envs.drawn import DUBINS, stepped
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def no_display(monkeypatch):

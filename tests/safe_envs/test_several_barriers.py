@@ -15,6 +15,8 @@ from safe_envs import ConfigurationError, SystemDefinitionError
 from safe_envs.calculus import drift_derivative
 from tests.conftest import problem_of
 
+pytestmark = pytest.mark.slow
+
 FIELD = "safe_envs/DubinsObstacles-v0"
 LIMITS = "safe_envs/QuadrotorLimits-v0"
 

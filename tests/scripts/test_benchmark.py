@@ -17,6 +17,8 @@ from safe_envs.errors import ConfigurationError
 from scripts import benchmark
 from wrappers import SafetyFilterWrapper
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def quick(monkeypatch):

@@ -17,6 +17,8 @@ import safe_envs
 from scripts import cli
 from tests.scripts.conftest import strictly
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 DUBINS = "safe_envs/StochasticDubins-v0"
 QUICK = ("--episodes", "8", "--horizon", "0.3")

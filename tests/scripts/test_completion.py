@@ -16,6 +16,8 @@ from scripts.reproduce.catalogue import ARTEFACTS
 from wrappers import CONDITIONS
 from wrappers.conditions import LEARNED
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_words_are_those_that_are_known():
     assert ("none", *CONDITIONS, *LEARNED) == completion.FILTERS

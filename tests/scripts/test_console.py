@@ -17,6 +17,8 @@ from scripts import cli, console
 from scripts.console import run
 from tests.wrappers.verified import verify_once
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 SCRIPTS = {"list": "listing.py", "reproduce": "reproduce/command.py"}
 QUICK = ("evaluate", "Scalar-v0", "--filter", "none", "--filter", "scbf", "--episodes", "8", "--horizon", "0.2")

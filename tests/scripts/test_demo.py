@@ -6,6 +6,8 @@ import pytest
 
 from scripts import demo
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.slow
 def test_demo_prints_two_tables_and_leaves_a_policy_and_two_pictures(tmp_path, capsys):

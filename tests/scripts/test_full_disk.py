@@ -8,6 +8,8 @@ import yaml
 from scripts import console
 from tests.full_disk import no_file_larger_than
 
+pytestmark = pytest.mark.slow
+
 SCALAR = ("Scalar-v0", "--horizon", 0.2, "--episodes", 5)
 TRAINED = ("Scalar-v0", "--algo", "ppo", "--n-timesteps", 64, "--num-envs", 2, "--eval-episodes", 2, "--set", "n_steps=16")
 

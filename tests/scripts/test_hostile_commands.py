@@ -7,6 +7,8 @@ import os
 
 import pytest
 
+pytestmark = pytest.mark.slow
+
 SCALAR = ("evaluate", "Scalar-v0", "--episodes", 2)
 TRAIN = ("train", "Scalar-v0", "--algo", "ppo", "--n-timesteps", 64, "--out", "run", "--set")
 LONG = "x" * 100_000

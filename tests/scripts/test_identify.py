@@ -20,6 +20,8 @@ from wrappers.learning import METHODS, learner_of, load_learned
 from wrappers.learning.collect import collect
 from wrappers.learning.transitions import Transitions
 
+pytestmark = pytest.mark.slow
+
 SMALL = ("--set", "starts=10", "--set", "steps=20", "--set", "repetitions=10")
 BAYESIAN = ("CubicSDEDisk-v0", "--method", "bayesian", *SMALL, "--set", "degree=2")
 NETWORK = ("Pendulum-v0", "--method", "ddscbf", "--set", "points=20", "--set", "repetitions=50")

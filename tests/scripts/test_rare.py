@@ -8,6 +8,8 @@ import pytest
 
 from tests.scripts.conftest import strictly
 
+pytestmark = pytest.mark.slow
+
 ACC = ("evaluate", "safe_envs/ACC-v0", "--filter", "scbf", "--start=10,10,40", "--horizon", "6", "--dt", "0.1")
 FEW = ("--particles", "50", "--repetitions", "10")
 

@@ -20,6 +20,8 @@ from scripts.render import frames_of, split_filters
 from tests.conftest import problem_of
 from wrappers import SafetyFilterWrapper
 
+pytestmark = pytest.mark.slow
+
 
 def render(*arguments: str):
     return CliRunner().invoke(app, ["render", *arguments])

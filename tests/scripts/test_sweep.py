@@ -15,6 +15,8 @@ import pytest
 from agents.sweep_store import read
 from tests.scripts.conftest import strictly
 
+pytestmark = pytest.mark.slow
+
 SPEC = """
 fixed: {env: Scalar-v0, episodes: 20, horizon: 0.2}
 grid:

@@ -11,6 +11,8 @@ from agents.statistics import rate_interval, repeated_interval
 from scripts import sweep_figure
 from scripts.sweep_figure import Layout, _rate, draw
 
+pytestmark = pytest.mark.slow
+
 FILTERS = ("none", "scbf")
 SWEPT = ("filter", "noise", "dt", "seed")
 

@@ -10,6 +10,8 @@ import pytest
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
 
+pytestmark = pytest.mark.slow
+
 DUBINS = "safe_envs/StochasticDubins-v0"
 QUICK = ("--n-timesteps", 512, "--num-envs", 4, "--eval-freq", 256, "--eval-episodes", 8, "--horizon", 0.5)
 

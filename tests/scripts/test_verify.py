@@ -11,6 +11,8 @@ from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
 from tests.wrappers.verified import verify_once
 
+pytestmark = pytest.mark.slow
+
 CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
 
 

@@ -26,6 +26,8 @@ from wrappers import (
 )
 from wrappers.learning.regression import Gaussian
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cubic", "gap"])

@@ -18,6 +18,8 @@ from safe_envs.codegen import compile_function
 from tests.conftest import problem_of
 from wrappers import parse_conditions
 
+pytestmark = pytest.mark.slow
+
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 _STEP = 2e-3

@@ -14,6 +14,8 @@ from tests.conftest import problem_of
 from wrappers import ClassK, parse_conditions, spec_of
 from wrappers.conditions.class_k import S
 
+pytestmark = pytest.mark.slow
+
 SCALAR = problem_of("safe_envs/Scalar-v0")
 
 _SECONDS = 2.0

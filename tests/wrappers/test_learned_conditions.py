@@ -31,6 +31,8 @@ from wrappers import (
     parse_conditions,
 )
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(("name", "degree"), [("top", 1), ("gap", 2)])
 def test_exact_generators_make_the_filter_of_the_known_noise(request, name, degree):

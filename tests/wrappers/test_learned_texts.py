@@ -30,6 +30,8 @@ from wrappers.formulas import Formulas
 from wrappers.learning.files import LearnedFileError
 from wrappers.verify import verify
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(params=["residual", "network", "diffusion", "most probable", "confident", "simultaneous"])
 def kept(request, tmp_path):

@@ -18,6 +18,8 @@ from wrappers import SCBF, BayesianSCBF, SafetyFilter, SafetyFilterVectorWrapper
 from wrappers.learning.bayesian import identify
 from wrappers.posterior_bound import posterior_bound
 
+pytestmark = pytest.mark.slow
+
 START = (0.0, 0.6)
 
 

@@ -33,6 +33,8 @@ from wrappers.safe_set import draw_starts
 from wrappers.survey import unbounded
 from wrappers.verify import verify
 
+pytestmark = pytest.mark.slow
+
 
 def test_scbf_fails_near_the_centre_of_the_cubic_disk():
     found = findings(CUBIC_DISK)

@@ -18,6 +18,8 @@ from wrappers.learning.bayesian import identify
 from wrappers.learning.posterior import Diffusion
 from wrappers.posterior_bound import posterior_bound
 
+pytestmark = pytest.mark.slow
+
 TIMES = 40
 # The share of so many that are right with the probability .95 is within three standard deviations of it.
 LEAST = 0.95 - 3 * math.sqrt(0.05 * 0.95 / TIMES)

@@ -33,6 +33,8 @@ from wrappers.safe_set import draw_starts
 from wrappers.survey import Survey
 from wrappers.verify import _infeasible, verify
 
+pytestmark = pytest.mark.slow
+
 STATUSES = {"estimated", "withheld", "hypothesis fails", "no bound", "not established"}
 
 

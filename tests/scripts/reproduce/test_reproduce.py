@@ -30,6 +30,8 @@ from scripts.reproduce.store import keep, read, source_checksum
 from tests.scripts.conftest import strictly
 from tests.scripts.reproduce.test_chapter_6 import outcome as outcome_of
 
+pytestmark = pytest.mark.slow
+
 ALL = [f"figure-{n}" for n in ("3.1", "3.2a", "3.2b", "3.3", "4.1", "4.2", "4.3", "5.1", "5.2", "5.3a", "5.3b", "5.3c", "5.3d")]
 ALL += (
     [f"figure-6.{n}" for n in range(1, 5)] + [f"table-{n}" for n in ("4.1", "5.1", "5.2", "6.1", "6.2", "6.3", "6.4")] + ["example-4.2.2"]

@@ -26,6 +26,8 @@ from wrappers.learning.posterior import Posterior
 from wrappers.learning.regression import Rows, posterior
 from wrappers.learning.transitions import Transitions
 
+pytestmark = pytest.mark.slow
+
 CUBIC = cubic_sde_disk()
 PLACES = np.array([[0.0, 0.0], [0.5, -0.3], [-0.6, 0.6]])
 FLAT = Prior(1e4, 1.0, 1.0)

@@ -18,6 +18,8 @@ from wrappers.learning.files import LearnedFileError, Signature, load
 from wrappers.learning.generator import GeneratorModel, learn_generator
 from wrappers.learning.transitions import Transitions
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def first_order(top):

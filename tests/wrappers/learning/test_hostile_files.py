@@ -26,6 +26,8 @@ from wrappers.learning import load_learned
 from wrappers.learning.files import LearnedFileError, Signature, load, save
 from wrappers.learning.transitions import Transitions
 
+pytestmark = pytest.mark.slow
+
 SIGNATURE = Signature.of(problem_of("safe_envs/CubicSDEDisk-v0"))
 ARRAYS = {"weights": np.linspace(0.0, 1.0, 4), "count": np.array(3)}
 

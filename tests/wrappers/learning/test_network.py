@@ -10,6 +10,8 @@ from wrappers.learning.checks import Purpose, random_stream
 from wrappers.learning.network import Network
 from wrappers.learning.training import train
 
+pytestmark = pytest.mark.slow
+
 _ACTIVATIONS = ("relu", "tanh")
 
 

@@ -16,6 +16,8 @@ from wrappers.learning.collect import collect_paths, draw_states, plant_step
 from wrappers.learning.files import LearnedFileError, load
 from wrappers.learning.residual import ResidualModel, learn_residual, residual_labels
 
+pytestmark = pytest.mark.slow
+
 _DT = 1e-3
 _SMALL = {"states": 300, "hidden": (20,), "epochs": 20}
 
