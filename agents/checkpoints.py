@@ -135,6 +135,8 @@ def restore_model(checkpoint: Path, model: Any, figures: SafetyFigures, n_timest
     """
     with _reading(checkpoint):
         document = json.loads(read_bytes(checkpoint / _STATE, _MOST_TEXT))
+        if not isinstance(document, dict):
+            raise ValueError(f"{_STATE} holds no names with values")
         if document.get("format") != _FORMAT:
             raise ConfigurationError(
                 f"{checkpoint} was written by another version, whose checkpoints this one does not read; "

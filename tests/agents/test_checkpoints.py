@@ -157,6 +157,13 @@ def test_a_checkpoint_with_a_pickle_is_of_another_version(copied):
         train(WHOLE, folder, resume=True)
 
 
+def test_a_state_that_is_a_list_is_refused_in_words(copied):
+    folder, checkpoint = copied
+    (checkpoint / "state.json").write_text("[]")
+    with pytest.raises(ConfigurationError, match=r"state.json holds no names with values"):
+        train(WHOLE, folder, resume=True)
+
+
 @pytest.mark.parametrize("name", READ)
 def test_files_that_are_not_there_or_endless_or_too_large_are_refused_before_they_are_read(name, copied):
     folder, checkpoint = copied
