@@ -54,7 +54,7 @@ class SafetyFilter:
     Where the rows cannot all be met, the sum of their squared slacks is as small as can be, weighted by the priorities.
 
     One row has a closed form for any number of inputs, and any number of rows an exact solution for one and two inputs;
-    others go to ProxQP and an active-set method, which make their answers exact to rounding.
+    others go to ProxQP and an active-set method, whose answers are right to rounding for rows and inputs up to a million apart.
 
     A row counts as met where it misses by no more than the rounding of its terms; see `wrappers.qp.rows`.
 

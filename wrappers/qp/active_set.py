@@ -1,10 +1,13 @@
-"""One state, any number of rows and inputs: the nearest of the actions that violate the rows least, exact to rounding.
+"""One state, any number of rows and inputs: the nearest of the actions that violate the rows least, to rounding.
 
 Two steps. The least sum of squared slacks comes from bounded least squares; where it is zero, the rows can be met. The slacks
 are the same at all its minimisers, so that these are the actions inside the box which violate no row by more. Among them the
 nearest one to the proposal is found by a primal active-set method, which begins at the one at hand and never leaves them
 (Nocedal and Wright, Numerical Optimization, Sec. 16.5). Distances are those of y = sqrt(w) u, where the objective is |y - y_v|^2
 and rows have unit length.
+
+Rounding counts: with rows or inputs whose sizes differ by more than about a million, the action may be somewhat worse than the best.
+It stays in the box, and is flagged where a row is missed.
 """
 
 from __future__ import annotations

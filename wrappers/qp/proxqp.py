@@ -1,9 +1,9 @@
-"""Several constraint rows and a box: ProxQP for the batch, made exact, and never wrong silently.
+"""Several constraint rows and a box: ProxQP for the batch, each answer checked and made precise.
 
 ProxQP's defaults return feasible points that are not the minimisers, and an infeasible problem ends at the iteration
 limit. So the settings ask for the duality gap and cap the iterations. Of its answer only the rows and bounds that hold it are
 taken: the minimiser is the point of these equations nearest to the proposal, if it meets all rows, and if what holds it presses
-in the right direction. So it is exact, whatever the precision of the solver was. States without such a certificate, among them
+in the right direction. So its precision is that of these equations, not that of the solver. States without such a certificate, among them
 all with contradicting rows, go to `wrappers.qp.active_set` one by one.
 """
 
