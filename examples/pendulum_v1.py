@@ -10,7 +10,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs import ControlAffineSDE
-from wrappers import FilterSpec
+from safe_envs.wrappers import FilterSpec
 
 theta, rate, torque = sp.symbols("theta rate torque", real=True)
 

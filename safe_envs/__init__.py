@@ -19,14 +19,14 @@ from safe_envs.errors import (
 from safe_envs.systems import ENV_IDS, register_all
 
 if TYPE_CHECKING:
-    from safe_envs.barrier import Barrier
-    from safe_envs.clf import CLF
-    from safe_envs.custom import register
-    from safe_envs.env import SafeEnv
-    from safe_envs.problem import SafetyProblem
-    from safe_envs.sde import ControlAffineSDE
-    from safe_envs.statement import state_problem
-    from safe_envs.vector import SafeVectorEnv
+    from safe_envs.dynamics.sde import ControlAffineSDE
+    from safe_envs.envs.custom import register
+    from safe_envs.envs.env import SafeEnv
+    from safe_envs.envs.vector_env import SafeVectorEnv
+    from safe_envs.problem.barrier import Barrier
+    from safe_envs.problem.builder import state_problem
+    from safe_envs.problem.clf import CLF
+    from safe_envs.problem.problem import SafetyProblem
 
 __all__ = [
     "CLF",
@@ -50,14 +50,14 @@ __all__ = [
 __version__ = version("safe-envs")
 
 _MODULES = {
-    "Barrier": "barrier",
-    "CLF": "clf",
-    "ControlAffineSDE": "sde",
-    "SafeEnv": "env",
-    "SafeVectorEnv": "vector",
-    "SafetyProblem": "problem",
-    "register": "custom",
-    "state_problem": "statement",
+    "Barrier": "problem.barrier",
+    "CLF": "problem.clf",
+    "ControlAffineSDE": "dynamics.sde",
+    "SafeEnv": "envs.env",
+    "SafeVectorEnv": "envs.vector_env",
+    "SafetyProblem": "problem.problem",
+    "register": "envs.custom",
+    "state_problem": "problem.builder",
 }
 
 

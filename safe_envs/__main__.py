@@ -4,6 +4,6 @@ This is an entry point and no part of the library: here alone a lower layer impo
 """
 
 if __name__ == "__main__":
-    from scripts.cli import main
+    from safe_envs.scripts.cli import main
 
     main()

@@ -16,7 +16,7 @@ import hypothesis
 import pytest
 
 import safe_envs
-from safe_envs.problem import SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
 
 # The expressions that SymPy keeps are many: to look through all of them for garbage as often as usual takes a tenth of the time.
 gc.set_threshold(10_000, 20, 50)

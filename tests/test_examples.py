@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from agents import evaluate
+from safe_envs.agents import evaluate
+from safe_envs.scripts.cli import app
 from safe_envs.systems import CUSTOM_ID
-from scripts.cli import app
 
 pytestmark = pytest.mark.slow
 
-EXAMPLES = Path(__file__).parent.parent / "examples"
+EXAMPLES = Path(__file__).parents[1] / "examples"
 SYSTEMS = ("cart_pole.py", "double_integrator.py", "bicycle.py")
 
 

@@ -17,27 +17,27 @@ def loaded(*names):
     return [name for name in names if name in sys.modules]
 
 
-from scripts import cli
+from safe_envs.scripts import cli
 
-assert not loaded("sympy", "scipy", "torch", "matplotlib", "pygame", "agents"), "the command line, for completion"
+assert not loaded("sympy", "scipy", "torch", "matplotlib", "pygame", "safe_envs.agents"), "the command line, for completion"
 for command in ("evaluate", "verify", "identify", "train", "render"):
     cli.app([command, "--help"], standalone_mode=False)
-assert not loaded("agents", "torch", "matplotlib", "pygame"), "help"
+assert not loaded("safe_envs.agents", "torch", "matplotlib", "pygame"), "help"
 
-import agents
+import safe_envs.agents
 
 HEAVY = ("torch", "stable_baselines3", "matplotlib", "proxsuite", "pygame")
 assert not loaded(*HEAVY), "the packages"
 
-from wrappers.qp import several_rows
+from safe_envs.wrappers.qp import dispatch
 
 box = ([0.0, 0.0], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0], [1.0, 1.0])
-assert not several_rows.project_floats([[1.0, 0.2], [-1.0, 0.1]], [-0.5, 0.1], *box)[3]
+assert not dispatch.project_floats([[1.0, 0.2], [-1.0, 0.1]], [-0.5, 0.1], *box)[3]
 assert not loaded("scipy", *HEAVY), "programs of two inputs"
 box = ([0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0, 1.0])
-assert several_rows.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.1], *box)[2] == [True, False]
+assert dispatch.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.1], *box)[2] == [True, False]
 assert not loaded("scipy", *HEAVY), "one constraint of several binds"
-assert several_rows.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.5], *box)[2] == [True, True]
+assert dispatch.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.5], *box)[2] == [True, True]
 assert loaded("proxsuite")
 
 import gymnasium as gym

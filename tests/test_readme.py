@@ -8,9 +8,9 @@ import re
 from pathlib import Path
 
 import safe_envs
-from scripts.cli import app
+from safe_envs.scripts.cli import app
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 
 

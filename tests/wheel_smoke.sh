@@ -37,10 +37,10 @@ from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 
-import agents
+import safe_envs.agents
 import safe_envs
-import scripts
-import wrappers
+import safe_envs.scripts
+import safe_envs.wrappers
 
 inside = Path(sys.argv[1]).resolve()
 for package in (safe_envs, wrappers, agents, scripts):
@@ -57,7 +57,7 @@ python - <<'END'
 import gymnasium as gym
 
 import safe_envs
-from wrappers import SafetyFilterWrapper
+from safe_envs.wrappers import SafetyFilterWrapper
 
 for env_id in safe_envs.ENV_IDS:
     bare = gym.make(env_id)

@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from scripts.cli import app
+from safe_envs.scripts.cli import app
 
 _INTRODUCTION = """# Command line
 

@@ -1,10 +1,10 @@
-"""The page of the info contract, from the docstring of `safe_envs.info` and what an env reports."""
+"""The page of the info contract, from the docstring of `safe_envs.envs.info` and what an env reports."""
 
 from __future__ import annotations
 
 import inspect
 
-from safe_envs import info
+from safe_envs.envs import info
 
 
 def info_page() -> str:

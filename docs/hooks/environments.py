@@ -11,10 +11,10 @@ import gymnasium as gym
 import sympy as sp
 from PIL import Image
 
-from agents import NominalController
 from safe_envs import ENV_IDS, SafetyProblem
-from safe_envs.calculus import relative_degree
-from wrappers import SafetyFilterWrapper
+from safe_envs.agents import NominalController
+from safe_envs.dynamics.lie import relative_degree
+from safe_envs.wrappers import SafetyFilterWrapper
 
 _SHOWN, _MOST_STEPS = 0.4, 400
 """Part of an episode after which the picture is taken, and the most steps until then."""

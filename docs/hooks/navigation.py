@@ -8,7 +8,7 @@ from typing import Any
 from environments import short_name
 
 from safe_envs import ENV_IDS
-from wrappers import CONDITIONS, LEARNED
+from safe_envs.wrappers import CONDITIONS, LEARNED
 
 
 def complete(nav: Sequence[dict[str, Any]]) -> None:

@@ -15,14 +15,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 import safe_envs  # noqa: F401  (registers the ids)
-from agents import evaluate
-from agents.verification import starts_of
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
-from safe_envs.codegen import compile_function
-from scripts.figure import COLORS, QUIET, STYLE, UNSAFE
-from wrappers import HOCBF, SafetyFilter, parse_conditions
-from wrappers.promise import promise
-from wrappers.verify import verify
+from safe_envs.agents import evaluate
+from safe_envs.agents.evaluation.bound_check import starts_of
+from safe_envs.dynamics.codegen import compile_function
+from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, UNSAFE
+from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
+from safe_envs.wrappers.verification.feasibility import verify
+from safe_envs.wrappers.verification.guarantee import promise
 
 _GRID = 241
 _EPISODES = 1000

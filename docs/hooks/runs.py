@@ -89,8 +89,8 @@ def _output(words: Sequence[str], fails: bool) -> str:
     """What a command prints, run in this process, since importing everything again takes longer than most commands."""
     import typer
 
-    from scripts.cli import app
-    from scripts.console import run
+    from safe_envs.scripts.cli import app
+    from safe_envs.scripts.options.console import run
 
     command, out, err, status = typer.main.get_command(app), io.StringIO(), io.StringIO(), 0
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):

@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from safe_envs.problem import SafetyProblem, Variable
+from safe_envs.problem.problem import SafetyProblem, Variable
 from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Canvas
-from safe_envs.rendering.history import Moment
 from safe_envs.rendering.scenes.base import runs
+from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import (
     EDGE,
     EXECUTED,
@@ -77,7 +77,7 @@ class Panel:
         canvas.text("Smallest h" if len(problem.barriers) > 1 else "h", (_LEFT, below), INK, NORMAL, bold=True)
         self._legend()
 
-    def draw(self, canvas: Canvas, moment: Moment, caption: str) -> None:
+    def draw(self, canvas: Canvas, moment: EpisodeSnapshot, caption: str) -> None:
         """Draw the panel, and blank paper for the scene."""
         canvas.lay(self._background)
         if caption:
@@ -92,7 +92,7 @@ class Panel:
         self._actions(canvas, moment)
         self._chart(canvas, moment)
 
-    def _status(self, canvas: Canvas, moment: Moment) -> None:
+    def _status(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         half = _WIDTH // 2 - 4
         if moment.infeasible:
             filtered = ("infeasible", INFEASIBLE, True)
@@ -121,7 +121,7 @@ class Panel:
         canvas.fill((_LEFT, top + 20, _WIDTH, 12), PAPER, 2)
         canvas.frame((_LEFT, top + 20, _WIDTH, 12), mix(GREY, PANEL, 0.6), 1, 2)
 
-    def _actions(self, canvas: Canvas, moment: Moment) -> None:
+    def _actions(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         executed, decision = moment.executed, moment.decision
         if executed is None:
             return
@@ -142,7 +142,7 @@ class Panel:
             right -= canvas.text(number(executed[j], scale), (right, top), INK, SMALL, bold=True, align=(1.0, 0.0)) + 14
             canvas.fill((right, top + 3, 9, 9), color)
 
-    def _chart(self, canvas: Canvas, moment: Moment) -> None:
+    def _chart(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         times, h = _thinned(moment.times, moment.h)
         low, high = min(float(h.min()), 0.0), max(float(h.max()), 0.0)
         span = max(high - low, 1e-9)

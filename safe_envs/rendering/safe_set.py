@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pygame
 
-from safe_envs.codegen import compile_function, filled
-from safe_envs.problem import SafetyProblem
+from safe_envs.dynamics.codegen import compile_function, filled
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.style import EDGE, GREEN, HATCH, PAPER, UNSAFE, Color, mix

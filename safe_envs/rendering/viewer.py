@@ -10,11 +10,11 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.problem import SafetyProblem
-from safe_envs.rendering.history import Decision, History
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.rendering.snapshot import Decision, History
 
 if TYPE_CHECKING:
-    from safe_envs.rendering.picture import Picture
+    from safe_envs.rendering.frame import Picture
     from safe_envs.rendering.window import Window
 
 Rows = Any
@@ -156,7 +156,7 @@ class Viewer:
     def _drawn(self) -> Picture:
         if self._picture is None:
             require_pygame()
-            from safe_envs.rendering.picture import Picture
+            from safe_envs.rendering.frame import Picture
 
             self._picture = Picture(self._problem)
         return self._picture

@@ -25,12 +25,12 @@ ENV_IDS = tuple(f"safe_envs/{name}-v0" for name in _CLASSES)
 
 
 CUSTOM_ID = "safe_envs/Custom-v0"
-"""The id that takes any system, as its argument `system`; see `safe_envs.custom`."""
+"""The id that takes any system, as its argument `system`; see `safe_envs.envs.custom`."""
 
 
 def register_all() -> None:
     """Register every id with Gymnasium; the systems themselves are imported when an env is made."""
-    gym.register(CUSTOM_ID, entry_point="safe_envs.custom:Custom", vector_entry_point="safe_envs.custom:CustomVector")
+    gym.register(CUSTOM_ID, entry_point="safe_envs.envs.custom:Custom", vector_entry_point="safe_envs.envs.custom:CustomVector")
     for name, module in _CLASSES.items():
         path = f"safe_envs.systems.{module}:{name}"
         gym.register(f"safe_envs/{name}-v0", entry_point=path, vector_entry_point=f"{path}Vector")

@@ -6,15 +6,15 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.barrier import Barrier
-from safe_envs.clf import CLF
-from safe_envs.env import SystemEnv
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError, shown
-from safe_envs.exploration import Exploration
-from safe_envs.problem import Feature, SafetyProblem, Start, Variable
-from safe_envs.sde import ControlAffineSDE
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.clf import CLF
+from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.systems._common import positive
-from safe_envs.vector import SystemVectorEnv
 
 u = sp.Symbol("u", real=True)
 x_1, x_2, x_3 = sp.symbols("x_1 x_2 x_3", real=True)
@@ -114,7 +114,7 @@ def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> S
         gains=(1.0,),
         plane=("x_1", "x_3"),
         scene="road",
-        explored=Exploration(region=((10.0, 25.0), (15.0, 25.0), (20.0, 200.0)), inputs=((-4000.0,), (4000.0,))),
+        explored=SamplingDomain(region=((10.0, 25.0), (15.0, 25.0), (20.0, 200.0)), inputs=((-4000.0,), (4000.0,))),
     )
 
 
@@ -151,7 +151,7 @@ def acc_gap(*, distance: float = 10.0, power: int = 5, rate: float = 1.0, slack_
         gains=(1.0, 1.0),
         plane=("v", "z"),
         scene="road",
-        explored=Exploration(region=((8.0, 24.0), (10.0, 32.0)), inputs=((-4000.0,), (4000.0,))),
+        explored=SamplingDomain(region=((8.0, 24.0), (10.0, 32.0)), inputs=((-4000.0,), (4000.0,))),
     )
 
 

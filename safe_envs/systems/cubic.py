@@ -7,14 +7,14 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.barrier import Barrier
-from safe_envs.clf import CLF
-from safe_envs.env import SystemEnv
-from safe_envs.exploration import Exploration
-from safe_envs.problem import SafetyProblem, Start, Variable
-from safe_envs.sde import ControlAffineSDE
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.clf import CLF
+from safe_envs.problem.problem import SafetyProblem, Start, Variable
+from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.systems._common import around, in_disk, positive, uniforms
-from safe_envs.vector import SystemVectorEnv
 
 x_1, x_2, u = sp.symbols("x_1 x_2 u", real=True)
 a, k, sigma_1, sigma_2 = sp.symbols("a k sigma_1 sigma_2", real=True)
@@ -75,7 +75,7 @@ def cubic_sde(*, offset: float = 1.0, rate: float = 1.0, slack_weight: float = 1
         starts={"near-edge": Start((around(-1.0, 2.0, first), around(0.0, 2.0, second)), (first, second), sp.Min(h, 0.5 - h))},
         horizon=2.0,
         noise=("k",),
-        explored=Exploration(region=((-1.0, 1.0), (-1.0, 1.0)), inputs=((-1.0,), (1.0,))),
+        explored=SamplingDomain(region=((-1.0, 1.0), (-1.0, 1.0)), inputs=((-1.0,), (1.0,))),
     )
 
 
@@ -105,7 +105,7 @@ def cubic_sde_disk(*, radius: float = 1.0) -> SafetyProblem:
         },
         horizon=1.0,
         noise=("sigma_1", "sigma_2"),
-        explored=Exploration(region=((-r, r), (-r, r)), inputs=((-1.0,), (1.0,))),
+        explored=SamplingDomain(region=((-r, r), (-r, r)), inputs=((-1.0,), (1.0,))),
     )
 
 

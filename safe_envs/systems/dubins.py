@@ -8,14 +8,14 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.barrier import Barrier
-from safe_envs.calculus import drift_derivative, generator
-from safe_envs.env import SystemEnv
-from safe_envs.exploration import Exploration
-from safe_envs.problem import Feature, SafetyProblem, Start, Variable
-from safe_envs.sde import ControlAffineSDE
+from safe_envs.dynamics.lie import generator, lie_derivative_f
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.systems._common import in_disk, positive, uniforms
-from safe_envs.vector import SystemVectorEnv
 
 x, y, theta, omega = sp.symbols("x y theta omega", real=True)
 v, sigma_1, sigma_2 = sp.symbols("v sigma_1 sigma_2", real=True)
@@ -84,7 +84,7 @@ def _disk(
         noise=("sigma_1", "sigma_2"),
         plane=("x", "y"),
         scene="top-view",
-        explored=Exploration(region=((-r, r), (-r, r), (-math.pi, math.pi))),
+        explored=SamplingDomain(region=((-r, r), (-r, r), (-math.pi, math.pi))),
         **rest,
     )
 
@@ -107,7 +107,7 @@ def dubins_disk(*, radius: float = 1.0) -> SafetyProblem:
     plant, model = vehicle(0.8, noise=0.0), vehicle(0.5, noise=0.0)
     h = r**2 - x**2 - y**2
     gains = (1.0, 2.0)
-    b_1 = plant.numeric(drift_derivative(plant, h)) + gains[0] * h
+    b_1 = plant.numeric(lie_derivative_f(plant, h)) + gains[0] * h
     return _disk(
         "DubinsDisk",
         plant=plant,

@@ -8,14 +8,14 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.barrier import Barrier
-from safe_envs.env import SystemEnv
-from safe_envs.exploration import Exploration
-from safe_envs.problem import Feature, SafetyProblem, Start, Variable
-from safe_envs.sde import ControlAffineSDE
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.systems._common import around, positive, uniforms
 from safe_envs.systems.dubins import omega, theta, turn_rate_towards, vehicle, x, y
-from safe_envs.vector import SystemVectorEnv
 
 x_o, y_o, v_o = sp.symbols("x_o y_o v_o", real=True)
 
@@ -110,7 +110,7 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
         filter="hocbf",
         plane=("x", "y"),
         scene="top-view",
-        explored=Exploration(
+        explored=SamplingDomain(
             region=((-3.0, 4.0), (-3.0, 3.0), (-math.pi, math.pi), (-2.0, 7.0), (-1.0, 1.0)),
             coordinates=(sp.cos(theta), sp.sin(theta), x_o - x, y_o - y),
         ),

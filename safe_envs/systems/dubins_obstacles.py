@@ -6,14 +6,14 @@ import math
 
 import sympy as sp
 
-from safe_envs.barrier import Barrier
-from safe_envs.env import SystemEnv
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError, shown
-from safe_envs.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
 from safe_envs.systems._common import around, positive, uniforms
 from safe_envs.systems.dubins import omega, theta, x, y
 from safe_envs.systems.dubins_obstacle import separation, vehicle_among, way_to
-from safe_envs.vector import SystemVectorEnv
 
 w_o = sp.Symbol("w_o", real=True)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import sympy as sp
 
-from safe_envs.barrier import Barrier
-from safe_envs.env import SystemEnv
-from safe_envs.exploration import Exploration
-from safe_envs.problem import SafetyProblem, Start, Variable
-from safe_envs.sde import ControlAffineSDE
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import SafetyProblem, Start, Variable
+from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.systems._common import around, positive, uniforms
-from safe_envs.vector import SystemVectorEnv
 
 theta, thetadot, u = sp.symbols("theta thetadot u", real=True)
 m, ell, g, sigma = sp.symbols("m l g sigma", real=True)
@@ -70,7 +70,7 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         filter="scbf",
         plane=("theta", "thetadot"),
         scene="pendulum",
-        explored=Exploration(region=((-reach, reach), (-reach, reach))),
+        explored=SamplingDomain(region=((-reach, reach), (-reach, reach))),
     )
 
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.env import SystemEnv
-from safe_envs.exploration import Exploration
-from safe_envs.problem import Feature, SafetyProblem, Start, Variable
-from safe_envs.sde import ControlAffineSDE
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.systems._common import around, uniforms
 from safe_envs.systems.quadrotor_altitude import (
     CLIMB_RATES,
@@ -32,7 +33,6 @@ from safe_envs.systems.quadrotor_altitude import (
     z,
     zdot,
 )
-from safe_envs.vector import SystemVectorEnv
 
 x, y, psi = sp.symbols("x y psi", real=True)
 xdot, ydot, phidot, thetadot, psidot = sp.symbols("xdot ydot phidot thetadot psidot", real=True)
@@ -161,7 +161,7 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
         barriers=(band(center, half_width),),
         nominal=rotor_laws(sp.Integer(0), sp.Integer(0)),
         starts={"spread": start_at({z: around(5.0, 0.5, height), zdot: around(0.0, 0.5, climb)}, spread), "thesis": start_at({z: 5})},
-        explored=Exploration(
+        explored=SamplingDomain(
             region=tuple(
                 {z: (center - half_width, center + half_width), zdot: CLIMB_RATES, psi: (-math.pi, math.pi)}.get(s.symbol, (s.low, s.high))
                 for s in _STATES

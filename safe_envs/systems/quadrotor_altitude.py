@@ -6,13 +6,13 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.barrier import Barrier
-from safe_envs.env import SystemEnv
-from safe_envs.exploration import Exploration
-from safe_envs.problem import TIME, Feature, SafetyProblem, Start, Variable
-from safe_envs.sde import ControlAffineSDE, finite_number
+from safe_envs.dynamics.sde import ControlAffineSDE, finite_number
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import TIME, Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.systems._common import around, positive, uniforms
-from safe_envs.vector import SystemVectorEnv
 
 z, zdot, phi, theta = sp.symbols("z zdot phi theta", real=True)
 U_1 = sp.Symbol("U_1", real=True)
@@ -101,7 +101,7 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         noise=("sigma_z",),
         plane=("z", "zdot"),
         scene="altitude",
-        explored=Exploration(region=((center - half_width, center + half_width), CLIMB_RATES)),
+        explored=SamplingDomain(region=((center - half_width, center + half_width), CLIMB_RATES)),
     )
 
 

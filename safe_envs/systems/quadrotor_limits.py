@@ -6,15 +6,15 @@ import math
 
 import sympy as sp
 
-from safe_envs.barrier import Barrier
-from safe_envs.env import SystemEnv
+from safe_envs.dynamics.sde import finite_number
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError
-from safe_envs.problem import TIME, Feature, SafetyProblem
-from safe_envs.sde import finite_number
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import TIME, Feature, SafetyProblem
 from safe_envs.systems._common import around, uniforms
 from safe_envs.systems.quadrotor import LARGEST_TILT, phi, psi, quadrotor, rotor_laws, rotor_problem, start_at, theta, x
 from safe_envs.systems.quadrotor_altitude import ALTITUDE_REWARD, HEIGHT, PLANT_MASS, z, zdot
-from safe_envs.vector import SystemVectorEnv
 
 x_ref, x_ref_rate = sp.symbols("x_ref x_ref_rate", real=True)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import sympy as sp
 
-from safe_envs.barrier import Barrier
-from safe_envs.env import SystemEnv
-from safe_envs.problem import SafetyProblem, Start, Variable
-from safe_envs.sde import ControlAffineSDE
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import SafetyProblem, Start, Variable
 from safe_envs.systems._common import around, positive, uniforms
-from safe_envs.vector import SystemVectorEnv
 
 x, u, sigma = sp.symbols("x u sigma", real=True)
 

@@ -18,12 +18,10 @@ import yaml
 from IPython.display import Image
 from matplotlib import pyplot as plt
 
-import agents
 import safe_envs
-import wrappers
-from agents.rare import estimate_rare
-from safe_envs import ENV_IDS
-from wrappers import CONDITIONS, LEARNED
+from safe_envs import ENV_IDS, agents, wrappers
+from safe_envs.agents.rare_events.estimate import estimate_rare
+from safe_envs.wrappers import CONDITIONS, LEARNED
 
 pytestmark = pytest.mark.slow
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from scripts import cli
-from tests.wrappers.verified import hurry
+from safe_envs.scripts import cli
+from tests.wrappers.verification.verified import hurry
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from agents import sb3_speed
+from safe_envs.agents.training import vec_env_speed as sb3_speed
 from safe_envs.errors import ConfigurationError
-from scripts import benchmark
-from wrappers import SafetyFilterWrapper
+from safe_envs.scripts import benchmark
+from safe_envs.wrappers import SafetyFilterWrapper
 
 pytestmark = pytest.mark.slow
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 import safe_envs
-from scripts import cli
+from safe_envs.scripts import cli
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.slow

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from scripts import demo
+from safe_envs.scripts import demo
 
 pytestmark = pytest.mark.slow
 

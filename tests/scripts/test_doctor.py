@@ -8,9 +8,9 @@ from importlib.metadata import PackageNotFoundError
 import pytest
 
 import safe_envs
-from scripts import doctor
+from safe_envs.scripts import doctor
+from safe_envs.wrappers import SafetyFilterWrapper
 from tests.scripts.conftest import strictly
-from wrappers import SafetyFilterWrapper
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from agents import evaluate
-from agents.contradiction import judged
-from scripts.table import print_evaluation
+from safe_envs.agents import evaluate
+from safe_envs.agents.evaluation.contradiction import judged
+from safe_envs.scripts.reports.evaluation_report import print_evaluation
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.usefixtures("coarse_bounds")

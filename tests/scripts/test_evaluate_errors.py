@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from agents import load_problem
+from safe_envs.agents import load_problem
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.usefixtures("coarse_bounds")
@@ -96,7 +96,7 @@ def ppo(tmp_path):
     import gymnasium as gym
     from stable_baselines3 import PPO
 
-    from agents.weights import save_policy
+    from safe_envs.agents.policies.network import save_policy
 
     model = PPO("MlpPolicy", gym.make(DUBINS), policy_kwargs={"net_arch": [8]}, device="cpu")
     save_policy(model, tmp_path / "ppo", load_problem(DUBINS))

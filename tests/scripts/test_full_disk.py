@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import yaml
 
-from scripts import console
-from tests.full_disk import no_file_larger_than
+from safe_envs.scripts.options import console
+from tests.oracles.full_disk import no_file_larger_than
 
 pytestmark = pytest.mark.slow
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.evaluation import package_versions
-from agents.problems import load_problem
-from scripts.identify import SETTINGS, read_settings, settings_of
-from scripts.identify_report import Function, Source, percent, unit_of
+from safe_envs.agents.evaluation.evaluate import package_versions
+from safe_envs.registry import load_problem
+from safe_envs.scripts.identify import SETTINGS, read_settings, settings_of
+from safe_envs.scripts.reports.identify_report import Function, Source, percent, unit_of
+from safe_envs.wrappers.learning import METHODS, learner_of, load_learned
+from safe_envs.wrappers.learning.data.collection import collect
+from safe_envs.wrappers.learning.data.transitions import Transitions
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
-from wrappers.learning import METHODS, learner_of, load_learned
-from wrappers.learning.collect import collect
-from wrappers.learning.transitions import Transitions
 
 pytestmark = pytest.mark.slow
 

@@ -9,16 +9,16 @@ import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
-from agents.policy import make_policy
 from safe_envs import SafeEnv
+from safe_envs.agents.policies.registry import make_policy
 from safe_envs.errors import ConfigurationError
 from safe_envs.rendering import style
-from scripts.cli import app
-from scripts.doctor import packages
-from scripts.film import steps_a_frame, write_film
-from scripts.render import frames_of, split_filters
+from safe_envs.scripts.cli import app
+from safe_envs.scripts.doctor import packages
+from safe_envs.scripts.figures.film import steps_a_frame, write_film
+from safe_envs.scripts.render import frames_of, split_filters
+from safe_envs.wrappers import SafetyFilterWrapper
 from tests.conftest import problem_of
-from wrappers import SafetyFilterWrapper
 
 pytestmark = pytest.mark.slow
 

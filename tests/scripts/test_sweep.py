@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from agents.sweep_store import read
+from safe_envs.agents.sweeps.store import read
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.slow
@@ -26,7 +26,7 @@ grid:
 """
 
 SYSTEM = """
-from agents.problems import load_problem
+from safe_envs.registry import load_problem
 
 def problem(first=0, second=0):
     1 / (2 - first - second)
@@ -120,7 +120,7 @@ def test_mistakes_in_a_report(safe_envs_command, spec: Path, tmp_path: Path):
 @pytest.mark.parametrize(("jobs", "number"), [("2", signal.SIGINT), ("1", signal.SIGTERM)])
 def test_a_stop_keeps_what_is_done_and_leaves_no_process(spec: Path, tmp_path: Path, jobs: str, number: signal.Signals):
     spec.write_text(SPEC.replace("seed: [0, 1]", f"seed: {list(range(100))}"))
-    words = [sys.executable, "-m", "scripts.sweep", str(spec), "--out", str(tmp_path / "out"), "--jobs", jobs]
+    words = [sys.executable, "-m", "safe_envs.scripts.sweep", str(spec), "--out", str(tmp_path / "out"), "--jobs", jobs]
     # A shell that runs the tests in the background has its processes ignore the signal.
     heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heed)

@@ -82,7 +82,7 @@ def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(safe_envs_com
 
 @pytest.mark.slow
 def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command, monkeypatch):
-    monkeypatch.setattr("scripts.leaderboard._QUICK", {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4})
+    monkeypatch.setattr("safe_envs.scripts.leaderboard._QUICK", {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4})
     arguments = ("leaderboard", "Scalar-v0", "safe_envs/Scalar-v0", "--quick", "--episodes", 8, "--out", "board")
     status, out, err = safe_envs_command(*arguments)
     assert (status, err) == (0, "")

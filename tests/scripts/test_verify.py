@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from agents import verification
+from safe_envs.agents.evaluation import bound_check
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
-from tests.wrappers.verified import verify_once
+from tests.wrappers.verification.verified import verify_once
 
 pytestmark = pytest.mark.slow
 
@@ -19,9 +19,9 @@ CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
 @pytest.fixture
 def verify(monkeypatch, safe_envs_command):
     """Runs `safe-envs verify` over the shorter horizons, from fewer starts."""
-    monkeypatch.setattr(verification, "_LONG_MULTIPLES", ())
-    monkeypatch.setattr(verification, "STARTS", 512)
-    monkeypatch.setattr("wrappers.verify.verify", verify_once)
+    monkeypatch.setattr(bound_check, "_LONG_MULTIPLES", ())
+    monkeypatch.setattr(bound_check, "STARTS", 512)
+    monkeypatch.setattr("safe_envs.wrappers.verification.feasibility.verify", verify_once)
     return lambda *arguments: safe_envs_command("verify", *arguments)
 
 

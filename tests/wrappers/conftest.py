@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from safe_envs.wrappers.learning.bayesian import identify
+from safe_envs.wrappers.learning.generator import GeneratorModel, LearnedGenerator, learn_generator
+from safe_envs.wrappers.learning.models.files import Signature
+from safe_envs.wrappers.learning.residual import LearnedResidual, ResidualModel
 from tests.conftest import problem_of
-from tests.wrappers.learned import (
-    NO_RECORD,
-    some_network,
-)
-from wrappers.learning.bayesian import identify
-from wrappers.learning.files import Signature
-from wrappers.learning.generator import GeneratorModel, LearnedGenerator, learn_generator
-from wrappers.learning.residual import LearnedResidual, ResidualModel
+from tests.wrappers.learned import NO_RECORD, some_network
 
 
 @pytest.fixture(scope="session")

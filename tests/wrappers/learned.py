@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.calculus import derivatives, drift_derivative, generator, input_derivative
-from safe_envs.codegen import compile_function, filled, stacked
-from wrappers.learning.base import Record
-from wrappers.learning.collect import draw_states
-from wrappers.learning.files import Signature
-from wrappers.learning.generator import GeneratorModel
-from wrappers.learning.network import Network
-from wrappers.learning.residual import ResidualModel
+from safe_envs.dynamics.codegen import compile_function, filled, stacked
+from safe_envs.dynamics.lie import derivatives, generator, lie_derivative_f, lie_derivative_g
+from safe_envs.wrappers.learning.base import Record
+from safe_envs.wrappers.learning.data.collection import draw_states
+from safe_envs.wrappers.learning.generator import GeneratorModel
+from safe_envs.wrappers.learning.models.files import Signature
+from safe_envs.wrappers.learning.models.network import Network
+from safe_envs.wrappers.learning.residual import ResidualModel
 
 NO_RECORD = Record(0, 0.0, 0.0)
 
@@ -63,8 +63,8 @@ class Undefined(Terms):
 
 def lie(system, barrier, degree):
     """L_f h, ..., L_f^r h and the entries of L_g L_f^(r-1) h, with the numbers of the system."""
-    along = derivatives(system, barrier.expression, degree, drift_derivative)
-    return [system.numeric(e) for e in (*along[1:], *input_derivative(system, along[degree - 1]))]
+    along = derivatives(system, barrier.expression, degree, lie_derivative_f)
+    return [system.numeric(e) for e in (*along[1:], *lie_derivative_g(system, along[degree - 1]))]
 
 
 def residual_of(problem, errors=()) -> Any:
@@ -80,7 +80,7 @@ def residual_of(problem, errors=()) -> Any:
 def generator_of(problem, degree) -> Any:
     """The exact part of the noise, and of the order below its slopes."""
     plant, h = problem.plant, problem.barriers[0].expression
-    noisy, plain = (derivatives(plant, h, degree, d) for d in (generator, drift_derivative))
+    noisy, plain = (derivatives(plant, h, degree, d) for d in (generator, lie_derivative_f))
     parts = [a - b for a, b in zip(noisy, plain, strict=True)]
     slopes = [sp.diff(parts[-2], s) for s in plant.states] if degree > 1 else []
     return GeneratorModel(Signature.of(problem), NO_RECORD, (Terms(plant, degree, [parts[-1], *slopes]),))  # pyright: ignore[reportArgumentType]

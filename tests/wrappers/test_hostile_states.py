@@ -11,11 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safe_envs import Barrier, ControlAffineSDE, NumericalError
-from safe_envs.codegen import compile_function, filled
+from safe_envs.dynamics.codegen import compile_function, filled
 from safe_envs.systems import ENV_IDS
+from safe_envs.wrappers import CBF, RCBF, SCBF, SafetyFilter
+from safe_envs.wrappers.qp.rows import ROUNDING
 from tests.conftest import problem_of
-from wrappers import CBF, RCBF, SCBF, SafetyFilter
-from wrappers.qp.rows import ROUNDING
 
 FILTERS = {
     "Scalar": ["rcbf nearest", "szcbf nearest"],

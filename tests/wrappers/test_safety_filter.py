@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, InvalidInputError, NumericalError, SystemDefinitionError
+from safe_envs.wrappers import CBF, HOCBF, SCBF, SafetyFilter
 from tests.conftest import problem_of
-from wrappers import CBF, HOCBF, SCBF, SafetyFilter
 
 x, y, u, w = sp.symbols("x y u w", real=True)
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 import importlib
 
 from safe_envs.errors import ConfigurationError, nearest
-from safe_envs.problem import SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.scenes.base import Scene
 
 SCENES = {
     "plane": "plane:PlaneScene",
     "bars": "bars:BarsScene",
     "top-view": "top_view:TopView",
-    "altitude": "craft:AltitudeScene",
-    "side-view": "craft:SideView",
+    "altitude": "quadrotor:AltitudeScene",
+    "side-view": "quadrotor:SideView",
     "road": "road:Road",
     "pendulum": "pendulum:PendulumScene",
-    "line": "strip:LineScene",
+    "line": "time_series:LineScene",
 }
 """Where the scene of each name is."""
 

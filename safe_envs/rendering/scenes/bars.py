@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from safe_envs.problem import SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range, grown, ticks
 from safe_envs.rendering.canvas import Canvas
-from safe_envs.rendering.history import Moment
 from safe_envs.rendering.safe_set import Barriers, tint
 from safe_envs.rendering.scenes.base import Scene, draw_point, draw_trail, draw_violation, warning_color
+from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import EDGE, GREY, INK, LINE, PANEL, SMALL, UNSAFE, VIOLATION, bound, label, number
 
 _LEFT, _WIDTH, _TOP, _BOTTOM = 40, 520, 58, 532
@@ -29,7 +29,7 @@ class BarsScene(Scene):
         self._ranges = [self.range_of(i) for i in range(min(len(self.names), _MOST))]
         self._pitch = min(_HIGHEST, (_BOTTOM - _TOP) / len(self._ranges))
 
-    def draw(self, canvas: Canvas, moment: Moment) -> None:
+    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         """Draw the bars."""
         more = len(self.names) - len(self._ranges)
         rest = f" (and {more} more)" if more else ""
@@ -38,7 +38,7 @@ class BarsScene(Scene):
         for i, usual in enumerate(self._ranges):
             self._draw_bar(canvas, moment, i, round(_TOP + i * self._pitch), *grown(usual, moment.states[:, i]))
 
-    def _draw_bar(self, canvas: Canvas, moment: Moment, i: int, top: int, low: float, high: float) -> None:
+    def _draw_bar(self, canvas: Canvas, moment: EpisodeSnapshot, i: int, top: int, low: float, high: float) -> None:
         value = float(moment.state[i])
 
         def place(at: float) -> float:
@@ -63,11 +63,11 @@ class BarsScene(Scene):
         if self._pitch >= _WITH_TRAIL:
             self._draw_trail(canvas, moment, i, Axes((_LEFT, top + 56, _WIDTH, round(self._pitch) - 72), (low, high), self._times(moment)))
 
-    def _times(self, moment: Moment) -> Range:
+    def _times(self, moment: EpisodeSnapshot) -> Range:
         now = float(moment.times[-1])
         return now - self.problem.horizon, now
 
-    def _draw_trail(self, canvas: Canvas, moment: Moment, i: int, axes: Axes) -> None:
+    def _draw_trail(self, canvas: Canvas, moment: EpisodeSnapshot, i: int, axes: Axes) -> None:
         left, top, width, height = axes.box
         canvas.fill(axes.box, PANEL)
         for tick in ticks(*axes.x, most=10):

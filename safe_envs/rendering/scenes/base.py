@@ -8,12 +8,12 @@ from abc import ABC, abstractmethod
 import numpy as np
 
 from safe_envs.errors import ConfigurationError, SystemDefinitionError
-from safe_envs.problem import SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Canvas
-from safe_envs.rendering.history import Moment
 from safe_envs.rendering.safe_set import Barriers, barriers_in
 from safe_envs.rendering.scenes.ranges import first_range
+from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import EXECUTED, INFEASIBLE, INK, INTERVENING, PAPER, SKY, VIOLATION, Color, mix
 
 _MOST_POINTS = 1000
@@ -33,7 +33,7 @@ class Scene(ABC):
         self.names = [s.symbol.name for s in problem.states]
 
     @abstractmethod
-    def draw(self, canvas: Canvas, moment: Moment) -> None:
+    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         """Draw an instant within `style.SCENE`."""
 
     def index(self, name: str) -> int:
@@ -82,7 +82,7 @@ def _around(values: np.ndarray, limits: Range) -> Range:
     return max(float(values[0]) - pad, limits[0]), min(float(values[-1]) + pad, limits[1])
 
 
-def warning_color(moment: Moment, usual: Color = EXECUTED) -> Color:
+def warning_color(moment: EpisodeSnapshot, usual: Color = EXECUTED) -> Color:
     """Of what moves: a warning while the filter intervenes or has no feasible action."""
     return INFEASIBLE if moment.infeasible else INTERVENING if moment.intervening else usual
 

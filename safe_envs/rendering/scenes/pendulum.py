@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from safe_envs.problem import SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.canvas import Box, Canvas
-from safe_envs.rendering.history import Moment
 from safe_envs.rendering.safe_set import Barriers, tint
 from safe_envs.rendering.scenes.base import Scene, warning_color
 from safe_envs.rendering.scenes.plane import Plane
+from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import EDGE, GREY, HATCH, INK, PAPER, SMALL, UNSAFE, mix, number
 
 _ROD: Box = (76, 30, 504, 178)
@@ -29,12 +29,12 @@ class PendulumScene(Scene):
         self._plane = Plane(self, ("theta", "thetadot"), _PLANE)
         self._length = next((float(value) for symbol, value in problem.plant.parameters.items() if symbol.name == "l"), None)
 
-    def draw(self, canvas: Canvas, moment: Moment) -> None:
+    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         """Draw the rod and the plane."""
         self._draw_rod(canvas, moment)
         self._plane.draw(canvas, moment)
 
-    def _draw_rod(self, canvas: Canvas, moment: Moment) -> None:
+    def _draw_rod(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         left, top, width, height = _ROD
         pivot, length = (left + width / 2, top + height - 26.0), height - 44.0
         theta = float(moment.state[self._angle])

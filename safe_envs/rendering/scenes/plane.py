@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from safe_envs.problem import SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range, grown
 from safe_envs.rendering.canvas import Box, Canvas
-from safe_envs.rendering.history import Moment
 from safe_envs.rendering.safe_set import LEVELS, Barriers, SafeSet, tint
 from safe_envs.rendering.scenes.base import Scene, draw_point, draw_trail, draw_violation, warning_color
+from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import label
 
 BOX = (76, 20, 504, 466)
@@ -57,7 +57,7 @@ class Plane:
         self._changes = any(problem.barriers[k].expression.free_symbols - inside for k in self._barriers.chosen)
         self._views: dict[Axes, tuple[SafeSet | None, Canvas]] = {}
 
-    def background(self, canvas: Canvas, moment: Moment) -> Axes:
+    def background(self, canvas: Canvas, moment: EpisodeSnapshot) -> Axes:
         """Draw the safe set and the axes, which grow where the trail leaves them."""
         ranges = [grown(r, _values(moment, i)) for r, i in zip(self._shown, (self.x, self.y), strict=True)]
         axes = Axes.equal(self._box, *ranges) if self._equal else Axes(self._box, *ranges)
@@ -69,7 +69,7 @@ class Plane:
         canvas.lay(furniture)
         return axes
 
-    def _view(self, axes: Axes, moment: Moment) -> tuple[SafeSet | None, Canvas]:
+    def _view(self, axes: Axes, moment: EpisodeSnapshot) -> tuple[SafeSet | None, Canvas]:
         safe_set = SafeSet(self._barriers, axes, (self.x, self.y)) if len(self._barriers.chosen) else None
         furniture = Canvas((axes.box[0] + axes.box[2] + 20, axes.box[1] + axes.box[3] + 42), clear=True)
         if safe_set is None:
@@ -83,7 +83,7 @@ class Plane:
         axes.furnish(furniture, *self._labels, grid=False)
         return safe_set if self._changes else None, furniture
 
-    def trail(self, canvas: Canvas, axes: Axes, moment: Moment) -> tuple[float, float]:
+    def trail(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> tuple[float, float]:
         """Draw the trail and the first violation; returns the pixel of the state."""
         x, y = _values(moment, self.x), _values(moment, self.y)
         draw_trail(canvas, axes, x, y, moment.h)
@@ -92,7 +92,7 @@ class Plane:
             draw_violation(canvas, axes, (x_then, moment.violated[self.y]))
         return axes.place(float(x[-1]), float(y[-1]))
 
-    def draw(self, canvas: Canvas, moment: Moment) -> None:
+    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         """Draw all of it, with a point for the state."""
         axes = self.background(canvas, moment)
         at = self.trail(canvas, axes, moment)
@@ -101,7 +101,7 @@ class Plane:
         canvas.within(None)
 
 
-def _values(moment: Moment, i: int) -> np.ndarray:
+def _values(moment: EpisodeSnapshot, i: int) -> np.ndarray:
     """A state along the episode; the time for -1."""
     return moment.times if i < 0 else moment.states[:, i]
 
@@ -117,6 +117,6 @@ class PlaneScene(Scene):
         alike = self.unit(names[0]) == self.unit(names[1]) and max(wide, tall) <= _LONGEST * min(wide, tall)
         self._plane = Plane(self, names, BOX, equal=alike, shown=shown)
 
-    def draw(self, canvas: Canvas, moment: Moment) -> None:
+    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         """Draw the plane."""
         self._plane.draw(canvas, moment)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from safe_envs.problem import SafetyProblem
+from safe_envs.envs.simulation import proposed_starts
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Range, nice_step
 from safe_envs.rendering.safe_set import Barriers
-from safe_envs.simulation import proposed_starts
 
 _DRAWN = 64
 _HALF_POWERS = range(-16, 27)

@@ -7,12 +7,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from safe_envs.problem import SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes
 from safe_envs.rendering.canvas import Box, Canvas
-from safe_envs.rendering.history import Moment
 from safe_envs.rendering.safe_set import STEP, Barriers, tint
 from safe_envs.rendering.scenes.base import Scene, draw_point, draw_trail, draw_violation, thinned, warning_color
+from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import EDGE, GREY, HATCH, INK, LINE, PAPER, SMALL, UNSAFE, VIOLATION, Color, label, mix, number
 
 _ROAD: Box = (90, 84, 420, 64)
@@ -56,14 +56,14 @@ class Road(Scene):
             low, high = np.where(safe, low, middle), np.where(safe, middle, high)
         return 0.5 * (low + high)
 
-    def draw(self, canvas: Canvas, moment: Moment) -> None:
+    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         """Draw the road and the chart."""
         kept = thinned(len(moment.times), _MOST)
         required = self.required(moment.states[kept])
         self._draw_road(canvas, moment, float(required[-1]))
         self._draw_chart(canvas, moment, kept, required)
 
-    def _draw_road(self, canvas: Canvas, moment: Moment, required: float) -> None:
+    def _draw_road(self, canvas: Canvas, moment: EpisodeSnapshot, required: float) -> None:
         _, top, _, height = _ROAD
         gap = float(moment.state[self._gap])
         axes = Axes(_ROAD, (0.0, _reach(max(gap, required))), (0.0, 1.0))
@@ -96,7 +96,7 @@ class Road(Scene):
         at = (max(middle, start + 60), y - 4 if above else y + 4)
         canvas.text(text, at, mix(color, INK, 0.7), SMALL, bold=True, align=(0.5, 1.0 if above else 0.0))
 
-    def _draw_speeds(self, canvas: Canvas, moment: Moment, own: float, lead: float) -> None:
+    def _draw_speeds(self, canvas: Canvas, moment: EpisodeSnapshot, own: float, lead: float) -> None:
         y = _ROAD[1] + _ROAD[3] + 34
         speed = float(moment.state[self._speed])
         canvas.text(f"own {number(speed)} m/s", (14, y), INK, SMALL)
@@ -104,7 +104,7 @@ class Road(Scene):
             other = float(moment.state[self._lead]) if isinstance(self._lead, int) else self._lead
             canvas.text(f"lead {number(other)} m/s", (586, y), INK, SMALL, align=(1.0, 0.0))
 
-    def _draw_chart(self, canvas: Canvas, moment: Moment, kept: np.ndarray, required: np.ndarray) -> None:
+    def _draw_chart(self, canvas: Canvas, moment: EpisodeSnapshot, kept: np.ndarray, required: np.ndarray) -> None:
         times, gaps = moment.times[kept], moment.states[kept, self._gap]
         end = max(self.problem.horizon, float(times[-1]))
         axes = Axes(_CHART, (end - self.problem.horizon, end), (0.0, _reach(max(float(gaps.max()), float(required.max())))))

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.codegen import compile_function
-from safe_envs.problem import SafetyProblem
+from safe_envs.dynamics.codegen import compile_function
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes
 from safe_envs.rendering.canvas import Canvas
-from safe_envs.rendering.history import Moment
 from safe_envs.rendering.safe_set import LEVELS, STEP, tint
 from safe_envs.rendering.scenes.base import Scene, warning_color
 from safe_envs.rendering.scenes.plane import BOX, Plane
+from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import GOAL, GREY, INK, PAPER, SMALL, VIOLATION, mix
 
 _LENGTH = 15.0
@@ -80,7 +80,7 @@ class TopView(Scene):
         self._rings = len(self._obstacles) == len(circles)
         self._plane = Plane(self, ("x", "y"), BOX, chosen=[] if self._rings else None, equal=True)
 
-    def draw(self, canvas: Canvas, moment: Moment) -> None:
+    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         """Draw the vehicle and what is around it."""
         axes = self._plane.background(canvas, moment)
         canvas.within(axes.box)
@@ -93,14 +93,14 @@ class TopView(Scene):
         draw_vehicle(canvas, at, float(moment.state[self._heading]), moment)
         canvas.within(None)
 
-    def _draw_goal(self, canvas: Canvas, axes: Axes, moment: Moment, goal: Circle) -> None:
+    def _draw_goal(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot, goal: Circle) -> None:
         at = axes.place(*goal.middles(moment.states[-1:])[0])
         radius = goal.radius * axes.scale[0]
         canvas.disk(at, radius, mix(GOAL, PAPER, 0.35), GOAL, 2)
         canvas.disk(at, 2, INK)
         canvas.text("goal", (at[0], at[1] - radius - 3), INK, SMALL, align=(0.5, 1.0))
 
-    def _draw_obstacles(self, canvas: Canvas, axes: Axes, moment: Moment) -> None:
+    def _draw_obstacles(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> None:
         ways = [axes.places(*obstacle.middles(moment.states[-60:]).T) for obstacle in self._obstacles]
         sizes = [obstacle.radius * axes.scale[0] for obstacle in self._obstacles]
         if self._rings:
@@ -117,7 +117,7 @@ class TopView(Scene):
                 canvas.line(middle, (middle[0] + size, middle[1]), INK)
                 canvas.text(f"{obstacle.radius:g} m", (middle[0] + size / 2, middle[1] - 1), INK, SMALL - 2, align=(0.5, 1.0))
 
-    def _draw_hit(self, canvas: Canvas, axes: Axes, moment: Moment) -> None:
+    def _draw_hit(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> None:
         """Outline the obstacles that the vehicle was in at the first violation, where they were then; they may be elsewhere now."""
         if moment.violated is None:
             return
@@ -134,7 +134,7 @@ class TopView(Scene):
             canvas.text(f"at {moment.violated_at:.2f} s", (at[0], edge), mix(color, INK, 0.6), SMALL, align=(0.5, float(up)))
 
 
-def draw_vehicle(canvas: Canvas, at: tuple[float, float], heading: float, moment: Moment) -> None:
+def draw_vehicle(canvas: Canvas, at: tuple[float, float], heading: float, moment: EpisodeSnapshot) -> None:
     """Draw a triangle that points along a heading, and a line ahead of it."""
     ahead = math.cos(heading), -math.sin(heading)
     aside = -ahead[1], ahead[0]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from scripts.reproduce.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 
 
 @pytest.fixture
@@ -38,11 +38,11 @@ def coin(computed):
 @pytest.fixture
 def catalogue(coin, monkeypatch):
     """A catalogue of that alone."""
-    monkeypatch.setattr("scripts.reproduce.catalogue.ARTEFACTS", (coin,))
+    monkeypatch.setattr("safe_envs.scripts.reproduce.catalogue.ARTEFACTS", (coin,))
     return (coin,)
 
 
 @pytest.fixture
 def pictures(monkeypatch):
     """Has real figures saved as PNG only, which takes half as long; those of the coin are saved as SVG, too."""
-    monkeypatch.setattr("scripts.reproduce.store._SUFFIXES", (".png",))
+    monkeypatch.setattr("safe_envs.scripts.reproduce.framework.store._SUFFIXES", (".png",))

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from agents.problems import load_problem
-from scripts.reproduce import dubins_disk, dubins_learning, learned_runs, quadrotor, store, verdict
-from scripts.reproduce.artefact import Outcome, Sample
-from scripts.reproduce.learned_runs import runs, thinned
-from scripts.reproduce.printed_differences import printed_residuals
-from wrappers import HOCBF
+from safe_envs.registry import load_problem
+from safe_envs.scripts.reproduce.chapter_3 import dubins_disk, dubins_learning, learned_runs, quadrotor
+from safe_envs.scripts.reproduce.chapter_3.learned_runs import runs, thinned
+from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
+from safe_envs.scripts.reproduce.framework import store, verdict
+from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.wrappers import HOCBF
 
 pytestmark = pytest.mark.slow
 ARTEFACTS = {artefact.name: artefact for artefact in (*dubins_learning.ARTEFACTS, *quadrotor.ARTEFACTS)}

@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from agents.problems import load_problem
-from scripts.reproduce import dubins_disk, dubins_learning, quadrotor, verdict
-from scripts.reproduce.artefact import Outcome, Sample
-from scripts.reproduce.learned_runs import Run
+from safe_envs.registry import load_problem
+from safe_envs.scripts.reproduce.chapter_3 import dubins_disk, dubins_learning, quadrotor
+from safe_envs.scripts.reproduce.chapter_3.learned_runs import Run
+from safe_envs.scripts.reproduce.framework import verdict
+from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
 
 GOAL = (3.0, 1.5)
 OBSTACLE = load_problem(dubins_learning.OBSTACLE)

@@ -11,13 +11,22 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from agents.nominal import NominalController
-from safe_envs.barrier import Barrier
-from safe_envs.calculus import generator
-from scripts.reproduce import cruise, cruise_effort, cruise_setting, dubins_noise, dubins_points, dubins_runs, martingale, store
-from scripts.reproduce.artefact import Artefact, Outcome, Sample
-from scripts.reproduce.verdict import Verdict, judge
-from wrappers import SZCBF
+from safe_envs.agents.policies.nominal import NominalController
+from safe_envs.dynamics.lie import generator
+from safe_envs.problem.barrier import Barrier
+from safe_envs.scripts.reproduce.chapter_4 import (
+    cruise,
+    cruise_effort,
+    cruise_setting,
+    dubins_noise,
+    dubins_points,
+    dubins_runs,
+    martingale,
+)
+from safe_envs.scripts.reproduce.framework import store
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
+from safe_envs.wrappers import SZCBF
 
 pytestmark = pytest.mark.slow
 ARTEFACTS = {a.name: a for module in (martingale, cruise, dubins_noise) for a in module.ARTEFACTS}

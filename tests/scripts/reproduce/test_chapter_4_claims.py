@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from scripts.reproduce import cruise, cruise_effort, dubins_noise, dubins_points, dubins_runs, martingale
-from scripts.reproduce.artefact import Claim, Number
-from scripts.reproduce.cruise_effort import Run
-from scripts.reproduce.paired_episodes import Exits
+from safe_envs.scripts.reproduce.chapter_4 import cruise, cruise_effort, dubins_noise, dubins_points, dubins_runs, martingale
+from safe_envs.scripts.reproduce.chapter_4.cruise_effort import Run
+from safe_envs.scripts.reproduce.chapter_4.paired_episodes import Exits
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
 
 H = martingale.DISTANCES
 X = 1.0 - H
@@ -65,7 +65,7 @@ def test_bound_is_not_attained_off_the_closed_form() -> None:
 
 
 def first(count: int, of: int = 100) -> np.ndarray:
-    """Flags of which the first ones are set."""
+    """SafetyBits of which the first ones are set."""
     return np.arange(of) < count
 
 

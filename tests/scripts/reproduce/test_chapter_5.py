@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scripts.reproduce import cubic, cubic_paths, noise_terms, paired_rates, pendulum, store
-from scripts.reproduce.artefact import Outcome, Sample
-from scripts.reproduce.verdict import Verdict, judge
+from safe_envs.scripts.reproduce.chapter_5 import cubic, cubic_paths, noise_terms, paired_rates, pendulum
+from safe_envs.scripts.reproduce.framework import store
+from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
 
 pytestmark = pytest.mark.slow
 SAMPLE, FULL = Sample(quick=True), Sample()

@@ -5,18 +5,18 @@ import math
 import numpy as np
 import pytest
 
-from agents.comparison import Flags
-from agents.statistics import rate_interval
-from scripts.reproduce import cubic, cubic_paths, noise_terms, paired_rates, pendulum
-from scripts.reproduce.artefact import Sample
-from scripts.reproduce.paired_rates import Runs
-from scripts.reproduce.verdict import Verdict, judge
+from safe_envs.agents.evaluation.comparison import SafetyBits
+from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.scripts.reproduce.chapter_5 import cubic, cubic_paths, noise_terms, paired_rates, pendulum
+from safe_envs.scripts.reproduce.chapter_5.paired_rates import Runs
+from safe_envs.scripts.reproduce.framework.artefact import Sample
+from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
 
 
 def made(*safe, episodes=1000):
     """Runs in which the first so many episodes are safe, a number for each identification; or which ones, where an array is given."""
     flags = [np.arange(episodes) < each if isinstance(each, int) else each for each in safe]
-    kept = [Flags() for _ in flags]
+    kept = [SafetyBits() for _ in flags]
     for each, values in zip(kept, flags, strict=True):
         each.add(values)
     safe, trials = int(np.sum(flags)), len(flags) * episodes

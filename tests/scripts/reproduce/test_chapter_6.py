@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agents.evaluation import evaluate
-from agents.problems import load_problem
-from safe_envs.calculus import derivatives, generator
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.dynamics.lie import derivatives, generator
 from safe_envs.errors import RelativeDegreeError
-from scripts.reproduce import bayesian_cruise, bayesian_cubic, cubic_drift, identifications, learning_times
-from scripts.reproduce.artefact import Outcome, Sample
-from scripts.reproduce.learned_controllers import Learned, known, printed_totals
-from scripts.reproduce.store import keep
-from scripts.reproduce.verdict import Verdict, judge
+from safe_envs.registry import load_problem
+from safe_envs.scripts.reproduce.chapter_6 import bayesian_cruise, bayesian_cubic, cubic_drift, identifications, learning_times
+from safe_envs.scripts.reproduce.chapter_6.learned_controllers import Learned, known, printed_totals
+from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.store import keep
+from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
 
 pytestmark = pytest.mark.slow
 ARTEFACTS = {a.name: a for a in (*bayesian_cubic.ARTEFACTS, *bayesian_cruise.ARTEFACTS)}
@@ -149,8 +149,8 @@ def test_the_error_of_the_drift_is_the_law_for_states_over_the_disk():
     found = cubic_drift.study(problem, x, 10, range(6), 1000, 1)
     # Ten features, sigma = .2, K = 10, R = 1000, dt = .01. Near the centre the errors are smaller than on average over the disk.
     assert 0.3 < found.squares.mean() / (10 * 0.2**2 / (10 * 1000 * 0.01)) < 1.2
-    assert 0.7 < found.doubts.mean() < 1.3
-    assert found.overconfident.mean() == pytest.approx(found.doubts.mean() / math.sqrt(problem.dt), rel=0.05)
+    assert 0.7 < found.unverified_assumptions.mean() < 1.3
+    assert found.overconfident.mean() == pytest.approx(found.unverified_assumptions.mean() / math.sqrt(problem.dt), rel=0.05)
 
 
 @pytest.mark.parametrize("name", ["figure-6.1", "table-6.1"])
@@ -254,7 +254,7 @@ def test_an_identification_without_any_input_is_counted_as_the_bare_env(monkeypa
             raise RelativeDegreeError("no input")
         return evaluate(*args, **how)
 
-    monkeypatch.setattr("scripts.reproduce.learned_controllers.evaluate", blind)
+    monkeypatch.setattr("safe_envs.scripts.reproduce.chapter_6.learned_controllers.evaluate", blind)
     blinds: Any = [None, None]
     found = Learned.run(problem, "bayesian-scbf", blinds, reference)
     bare = evaluate(problem, filters=["none"], episodes=20, bounds=False).rows[0]["safety_rate"]

@@ -8,10 +8,18 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from agents.statistics import rate_interval
-from scripts.reproduce import bayesian_cruise, bayesian_cubic, cubic_drift, identifications, learned_controllers, learning_times, worst_case
-from scripts.reproduce.artefact import Number
-from scripts.reproduce.learned_controllers import Learned
+from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.scripts.reproduce.chapter_6 import (
+    bayesian_cruise,
+    bayesian_cubic,
+    cubic_drift,
+    identifications,
+    learned_controllers,
+    learning_times,
+    worst_case,
+)
+from safe_envs.scripts.reproduce.chapter_6.learned_controllers import Learned
+from safe_envs.scripts.reproduce.framework.artefact import Number
 
 DRAWS = norm.ppf((np.arange(10_000) + 0.5) / 10_000)
 """Of a standard normal posterior."""

@@ -20,13 +20,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from agents.processes import end_with_parent
+from safe_envs.agents.jobs.processes import end_with_parent
 from safe_envs.errors import ConfigurationError, WorkersLostError
-from scripts.reproduce.artefact import Outcome, Sample
-from scripts.reproduce.catalogue import ARTEFACTS
-from scripts.reproduce.command import compute_one
-from scripts.reproduce.page import write_page
-from scripts.reproduce.store import keep, read, source_checksum
+from safe_envs.scripts.reproduce.catalogue import ARTEFACTS
+from safe_envs.scripts.reproduce.command import compute_one
+from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.page import write_page
+from safe_envs.scripts.reproduce.framework.store import keep, read, source_checksum
 from tests.scripts.conftest import strictly
 from tests.scripts.reproduce.test_chapter_6 import outcome as outcome_of
 
@@ -53,7 +53,7 @@ def test_results_are_kept_by_configuration_and_version(tmp_path, coin, monkeypat
     assert read(tmp_path, coin, sample) == (outcome, 1.5)
     assert read(tmp_path, coin, Sample(101)) is None
     with monkeypatch.context() as patch:
-        patch.setattr("scripts.reproduce.store.source_checksum", lambda: "another")
+        patch.setattr("safe_envs.scripts.reproduce.framework.store.source_checksum", lambda: "another")
         assert read(tmp_path, coin, sample) is None
     (tmp_path / "table-0.1.svg").unlink()
     assert read(tmp_path, coin, sample) is None
@@ -130,7 +130,7 @@ def test_an_interrupt_ends_a_single_job_at_once(safe_envs_command, catalogue, co
         computed.append(1)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("scripts.reproduce.catalogue.ARTEFACTS", (replace(coin, name="table-0.2", compute=interrupted), coin))
+    monkeypatch.setattr("safe_envs.scripts.reproduce.catalogue.ARTEFACTS", (replace(coin, name="table-0.2", compute=interrupted), coin))
     status, _, err = safe_envs_command("reproduce", "all", "--jobs", 1, "--out", "report")
     assert status == 130
     assert "Stopped. The same command goes on after what is in report." in err
@@ -139,7 +139,7 @@ def test_an_interrupt_ends_a_single_job_at_once(safe_envs_command, catalogue, co
 
 
 def test_an_interrupt_ends_the_processes(monkeypatch, tmp_path, coin):
-    from scripts.reproduce import command
+    from safe_envs.scripts.reproduce import command
 
     def interrupted(*_):
         yield "table-0.1", None
@@ -176,7 +176,7 @@ def test_a_picture_without_its_numbers_is_not_taken_for_a_result(tmp_path, coin,
         raise ConfigurationError("no room")
 
     with monkeypatch.context() as patch:
-        patch.setattr("scripts.reproduce.store.write_json", full)
+        patch.setattr("safe_envs.scripts.reproduce.framework.store.write_json", full)
         with pytest.raises(ConfigurationError, match="no room"):
             keep(tmp_path, replace(coin, draw=lambda figure, _: figure.subplots()), Sample(100), coin.compute(Sample(100)), 1.0)
     with pytest.raises(ConfigurationError, match=r"table-0.1.png is another picture.*remove it, and it is computed again"):
@@ -274,7 +274,7 @@ def test_code_that_changed_during_a_run_is_not_kept(tmp_path, catalogue, compute
 
 
 def test_what_a_lost_process_computed_is_computed_again(tmp_path, monkeypatch):
-    from scripts.reproduce import command
+    from safe_envs.scripts.reproduce import command
 
     asked = []
 
@@ -291,7 +291,7 @@ def test_what_a_lost_process_computed_is_computed_again(tmp_path, monkeypatch):
 
 
 def test_the_processes_watch_their_parent(monkeypatch, tmp_path):
-    from scripts.reproduce import command
+    from safe_envs.scripts.reproduce import command
 
     given = {}
 
@@ -313,12 +313,12 @@ def test_a_run_that_was_stopped_goes_on(safe_envs_command, catalogue, computed, 
         raise ValueError("no luck")
 
     other = replace(coin, name="table-0.2", compute=fail)
-    monkeypatch.setattr("scripts.reproduce.catalogue.ARTEFACTS", (other, coin))
+    monkeypatch.setattr("safe_envs.scripts.reproduce.catalogue.ARTEFACTS", (other, coin))
     status, out, err = safe_envs_command("reproduce", "all", "--jobs", 1, "--out", "report")
     assert status == 2
     assert "table-0.2 failed: ValueError: no luck" in err
     assert "table-0.1" in out
-    monkeypatch.setattr("scripts.reproduce.catalogue.ARTEFACTS", (replace(coin, name="table-0.2"), coin))
+    monkeypatch.setattr("safe_envs.scripts.reproduce.catalogue.ARTEFACTS", (replace(coin, name="table-0.2"), coin))
     status, out, _ = safe_envs_command("reproduce", "table-0.2", "--jobs", 1, "--out", "report")
     assert status == 0
     assert len(computed) == 2
@@ -341,7 +341,7 @@ def test_what_it_cannot_take_ends_with_status_2(safe_envs_command, catalogue, tm
 @pytest.mark.slow
 def test_processes_compute_what_a_single_one_does(safe_envs_command, monkeypatch, tmp_path):
     """Over real artefacts, the quickest ones; in one process, whose start takes longer than they do."""
-    from scripts.reproduce import command
+    from safe_envs.scripts.reproduce import command
 
     asked = []
 

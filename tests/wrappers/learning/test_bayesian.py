@@ -10,21 +10,21 @@ import pytest
 import sympy as sp
 from scipy.stats import norm
 
-from safe_envs.calculus import generator, relative_degree
-from safe_envs.codegen import compile_function, stacked
+from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.lie import generator, relative_degree
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
-from safe_envs.problem import SafetyProblem
-from safe_envs.sde import ControlAffineSDE
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.systems.acc import acc_gap
 from safe_envs.systems.cubic import cubic_sde, cubic_sde_disk
 from safe_envs.systems.dubins import dubins_disk
-from wrappers.learning.bayesian import Prior, fit, identify
-from wrappers.learning.collect import collect, draw_states
-from wrappers.learning.features import Features
-from wrappers.learning.files import LearnedFileError, Signature, load
-from wrappers.learning.posterior import Posterior
-from wrappers.learning.regression import Rows, posterior
-from wrappers.learning.transitions import Transitions
+from safe_envs.wrappers.learning.bayesian import Prior, fit, identify
+from safe_envs.wrappers.learning.data.collection import collect, draw_states
+from safe_envs.wrappers.learning.data.transitions import Transitions
+from safe_envs.wrappers.learning.models.features import Features
+from safe_envs.wrappers.learning.models.files import LearnedFileError, Signature, load
+from safe_envs.wrappers.learning.posterior import Posterior
+from safe_envs.wrappers.learning.regression import Rows, posterior
 
 pytestmark = pytest.mark.slow
 

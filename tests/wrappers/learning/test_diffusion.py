@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs.calculus import ito_term
-from safe_envs.codegen import compile_function
+from safe_envs.dynamics.codegen import compile_function
+from safe_envs.dynamics.lie import ito_correction
 from safe_envs.systems.cubic import x_1, x_2
+from safe_envs.wrappers.learning.data.collection import collect
+from safe_envs.wrappers.learning.diffusion import LearnedDiffusion, covariances
+from safe_envs.wrappers.learning.estimators import drift_warnings, mean_rates, rates, slack
 from tests.conftest import problem_of
-from wrappers.learning.collect import collect
-from wrappers.learning.diffusion import LearnedDiffusion, covariances
-from wrappers.learning.estimators import drift_warnings, mean_rates, rates, slack
 
 CORRELATED = [[0.3, 0.0], [0.2, 0.15]]
 VARYING = [[0.3 + 0.1 * x_1, 0], [0.2, 0.1 * x_2]]
@@ -101,7 +101,7 @@ def test_the_factor_of_the_system_returns_the_covariance(diffusion):
     assert np.abs(np.array(difference, dtype=float)).max() < 1e-12
     assert system.drift == problem.model.drift
     h = problem.barriers[0].expression
-    assert all(power.exp.is_Integer for power in ito_term(system, h).atoms(sp.Pow))
+    assert all(power.exp.is_Integer for power in ito_correction(system, h).atoms(sp.Pow))
 
 
 def test_a_singular_covariance_keeps_a_real_factor():

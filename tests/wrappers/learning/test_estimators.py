@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safe_envs.calculus import gradient
-from safe_envs.codegen import compile_function
+from safe_envs.dynamics.codegen import compile_function
+from safe_envs.dynamics.lie import gradient
 from safe_envs.errors import ConfigurationError
+from safe_envs.wrappers.learning.data.collection import collect
+from safe_envs.wrappers.learning.estimators import drift_score, drift_warnings, in_bulk, ito_part, mean_rates, rates, region_warnings
+from safe_envs.wrappers.learning.models.network import Network
 from tests.conftest import problem_of
-from wrappers.learning.collect import collect
-from wrappers.learning.estimators import drift_score, drift_warnings, in_bulk, ito_part, mean_rates, rates, region_warnings
-from wrappers.learning.network import Network
 
 K = 200
 P = np.array([[np.sqrt(3), 1.0], [1.0, np.sqrt(3)]])

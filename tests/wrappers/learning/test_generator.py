@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safe_envs.barrier import Barrier
-from safe_envs.calculus import derivatives, drift_derivative, generator, input_derivative
-from safe_envs.codegen import compile_function
+from safe_envs.dynamics.codegen import compile_function
+from safe_envs.dynamics.lie import derivatives, generator, lie_derivative_f, lie_derivative_g
 from safe_envs.errors import ConfigurationError, InvalidInputError
+from safe_envs.problem.barrier import Barrier
 from safe_envs.systems.pendulum import pendulum
+from safe_envs.wrappers.learning.data.collection import collect
+from safe_envs.wrappers.learning.data.transitions import Transitions
+from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
+from safe_envs.wrappers.learning.models.files import LearnedFileError, Signature, load
 from tests.conftest import problem_of
-from wrappers.learning.collect import collect
-from wrappers.learning.files import LearnedFileError, Signature, load
-from wrappers.learning.generator import GeneratorModel, learn_generator
-from wrappers.learning.transitions import Transitions
 
 pytestmark = pytest.mark.slow
 
@@ -48,16 +48,16 @@ def at(problem, system, expression, x):
 def limit(problem, system, x):
     """Acceleration -b/(a M) at which the row a u + b >= 0 of the second order has its edge, in m/s^2."""
     first, second = derivatives(system, problem.barriers[0].expression, 2, generator)[1:]
-    coefficient = input_derivative(system, first)[0, 0]
+    coefficient = lie_derivative_g(system, first)[0, 0]
     return -at(problem, system, second, x) / at(problem, system, coefficient, x) / 1650
 
 
 def learned_limit(problem, model, x):
     """The same with the terms of the recursion."""
     system, terms = problem.model, model.generators[0].arrays(tuple(np.ascontiguousarray(x.T)))
-    first, second = derivatives(system, problem.barriers[0].expression, 2, drift_derivative)[1:]
+    first, second = derivatives(system, problem.barriers[0].expression, 2, lie_derivative_f)[1:]
     g = [float(e) for e in system.numeric(system.input_matrix)]
-    coefficient = at(problem, system, input_derivative(system, first)[0, 0], x) + sum(t * e for t, e in zip(terms[1:], g, strict=True))
+    coefficient = at(problem, system, lie_derivative_g(system, first)[0, 0], x) + sum(t * e for t, e in zip(terms[1:], g, strict=True))
     return -(at(problem, system, second, x) + terms[0]) / coefficient / 1650
 
 

@@ -7,16 +7,16 @@ import warnings
 import numpy as np
 import pytest
 
-from safe_envs.problem import SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.systems.cubic import cubic_sde, cubic_sde_disk
 from safe_envs.systems.quadrotor_altitude import quadrotor_altitude
-from wrappers.learning.bayesian import identify
-from wrappers.learning.collect import collect, draw_states, plant_step
-from wrappers.learning.features import Features
-from wrappers.learning.files import Signature
-from wrappers.learning.identifiability import IdentifiabilityWarning, term_names
-from wrappers.learning.posterior import Posterior
-from wrappers.learning.transitions import Transitions
+from safe_envs.wrappers.learning.bayesian import identify
+from safe_envs.wrappers.learning.data.collection import collect, draw_states, plant_step
+from safe_envs.wrappers.learning.data.transitions import Transitions
+from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning, term_names
+from safe_envs.wrappers.learning.models.features import Features
+from safe_envs.wrappers.learning.models.files import Signature
+from safe_envs.wrappers.learning.posterior import Posterior
 
 PROBLEM = cubic_sde_disk()
 

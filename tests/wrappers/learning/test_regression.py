@@ -9,7 +9,7 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import kstest, norm
 
 from safe_envs.errors import ConfigurationError
-from wrappers.learning.regression import Gaussian, posterior, sigma_map, sigma_quantile, sigma_samples
+from safe_envs.wrappers.learning.regression import Gaussian, posterior, sigma_map, sigma_quantile, sigma_samples
 
 
 @pytest.fixture

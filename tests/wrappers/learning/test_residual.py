@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safe_envs.barrier import Barrier
-from safe_envs.calculus import drift_derivative, input_derivative
-from safe_envs.codegen import compile_function, stacked
+from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.lie import lie_derivative_f, lie_derivative_g
 from safe_envs.errors import ConfigurationError
-from safe_envs.exploration import Exploration
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.wrappers.learning.base import Record
+from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states, plant_step
+from safe_envs.wrappers.learning.models.files import LearnedFileError, load
+from safe_envs.wrappers.learning.residual import ResidualModel, learn_residual, residual_labels
 from tests.conftest import problem_of
-from wrappers.learning.base import Record
-from wrappers.learning.collect import collect_paths, draw_states, plant_step
-from wrappers.learning.files import LearnedFileError, load
-from wrappers.learning.residual import ResidualModel, learn_residual, residual_labels
 
 pytestmark = pytest.mark.slow
 
@@ -28,8 +28,8 @@ def exact_residuals(problem, barrier, degree, x):
     for system in (problem.plant, problem.model):
         chain = [barrier.expression]
         for _ in range(degree):
-            chain.append(drift_derivative(system, chain[-1]))
-        expressions = [system.numeric(e) for e in (*chain[1:], *input_derivative(system, chain[-2]))]
+            chain.append(lie_derivative_f(system, chain[-1]))
+        expressions = [system.numeric(e) for e in (*chain[1:], *lie_derivative_g(system, chain[-2]))]
         found.append(stacked(compile_function(system.states, expressions, "arrays")(*np.ascontiguousarray(x.T)), len(x)))
     return found[0] - found[1]
 
@@ -215,7 +215,7 @@ def test_inputs_that_tell_nothing_apart_are_refused(disk):
     quadrotor = problem_of("safe_envs/Quadrotor-v0")
     four = quadrotor.exploration.inputs[:4]
     for problem, inputs in ((disk, ((1.0,),)), (disk, ((1.0,), (1.0,))), (quadrotor, four)):
-        poor = replace(problem, explored=Exploration(problem.exploration.region, inputs, problem.exploration.coordinates))
+        poor = replace(problem, explored=SamplingDomain(problem.exploration.region, inputs, problem.exploration.coordinates))
         with pytest.raises(ConfigurationError, match="apart"):
             learn_residual(poor, **_SMALL)
 

@@ -1,0 +1,1 @@
+"""Safety rates of filters with confidence intervals, on the same episodes for each filter."""

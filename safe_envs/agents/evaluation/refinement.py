@@ -1,0 +1,130 @@
+"""Has the safety rate converged in the control period?"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from safe_envs.agents.evaluation.contradiction import judged
+from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate
+from safe_envs.agents.evaluation.rollout import Progress, Row
+from safe_envs.agents.evaluation.statistics import paired_difference_interval
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.problem import SafetyProblem
+
+DIVISORS = (1, 2, 4)
+"""By what the control period is divided."""
+
+TOLERANCE = 0.03
+"""The most by which a rate may change, at either end of the interval, to be called converged."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """The answer of `refine`.
+
+    Attributes:
+        evaluations: with the control period dt as given, dt/2 and dt/4.
+        rows: for each filter its rates with these periods, the change between the last two, and a verdict.
+    """
+
+    evaluations: tuple[Evaluation, ...]
+    rows: list[Row]
+
+    @property
+    def periods(self) -> list[float]:
+        """The control periods in s."""
+        return [evaluation.problem.dt for evaluation in self.evaluations]
+
+    def document(self) -> dict[str, Any]:
+        """The evaluation with the given dt, and what its refinement says, as JSON-able data."""
+        refinement = {"dt": self.periods, "tolerance": TOLERANCE, "rows": self.rows}
+        return {**self.evaluations[0].document(), "refinement": refinement}
+
+
+def refine(
+    problem: SafetyProblem | str, policy: Any = "nominal", *, progress: Progress | None = None, record: bool = False, **arguments: Any
+) -> Refinement:
+    """Evaluate with the control period dt of a problem, with dt/2 and with dt/4: has the safety rate converged?
+
+    What filters rest on that is learned, is learned once, with the period dt.
+
+    Control, noise and the check of safety go with the period; `substeps` stay as they are. The horizon is the
+    number of whole periods dt that is simulated with the first. Episode i has the same seed each time, hence the same
+    start, but its noise is not the same path sampled more finely. The change is that of paired episodes.
+
+    The verdict on a rate is "converged" where the interval of its change from dt/2 to dt/4 reaches no further than
+    `TOLERANCE` either way. Elsewhere it is "still changing" where the interval does not contain 0, and "not resolved"
+    where it does, so that more episodes are needed. It says nothing of still smaller periods. A rate with any of these periods
+    contradicts a bound as it does in `evaluate`: then that is withheld, and the verdict "contradicted".
+
+    Args:
+        problem: as for `evaluate`.
+        policy: as for `evaluate`.
+        progress: told the part of the work of all three that is done, from 0 to 1.
+        record: keep trajectories of the first evaluation for pictures.
+        **arguments: the others of `evaluate`.
+
+    Raises:
+        ConfigurationError: as for `evaluate`, or dt cannot be divided.
+        RelativeDegreeError: a condition does not suit a barrier.
+        NumericalError: a simulation or a condition left the finite numbers.
+    """
+    if arguments.get("repeats", 1) != 1:
+        raise ConfigurationError("repeats are of the identification and refinement of the period: ask for one of the two")
+    if arguments.get("spec") is not None:
+        raise ConfigurationError("the control period of an env of somebody else is its own, and cannot be refined")
+    first = evaluate(problem, policy, progress=_share(progress, 0), record=record, **arguments)
+    arguments |= {"options": None, "filters": [row["filter"] for row in first.rows], "bounds": False, "learned": first.learned}
+    finer = [evaluate(_divided(first.problem, d), policy, progress=_share(progress, i), **arguments) for i, d in enumerate(DIVISORS) if i]
+    # The finer ones are nearer to continuous time, of which the bounds are.
+    first = replace(first, rows=[_judged(row, finer) for row in first.rows])
+    evaluations = (first, *finer)
+    return Refinement(evaluations, [_row(row["filter"], evaluations) for row in first.rows])
+
+
+def _judged(row: Row, finer: Sequence[Evaluation]) -> Row:
+    """A row without bounds that a rate with a finer period contradicts."""
+    for evaluation in finer:
+        row = judged(row, _of(evaluation, row["filter"])["ci_high"])
+    return row
+
+
+def _of(evaluation: Evaluation, name: str) -> Row:
+    return next(row for row in evaluation.rows if row["filter"] == name)
+
+
+def _share(progress: Progress | None, i: int) -> Progress | None:
+    """From the done part of the i-th evaluation to that of all: an evaluation has as much work as it has steps."""
+    if progress is None:
+        return None
+    before, all_steps = sum(DIVISORS[:i]), sum(DIVISORS)
+    return lambda done: progress((before + DIVISORS[i] * done) / all_steps)
+
+
+def _divided(problem: SafetyProblem, divisor: int) -> SafetyProblem:
+    # With the whole number of periods as the horizon all three end at the same time.
+    return replace(problem, dt=problem.dt / divisor, horizon=problem.duration)
+
+
+def _row(name: str, evaluations: tuple[Evaluation, ...]) -> Row:
+    cells = [_of(evaluation, name) for evaluation in evaluations]
+    coarse, fine = evaluations[-2:]
+    low, high = paired_difference_interval(*fine.flags[name][0].table(coarse.flags[name][0]), fine.config["confidence"])
+    return {
+        "filter": name,
+        **{key: [cell[key] for cell in cells] for key in ("safe", "safety_rate", "ci_low", "ci_high")},
+        "change": cells[-1]["safety_rate"] - cells[-2]["safety_rate"],
+        "change_low": low,
+        "change_high": high,
+        "verdict": "contradicted" if cells[0]["withheld"] else verdict(low, high),
+        "withheld": cells[0]["withheld"],
+    }
+
+
+def verdict(low: float, high: float) -> str:
+    """What the interval (low, high) of the change of a rate says: see `refine`."""
+    if max(-low, high) <= TOLERANCE:
+        return "converged"
+    return "not resolved" if low <= 0.0 <= high else "still changing"

@@ -1,0 +1,110 @@
+"""Those states of episodes that say something against a bound, or of a violation: kept while the episodes run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from safe_envs.dynamics.codegen import Components
+from safe_envs.problem.problem import SafetyProblem
+
+_KEPT = 64
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The states of episodes where most was missed, and where h was largest.
+
+    Attributes:
+        missed: states before a first violation where the filter missed its conditions by most, one an episode, shape (E, n).
+        actions: what was executed there, shape (E, m).
+        slack: by how much the worst row was missed there, shape (E,), the largest first.
+        deepest: states where the smallest h was largest, one an episode, shape (D, n).
+        depth: h there, shape (D,), the largest first.
+    """
+
+    missed: np.ndarray
+    actions: np.ndarray
+    slack: np.ndarray
+    deepest: np.ndarray
+    depth: np.ndarray
+
+    @classmethod
+    def nothing(cls, problem: SafetyProblem) -> Seen:
+        """Of no episodes."""
+        n, m = len(problem.states), len(problem.inputs)
+        return cls(np.empty((0, n)), np.empty((0, m)), np.empty(0), np.empty((0, n)), np.empty(0))
+
+    def joined(self, other: Seen) -> Seen:
+        """The most extreme states of both."""
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        missed, actions, slack, deepest, depth = (np.concatenate(pair) for pair in pairs)
+        worst, highest = _first(slack), _first(depth)
+        return Seen(missed[worst], actions[worst], slack[worst], deepest[highest], depth[highest])
+
+
+def _first(values: np.ndarray) -> np.ndarray:
+    """Where the largest values are, the largest first."""
+    return np.argsort(-values, kind="stable")[:_KEPT]
+
+
+class Watch:
+    """Keeps the extreme states of each episode of a wave."""
+
+    def __init__(self, x: Components, h: np.ndarray, inputs: int) -> None:
+        self._deepest = np.stack(x)
+        self.depth = h.copy()
+        """Largest value of the smallest barrier in each episode up to a violation, shape (B,)."""
+        self._missed, self._slack = np.zeros_like(self._deepest), np.zeros(len(h))
+        self._actions = np.zeros((inputs, len(h)))
+        self.lowest = np.stack(x)
+        """States (n, B) where an episode that violates has its smallest h."""
+
+    def add(self, before: Components, u: Components, slack: np.ndarray | None, counts: np.ndarray) -> None:
+        """Look at a step, from the state before it.
+
+        Args:
+            before: state before the step.
+            u: what was executed.
+            slack: by how much the worst row was missed, shape (B,); None without a filter.
+            counts: the episodes without a violation so far.
+        """
+        if slack is None or not slack.any():
+            return
+        worse = counts & (slack > self._slack)
+        if not worse.any():
+            return
+        np.copyto(self._slack, slack, where=worse)
+        _keep(self._missed, before, worse)
+        _keep(self._actions, u, worse)
+
+    def reached(self, x: Components, h: np.ndarray, h_min: np.ndarray, alive: np.ndarray, counts: np.ndarray) -> None:
+        """Look at the state that a step led to.
+
+        Args:
+            x: the state.
+            h: its smallest barrier.
+            h_min: the smallest of the episode before it.
+            alive: the episodes that go on.
+            counts: those of them without a violation before.
+        """
+        higher = counts & (h > self.depth)
+        np.copyto(self.depth, h, where=higher)
+        _keep(self._deepest, x, higher)
+        lower = alive & (h <= 0.0) & (h < h_min)
+        if lower.any():
+            _keep(self.lowest, x, lower)
+
+    def seen(self, count: int) -> Seen:
+        """What was seen in the first `count` episodes."""
+        slack, depth = self._slack[:count], self.depth[:count]
+        worst = _first(slack)
+        worst, highest = worst[slack[worst] > 0.0], _first(depth)
+        return Seen(self._missed.T[worst], self._actions.T[worst], slack[worst], self._deepest.T[highest], depth[highest])
+
+
+def _keep(kept: np.ndarray, values: Any, where: np.ndarray) -> None:
+    for row, value in zip(kept, values, strict=True):
+        np.copyto(row, value, where=where)

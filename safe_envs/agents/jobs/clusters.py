@@ -1,0 +1,154 @@
+"""joblib's own backends for Dask and Ray, with the loss of a worker told to joblib in place of waited for without end."""
+
+from __future__ import annotations
+
+import logging
+import re
+import socket
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from safe_envs.agents.sweeps.cell import Cell
+from safe_envs.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_PATIENCE = 15
+"""Seconds to wait for a scheduler, and for its first worker."""
+
+_LOOK = 5.0
+"""Seconds between two looks at whether a scheduler still has workers."""
+
+_MOST_LOOKS = 60
+"""After how many looks in a row without workers it is given up."""
+
+_RETRIES = 2
+"""How often Ray starts a cell again whose worker has ended; Dask's own setting says it for Dask."""
+
+
+class TaskLostError(Exception):
+    """A task ended outside of its function, as with its worker.
+
+    Attributes:
+        reason: what the cluster says.
+        cells: of the task.
+    """
+
+    def __init__(self, reason: BaseException, cells: Sequence[Cell]) -> None:
+        super().__init__(str(reason))
+        self.reason, self.cells = reason, cells
+
+
+@contextmanager
+def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[str, Any]]:
+    """The arguments of `joblib.Parallel` for a Dask scheduler.
+
+    Args:
+        address: of the scheduler.
+        tell: told when it has no workers any more. Without any for minutes, joblib raises ConfigurationError.
+
+    Raises:
+        ConfigurationError: there is none, or it has no workers.
+    """
+    from distributed import Client
+    from joblib._dask import DaskDistributedBackend
+
+    class Dask(DaskDistributedBackend):
+        def __init__(self, client: Client) -> None:
+            super().__init__(client=client)
+            self._waiting: dict[Any, Callable[[Any], None]] = {}
+
+        def effective_n_jobs(self, n_jobs: int) -> int:
+            # joblib computes in this process where there is one worker.
+            return max(super().effective_n_jobs(n_jobs), 2)
+
+        def submit(self, func: Any, callback: Callable[[Any], None] | None = None) -> Any:
+            future = super().submit(func, callback)
+            if callback is not None:
+                self._waiting[future] = callback
+                future.add_done_callback(lambda done: self._end(done, [args[0] for _, args, _ in func.items]))
+            return future
+
+        def _end(self, done: Any, cells: Sequence[Cell]) -> None:
+            callback, error = self._waiting.pop(done), done.exception()
+            if error is not None:
+                # Of a task that ended with an error outside of its function, joblib would never hear.
+                callback(TaskLostError(error, cells))
+
+        def give_up(self, error: Exception) -> None:
+            for callback in list(self._waiting.values())[:1]:
+                callback(error)
+
+    try:
+        _require_listener(re.sub("^(tcp|tls|ucx)://", "", address))
+        client = Client(address, timeout=_PATIENCE, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"no Dask scheduler answers at {address} ({error}); start one by: dask scheduler") from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=_PATIENCE)
+        except TimeoutError as error:
+            raise ConfigurationError(f"the Dask scheduler at {address} has no workers; start some by: dask worker {address}") from error
+        backend, ended = Dask(client), threading.Event()
+        watch = threading.Thread(target=_watch, args=(client, address, tell, backend.give_up, ended), daemon=True)
+        watch.start()
+        try:
+            # All at once: workers that come later get some, too.
+            yield {"backend": backend, "n_jobs": -1, "pre_dispatch": "all"}
+        finally:
+            ended.set()
+
+
+def _watch(client: Client, address: str, tell: Callable[[str], None], give_up: Callable[[Exception], None], ended: threading.Event) -> None:
+    """Look from time to time whether a scheduler has workers; say once that it has none, and give up when none come."""
+    looks = 0
+    while not ended.wait(_LOOK):
+        try:
+            looks = 0 if client.nthreads() else looks + 1
+        except Exception:  # That the scheduler itself ends is told with the tasks.
+            continue
+        if ended.is_set():
+            return
+        if looks == 1:
+            tell(f"The Dask scheduler at {address} has no workers any more; waiting for some. Start them by: dask worker {address}")
+        if looks == _MOST_LOOKS:
+            minutes = _LOOK * _MOST_LOOKS / 60
+            told = f"the Dask scheduler at {address} has had no workers for {minutes:g} minutes; start some by: dask worker {address}"
+            give_up(ConfigurationError(f"{told}, and start the sweep again: it goes on after what was computed"))
+
+
+@contextmanager
+def ray_settings(address: str) -> Iterator[dict[str, Any]]:
+    """The arguments of `joblib.Parallel` for a Ray cluster.
+
+    Raises:
+        ConfigurationError: it cannot be reached.
+    """
+    import ray
+    from ray.util.joblib.ray_backend import RayBackend
+
+    class Ray(RayBackend):
+        supports_return_generator = True
+
+    try:
+        _require_listener(address)
+        ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+    except (OSError, ValueError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise ConfigurationError(f"no Ray cluster answers at {address} ({reason}); start one by: ray start --head") from error
+    try:
+        remote = {"max_restarts": -1, "max_task_retries": _RETRIES}
+        yield {"backend": Ray(ray_remote_args=remote), "n_jobs": -1}
+    finally:
+        ray.shutdown()
+
+
+def _require_listener(address: str) -> None:
+    """Raise OSError unless something listens at HOST:PORT, ValueError for another form; the clusters' own clients try for long."""
+    host, _, port = address.rpartition(":")
+    if not (host and port.isdecimal() and "/" not in host):
+        raise ValueError("this is not of the form HOST:PORT")
+    socket.create_connection((host, int(port)), timeout=_PATIENCE).close()

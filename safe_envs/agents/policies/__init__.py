@@ -1,0 +1,1 @@
+"""Policies with the `predict` of Stable-Baselines3."""

@@ -1,0 +1,76 @@
+"""The controller of a control Lyapunov function."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from safe_envs.agents.policies.nominal import checked_observation
+from safe_envs.agents.policies.registry import Policy
+from safe_envs.envs.simulation import center_and_half_width
+from safe_envs.errors import ConfigurationError, NumericalError
+from safe_envs.problem.clf import CLF
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.filter_qp import Program, Solver, UndefinedRowError
+
+
+class CLFController(Policy):
+    """Solves min w_u |u|^2 + w_d d^2 subject to AV + rate V <= d and the box, exactly, at every observation.
+
+    It is the joint program of `safe_envs.wrappers.SafetyFilter` without barriers: put a filter with `objective="clf"` over
+    `ZeroController` for the one with them. With a single input there is no difference between that and a filter over this
+    controller, since the cost is convex; with several there is, since the nearest action is not the cheapest one.
+
+    Args:
+        problem: whose model, box and features are taken.
+        clf: the goal; that of the problem by default.
+
+    Raises:
+        ConfigurationError: there is no goal, or the observation does not hold the states.
+
+    Source: the CLF part of the quadratic programs in thesis Sec. 4.3.1 and 5.4.2.
+    """
+
+    def __init__(self, problem: SafetyProblem, clf: CLF | None = None) -> None:
+        goal = clf or problem.clf
+        if goal is None:
+            raise ConfigurationError(f"{problem.name} has no control Lyapunov function; use the policy nominal, or give one")
+        self._name = problem.name
+        self._width = len(problem.features)
+        self._columns = _columns_of_states(problem)
+        self._center, self._half = center_and_half_width(problem)
+        low, high = [pair[0] for pair in problem.box], [pair[1] for pair in problem.box]
+        program = Program(problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal)
+        self._floats, self._arrays = Solver(program, "floats"), Solver(program, "arrays")
+
+    def predict(
+        self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+    ) -> tuple[np.ndarray, Any]:
+        """Solve the program; see `Policy.predict`. Actions are in double precision.
+
+        Raises:
+            InvalidInputError: the observation has another shape than (k,) or (B, k).
+            NumericalError: the goal has no finite value at an observation.
+        """
+        given = checked_observation(observation, self._width)
+        x = np.ascontiguousarray(given[..., self._columns].T)
+        try:
+            if given.ndim == 1:
+                inputs = self._floats.best(tuple(x.tolist()), [0.0] * len(self._half))
+            else:
+                with np.errstate(all="ignore"):
+                    inputs = self._arrays.best(tuple(x), [np.zeros(len(given))] * len(self._half))
+        except (ArithmeticError, ValueError) as error:
+            row = given[error.index] if given.ndim == 2 and isinstance(error, UndefinedRowError) else given
+            raise NumericalError(f"the goal of {self._name!r} has no finite value at the observation {row.tolist()}") from error
+        actions = np.stack([(u - c) / w for u, c, w in zip(inputs, self._center, self._half, strict=True)], axis=-1)
+        return actions, state
+
+
+def _columns_of_states(problem: SafetyProblem) -> list[int]:
+    expressions = [feature.expression for feature in problem.features]
+    hidden = [str(state) for state in problem.model.states if state not in expressions]
+    if hidden:
+        raise ConfigurationError(f"the observation of {problem.name} does not hold {', '.join(hidden)}, which a CLF controller needs")
+    return [expressions.index(state) for state in problem.model.states]

@@ -1,0 +1,1 @@
+"""Probabilities of rare violations, by multilevel splitting and importance sampling."""

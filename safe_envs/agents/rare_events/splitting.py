@@ -1,0 +1,204 @@
+"""Probabilities of rare violations, by adaptive multilevel splitting on h."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
+from safe_envs.agents.jobs import blas_threads
+from safe_envs.agents.rare_events.importance_sampling import MakeDrifting
+from safe_envs.agents.rare_events.particles import Particles
+
+KILLED = 0.75
+"""Share of a repetition's paths that are killed at a level, at least."""
+
+LEAST = 1e-20
+"""Below this a probability is given up: its next level may be one that is never reached."""
+
+POWERS = (0.0, 0.5)
+"""Of the time that is left, in the two scores: see `safe_envs.agents.rare_events.particles.Particles`."""
+
+_PILOTS = 10
+_FEWEST_PARTICLES = 50
+_OFTEN = 0.1
+
+
+@dataclass(frozen=True)
+class Repetitions:
+    """Independent estimates of one probability.
+
+    Attributes:
+        estimates: unbiased, shape (R,); those that were given up are 0.
+        levels: that each took, shape (R,).
+        steps: control periods that were simulated in all.
+        first: violations among the paths of the beginning, which are plain episodes.
+        paths: how many these are.
+        outside: how many of them start where h <= 0.
+        kept_length: mean length of those that do not violate, in control periods; None without any.
+        length: mean length of all of these, up to a violation, in control periods.
+        stuck: for each repetition all of whose paths stood at one level, h there.
+        endless: for each one that fell below `LEAST`, h of its last level.
+        girsanov_integrals: of the paths that violate, as in `safe_envs.agents.rare_events.importance_sampling.TiltedNoiseEnv`, shape (V, 2).
+        shares: of the probability for which each of them stands, shape (V,).
+    """
+
+    estimates: np.ndarray
+    levels: np.ndarray
+    steps: int
+    first: int
+    paths: int
+    outside: int
+    kept_length: float | None
+    length: float
+    stuck: tuple[float, ...]
+    endless: tuple[float, ...]
+    girsanov_integrals: np.ndarray
+    shares: np.ndarray
+
+    @property
+    def given_up(self) -> int:
+        """Number of repetitions without an estimate."""
+        return len(self.stuck) + len(self.endless)
+
+
+@dataclass(frozen=True)
+class Splitting:
+    """How to estimate the probability that h comes down to 0, several times, side by side.
+
+    Each repetition begins with `particles` episodes. A level is the height that a given share of them did not fall below; those are
+    killed, all of them where several stand at one level, and replaced: by copies of survivors, chosen at random, up to the first
+    instant at which they fell below the level, and from there with noise of their own. With K_i of N killed at level i, the
+    probability is the product of the 1 - K_i/N, times the share that violates in the end. That is unbiased for any share and for
+    any score; both count for the spread alone.
+
+    Attributes:
+        make: a filtered env, which is made without a drift.
+        policy: anything with Stable-Baselines3's `predict`, without memory.
+        seed: of all randomness.
+        num_envs: the most episodes side by side.
+        bridge: looks at h between control instants too.
+        killed: share at a level, at least, between 0 and 1.
+
+    Source: C.-E. Brehier, M. Gazeau, L. Goudenege, T. Lelievre, M. Rousset, Unbiasedness of some generalized adaptive multilevel
+        splitting algorithms, Annals of Applied Probability 26 (2016) 3559-3601.
+    """
+
+    make: MakeDrifting
+    policy: Any
+    seed: int
+    num_envs: int
+    bridge: BrownianBridge | None = None
+    killed: float = KILLED
+
+    def choose(self, particles: int, progress: Callable[[float], None] | None = None) -> tuple[float, int]:
+        """Find the power whose estimates differ less, in a few small repetitions with each; 0 if violations are frequent.
+
+        Args:
+            particles: of the estimation that is to come.
+            progress: told the part that is done.
+
+        Returns:
+            One of `POWERS`, and the control periods that were simulated.
+        """
+        count = max(particles // 5, _FEWEST_PARTICLES)
+        run = _Run(self, np.repeat(POWERS, _PILOTS), count, spawn_key=(0, 2))
+        often = run.first > _OFTEN * run.paths.lowest.size
+        if not often:
+            run.finish(progress)
+        spreads = [_spread(part) for part in np.split(run.estimates, len(POWERS))]
+        return (POWERS[0] if often else POWERS[spreads.index(min(spreads))]), run.paths.steps
+
+    def estimate(self, power: float, particles: int, repetitions: int, progress: Callable[[float], None] | None = None) -> Repetitions:
+        """Estimate the probability.
+
+        Args:
+            power: of the score.
+            particles: N.
+            repetitions: R.
+            progress: told the part of the way from the first level to 0.
+
+        Raises:
+            ConfigurationError: the policy has a memory.
+        """
+        run = _Run(self, np.full(repetitions, power), particles, spawn_key=(1, 2))
+        length = run.paths.steps / run.paths.lowest.size
+        run.finish(progress)
+        return Repetitions(
+            run.estimates,
+            run.levels,
+            run.paths.steps,
+            run.first,
+            run.paths.lowest.size,
+            run.paths.outside,
+            run.paths.kept_length,
+            length,
+            tuple(run.stuck),
+            tuple(run.endless),
+            *run.violating(),
+        )
+
+
+def _spread(estimates: np.ndarray) -> tuple[int, float]:
+    """How much estimates differ: first by how many there are none, then by the deviation of the logarithms of the others."""
+    found = estimates[estimates > 0.0]
+    return len(estimates) - len(found), float(np.std(np.log(found))) if len(found) else 0.0
+
+
+class _Run:
+    """Repetitions under way, after their first episodes."""
+
+    def __init__(self, how: Splitting, powers: np.ndarray, particles: int, spawn_key: Sequence[int]) -> None:
+        seed = np.random.SeedSequence(how.seed, spawn_key=spawn_key)
+        self._particles, self._rank = particles, min(max(round(how.killed * particles), 1), particles - 1)
+        self._generator = np.random.default_rng(seed.spawn(1)[0])
+        self.paths = Particles(how.make, how.policy, np.repeat(powers, particles), seed, how.num_envs, how.bridge)
+        self.estimates, self.levels = np.ones(len(powers)), np.zeros(len(powers), dtype=np.int64)
+        self.stuck: list[float] = []
+        self.endless: list[float] = []
+        with blas_threads.limited():
+            self.paths.begin()
+        self.first = int(np.count_nonzero(self.paths.lowest <= 0.0))
+
+    def finish(self, progress: Callable[[float], None] | None) -> None:
+        """Go from level to level until every repetition has its estimate or is given up."""
+        active, highest = range(len(self.estimates)), 0.0
+        with blas_threads.limited():
+            while True:
+                found = {r: kill for r in active if (kill := self._next_level(r)) is not None}
+                if not found:
+                    return
+                active = list(found)
+                killed, parents, levels = (np.concatenate(parts) for parts in zip(*found.values(), strict=True))
+                self.levels[active] += 1
+                highest = max(highest, float(levels.max()))
+                if progress:
+                    progress(1.0 - float(levels.mean()) / highest)
+                self.paths.branch(killed, parents, levels)
+
+    def violating(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the paths that violate, their `girsanov_integrals`, and the part of the estimated probability for which each stands."""
+        violate = self.paths.lowest.reshape(len(self.estimates), self._particles) <= 0.0
+        each = self.estimates / (np.maximum(violate.sum(axis=1), 1) * len(self.estimates))
+        return self.paths.girsanov_integrals(np.flatnonzero(violate)), np.repeat(each, violate.sum(axis=1))
+
+    def _next_level(self, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Whom to kill, whom to continue in their place and from which level; None if the repetition is at its end."""
+        own = np.arange(r * self._particles, (r + 1) * self._particles)
+        lowest = self.paths.lowest[own]
+        place = self._particles - self._rank
+        level = float(np.partition(lowest, place)[place])
+        if level <= 0.0:
+            self.estimates[r] *= np.count_nonzero(lowest <= 0.0) / self._particles
+            return None
+        killed, survivors = own[lowest >= level], own[lowest < level]
+        self.estimates[r] *= survivors.size / self._particles
+        if self.estimates[r] < LEAST:
+            kept = self.endless if survivors.size else self.stuck
+            kept.append(float(self.paths.h_at_lowest(killed).min()))
+            self.estimates[r] = 0.0
+            return None
+        return killed, self._generator.choice(survivors, killed.size), np.full(killed.size, level)

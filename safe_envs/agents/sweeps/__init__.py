@@ -1,0 +1,1 @@
+"""Evaluations over a grid of settings, read from one file."""

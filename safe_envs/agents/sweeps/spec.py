@@ -1,0 +1,158 @@
+"""What a sweep is: from a file that names settings and their values to cells, each of which is one evaluation."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.policies.registry import make_policy
+from safe_envs.agents.sweeps.cell import Cell, checksum, versions
+from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_imported
+from safe_envs.agents.sweeps.document import document_in
+from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_of
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
+from safe_envs.registry import load_problem
+from safe_envs.wrappers import LEARNED, SafetyFilter, require_readable
+
+_NO_PART = ("seed", "episodes", "bounds")
+"""Settings that change neither the problem nor the filter nor the policy."""
+
+_BESIDE = {"filter": ("env", "system", "knowledge", "objective"), "policy": ("env", "system")}
+"""With what else a setting has to suit."""
+
+_MOST_CELLS = 50_000
+"""They are all told apart before the first is computed, in a second."""
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Cells, in the order of their file.
+
+    Attributes:
+        cells: each once.
+        swept: names of the settings that are not the same in all of them.
+    """
+
+    cells: tuple[Cell, ...]
+    swept: tuple[str, ...]
+
+
+def read_sweep(path: Path, trust: bool = False) -> Sweep:
+    """Read a sweep from a YAML file, and check all that can be checked before a cell is computed.
+
+    The file has the sections `fixed` (setting: value), `grid` (setting: list of values; lists multiply) and `cells` (a list of
+    setting: value). Settings are the arguments of an evaluation: see `docs/guides/sweep.md`.
+
+    Args:
+        path: of the file. Paths in it begin at the working directory.
+        trust: load a policy's .zip, which runs code that it contains.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or a section, setting, id, filter, policy or value is not allowed.
+        RelativeDegreeError: a filter does not suit a barrier.
+    """
+    sweep = sweep_of(document_in(path), trust, what=str(path))
+    _check(sweep, str(path))
+    return sweep
+
+
+def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Sweep:
+    """A sweep from what its file holds, with names and kinds of values checked.
+
+    Args:
+        document: the file's mapping from sections.
+        trust: see `read_sweep`.
+        what: how errors call it.
+
+    Raises:
+        ConfigurationError: a section or a setting is not allowed.
+    """
+    fixed, grid, given = sections(document, what)
+    for name in (*grid, *itertools.chain.from_iterable(given)):
+        if name in fixed:
+            raise ConfigurationError(f"{what}: {name} is fixed, and has other values too; give it once")
+    count = 1
+    for values in grid.values():
+        count *= len(values)
+    if count > _MOST_CELLS:
+        raise ConfigurationError(f"{what}: the grid has {count} cells; the most are {_MOST_CELLS}")
+    chosen = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())] if grid else []
+    chosen += given
+    if not chosen:
+        chosen = [{}]
+    once = {_equal(settings): settings for settings in (complete({**fixed, **each}, what) for each in chosen)}
+    cells = {cell.key: cell for cell in _cells(once.values(), trust)}
+    return Sweep(tuple(cells.values()), tuple(_swept([cell.settings for cell in cells.values()])))
+
+
+def describe(cell: Cell, names: Iterable[str]) -> str:
+    """A cell in a few words: the settings of these names."""
+    return ", ".join(f"{name} = {text_of(cell.settings[name])}" for name in names if name in cell.settings)
+
+
+def _equal(settings: Settings) -> str:
+    """The same for settings that differ in 1 and 1.0 of a barrier only, and so are of the same episodes."""
+
+    def one_form(value: Any) -> Any:
+        return json.loads(json.dumps(value), parse_int=float)
+
+    return json.dumps({name: one_form(value) if name.startswith("barrier.") else value for name, value in settings.items()})
+
+
+def _cells(found: Iterable[Settings], trust: bool) -> Iterable[Cell]:
+    digests: dict[Path, dict[str, str]] = {}
+    for given in found:
+        settings, files = absolute(given), {}
+        for path in read_by(settings):
+            if path not in digests:
+                digests[path] = {str(each): checksum(each) for each in with_imported(path)}
+            files |= digests[path]
+        yield Cell(settings, files, versions(), trust)
+
+
+def _swept(settings: Sequence[Mapping[str, Any]]) -> Iterable[str]:
+    names = dict.fromkeys(name for each in settings for name in each)
+    return (name for name in names if len({json.dumps(each.get(name)) for each in settings}) > 1)
+
+
+def _check(sweep: Sweep, what: str) -> None:
+    """Make the problem, the filter and the policy of every cell that has a value, or one with its env, that none before it had.
+
+    Others would repeat it, and to make the problem of a large system takes a second.
+
+    Raises:
+        SafeEnvsError: one cannot be made; says of which cell.
+    """
+    seen: set[str] = set()
+    for cell in sweep.cells:
+        beside = {name: [cell.settings.get(other) for other in others] for name, others in _BESIDE.items()}
+        looked_at = {name: value for name, value in cell.settings.items() if name not in _NO_PART}
+        parts = {name: json.dumps([name, value, beside.get(name)]) for name, value in looked_at.items()}
+        new = {name for name, part in parts.items() if part not in seen}
+        if not new:
+            continue
+        seen |= set(parts.values())
+        try:
+            _check_cell(cell, "filter" in new)
+        except SafeEnvsError as error:
+            where = describe(cell, sweep.swept)
+            raise type(error)(f"{what}{', cell ' * bool(where)}{where}: {error}") from error
+
+
+def _check_cell(cell: Cell, derive: bool) -> None:
+    settings = cell.settings
+    for name, allowed in (("knowledge", ("model", "plant")), ("objective", ("nearest", "clf"))):
+        if settings[name] not in allowed:
+            raise ConfigurationError(f"{name} = {shown(settings[name])}; {nearest(settings[name], allowed)}")
+    problem = load_problem(cell.env_id, cell.options)
+    if settings["filter"] != BARE:
+        require_readable(settings["filter"], problem)
+        rests_on_learned = any(part.split(":")[0] in LEARNED for part in settings["filter"].split("+"))
+        if derive and not rests_on_learned:
+            SafetyFilter.for_problem(problem, settings["filter"], settings["knowledge"], settings["objective"])
+    make_policy(settings["policy"], problem, cell.trust)

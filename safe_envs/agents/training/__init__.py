@@ -1,0 +1,1 @@
+"""Training of Stable-Baselines3 agents with a filter in the loop."""

@@ -1,0 +1,148 @@
+"""The algorithms of Stable-Baselines3, made from hyperparameters by the RL Zoo's names."""
+
+from __future__ import annotations
+
+import ast
+import copy
+import inspect
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from safe_envs.agents.training.hyperparameters import scheduled
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
+from safe_envs.problem.problem import SafetyProblem
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecEnv
+
+OFF_POLICY = ("sac", "td3")
+
+ACTIONS = ("executed", "proposed", "both")
+"""On which these may learn behind a filter; see `safe_envs.agents.training.replay_buffer`."""
+
+SHOWN = 1000
+"""Characters of hyperparameters, or of what others say of them, at most, that a message repeats."""
+
+_OF_THE_ENV = ("normalize",)
+_OF_THE_NOISE = ("noise_type", "noise_std")
+_OF_THE_BUFFER = ("replay_buffer_class", "replay_buffer_kwargs")
+
+
+def algorithm_class(name: str) -> type[BaseAlgorithm]:
+    """The class of "ppo", "a2c", "sac" or "td3"."""
+    import stable_baselines3
+
+    return getattr(stable_baselines3, name.upper())
+
+
+def new_model(name: str, envs: VecEnv, problem: SafetyProblem, settings: Mapping[str, Any], action: str | None, seed: int) -> BaseAlgorithm:
+    """Make an algorithm that has learned nothing yet; its `get_env()` is `envs`, normalised if the settings say so.
+
+    Args:
+        name: see `algorithm_class`.
+        envs: on which it learns.
+        problem: of the envs.
+        settings: hyperparameters of the algorithm, and `normalize`, `noise_type` and `noise_std`.
+        action: on which an off-policy algorithm learns behind a filter; None without a filter, or on-policy.
+        seed: of the algorithm.
+
+    Raises:
+        ConfigurationError: the algorithm does not take these settings, or its policy cannot be saved as numbers.
+    """
+    from safe_envs.agents.policies.sb3_actor import actor_of
+
+    # Stable-Baselines3 writes into what it is given.
+    left = scheduled(copy.deepcopy(dict(settings)))
+    _require_known(name, left)
+    try:
+        envs = _normalized(envs, left.pop("normalize", False), left.get("gamma", 0.99))
+        left |= _action_noise(left.pop("noise_type", None), left.pop("noise_std", None), problem.plant.m)
+        if action is not None:
+            left |= _replay(problem, action, left)
+        if isinstance(left.get("train_freq"), list):
+            left["train_freq"] = tuple(left["train_freq"])
+        model: Any = algorithm_class(name)(env=envs, seed=seed, device="cpu", **left)
+    except SafeEnvsError:
+        raise
+    except (ArithmeticError, AssertionError, LookupError, RecursionError, SyntaxError, TypeError, ValueError) as error:
+        raise ConfigurationError(
+            f"{name} does not take these hyperparameters: {str(error)[:SHOWN]}; they are {str(settings)[:SHOWN]}"
+        ) from error
+    # Better now than when the first checkpoint is written.
+    actor_of(model.policy)
+    return model
+
+
+def _require_known(name: str, settings: Mapping[str, Any]) -> None:
+    given = ("self", "env", "seed", "device", "_init_setup_model")
+    parameters = inspect.signature(algorithm_class(name)).parameters
+    allowed = [key for key in parameters if key not in given]
+    allowed += [*_OF_THE_ENV, *(_OF_THE_NOISE if name in OFF_POLICY else ())]
+    for key, value in settings.items():
+        if key not in allowed:
+            raise ConfigurationError(f"{name} does not take the hyperparameter {shown(key)}; {nearest(key, allowed)}")
+        # Stable-Baselines3 would fail after the first rollout only.
+        if isinstance(value, str) and key in parameters and type(parameters[key].default) in (int, float):
+            raise ConfigurationError(f"{key} = {shown(value)}; give a number")
+
+
+def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:
+    """The size of the minibatches that a rollout is cut into: the given one, or the largest below it that leaves no rest.
+
+    Args:
+        batch_size: wanted.
+        rollout: steps of all envs.
+        asked_for: whether a user gave it, who is not to get another one.
+
+    Raises:
+        ConfigurationError: it is no whole number from 2, or it was asked for and leaves a rest.
+    """
+    if isinstance(batch_size, bool) or not isinstance(batch_size, int) or batch_size < 2:
+        raise ConfigurationError(f"batch_size = {batch_size!r}; give a whole number from 2")
+    fits = next((size for size in range(min(batch_size, rollout), 1, -1) if rollout % size == 0), rollout)
+    if asked_for and fits != batch_size:
+        raise ConfigurationError(
+            f"batch_size = {batch_size} does not divide the rollout of n_steps x num_envs = {rollout} steps; give {fits}"
+        )
+    return fits
+
+
+def _normalized(envs: VecEnv, normalize: Any, gamma: float) -> VecEnv:
+    """The envs in a VecNormalize, as the Zoo's `normalize` says: a bool, a mapping, or the text of one."""
+    if isinstance(normalize, str):
+        normalize = ast.literal_eval(normalize)
+    if normalize is False or normalize is None:
+        return envs
+    if normalize is not True and not isinstance(normalize, Mapping):
+        raise ConfigurationError(
+            f"normalize = {normalize!r}; give true, false, or a mapping such as {{norm_obs: true, norm_reward: false}}"
+        )
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    return VecNormalize(envs, **{"gamma": gamma, **({} if normalize is True else normalize)})
+
+
+def _action_noise(kind: str | None, deviation: float | None, inputs: int) -> dict[str, Any]:
+    from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+
+    kinds = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
+    if kind is None and deviation is None:
+        return {}
+    if kind not in kinds:
+        raise ConfigurationError(f"noise_type = {kind!r}; {nearest(str(kind), kinds)}")
+    if deviation is None:
+        raise ConfigurationError(f"noise_type = {kind!r} needs noise_std")
+    return {"action_noise": kinds[kind](np.zeros(inputs), np.full(inputs, float(deviation)))}
+
+
+def _replay(problem: SafetyProblem, action: str, settings: dict[str, Any]) -> dict[str, Any]:
+    """Take what the buffer needs out of the settings, and return the buffer's."""
+    from safe_envs.agents.training.replay_buffer import replay_options
+
+    given = [key for key in _OF_THE_BUFFER if key in settings]
+    if given:
+        raise ConfigurationError(f"{', '.join(given)}: behind a filter the replay buffer is that of --action; leave it out")
+    return replay_options(problem, action, n_steps=settings.pop("n_steps", 1), gamma=settings.pop("gamma", 0.99))

@@ -1,0 +1,140 @@
+"""What happens while an agent is trained, for Stable-Baselines3's logger: safety of episodes, interventions, infeasible steps."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections import deque
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter
+
+from safe_envs.atomic_io import write_atomically, writing
+from safe_envs.errors import ConfigurationError
+
+_EPISODES = 100
+
+_LONGEST = 1_000_000
+"""Characters of a line of a log, at most: it has some tens of numbers."""
+
+
+class SafetyFigures(BaseCallback):
+    """Counts what the infos of a `SafeVecEnv` say, and records it under `safety/` whenever a rollout ends.
+
+    | key | meaning |
+    |---|---|
+    | `rate` | share of the last 100 episodes without a violation |
+    | `episode_cost` | their mean number of unsafe steps |
+    | `h_min` | their mean smallest barrier value |
+    | `violations` | unsafe steps in the training so far |
+    | `interventions`, `infeasible` | shares of all steps so far, with a filter |
+
+    Attributes:
+        counts: JSON-able, all that has to be kept to go on later.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: dict[str, Any] = {"steps": 0, "violations": 0, "episodes": []}
+
+    def _on_step(self) -> bool:
+        batch = self.training_env.unwrapped.batch_info  # pyright: ignore[reportAttributeAccessIssue]
+        counts, done = self.counts, np.flatnonzero(self.locals["dones"])
+        counts["steps"] += len(batch["violation"])
+        counts["violations"] += int(batch["violation"].sum())
+        if "intervention" in batch:
+            counts["interventions"] = counts.get("interventions", 0) + int(batch["intervention"].sum())
+            counts["infeasible"] = counts.get("infeasible", 0) + int((~batch["feasible"]).sum())
+        if done.size:
+            ended = zip(batch["episode_cost"][done].tolist(), batch["h_min"][done].tolist(), strict=True)
+            counts["episodes"] = list(deque([*counts["episodes"], *map(list, ended)], _EPISODES))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        for name, value in self.figures().items():
+            self.logger.record(f"safety/{name}", value)
+
+    def restore(self, counts: Any) -> None:
+        """Go on with the counts of another run.
+
+        Raises:
+            ValueError: they are not such counts.
+        """
+        whole = [count for name, count in counts.items() if name != "episodes"]
+        ended = [number for episode in counts["episodes"] for number in episode]
+        known = {"steps", "violations", "episodes"} <= set(counts) <= {*self.counts, "interventions", "infeasible"}
+        if not (known and all(type(n) is int and n >= 0 for n in whole) and len(ended) == 2 * len(counts["episodes"]) <= 2 * _EPISODES):
+            raise ValueError(f"the counts are {list(counts)}")
+        if not all(type(number) in (int, float) and math.isfinite(number) for number in ended):
+            raise ValueError("the last episodes are not numbers")
+        self.counts = counts
+
+    def figures(self) -> dict[str, float]:
+        """The figures by name; those of episodes from the first one on that ended."""
+        counts = self.counts
+        found = {"violations": float(counts["violations"])}
+        found |= {name: counts[name] / counts["steps"] for name in ("interventions", "infeasible") if name in counts}
+        if counts["episodes"]:
+            cost, h_min = np.array(counts["episodes"]).T
+            found |= {"rate": float(np.mean(cost == 0)), "episode_cost": float(cost.mean()), "h_min": float(h_min.mean())}
+        return found
+
+
+class ProgressLog(KVWriter):
+    """Everything that is logged, as a line of JSON for each dump, in a file that a resumed training goes on with.
+
+    Args:
+        path: of the file.
+        until: lines of later steps are dropped: they were written after the checkpoint from which a training goes on.
+    """
+
+    def __init__(self, path: Path, until: int) -> None:
+        self._path = path
+        write_atomically(path, lambda part: _copy(path, part, until))
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Append a line; numbers that are not finite are null."""
+        numbers = {key: _number(value) for key, value in sorted(key_values.items()) if isinstance(value, int | float | np.number)}
+        with writing(self._path), self._path.open("a") as stream:
+            stream.write(json.dumps({"step": step, **numbers}, allow_nan=False) + "\n")
+
+    def close(self) -> None:
+        """There is nothing to close: each line is written at once."""
+
+
+def read_progress(path: Path) -> list[Mapping[str, Any]]:
+    """The lines of a `ProgressLog`."""
+    return [line for _, line in _lines(path)]
+
+
+def _copy(path: Path, to: Path, until: int) -> None:
+    """Copy the lines of a log up to a step."""
+    with to.open("w") as stream:
+        stream.writelines(text for text, line in _lines(path) if line["step"] <= until)
+
+
+def _lines(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """The whole lines of a log, as they are and read."""
+    if not path.is_file():
+        return
+    with path.open() as stream:
+        try:
+            # The last line of a training that was killed may be half a line.
+            while (text := stream.readline(_LONGEST)).endswith("\n"):
+                line = json.loads(text)
+                if type(line["step"]) is not int:
+                    raise ValueError(f"a line is of step {line['step']!r}")
+                yield text, line
+            if len(text) == _LONGEST:
+                raise ValueError("a line is too long")
+        except (LookupError, RecursionError, TypeError, ValueError) as error:
+            raise ConfigurationError(f"{path} cannot be read ({error}); it is damaged or altered: remove it") from error
+
+
+def _number(value: Any) -> float | int | None:
+    number = value.item() if isinstance(value, np.number) else value
+    return number if math.isfinite(number) else None

@@ -1,0 +1,1 @@
+"""Control-affine stochastic differential equations: symbols, derivatives, generated code and integrators."""

@@ -1,0 +1,257 @@
+"""From sympy expressions to functions of plain floats, or of NumPy arrays over any batch.
+
+Both flavours take their arguments one by one, component by component, and return a tuple: with arrays, every
+component is an array over the batch, so that elementwise arithmetic runs on contiguous memory.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from typing import Any, Literal
+
+import numpy as np
+import sympy as sp
+from sympy.printing.codeprinter import PrintMethodNotImplementedError
+
+from safe_envs.dynamics.printers import SUPPORTED, ArrayPrinter, FloatPrinter
+from safe_envs.errors import SystemDefinitionError
+
+Flavour = Literal["floats", "arrays"]
+Components = tuple[Any, ...]
+
+_LARGEST_EXPANDED_POWER = 8
+_LARGEST_FLOAT = sp.Rational(sys.float_info.max)
+_LONGEST_QUOTED = 120
+
+
+_settled: dict[int, np.ndarray] = {}
+
+
+class _Remembering:
+    """A costly ufunc that knows its values at the arrays that were last given to `settled`.
+
+    The observation, the filter and the next step ask for the sine of one and the same heading. No other array is
+    remembered: its owner may change it in place between two calls.
+    """
+
+    def __init__(self, ufunc: np.ufunc) -> None:
+        self._ufunc = ufunc
+        self.known: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def __call__(self, argument: Any) -> Any:
+        entry = self.known.get(id(argument))
+        if entry is not None and entry[0] is argument:
+            return entry[1]
+        value = self._ufunc(argument)
+        if _settled.get(id(argument)) is argument:
+            value.setflags(write=False)
+            self.known[id(argument)] = (argument, value)
+        return value
+
+
+_REMEMBERING = {name: _Remembering(getattr(np, name)) for name in ("sin", "cos")}
+
+
+def _elementwise(function: Callable[[float], float]) -> Callable[[Any], np.ndarray]:
+    """What NumPy lacks, one element at a time."""
+    ufunc = np.frompyfunc(function, 1, 1)
+    return lambda argument: np.asarray(ufunc(argument), dtype=float)
+
+
+_ARRAY_FUNCTIONS = {**_REMEMBERING, "erf": _elementwise(math.erf), "erfc": _elementwise(math.erfc)}
+
+
+def settled(components: Sequence[Any], shape: tuple[int, ...]) -> Components:
+    """Components as read-only arrays of their own, whose sines and cosines are computed once until the next call.
+
+    Args:
+        components: arrays that were made for the caller, and that nobody else can write to, or numbers.
+        shape: of the arrays returned.
+    """
+    global _settled
+    arrays = tuple([a if type(a) is np.ndarray and a.base is None and a.ndim else np.array(filled(a, shape)) for a in components])
+    for array in arrays:
+        array.setflags(False)  # pyright: ignore[reportCallIssue]  (a keyword takes three times as long)
+    _settled = {id(array): array for array in arrays}
+    for function in _REMEMBERING.values():
+        function.known = {}
+    return arrays
+
+
+def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[Any], flavour: Flavour) -> Callable[..., Components]:
+    """Compile expressions that share their common subexpressions.
+
+    Args:
+        arguments: symbols, in the order in which the function takes them; their names may be any texts.
+        expressions: what it returns, in order; every free symbol must be an argument.
+        flavour: "floats" for plain floats, "arrays" for NumPy arrays that broadcast against each other.
+
+    Returns:
+        A function of `len(arguments)` positional arguments that returns a tuple of `len(expressions)`. An
+        expression without any argument in it comes back as a number without axes. The arrays returned may be those
+        given, and must not be changed in place.
+
+    Raises:
+        SystemDefinitionError: an expression holds a symbol that is no argument, a function without a numerical form,
+            or a number that is not real or too large; or a symbol is an argument twice.
+    """
+    return _compile(tuple(arguments), tuple(sp.sympify(e) for e in expressions), flavour)
+
+
+@lru_cache(maxsize=1024)
+def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], flavour: Flavour) -> Callable[..., Components]:
+    names, formulas, numbers, shared = _prepared(arguments, expressions)
+    printer = ArrayPrinter() if flavour == "arrays" else FloatPrinter()
+    try:
+        function = sp.lambdify(
+            names,
+            numbers,
+            modules=[_ARRAY_FUNCTIONS, np] if flavour == "arrays" else [math],
+            printer=printer,
+            cse=lambda _: shared,  # pyright: ignore[reportArgumentType]  (annotated as bool, documented as callable)
+            docstring_limit=0,
+        )
+    except PrintMethodNotImplementedError as error:
+        raise SystemDefinitionError(f"{_shortened(expressions)} has no numerical form: {str(error).splitlines()[0]}") from error
+    if isinstance(printer, ArrayPrinter):
+        function.__globals__.update(printer.constants)
+    elif any(e.has(sp.Piecewise, sp.Heaviside, sp.sinc) for e in formulas):
+        return _piece_by_piece(function, names, formulas)
+    return function
+
+
+@lru_cache(maxsize=256)
+def _prepared(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...]) -> tuple[tuple[sp.Symbol, ...], Any, Any, Any]:
+    """What both flavours have in common: the arguments and formulas in plain names, these with rounded numbers, and what they share.
+
+    An env and a batch of it ask for the same formulas, one after the other, and to find what they share takes longest.
+    """
+    for expression in expressions:
+        _require_computable(expression, arguments)
+    names, formulas = in_plain_names(arguments, expressions)
+    numbers = tuple(sp.Float(float(sp.N(e, 30)), 17) if e.is_number else e for e in formulas)
+    return names, formulas, numbers, _shared_subexpressions(numbers)
+
+
+def _piece_by_piece(quick: Callable[..., Components], names: Sequence[sp.Symbol], formulas: Sequence[Any]) -> Callable[..., Components]:
+    """A function of floats that evaluates the pieces that apply, where a shared subexpression of others has no value."""
+    careful = lru_cache(maxsize=1)(lambda: sp.lambdify(names, tuple(formulas), modules=[math], printer=FloatPrinter(), docstring_limit=0))
+
+    def function(*arguments: float) -> Components:
+        try:
+            return quick(*arguments)
+        except (ArithmeticError, ValueError):
+            return careful()(*arguments)
+
+    return function
+
+
+def _require_computable(expression: Any, arguments: tuple[sp.Symbol, ...]) -> None:
+    unknown = expression.free_symbols - set(arguments)
+    if unknown:
+        raise SystemDefinitionError(
+            f"{_shortened(expression)} holds {', '.join(sorted(map(str, unknown)))}, which is none of {', '.join(map(str, arguments))}"
+        )
+    if len(set(arguments)) < len(arguments):
+        raise SystemDefinitionError(f"a symbol stands for two arguments of {_shortened(expression)}: {', '.join(map(str, arguments))}")
+    strange = {f.func for f in expression.atoms(sp.Function) if not isinstance(f, SUPPORTED)}
+    if strange:
+        advice = "; DiracDelta is the derivative of a jump: use a smooth function" if sp.DiracDelta in strange else ""
+        raise SystemDefinitionError(
+            f"{_shortened(expression)} holds {', '.join(sorted(map(str, strange)))}, which has no numerical form here; "
+            f"write it with {', '.join(f.__name__ for f in SUPPORTED)}, Max and Min{advice}"
+        )
+    if expression.has(sp.I, sp.zoo):
+        raise SystemDefinitionError(f"{_shortened(expression)} is not real everywhere, or has a division by 0; look at its numbers")
+    if any(abs(number) > _LARGEST_FLOAT for number in expression.atoms(sp.Float, sp.Rational)):
+        raise SystemDefinitionError(f"{_shortened(expression)} holds a number beyond {float(_LARGEST_FLOAT):.2g}, the largest of floats")
+
+
+def _shortened(expression: Any) -> str:
+    try:
+        text = str(expression)
+    except ValueError:  # Python does not print whole numbers of thousands of digits.
+        return "an expression"
+    return text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}..."
+
+
+def in_plain_names(arguments: Sequence[sp.Symbol], expressions: Sequence[Any]) -> tuple[tuple[sp.Symbol, ...], tuple[Any, ...]]:
+    """The same formulas of arguments a000, a001, ..., so that no name in generated code is a user's.
+
+    A name of the user's may be a keyword, a function, no identifier at all, or one of those that common subexpressions
+    get. The new names sort like the old ones, for sympy orders the terms of a sum by them, and rounding follows the order.
+    """
+    ordered = sorted(arguments, key=sp.default_sort_key)
+    plain = {s: sp.Symbol(f"a{i:03d}", **s.assumptions0) for i, s in enumerate(ordered)}
+    known: dict[Any, Any] = dict(plain)
+
+    def renamed(expression: Any) -> Any:
+        if not expression.args:
+            return known.get(expression, expression)
+        if expression not in known:
+            parts = [renamed(part) for part in expression.args]
+            # Sympy would compare all parts with each other once more, which takes longer than all else.
+            as_it_is = {"evaluate": False} if isinstance(expression, sp.Max | sp.Min) else {}
+            known[expression] = expression.func(*parts, **as_it_is)
+        return known[expression]
+
+    return tuple(plain[s] for s in arguments), tuple(renamed(e) for e in expressions)
+
+
+def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
+    """Common subexpressions, with small integer powers written as products: `pow` is many times slower."""
+    shared: Any
+    reduced: Any
+    shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("x"), list=False)
+    fresh = sp.numbered_symbols("p")
+    replacements: list[tuple[sp.Symbol, sp.Expr]] = []
+
+    def expand(expression: Any) -> Any:
+        if not expression.args:
+            return expression
+        arguments = [expand(a) for a in expression.args]
+        if isinstance(expression, sp.Pow) and expression.exp.is_Integer and 2 <= abs(expression.exp) <= _LARGEST_EXPANDED_POWER:
+            base = arguments[0]
+            if not base.is_Symbol:
+                symbol = next(fresh)
+                replacements.append((symbol, base))
+                base = symbol
+            product = sp.Mul(*[base] * abs(int(expression.exp)), evaluate=False)
+            return product if expression.exp > 0 else sp.Pow(product, -1, evaluate=False)
+        if arguments == list(expression.args):
+            return expression
+        # Only these would undo what was done, and not every other function knows the word.
+        as_it_is = {"evaluate": False} if isinstance(expression, sp.Add | sp.Mul | sp.Pow) else {}
+        return expression.func(*arguments, **as_it_is)
+
+    for symbol, expression in shared:
+        expanded = expand(expression)
+        replacements.append((symbol, expanded))
+    return replacements, type(reduced)(expand(e) for e in reduced)
+
+
+def constants(values: Sequence[float]) -> list[np.ndarray]:
+    """Numbers as arrays without axes: a ufunc converts a Python float anew at every call, for as long as a small batch takes."""
+    return [np.array(v) for v in values]
+
+
+def filled(component: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """A component as an array of the batch's shape: what does not depend on the arguments comes back as a float."""
+    return component if getattr(component, "shape", None) == shape else np.full(shape, component)
+
+
+def stacked(components: Sequence[Any], size: int) -> np.ndarray:
+    """Components side by side, shape (size, len(components)), in memory of their own."""
+    table = np.empty((len(components), size))
+    for row, component in zip(table, components, strict=True):
+        row[:] = component
+    return table.T
+
+
+def finite(values: np.ndarray) -> bool:
+    """Whether no entry is NaN or infinite; a quick look that may report huge finite entries as infinite."""
+    flat = values.ravel()
+    return math.isfinite(flat.dot(flat))

@@ -1,0 +1,140 @@
+"""Lie derivatives, the Ito generator and relative degree, by symbolic differentiation.
+
+The printed derivations of this field contain sign errors; here nothing is differentiated by hand.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import sympy as sp
+from sympy.simplify.fu import TR5
+
+from safe_envs.dynamics.identities import is_zero
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.errors import RelativeDegreeError
+
+Derivative = Callable[[ControlAffineSDE, sp.Expr], sp.Expr]
+
+_KINKED = (sp.Piecewise, sp.Abs, sp.Min, sp.Max, sp.sign, sp.Heaviside, sp.DiracDelta, sp.floor, sp.ceiling, sp.frac, sp.Mod)
+_LARGEST_TIDIED = 100
+_MOST_TERMS = 200
+
+
+def gradient(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
+    """Row of partial derivatives with respect to the states, shape (1, n)."""
+    return _gradient(system.states, expression)
+
+
+@lru_cache(maxsize=512)
+def _gradient(states: tuple[sp.Symbol, ...], expression: sp.Expr) -> sp.ImmutableMatrix:
+    """Remembered: the drift, the input and the noise each ask for the gradient of the same link of a chain."""
+    return sp.ImmutableMatrix([[sp.diff(expression, s) for s in states]])
+
+
+def lie_derivative_f(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
+    """L_f phi = grad phi . f, the rate of phi along the uncontrolled, noise-free motion."""
+    return (gradient(system, expression) * system.drift)[0, 0]
+
+
+def lie_derivative_g(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
+    """L_g phi = grad phi . g, shape (1, m): how the input changes the rate of phi."""
+    return sp.ImmutableMatrix(gradient(system, expression) * system.input_matrix)
+
+
+def ito_correction(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
+    """1/2 tr(sigma sigma' phi_xx), the drift that the noise gives to a curved function."""
+    covariance = system.diffusion * system.diffusion.T
+    total = sp.Integer(0)
+    for i, row_state in enumerate(system.states):
+        if all(covariance[i, j] == 0 for j in range(system.n)):
+            continue
+        slope = sp.diff(expression, row_state)
+        total += sum(covariance[i, j] * sp.diff(slope, s) for j, s in enumerate(system.states) if covariance[i, j] != 0)
+    return total / 2
+
+
+def quadratic_variation_rate(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
+    """|sigma' grad phi|^2, the variance of phi per s that the noise makes."""
+    row = gradient(system, expression) * system.diffusion
+    return (row * row.T)[0, 0]
+
+
+def has_kinks(expression: Any) -> bool:
+    """Whether functions are in it that are not smooth everywhere, so that its derivatives may not say all."""
+    return expression.has(*_KINKED)
+
+
+def generator(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
+    """The part of A phi = L_f phi + L_g phi u + 1/2 tr(sigma sigma' phi_xx) that does not contain the input.
+
+    Source: thesis Eq. (4.4).
+    """
+    return lie_derivative_f(system, expression) + ito_correction(system, expression)
+
+
+def vanishes(system: ControlAffineSDE, expression: Any) -> bool:
+    """Whether an expression is zero at every state, for the system's parameters.
+
+    Where that can be neither shown nor refuted, the answer is no, which is the safe one: noise that may reach h is drawn,
+    and an input that may have a say is not taken for one that has none.
+    """
+    return is_zero(system.exact(expression))
+
+
+def derivatives(system: ControlAffineSDE, expression: sp.Expr, order: int, derivative: Derivative) -> tuple[sp.Expr, ...]:
+    """(phi, D phi, ..., D^order phi) for D = `lie_derivative_f` or `generator`."""
+    result = [expression]
+    for _ in range(order):
+        result.append(derivative(system, result[-1]))
+    return tuple(result)
+
+
+def tidied(expression: Any) -> sp.Expr:
+    """An equal expression with fewer operations, if sin^2 + cos^2 = 1 and common factors give one quickly."""
+    if expression.count_ops() > _LARGEST_TIDIED or _expanded_terms(expression) > _MOST_TERMS:
+        return expression
+    # An exponential that is taken apart may overflow in one factor and vanish in the other.
+    expanded = expression if expression.has(sp.exp) else sp.expand(TR5(sp.expand(expression)))
+    return min((expression, sp.factor_terms(expression), sp.factor_terms(expanded)), key=sp.count_ops)
+
+
+def _expanded_terms(expression: Any) -> int:
+    """How many terms an expression has at most, once its products and powers are multiplied out."""
+    parts = [_expanded_terms(part) for part in expression.args]
+    if expression.is_Add:
+        return sum(parts)
+    if expression.is_Mul:
+        return math.prod(parts)
+    if expression.is_Pow and expression.exp.is_Integer and expression.exp > 0:
+        return math.comb(parts[0] + int(expression.exp) - 1, int(expression.exp))
+    return 1
+
+
+def relative_degree(system: ControlAffineSDE, expression: sp.Expr, derivative: Derivative = lie_derivative_f) -> int:
+    """Smallest r with L_g D^(r-1) h not identically zero.
+
+    Args:
+        system: with the parameters for which the degree is asked.
+        expression: h.
+        derivative: D; `lie_derivative_f` for the deterministic degree (thesis Def. 3.1.3), `generator` for the
+            stochastic one. Thesis Def. 4.2.9 prints A^j h = 0 as the condition below r, where L_g A^(j-1) h = 0
+            is meant.
+
+    Raises:
+        RelativeDegreeError: the input reaches none of the first n derivatives (3 n with the generator), or h does not depend on the states.
+    """
+    system.require_known("the barrier", expression.free_symbols, system.states)
+    # Differentiation along a flow leaves nothing new after n orders; the Ito term has no such bound.
+    orders = system.n if derivative is lie_derivative_f else 3 * system.n
+    for order in range(orders):
+        if any(not vanishes(system, entry) for entry in lie_derivative_g(system, expression)):
+            return order + 1
+        expression = derivative(system, expression)
+    raise RelativeDegreeError(
+        f"no input ({', '.join(map(str, system.inputs))}) appears in the first {orders} derivatives of the barrier: "
+        "it has no relative degree, and no action can keep it positive. Check the barrier and the input matrix"
+    )

@@ -1,0 +1,261 @@
+"""A control-affine stochastic differential equation, stated once, in symbols."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Any
+
+import sympy as sp
+
+from safe_envs.dynamics.identities import is_zero
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
+from safe_envs.number_text import real
+
+_REAL = sp.Symbol("real", real=True).assumptions0
+
+
+def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
+    """Read a list, nested list or matrix as an immutable matrix of the required shape (None: any width)."""
+    try:
+        matrix = sp.ImmutableMatrix(entries)
+    except (TypeError, ValueError) as error:
+        raise SystemDefinitionError(f"{name} is no matrix of expressions: {error}") from error
+    rows, columns = shape
+    if matrix.rows != rows or (columns is not None and matrix.cols != columns):
+        wanted = f"{rows} x {'any' if columns is None else columns}"
+        raise SystemDefinitionError(f"{name} has shape {matrix.rows} x {matrix.cols}; the states and inputs need {wanted}")
+    # To sympy 0.0 is not 0, and a channel of such entries would count as noise.
+    return sp.ImmutableMatrix(matrix.applyfunc(lambda entry: sp.Integer(0) if entry.is_Float and entry.is_zero else entry))
+
+
+def finite_number(name: str, value: Any) -> float:
+    """Return `value` as a float, or say why it cannot be one."""
+    try:
+        number = real(value) if isinstance(value, str) else float(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ConfigurationError(f"{name} = {shown(value)} is not a number") from error
+    if not math.isfinite(number):
+        raise ConfigurationError(f"{name} = {number} is not finite")
+    return number
+
+
+def _require_real(states: Iterable[Any], inputs: Iterable[Any], parameters: Iterable[Any]) -> None:
+    """Check that states and inputs are declared real, and nothing more, and parameters real."""
+    wrong = []
+    for symbol in (*states, *inputs, *parameters):
+        if not isinstance(symbol, sp.Symbol):
+            raise SystemDefinitionError(f"{symbol!r} among states, inputs and parameters is no symbol; make it by sympy.symbols")
+        if symbol.assumptions0 != _REAL and not (symbol.is_real and symbol in parameters):
+            wrong.append(symbol)
+    if wrong:
+        told = "; ".join(f"{s} is declared {_declared(s) or 'nothing, so that it may be complex'}" for s in wrong)
+        names = " ".join(s.name for s in wrong)
+        raise SystemDefinitionError(
+            f"states and inputs are to be declared real and nothing more, parameters real at least, for sympy simplifies by that: {told}. "
+            f"Make them by sympy.symbols({names!r}, real=True), in the system and in all that is said of it"
+        )
+
+
+def _declared(symbol: sp.Symbol) -> str:
+    """What a symbol was declared to be, like "positive=True"."""
+    return ", ".join(f"{word}={value}" for word, value in getattr(symbol, "_assumptions_orig", symbol.assumptions0).items())
+
+
+def _fitting(symbol: sp.Symbol, value: Any) -> float:
+    """The value of a parameter, if it is a finite number and what its symbol is declared to be."""
+    number = finite_number(f"parameter {symbol}", value)
+    if symbol.assumptions0 != _REAL:
+        exact = sp.Rational(number)
+        wrong = [word for word, holds in symbol.assumptions0.items() if getattr(exact, f"is_{word}") is (not holds)]
+        if wrong:
+            raise ConfigurationError(
+                f"parameter {symbol} = {number:g}, but its symbol is declared {_declared(symbol)}, and sympy simplifies by that; "
+                f"give another value, or make the symbol by sympy.symbols({symbol.name!r}, real=True)"
+            )
+    return number
+
+
+@dataclass(frozen=True)
+class ControlAffineSDE:
+    """dx = (f(x) + g(x) u) dt + sigma(x) dW.
+
+    Exogenous motion, a moving obstacle say, is a state of its own with a known drift, so that no time derivative
+    of a barrier can be forgotten.
+
+    States and inputs are symbols that are declared real and nothing more, parameters real or whatever else their values are:
+    sympy simplifies by these words, sqrt(x**2) to |x| for a real x, to x for a positive one, and not at all without.
+
+    Attributes:
+        states: n symbols x.
+        inputs: m symbols u.
+        drift: f, n x 1 expressions of the states and parameters. Lists are read as matrices, here and below.
+        input_matrix: g, n x m.
+        diffusion: sigma, n x d, for a d-dimensional standard Wiener process W.
+        parameters: value of every other symbol that occurs.
+
+    Raises:
+        SystemDefinitionError: a shape does not fit, a symbol is unknown, defined twice or not declared real, or an input
+            occurs in f, g or sigma, so that the system is not control-affine.
+        ConfigurationError: a parameter is no finite number, or not what its symbol is declared to be.
+
+    Source: thesis Eq. (4.1).
+    """
+
+    states: tuple[sp.Symbol, ...]
+    inputs: tuple[sp.Symbol, ...]
+    drift: Any
+    input_matrix: Any
+    diffusion: Any
+    parameters: Mapping[sp.Symbol, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        _require_real(self.states, self.inputs, self.parameters)
+        n, m = len(self.states), len(self.inputs)
+        if not n or not m:
+            raise SystemDefinitionError(f"a system needs a state and an input; given {n} states and {m} inputs")
+        fields: dict[str, Any] = {
+            "states": tuple(self.states),
+            "inputs": tuple(self.inputs),
+            "drift": _matrix("drift", self.drift, (n, 1)),
+            "input_matrix": _matrix("input_matrix", self.input_matrix, (n, m)),
+            "diffusion": _matrix("diffusion", self.diffusion, (n, None)),
+            "parameters": {p: _fitting(p, v) for p, v in self.parameters.items()},
+        }
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        self._check_symbols()
+
+    @classmethod
+    def from_rate(
+        cls,
+        states: Sequence[sp.Symbol],
+        inputs: Sequence[sp.Symbol],
+        rate: Sequence[Any],
+        diffusion: Any = None,
+        parameters: Mapping[sp.Symbol, float] | None = None,
+    ) -> ControlAffineSDE:
+        """The system dx = rate(x, u) dt + sigma(x) dW, taken apart into f and g.
+
+        Args:
+            states: n symbols x.
+            inputs: m symbols u.
+            rate: n expressions of the states, inputs and parameters.
+            diffusion: sigma, n x d; none by default.
+            parameters: value of every other symbol that occurs.
+
+        Raises:
+            SystemDefinitionError: the rate is not affine in the inputs, or see the class.
+        """
+        if not all(isinstance(given, list | tuple) and given for given in (states, inputs)):
+            raise SystemDefinitionError(f"states = {states!r} and inputs = {inputs!r}; give lists of symbols, not empty")
+        _require_real(states, inputs, parameters or {})
+        column = _matrix("rate", rate, (len(states), 1))
+        used = set(inputs)
+        effect = column.jacobian(list(inputs)).applyfunc(lambda e: sp.simplify(e) if e.free_symbols & used else e)
+        for i, state in enumerate(states):
+            for j, u in enumerate(inputs):
+                if effect[i, j].free_symbols & used:
+                    raise SystemDefinitionError(
+                        f"the rate of {state} is not affine in the input {u}: its derivative is {effect[i, j]}. Take what is not affine "
+                        "for the input, or make the input a state whose rate is the new input"
+                    )
+        drift = column.subs(dict.fromkeys(inputs, 0))
+        rest = column - drift - effect * sp.Matrix(inputs)
+        for state, entry, at_zero in zip(states, rest, drift, strict=True):
+            if at_zero.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
+                raise SystemDefinitionError(f"the rate of {state} has no value where the inputs are 0; cancel what divides by an input")
+            if not is_zero(sp.expand(entry)):
+                raise SystemDefinitionError(
+                    f"the rate of {state} is not affine in the inputs: beside f + g u there is {entry}. Give f and g themselves where a "
+                    "system has several pieces"
+                )
+        return cls(tuple(states), tuple(inputs), drift, effect, [[0]] * len(states) if diffusion is None else diffusion, parameters or {})
+
+    def __hash__(self) -> int:
+        return hash((self.states, self.inputs, self.drift, self.input_matrix, self.diffusion, tuple(self.parameters.items())))
+
+    def _check_symbols(self) -> None:
+        symbols = [*self.states, *self.inputs, *self.parameters]
+        names = [s.name for s in symbols]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise SystemDefinitionError(f"defined more than once among states, inputs and parameters: {', '.join(twice)}")
+        for name in ("drift", "input_matrix", "diffusion"):
+            used: set[Any] = getattr(self, name).free_symbols
+            if used & set(self.inputs):
+                raise SystemDefinitionError(
+                    f"{name} depends on the input {_names(used & set(self.inputs))}; the system must be affine in "
+                    "the input: put what multiplies it into input_matrix"
+                )
+            self.require_known(name, used, allowed=(*self.states, *self.parameters))
+
+    def require_known(self, what: str, used: Iterable[Any], allowed: Sequence[sp.Symbol]) -> None:
+        """Raise SystemDefinitionError if an expression uses a symbol that is not allowed in it."""
+        unknown = set(used) - set(allowed)
+        if unknown:
+            twins = {s.name for s in unknown} & {s.name for s in allowed}
+            hint = (
+                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not Symbol('x'); the time is problem.TIME"
+                if twins
+                else "a parameter gets its value in parameters={...} of the system"
+            )
+            raise SystemDefinitionError(f"{what} uses the unknown symbol {_names(unknown)}; allowed: {_names(allowed)}. Note: {hint}")
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.states)
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.inputs)
+
+    @property
+    def noise_channels(self) -> tuple[int, ...]:
+        """The columns of the diffusion that are not zero, for the parameters as they are."""
+        diffusion = self.numeric(self.diffusion)
+        return tuple(j for j in range(diffusion.cols) if any(entry != 0 for entry in diffusion[:, j]))
+
+    @property
+    def noisy(self) -> bool:
+        """Whether there is any noise, for the parameters as they are."""
+        return bool(self.noise_channels)
+
+    def with_parameters(self, **values: float) -> ControlAffineSDE:
+        """Return the same system with other parameter values.
+
+        Raises:
+            ConfigurationError: a name is no parameter of the system, or a value is no finite number.
+        """
+        by_name = {p.name: p for p in self.parameters}
+        for name in values:
+            if name not in by_name:
+                raise ConfigurationError(f"unknown parameter {shown(name)}; {nearest(name, by_name)}")
+        return replace(self, parameters={**self.parameters, **{by_name[k]: v for k, v in values.items()}})
+
+    def numeric(self, expression: Any) -> Any:
+        """Return an expression or matrix with the parameters' values in place of their symbols."""
+        # What is remembered must not change: a matrix is frozen first.
+        given: Any = sp.ImmutableMatrix(expression) if isinstance(expression, sp.MatrixBase) else expression
+        return _numeric(given, tuple(self.parameters.items()))
+
+    def exact(self, expression: Any) -> Any:
+        """Like `numeric`, with the decimal value of each parameter as a rational, so that terms cancel exactly."""
+        return expression.subs({p: sp.Rational(repr(v)) for p, v in self.parameters.items()})
+
+
+@lru_cache(maxsize=1024)
+def _numeric(expression: Any, parameters: tuple[tuple[sp.Symbol, float], ...]) -> Any:
+    found = expression.subs({p: sp.Float(v, 17) if v != int(v) else sp.Integer(int(v)) for p, v in parameters})
+    if found.has(sp.zoo, sp.nan, sp.oo, -sp.oo):
+        values = ", ".join(f"{p} = {v:g}" for p, v in parameters)
+        raise ConfigurationError(f"the system has no finite value for its parameters ({values}); look for a division by 0")
+    return found
+
+
+def _names(symbols: Iterable[Any]) -> str:
+    return ", ".join(sorted(str(s) for s in symbols))

@@ -1,0 +1,1 @@
+"""A problem as a Gymnasium env, scalar and vectorized."""

@@ -1,0 +1,269 @@
+"""The scalar face of a problem: a Gymnasium env."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache, wraps
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+from safe_envs.envs.info import Info, safety_info
+from safe_envs.envs.simulation import NoiseStream, Simulation, center_and_half_width, steps_until
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, nearest, shown
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
+from safe_envs.validators import real_array
+
+
+def observation_box(problem: SafetyProblem) -> gym.spaces.Box:
+    """Observation space of a problem: its features within their bounds."""
+    low = np.array([f.low for f in problem.features], dtype=np.float32)
+    high = np.array([f.high for f in problem.features], dtype=np.float32)
+    return gym.spaces.Box(low, high, dtype=np.float32)
+
+
+def action_box(problem: SafetyProblem) -> gym.spaces.Box:
+    """Action space of a problem: [-1, 1] for each input, which stands for the physical box."""
+    return gym.spaces.Box(-1.0, 1.0, (len(problem.inputs),), dtype=np.float32)
+
+
+def make_problem(name: str, factory: Any, barrier: Mapping[str, Any] | None, options: Mapping[str, Any]) -> SafetyProblem:
+    """Build a problem with the arguments of `gym.make`.
+
+    Args:
+        name: of the env, for errors.
+        factory: function that states the problem.
+        barrier: its arguments, which may also be given by themselves in `options`.
+        options: arguments of `SafetyProblem.configured`.
+
+    Raises:
+        ConfigurationError: an argument is unknown or out of range.
+    """
+    of_factory = inspect.signature(factory).parameters
+    of_problem = [name for name in inspect.signature(SafetyProblem.configured).parameters if name != "self"]
+    for what, values in (("barrier", barrier), *((what, options.get(what)) for what in ("plant", "model"))):
+        if values is not None and not (isinstance(values, Mapping) and all(isinstance(key, str) for key in values)):
+            raise ConfigurationError(f"{what} = {values!r}; give a dictionary of names and values")
+    shape = {**(barrier or {}), **{key: value for key, value in options.items() if key in of_factory}}
+    settings = {key: value for key, value in options.items() if key not in of_factory}
+    for what, allowed, given in (("barrier argument", of_factory, shape), ("argument", (*of_problem, *of_factory), settings)):
+        for key in given:
+            if key not in allowed:
+                raise ConfigurationError(f"{name} has no {what} {shown(key)}; {nearest(key, allowed)}")
+    return factory(**shape).configured(**settings)
+
+
+def _remembering(factory: Callable[..., SafetyProblem]) -> Callable[..., SafetyProblem]:
+    """The factory, which answers with the very object of the last time: its symbols take most of the time that an env takes to make."""
+    remembered = lru_cache(maxsize=32, typed=True)(factory)
+
+    @wraps(factory)
+    def answer(**arguments: Any) -> SafetyProblem:
+        numbers = all(isinstance(value, int | float) for value in arguments.values())
+        return remembered(**arguments) if numbers else factory(**arguments)
+
+    return answer
+
+
+class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
+    """Any `SafetyProblem` as a Gymnasium env.
+
+    Actions are in [-1, 1] for every input and stand for the physical box; what lies beyond is clipped. Actions may
+    be given in double precision. The observation holds the problem's features as float32, `state` the exact state.
+    The keys of `info` are those of `safe_envs.envs.info`.
+
+    The episode is terminated when the goal is reached or the state leaves the workspace, and truncated after
+    `horizon`. A violation does not end it.
+
+    Attributes:
+        executed: the physical input of the last step.
+        viewer: what is drawn, and its caption; None without a render mode.
+
+    Args:
+        problem: what to simulate.
+        max_episode_steps: truncate after so many control periods, if that is before the horizon.
+        render_mode: "rgb_array" for pictures by `render()`, "human" for a window that every step is drawn to, or None.
+
+    Raises:
+        ConfigurationError: an argument is out of range.
+    """
+
+    # The frame rate of an env is that of its own control period.
+    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 20}  # noqa: RUF012  (as in the base class)
+
+    def __init__(self, problem: SafetyProblem, max_episode_steps: int | None = None, render_mode: str | None = None) -> None:
+        self.viewer = open_viewer(problem, render_mode)
+        self.metadata = {**self.metadata, "render_fps": frames_a_second(problem)}
+        self.problem = problem
+        self.observation_space = self._bounds = observation_box(problem)
+        self.action_space = action_box(problem)
+        self.render_mode = render_mode
+        self._simulation = Simulation(problem, "floats")
+        self._noise = NoiseStream(self._simulation.integrator.channels)
+        center, half = center_and_half_width(problem)
+        self._scales = list(zip(center, half, strict=True))
+        self._action_shape = (len(problem.inputs),)
+        self._limit = steps_until(problem, max_episode_steps)
+        self.executed: Sequence[float] = ()
+        self._x: tuple[float, ...] | None = None
+        self._steps = 0
+        self._h_min = math.inf
+        self._episode_cost = 0.0
+
+    @property
+    def components(self) -> tuple[float, ...]:
+        """The exact state, as plain floats in the order of the problem's states."""
+        if self._x is None:
+            raise gym.error.ResetNeeded("the env has no state yet: call reset() first")
+        return self._x
+
+    @property
+    def state(self) -> np.ndarray:
+        """The exact state, shape (n,), in the units of the problem's states."""
+        return np.array(self.components)
+
+    def physical_action(self, action: Any) -> list[float]:
+        """Map an action in [-1, 1] to the physical box; what lies beyond is clipped.
+
+        Raises:
+            InvalidInputError: the action has another shape than (m,), or does not hold finite real numbers.
+        """
+        given = action if type(action) is np.ndarray and action.dtype.char in "fd" else real_array("action", action)
+        if given.shape != self._action_shape:
+            raise InvalidInputError(f"action has shape {given.shape}; the env takes {self._action_shape}")
+        physical = []
+        for a, (c, w) in zip(given.tolist(), self._scales, strict=True):
+            if not -math.inf < a < math.inf:
+                raise InvalidInputError(f"action {given.tolist()} is not finite; give numbers in [-1, 1]")
+            physical.append(c + w if a > 1.0 else c - w if a < -1.0 else c + w * a)
+        return physical
+
+    def normalized_action(self, physical: Sequence[float]) -> np.ndarray:
+        """Inverse of `physical_action`, in double precision."""
+        return np.array([(u - c) / w for u, (c, w) in zip(physical, self._scales, strict=True)])
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+        """Start an episode from the problem's initial distribution."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self._noise.clear()
+        self._x = self._simulation.draw_start(self.np_random)
+        self._steps = 0
+        self._h_min = math.inf
+        self._episode_cost = 0.0
+        observation, _, _, info = self._observe([c for c, _ in self._scales])
+        if self.viewer is not None:
+            self.viewer.restart([self._x], [0.0], [0])
+        return observation, info
+
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, Info]:
+        """Hold an action for one control period.
+
+        Raises:
+            InvalidInputError: see `physical_action`.
+            NumericalError: the state is not finite any more.
+        """
+        return self.step_physical(self.physical_action(action))
+
+    def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, bool, Info]:
+        """`step` for a physical input inside the box, as a filter has it."""
+        self.executed = u
+        try:
+            self._x = self._simulation.integrator.step(self.components, u, self._noise.next(self.np_random))
+            self._steps += 1
+            observation, reward, terminated, info = self._observe(u)
+        except (OverflowError, ZeroDivisionError, ValueError) as error:
+            raise NumericalError(f"the simulation of {self.problem.name!r} broke down at {self._x}: {error}") from error
+        if self.viewer is not None:
+            self.viewer.advance([self._x], [self._steps * self.problem.dt], [u])
+        return observation, reward, terminated, self._steps >= self._limit, info
+
+    def render(self) -> Any:
+        """Draw the state, with the trail of the episode and what a filter decided.
+
+        Returns:
+            uint8 of shape (height, width, 3) in the mode "rgb_array"; None in the mode "human", which draws to its window.
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: pygame is missing.
+            ResetNeeded: there is no state yet.
+            ConfigurationError: there is no display for a window.
+        """
+        if self.viewer is None:
+            gym.logger.warn('render() draws nothing without a render mode; make the env with render_mode="rgb_array" or "human"')
+            return None
+        if self._x is None:
+            raise gym.error.ResetNeeded("the env has no state yet: call reset() first")
+        return self.viewer.render()
+
+    def close(self) -> None:
+        """Close the window of the mode "human"."""
+        if self.viewer is not None:
+            self.viewer.close()
+
+    def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
+        x = self.components
+        features, barriers, reward, outside, goal = self._simulation.measure(x, u, self._steps * self.problem.dt)
+        h = min(barriers)
+        if not math.isfinite(h + sum(x)):
+            raise NumericalError(f"the state {x} of {self.problem.name!r} has left the finite numbers; reduce dt or raise substeps")
+        violation = h < 0.0
+        cost = 1.0 if violation else 0.0
+        self._episode_cost += cost
+        if h < self._h_min:
+            self._h_min = h
+        left = outside > 0.0
+        if left:
+            features = np.clip(features, self._bounds.low, self._bounds.high)
+        observation = np.array(features, dtype=np.float32)
+        info = safety_info(
+            violation=violation,
+            cost=cost,
+            barrier=np.array(barriers),
+            h_min=self._h_min,
+            episode_cost=self._episode_cost,
+        )
+        return observation, reward, left or goal >= 0.0, info
+
+
+class SystemEnv(SafeEnv):
+    """Base of the registered envs: a system's problem behind the arguments of `gym.make`.
+
+    Args:
+        noise: diffusion of plant and model, one number for all channels or one for each; 0 turns it off.
+        plant: parameters of the simulated system, by name.
+        model: parameters that the designer believes, by name.
+        barrier: arguments of the problem's factory (of the barrier, mostly), by name; each may also be given by itself.
+        dt: control period in s.
+        substeps: integration steps in a control period.
+        horizon: length of an episode in s.
+        box: physical bounds (low, high) of every input, or one pair for each.
+        start: name of an initial distribution, or a fixed initial state.
+        max_episode_steps: truncate after so many control periods, if that is before the horizon.
+        render_mode: "rgb_array", "human" or None; see `SafeEnv`.
+
+    Raises:
+        ConfigurationError: an argument names something unknown or is out of range.
+    """
+
+    problem_factory: ClassVar[Any]
+    """States the problem; asked once for the same arguments."""
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        if "problem_factory" in vars(cls):
+            cls.problem_factory = staticmethod(_remembering(cls.problem_factory))
+
+    def __init__(
+        self,
+        *,
+        barrier: Mapping[str, Any] | None = None,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(make_problem(type(self).__name__, type(self).problem_factory, barrier, options), max_episode_steps, render_mode)

@@ -1,0 +1,167 @@
+"""The one implementation of physics, reward, start and observation, over floats or over a batch of arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.codegen import Components, Flavour, compile_function, stacked
+from safe_envs.dynamics.integrators import Integrator
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.problem import TIME, SafetyProblem
+
+_CHUNK = 256
+_TRIES_AT_ONCE = 4
+_MOST_TRIES = 10_000
+
+
+class Simulation:
+    """The formulas of a problem, compiled: they hold no state, so that one object serves any number of envs."""
+
+    def __init__(self, problem: SafetyProblem, flavour: Flavour) -> None:
+        self.problem = problem
+        self.integrator = Integrator(problem.plant, problem.dt, problem.substeps, flavour)
+        self._features = len(problem.features)
+        self._barriers = self._features + len(problem.barriers)
+        read = (
+            *(f.expression for f in problem.features),
+            *(b.expression for b in problem.barriers),
+            problem.reward,
+            problem.outside,
+            -1 if problem.goal is None else problem.goal,
+        )
+        self.timed = TIME in set().union(*(sp.sympify(e).free_symbols for e in read))
+        self._measure = compile_function((*problem.plant.states, *problem.plant.inputs, TIME), read, flavour)
+        start = problem.starts[problem.start]
+        self._uniforms = len(start.uniforms)
+        self._tries = 1 if start.condition is None else _TRIES_AT_ONCE
+        # Few envs start together, and each from numbers of its own: plain floats are the quickest way.
+        self._start = compile_function(start.uniforms, start.state, "floats")
+        if start.condition is not None:
+            condition = problem.model.numeric(start.condition)
+            self._accept = compile_function(problem.plant.states, (condition,), "floats")
+        else:
+            self._accept = None
+
+    def measure(self, x: Components, u: Sequence[Any], time: Any) -> tuple[Components, Components, Any, Any, Any]:
+        """Read off a state what there is to see.
+
+        Args:
+            x: components of the state.
+            u: components of the executed input that led to it.
+            time: since the start of the episode, in s.
+
+        Returns:
+            The features, the barriers, the reward, the distance by which the workspace was left (> 0 outside), and the
+            goal (>= 0 where it is reached).
+        """
+        values = self._measure(*x, *u, time)
+        f, b = self._features, self._barriers
+        return values[:f], values[f:b], values[b], values[b + 1], values[b + 2]
+
+    def draw_start(self, rng: np.random.Generator) -> Components:
+        """Draw an initial state, by rejection: a plain float for each state."""
+        for _ in range(_MOST_TRIES // self._tries):
+            for uniforms in rng.random((self._tries, self._uniforms)).tolist():
+                x = self._start(*uniforms)
+                if self._accept is None or self._accept(*x)[0] > 0:
+                    return x
+        raise ConfigurationError(
+            f"no start of {self.problem.name!r} met the condition of the distribution {self.problem.start!r} in "
+            f"{_MOST_TRIES} tries; give a fixed start or another distribution"
+        )
+
+    def draw_starts(self, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        """Draw an initial state from each generator; shape (n, len(rngs))."""
+        if rngs and not self._uniforms:
+            # Nothing is drawn for a fixed start.
+            return np.repeat(np.array([self.draw_start(rngs[0])], dtype=float).T, len(rngs), axis=1)
+        return np.array([self.draw_start(rng) for rng in rngs], dtype=float).T.copy()
+
+
+def proposed_starts(problem: SafetyProblem, count: int) -> np.ndarray:
+    """Some states of a problem's start, whether or not they meet its condition: always the same, shape (count, n)."""
+    start = problem.starts[problem.start]
+    uniforms = np.random.default_rng(0).random((len(start.uniforms), count))
+    return stacked(compile_function(start.uniforms, start.state, "arrays")(*uniforms), count)
+
+
+class NoiseStream:
+    """Standard normals of one env, drawn ahead in chunks."""
+
+    def __init__(self, channels: int) -> None:
+        self._channels = channels
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget what was drawn ahead: the generator was seeded anew."""
+        self._rows: list[list[float]] = []
+        self._position = 0
+
+    def next(self, rng: np.random.Generator) -> list[float]:
+        """The draws of the next control period."""
+        if not self._channels:
+            return []
+        if self._position == len(self._rows):
+            self._rows = rng.standard_normal((_CHUNK, self._channels)).tolist()
+            self._position = 0
+        self._position += 1
+        return self._rows[self._position - 1]
+
+
+class NoiseStreams:
+    """The same for a batch: each env keeps its own stream, so that its noise does not depend on its neighbours."""
+
+    def __init__(self, num_envs: int, channels: int) -> None:
+        self._buffer = np.empty((num_envs, _CHUNK, channels))
+        self._rows = self._buffer.reshape(num_envs * _CHUNK, channels)
+        self._end = (np.arange(num_envs) + 1) * _CHUNK
+        self._row = self._end.copy()
+        self._before_refill = 0
+
+    def clear(self, envs: Sequence[int]) -> None:
+        """Forget what was drawn ahead for some envs: their generators were seeded anew."""
+        self._row[envs] = self._end[envs]
+        self._before_refill = 0
+
+    def next(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> np.ndarray:
+        """The draws of the next control period, shape (channels, num_envs).
+
+        Args:
+            rngs: generator of each env.
+            stepping: the envs whose stream moves on; None for all. The others get draws that are to be ignored.
+        """
+        if not self._buffer.shape[2]:
+            return self._rows.T[:0]
+        if not self._before_refill:
+            self._refill(rngs, stepping)
+        self._before_refill -= 1
+        draws = self._rows.take(self._row if stepping is None else np.where(stepping, self._row, 0), axis=0).T
+        self._row += 1 if stepping is None else stepping
+        return draws
+
+    def _refill(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> None:
+        used_up = self._row == self._end
+        for i in np.flatnonzero(used_up if stepping is None else used_up & stepping).tolist():
+            rngs[i].standard_normal(out=self._buffer[i])
+            self._row[i] -= _CHUNK
+        self._before_refill = max(int((self._end - self._row).min()), 1)
+
+
+def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
+    """Control periods until an episode is truncated."""
+    if max_episode_steps is None:
+        return problem.steps
+    if not isinstance(max_episode_steps, int) or max_episode_steps < 1:
+        raise ConfigurationError(f"max_episode_steps = {max_episode_steps!r}; give a whole number from 1")
+    return min(problem.steps, max_episode_steps)
+
+
+def center_and_half_width(problem: SafetyProblem) -> tuple[list[float], list[float]]:
+    """Physical input = center + half width * action, for an action in [-1, 1]."""
+    center = [0.5 * (low + high) for low, high in problem.box]
+    half = [0.5 * (high - low) for low, high in problem.box]
+    return center, half

@@ -1,0 +1,68 @@
+"""Locks of files, so that two processes do not write to one place at a time."""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO
+
+from safe_envs.atomic_io import writing
+from safe_envs.errors import ConfigurationError
+
+_HELD = (errno.EACCES, errno.EAGAIN, errno.EDEADLK)
+"""What the operating system says of a lock that somebody else holds."""
+
+
+@contextmanager
+def locked(path: Path, taken: str) -> Iterator[None]:
+    """Hold the lock of a file, which is made for it and removed with it.
+
+    The operating system releases it when the process ends, however that ends. On a file system without locks there is none.
+
+    Args:
+        path: of the file.
+        taken: what to say if another process holds the lock.
+
+    Raises:
+        ConfigurationError: another process holds the lock, or the file cannot be made.
+    """
+    with writing(path):
+        file = _opened(path, taken)
+    try:
+        yield
+    finally:
+        # Windows removes no file that is open.
+        with suppress(OSError):
+            path.unlink()
+        file.close()
+
+
+def _opened(path: Path, taken: str) -> IO[bytes]:
+    while True:
+        file = path.open("ab")
+        try:
+            _lock(file)
+            # Whoever held the lock before has removed its file.
+            if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
+                return file
+        except OSError as error:
+            if error.errno not in _HELD:
+                return file
+            file.close()
+            raise ConfigurationError(taken) from error
+        file.close()
+
+
+def _lock(file: IO[bytes]) -> None:
+    """Take the lock of an open file; raise OSError if somebody else holds it."""
+    try:
+        import fcntl
+    except ImportError:
+        import msvcrt
+
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)  # pyright: ignore[reportAttributeAccessIssue]
+    else:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -1,0 +1,148 @@
+"""What a user states in a Python file or module, found by its place: FILE.py:NAME or MODULE:NAME."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import os
+import sys
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import cloudpickle
+
+from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, open_regular
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shortened, shown
+
+_ADVICE = "give the path of a Python file, as in my_system.py:problem"
+
+
+def load_object(place: str) -> Any:
+    """Import what stands at a place, which runs the code there.
+
+    A file is read anew when it has changed; modules beside it are imported afresh with it, and stay as they are until then.
+
+    Args:
+        place: FILE.py:NAME or MODULE:NAME.
+
+    Raises:
+        ConfigurationError: there is no such place, or the code there ends with an error.
+    """
+    source, colon, name = place.rpartition(":")
+    if not (colon and source and name):
+        raise ConfigurationError(f"{shown(place)} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like my_system.py:problem")
+    module = _of_file(Path(source)) if source.endswith(".py") else _of_module(source)
+    if not hasattr(module, name):
+        raise ConfigurationError(f"{shortened(source)} has no {shown(name)}; {nearest(name, _stated_in(module))}")
+    return getattr(module, name)
+
+
+def resolved(place: str) -> str:
+    """The same place with the whole path of its file, so that it holds in any folder."""
+    source, _, name = place.rpartition(":")
+    return f"{os.path.realpath(source)}:{name}" if source.endswith(".py") else place
+
+
+def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) -> Any:
+    """The value of a function that stands at a place.
+
+    Raises:
+        ConfigurationError: an argument is missing or unknown, or the code there ends with an error.
+    """
+    try:
+        inspect.signature(function).bind(**arguments)
+    except TypeError as error:
+        raise ConfigurationError(f"{place}: {error}; give its arguments by --barrier NAME=VALUE (in Python: barrier={{...}})") from error
+    source = place.rpartition(":")[0]
+    with _running(Path(source).resolve() if source.endswith(".py") else None, place):
+        return function(**arguments)
+
+
+def _stated_in(module: ModuleType) -> list[str]:
+    """Names of what a module states itself: its functions, and objects that are neither modules nor classes nor symbols."""
+    return [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and not inspect.ismodule(value)
+        and not inspect.isclass(value)
+        and getattr(value, "__module__", module.__name__)
+        in (module.__name__, "safe_envs.problem.problem", "safe_envs.wrappers.env_wrappers.external_env")
+    ]
+
+
+def _of_file(path: Path) -> ModuleType:
+    try:
+        with open_regular(path, MOST_BYTES_OF_TEXT) as stream:
+            changed = os.fstat(stream.fileno()).st_mtime_ns
+    except FileNotFoundError as error:
+        raise ConfigurationError(f"there is no file {shortened(path)}; {_ADVICE}") from error
+    except OSError as error:
+        raise ConfigurationError(f"{shortened(path)} cannot be read: {error.strerror}; {_ADVICE}") from error
+    return _loaded(path.resolve(), changed)
+
+
+@lru_cache(maxsize=32)
+def _loaded(path: Path, _changed: int) -> ModuleType:
+    """Remembered until the file changes, so that the symbols of all envs of a file are compiled once."""
+    name = f"_{path.stem}_{zlib.crc32(bytes(path)):08x}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ConfigurationError(f"{path} cannot be read as Python")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    # Another process does not have this module: what is sent there takes its functions along.
+    cloudpickle.register_pickle_by_value(module)
+    try:
+        with _running(path, str(path)):
+            spec.loader.exec_module(module)
+    except SafeEnvsError:
+        cloudpickle.unregister_pickle_by_value(module)
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _of_module(name: str) -> ModuleType:
+    if name in sys.modules:
+        return sys.modules[name]
+    with _running(None, f"module {shortened(name)} (a file is named with .py)"):
+        return importlib.import_module(name)
+
+
+@contextmanager
+def _running(path: Path | None, what: str) -> Iterator[None]:
+    """Run a user's code: its errors become ours, with the line, and modules beside its file can be imported, as when Python runs it."""
+    folder = None if path is None else str(path.parent)
+    known = set(sys.modules)
+    if folder is not None:
+        sys.path.insert(0, folder)
+    try:
+        yield
+    except SafeEnvsError as error:
+        raise type(error)(f"{what}{_line(error, path)}: {error}") from error
+    except (Exception, SystemExit) as error:
+        reason = f"{type(error).__name__}: {shortened(error, 400)}"
+        raise ConfigurationError(f"{what} ended with an error{_line(error, path)}: {reason}") from error
+    finally:
+        if folder is not None:
+            sys.path.remove(folder)
+            # Another file may have a neighbour of the same name.
+            for name in set(sys.modules) - known:
+                if Path(getattr(sys.modules[name], "__file__", None) or "/").parent == Path(folder) and sys.modules[name].__name__ == name:
+                    del sys.modules[name]
+
+
+def _line(error: BaseException, path: Path | None) -> str:
+    """The last line of the file that led to an error."""
+    lines, trace = [], error.__traceback__
+    while trace is not None:
+        if path is not None and trace.tb_frame.f_code.co_filename == str(path):
+            lines.append(trace.tb_lineno)
+        trace = trace.tb_next
+    return f" in line {lines[-1]}" if lines else ""

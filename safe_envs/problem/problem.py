@@ -1,0 +1,312 @@
+"""A safety problem: plant, model, barriers, input box, start, timing and task, as one frozen statement."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.sde import ControlAffineSDE, finite_number
+from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.clf import CLF
+from safe_envs.problem.sampling_domain import SamplingDomain
+
+TIME = sp.Symbol("t", nonnegative=True)
+"""Time since the start of the episode, in s: references and rewards may depend on it. No state or input, which may have any sign,
+is the same symbol, even if its name is t."""
+
+_WIDEST = 1e100
+"""Largest bound of a box: its square, an effort, is still a number."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """A state or an input with its range.
+
+    For a state the range is the workspace: an episode ends when the state leaves it (an infinite range never ends
+    one). For an input it is the box of admissible actions, finite.
+    """
+
+    symbol: sp.Symbol
+    low: float
+    high: float
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Feature:
+    """An entry of the observation: an expression of the states and of `TIME`, with finite bounds."""
+
+    name: str
+    expression: sp.Expr
+    low: float
+    high: float
+
+    @property
+    def symbol(self) -> sp.Symbol:
+        """The symbol by which a nominal controller refers to it."""
+        return sp.Symbol(self.name, real=True)
+
+
+@dataclass(frozen=True)
+class Start:
+    """Distribution of the initial state: a map of independent uniforms on [0, 1), kept where `condition` > 0."""
+
+    state: tuple[sp.Expr, ...]
+    uniforms: tuple[sp.Symbol, ...] = ()
+    condition: sp.Expr | None = None
+
+    @classmethod
+    def at(cls, values: Sequence[float]) -> Start:
+        """A fixed initial state."""
+        return cls(tuple(sp.Float(v, 17) for v in values))
+
+
+@dataclass(frozen=True)
+class SafetyProblem:
+    """What the world is, what the designer believes, what is safe, and what is to be done.
+
+    Attributes:
+        name: of the problem.
+        plant: the real system, which the env simulates.
+        model: what the designer believes; filters and nominal controllers see this one.
+        barriers: what is safe.
+        states: range and unit of each state of the plant, in order.
+        inputs: box and unit of each input, in order.
+        reward: of a step, an expression of the state that it reaches, of the executed input and of `TIME`.
+        nominal: the nominal controller, an expression for each input of the features' symbols and the model's
+            parameters. The box clips it.
+        starts: named initial distributions.
+        start: the name of the one in use.
+        dt: control period in s.
+        horizon: length of an episode in s.
+        features: entries of the observation; the states by default.
+        goal: the episode ends where this expression is >= 0.
+        noise: names of the diffusion parameters, in the order of the `noise` argument.
+        gains: rates p_1..p_r in 1/s that the conditions use unless told otherwise, for all barriers; or such a tuple for each.
+        filter: name of the condition that suits the problem.
+        substeps: integration steps in a control period.
+        plane: the two states that draw a trajectory, if any.
+        scene: how the problem is drawn, a name of `safe_envs.rendering.scenes`; "" for the drawing that fits every problem.
+        clf: the task as a soft goal, if it is one.
+        explored: where and how the system is excited to learn from it, as far as the defaults do not suit; see `exploration`.
+
+    Raises:
+        SystemDefinitionError: the parts do not fit together.
+    """
+
+    name: str
+    plant: ControlAffineSDE
+    model: ControlAffineSDE
+    barriers: tuple[Barrier, ...]
+    states: tuple[Variable, ...]
+    inputs: tuple[Variable, ...]
+    reward: sp.Expr
+    nominal: tuple[sp.Expr, ...]
+    starts: Mapping[str, Start]
+    dt: float
+    horizon: float
+    features: tuple[Feature, ...] = ()
+    start: str = ""
+    goal: sp.Expr | None = None
+    noise: tuple[str, ...] = ()
+    gains: tuple[float, ...] | tuple[tuple[float, ...], ...] = (1.0,)
+    filter: str = "hocbf"
+    substeps: int = 1
+    plane: tuple[str, str] | None = None
+    scene: str = ""
+    clf: CLF | None = None
+    explored: SamplingDomain = field(default_factory=SamplingDomain)
+    box: tuple[tuple[float, float], ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        plant, model = self.plant, self.model
+        if not self.features:
+            features = tuple(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in self.states)
+            object.__setattr__(self, "features", features)
+        object.__setattr__(self, "start", self.start or next(iter(self.starts)))
+        object.__setattr__(self, "box", tuple((i.low, i.high) for i in self.inputs))
+        if (plant.states, plant.inputs) != (model.states, model.inputs):
+            raise SystemDefinitionError("plant and model must have the same states and inputs")
+        if tuple(s.symbol for s in self.states) != plant.states or tuple(i.symbol for i in self.inputs) != plant.inputs:
+            raise SystemDefinitionError("the ranges of states and inputs must be given in the order of the plant's symbols")
+        if not self.barriers or len(self.nominal) != plant.m:
+            raise SystemDefinitionError(f"a problem needs a barrier and a nominal expression for each of the {plant.m} inputs")
+        for barrier in self.barriers:
+            plant.require_known(f"barrier {barrier.name}", barrier.expression.free_symbols, plant.states)
+        if isinstance(self.gains[0], tuple) and len(self.gains) != len(self.barriers):
+            raise SystemDefinitionError(f"gains has {len(self.gains)} tuples for {len(self.barriers)} barriers; give one for each")
+        plant.require_known("the reward", self.reward.free_symbols, (*plant.states, *plant.inputs, TIME))
+        for feature in self.features:
+            plant.require_known(f"feature {feature.name}", feature.expression.free_symbols, (*plant.states, TIME))
+        self._check_feature_names()
+        for law in self.nominal:
+            known = (*(f.symbol for f in self.features), *model.parameters)
+            plant.require_known("the nominal controller", law.free_symbols, known)
+        if self.clf is not None:
+            self.clf.require_known(model)
+        for i in self.inputs:
+            if not -_WIDEST <= i.low < i.high <= _WIDEST:
+                raise ConfigurationError(
+                    f"box of input {i.symbol} is [{i.low}, {i.high}]; it needs bounds within {_WIDEST:g}, the lower one below the upper. "
+                    "Unbounded control is a wide box"
+                )
+        self._check_timing()
+        for coordinate in self.explored.coordinates:
+            plant.require_known("a coordinate of the exploration", coordinate.free_symbols, plant.states)
+
+    @cached_property
+    def exploration(self) -> SamplingDomain:
+        """Where and how the system is excited to learn from it, complete.
+
+        Raises:
+            SystemDefinitionError: a state without a finite range has none in `explored` either.
+        """
+        ranges = [(s.low, s.high) for s in self.states]
+        angles = [s.unit == "rad" and math.isinf(s.low) and math.isinf(s.high) for s in self.states]
+        return self.explored.completed(self.plant.states, ranges, angles, self.box)
+
+    def _check_feature_names(self) -> None:
+        """Check that a symbol of the nominal controller means one thing."""
+        symbols = [f.symbol for f in self.features]
+        twice = {s.name for s in symbols if symbols.count(s) > 1 or s in self.model.parameters}
+        if twice:
+            raise SystemDefinitionError(f"features named twice, or like a parameter: {', '.join(sorted(twice))}; give each another name")
+
+    def _check_timing(self) -> None:
+        if not self.dt > 0 or not math.isfinite(self.dt):
+            raise ConfigurationError(f"dt = {self.dt} s; a control period is positive and finite")
+        if not math.isfinite(self.horizon / self.dt) or round(self.horizon / self.dt) < 1:
+            raise ConfigurationError(f"horizon = {self.horizon} s; it must hold at least one control period of {self.dt} s")
+        if not isinstance(self.substeps, int) or self.substeps < 1:
+            raise ConfigurationError(f"substeps = {shown(self.substeps)}; give a whole number from 1")
+
+    def gains_of(self, barrier: int) -> tuple[float, ...]:
+        """Rates p_1..p_r for a barrier, by its index."""
+        gains: Any = self.gains
+        return gains[barrier] if isinstance(gains[0], tuple) else gains
+
+    @property
+    def steps(self) -> int:
+        """Control periods in an episode."""
+        return round(self.horizon / self.dt)
+
+    @property
+    def duration(self) -> float:
+        """Length of an episode in s as it is simulated: the whole number of control periods that is nearest to the horizon."""
+        return self.steps * self.dt
+
+    @property
+    def outside(self) -> sp.Expr:
+        """Positive where the state has left the workspace; -1 if the workspace is unbounded."""
+        return _excess(tuple((s.symbol, s.low, s.high) for s in self.states))
+
+    def configured(
+        self,
+        *,
+        noise: float | Sequence[float] | None = None,
+        plant: Mapping[str, float] | None = None,
+        model: Mapping[str, float] | None = None,
+        dt: float | None = None,
+        substeps: int | None = None,
+        horizon: float | None = None,
+        box: Sequence[Any] | None = None,
+        start: str | Sequence[float] | None = None,
+    ) -> SafetyProblem:
+        """Return the problem with other numbers; None keeps the default.
+
+        Args:
+            noise: diffusion of plant and model alike, one number for all channels or one for each; 0 turns it off.
+            plant: parameters of the plant, by name.
+            model: parameters of the model, by name.
+            dt: control period in s.
+            substeps: integration steps in a control period.
+            horizon: length of an episode in s.
+            box: (low, high) for every input, or one such pair for each.
+            start: name of an initial distribution, or a fixed initial state.
+
+        Raises:
+            ConfigurationError: a name is unknown or a value is not allowed.
+        """
+        levels = self._noise_levels(noise)
+        changes: dict[str, Any] = {
+            "plant": self.plant.with_parameters(**{**levels, **(plant or {})}),
+            "model": self.model.with_parameters(**{**levels, **(model or {})}),
+        }
+        for name, value in (("dt", dt), ("horizon", horizon)):
+            if value is not None:
+                changes[name] = finite_number(name, value)
+        if substeps is not None:
+            changes["substeps"] = substeps
+        if box is not None:
+            changes["inputs"] = self._boxed(box)
+        if isinstance(start, str):
+            if start not in self.starts:
+                raise ConfigurationError(f"unknown start {shown(start)}; {nearest(start, self.starts)}, or {len(self.states)} numbers")
+            changes["start"] = start
+        elif start is not None:
+            changes["starts"] = {**self.starts, "given": self._fixed(start)}
+            changes["start"] = "given"
+        return replace(self, **changes)
+
+    def _noise_levels(self, noise: float | Sequence[float] | None) -> dict[str, float]:
+        if noise is None:
+            return {}
+        if not self.noise:
+            advice = ": its diffusion holds numbers only; write it as a parameter, so that it can be changed" if self.plant.noisy else ""
+            raise ConfigurationError(f"{self.name} has no noise channels{advice}")
+        given = _numbers(noise)
+        if given.shape not in ((1,), (len(self.noise),)) or not np.isfinite(given).all() or (given < 0).any():
+            raise ConfigurationError(
+                f"noise = {shown(noise)}; give one number >= 0, or {len(self.noise)} of them ({', '.join(self.noise)})"
+            )
+        return dict(zip(self.noise, np.broadcast_to(given, len(self.noise)).tolist(), strict=True))
+
+    def _boxed(self, box: Sequence[Any]) -> tuple[Variable, ...]:
+        pairs = _numbers(box)
+        pairs = np.broadcast_to(pairs, (len(self.inputs), 2)) if pairs.shape == (2,) else pairs
+        if pairs.shape != (len(self.inputs), 2):
+            raise ConfigurationError(f"box = {shown(box)}; give (low, high), or one such pair for each of the {len(self.inputs)} inputs")
+        bounds = [(float(low), float(high)) for low, high in pairs]
+        return tuple(replace(i, low=low, high=high) for i, (low, high) in zip(self.inputs, bounds, strict=True))
+
+    def _fixed(self, start: Sequence[float]) -> Start:
+        names = ", ".join(s.symbol.name for s in self.states)
+        given = _numbers(start)
+        if given.shape != (len(self.states),):
+            raise ConfigurationError(f"start has {given.size} numbers; the state has {len(self.states)}: {names}")
+        values = [finite_number(f"start of {s.symbol}", v) for s, v in zip(self.states, given.tolist(), strict=True)]
+        for s, v in zip(self.states, values, strict=True):
+            if not s.low <= v <= s.high:
+                raise ConfigurationError(f"start of {s.symbol} = {v} is outside the workspace [{s.low}, {s.high}]")
+        return Start.at(values)
+
+
+def _numbers(given: Any) -> np.ndarray:
+    """What the user gave as an array of at least one axis; empty if it holds no numbers."""
+    try:
+        found = np.asarray(given)
+        # NumPy would read numbers out of texts.
+        return np.empty(0) if found.dtype.kind in "US" else np.atleast_1d(found.astype(float))
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0)
+
+
+@lru_cache(maxsize=256)
+def _excess(ranges: tuple[tuple[sp.Symbol, float, float], ...]) -> sp.Expr:
+    """By how much the furthest state is outside its range; -1 without a bound. Remembered, for sympy compares all it takes the most of."""
+    symmetric: dict[float, list[sp.Expr]] = {}
+    excess: list[sp.Expr] = []
+    for symbol, low, high in ranges:
+        if low == -high and math.isfinite(high):
+            symmetric.setdefault(high, []).append(sp.Abs(symbol))
+        else:
+            excess += [symbol - high] * math.isfinite(high) + [low - symbol] * math.isfinite(low)
+    excess += [sp.Max(*sizes) - half for half, sizes in symmetric.items()]
+    return sp.Max(*excess) if excess else sp.Integer(-1)

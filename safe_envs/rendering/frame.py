@@ -1,0 +1,53 @@
+"""The picture of an instant of an episode: the scene of the problem, and the panel beside it."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import pygame
+
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.rendering.canvas import Canvas
+from safe_envs.rendering.panel import Panel
+from safe_envs.rendering.scenes import make_scene
+from safe_envs.rendering.scenes.base import Scene
+from safe_envs.rendering.snapshot import EpisodeSnapshot
+from safe_envs.rendering.style import SCENE, SIZE
+
+
+class Picture:
+    """Draws instants of a problem's episodes; it holds no episode, so that one object serves any number of envs.
+
+    Args:
+        problem: that is drawn. A scene of its name is only looked for when it is to be shown.
+    """
+
+    def __init__(self, problem: SafetyProblem) -> None:
+        self._canvas = Canvas(SIZE)
+        self._panel = Panel(problem)
+        self._problem = problem
+
+    @cached_property
+    def _scene(self) -> Scene:
+        return make_scene(self._problem)
+
+    def draw(self, moment: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None) -> pygame.Surface:
+        """Draw an instant; the surface is drawn over by the next call.
+
+        Args:
+            moment: what is drawn.
+            caption: above it.
+            shot: somebody else's picture of it, uint8 of shape (height, width, 3), to show in place of the scene.
+        """
+        self._panel.draw(self._canvas, moment, caption)
+        if shot is None:
+            self._scene.draw(self._canvas, moment)
+        else:
+            self._canvas.photograph(shot, SCENE)
+        return self._canvas.surface
+
+    def frame(self, moment: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None) -> np.ndarray:
+        """Draw an instant; uint8 of shape (height, width, 3). Arguments as for `draw`."""
+        self.draw(moment, caption, shot)
+        return self._canvas.pixels()

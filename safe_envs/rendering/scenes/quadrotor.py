@@ -1,0 +1,128 @@
+"""A quadrotor: its altitude over time, or all of it from the side."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.rendering.axes import Axes
+from safe_envs.rendering.canvas import Canvas
+from safe_envs.rendering.safe_set import Barriers, barriers_in
+from safe_envs.rendering.scenes.base import Scene, warning_color
+from safe_envs.rendering.scenes.plane import BOX, Plane
+from safe_envs.rendering.scenes.time_series import StripScene, reference_of
+from safe_envs.rendering.snapshot import EpisodeSnapshot
+from safe_envs.rendering.style import EDGE, GOAL, GREEN, GREY, INK, PAPER, SMALL, UNSAFE, VIOLATION, Color, mix, number
+
+_ARM = 30.0
+_ELEVATION = math.radians(14)
+_DIAL = (512, 76, 48)
+
+
+def rotation(phi: float, theta: float, psi: float) -> np.ndarray:
+    """From body to world: yaw after pitch after roll, so that the last column is the direction of the thrust."""
+    (a, b), (c, d), (e, f) = ((math.cos(angle), math.sin(angle)) for angle in (phi, theta, psi))
+    return np.array([[c * e, d * e * b - f * a, d * e * a + f * b], [c * f, d * f * b + e * a, d * f * a - e * b], [-d, c * b, c * a]])
+
+
+def draw_craft(canvas: Canvas, at: tuple[float, float], attitude: np.ndarray, color: Color) -> None:
+    """Draw the symbol of a quadrotor, seen along y from a little above; its size is fixed in pixels."""
+
+    def seen(points: np.ndarray) -> np.ndarray:
+        world = points @ attitude.T
+        height = world[:, 2] * math.cos(_ELEVATION) + world[:, 1] * math.sin(_ELEVATION)
+        return np.stack([at[0] + world[:, 0], at[1] - height], axis=1)
+
+    angles = np.linspace(0.0, 2 * math.pi, 19)[:-1]
+    ring = 0.42 * _ARM * np.stack([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    hubs = _ARM * np.array([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
+    for one, other in ((0, 2), (1, 3)):
+        ends = seen(hubs[[one, other]])
+        canvas.line(ends[0], ends[1], PAPER, 8)
+        canvas.line(ends[0], ends[1], INK, 4)
+    for hub in hubs[np.argsort(-(hubs @ attitude.T)[:, 1])]:
+        canvas.shape(seen(ring + hub + (0.0, 0.0, 5.0)), mix(color, PAPER, 0.55), INK, 1)
+    canvas.disk(seen(np.zeros((1, 3)))[0], 7, color, INK, 1)
+
+
+class AltitudeScene(StripScene):
+    """The altitude z over time, with a level quadrotor at the right."""
+
+    def __init__(self, problem: SafetyProblem) -> None:
+        super().__init__(problem, "z")
+
+    def draw_marker(self, canvas: Canvas, at: tuple[float, float], moment: EpisodeSnapshot) -> None:
+        """Draw the quadrotor."""
+        draw_craft(canvas, at, np.eye(3), warning_color(moment))
+
+
+class SideView(Scene):
+    """The plane of x and z to scale, with the quadrotor at its attitude, enlarged, and a dial of its tilt.
+
+    The plane shows the barriers that depend on the position alone, and the dial those that depend on roll and pitch alone.
+    """
+
+    def __init__(self, problem: SafetyProblem) -> None:
+        super().__init__(problem)
+        place = [self.index(name) for name in ("x", "y", "z")]
+        self._angles = [self.index(name) for name in ("phi", "theta", "psi")]
+        shown = self.range_of(place[0]), self.range_of(place[2])
+        self._plane = Plane(self, ("x", "z"), BOX, chosen=barriers_in(problem, place), equal=True, shown=shown)
+        self._references = [reference_of(problem, name) for name in ("x", "z")]
+        tilts = barriers_in(problem, self._angles[:2])
+        self._limits: list[tuple[float, float]] = []
+        if tilts:
+            reach = self.range_of(self._angles[1])
+            self._limits = Barriers(problem, tilts).intervals(np.zeros(len(self.names)), self._angles[1], *reach)
+
+    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+        """Draw the quadrotor and what it is to follow."""
+        axes = self._plane.background(canvas, moment)
+        canvas.within(axes.box)
+        self._draw_reference(canvas, axes, moment)
+        at = self._plane.trail(canvas, axes, moment)
+        canvas.within(axes.box)
+        attitude = rotation(*(float(moment.state[i]) for i in self._angles))
+        draw_craft(canvas, at, attitude, warning_color(moment))
+        self._draw_dial(canvas, attitude)
+        canvas.within(None)
+
+    def _draw_reference(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> None:
+        now = moment.times[-1:]
+        x, z = (None if reference is None else float(reference(now)[0]) for reference in self._references)
+        if z is None:
+            return
+        at = axes.place(0.0 if x is None else x, z)
+        ink = mix(GOAL, INK, 0.6)
+        if x is None:
+            canvas.dashes(np.array([(axes.box[0], at[1]), (axes.box[0] + axes.box[2], at[1])]), GOAL, 2)
+            canvas.text("reference", (axes.box[0] + 6, at[1] + 2), ink, SMALL)
+            return
+        canvas.disk(at, 11, None, PAPER, 5)
+        canvas.disk(at, 10, None, GOAL, 3)
+        canvas.disk(at, 2, INK)
+        canvas.text("reference", (at[0], at[1] - 14), ink, SMALL, align=(0.5, 1.0))
+
+    def _draw_dial(self, canvas: Canvas, attitude: np.ndarray) -> None:
+        """The angle between the thrust and the vertical, in the plane of both, to the side of the thrust that is seen."""
+        x, y, radius = _DIAL
+        up = attitude[:, 2]
+        tilt = math.copysign(math.acos(min(max(float(up[2]), -1.0), 1.0)), float(up[0]))
+        safe = not self._limits or any(low <= tilt <= high for low, high in self._limits)
+        canvas.fill((x - radius - 8, y - radius - 6, 2 * radius + 16, radius + 36), PAPER, 6)
+        canvas.frame((x - radius - 8, y - radius - 6, 2 * radius + 16, radius + 36), GREY, 1, 6)
+        canvas.shape(_sector((x, y), radius, -math.pi / 2, math.pi / 2), UNSAFE if self._limits else mix(GREEN, PAPER, 0.1), GREY)
+        for low, high in self._limits:
+            canvas.shape(_sector((x, y), radius, low, high), mix(GREEN, PAPER, 0.2), EDGE, 2)
+        canvas.line((x, y), (x, y - radius), GREY)
+        tip = x + radius * math.sin(tilt), y - radius * math.cos(tilt)
+        canvas.arrow((x, y), tip, INK if safe else VIOLATION, 3, 9.0)
+        canvas.text(f"tilt {number(abs(tilt))} rad", (x, y + 6), INK, SMALL, align=(0.5, 0.0))
+
+
+def _sector(center: tuple[float, float], radius: float, low: float, high: float) -> list[tuple[float, float]]:
+    """Corners of a sector between two angles from the vertical, clockwise."""
+    angles = np.linspace(low, high, 25).tolist()
+    return [center, *((center[0] + radius * math.sin(a), center[1] - radius * math.cos(a)) for a in angles)]

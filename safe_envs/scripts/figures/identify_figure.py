@@ -1,0 +1,157 @@
+"""The picture of an identification: each learned function against the truth, and what is believed of the noise."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from safe_envs.atomic_io import write_atomically
+from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, add_legend
+from safe_envs.scripts.reports.identify_report import Function, Identification, percent
+from safe_envs.wrappers.learning.posterior import Diffusion, Posterior
+from safe_envs.wrappers.learning.regression import sigma_samples
+
+_TRUTH = "#D55E00"
+_MOST = 12
+_MOST_LEVELS = 4
+_ACROSS = 4
+_SAMPLES = 20_000
+_CONSTANT = 1e-9
+_AROUND = 0.1
+_HEADROOM = 1.3
+_SIDE, _WIDEST_SIDE, _LEAST_WIDTH = 2.9, 3.4, 7.6
+_TINY, _HUGE = 0.02, 2e4
+
+_ESTIMATE_HANDLE = Line2D([], [], color=COLORS[0], marker="o", linestyle="", markersize=4, label="estimate at a state")
+_COUNTS_HANDLE = Patch(color=COLORS[0], alpha=0.6, label="estimates at all states")
+_SAMPLES_HANDLE = Patch(color=COLORS[1], alpha=0.6, label="samples of the posterior")
+_TRUTH_HANDLE = Line2D([], [], color=_TRUTH, linewidth=1.4, label="truth")
+
+
+def draw(found: Identification, path: Path) -> None:
+    """Draw an identification, and write the picture whole or not at all.
+
+    Args:
+        found: what to draw; of many functions those of the largest truth are shown.
+        path: of the picture; its suffix is the format.
+    """
+    levels = _levels(found)
+    rest = [function for function in found.shown if function.name not in levels]
+    shown = sorted(rest, key=lambda function: (-function.size, -function.error))[: _MOST - len(levels)]
+    count = len(shown) + len(levels)
+    down = max(math.ceil(count / _ACROSS), 1)
+    across = max(math.ceil(count / down), 1)
+    with mpl.rc_context(STYLE):
+        side = max(_SIDE, min(_WIDEST_SIDE, _LEAST_WIDTH / across))
+        figure = Figure(figsize=(max(side * across, _LEAST_WIDTH), 1.4 + side * down))
+        axes = list(figure.subplots(down, across, squeeze=False).flat)
+        handles: dict[Line2D | Patch, None] = {}
+        for panel, function in zip(axes, shown, strict=False):
+            handles |= dict.fromkeys([_draw_function(panel, function), _TRUTH_HANDLE])
+        for panel, (index, function) in zip(axes[len(shown) :], levels.values(), strict=False):
+            _draw_level(panel, found, index, function)
+            handles |= dict.fromkeys([_SAMPLES_HANDLE, _TRUTH_HANDLE])
+        for panel in axes[count:]:
+            panel.axis("off")
+        if not count:
+            axes[0].text(0.5, 0.5, "There is nothing to compare.", ha="center", va="center")
+        if handles:
+            add_legend(figure, list(handles))
+        left = f", the largest {len(shown)} of {len(rest)} functions" if len(shown) < len(rest) else ""
+        figure.suptitle(f"{found.title}, {found.learned.method}{left}\n{found.setup}", fontsize=11)
+        write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+
+
+def _levels(found: Identification) -> dict[str, tuple[int, Function]]:
+    """The constant variances that are shown as posteriors of sigma, by name, with their state."""
+    diffusion = _constant_noise(found)
+    if diffusion is None or isinstance(found.functions, str):
+        return {}
+    named = {function.name: function for function in found.functions}
+    names = [f"covariance[{s}, {s}]" for s in found.problem.plant.states]
+    noisy = [(i, named[name]) for i, name in enumerate(names) if diffusion.squares[i] > 0 and _constant(named[name].truth)]
+    return {function.name: (i, function) for i, function in noisy[:_MOST_LEVELS]}
+
+
+def _constant_noise(found: Identification) -> Diffusion | None:
+    """The noise that was learned, if it is constant."""
+    learned = found.learned
+    return learned.diffusion if isinstance(learned, Posterior) and learned.diffusion.features is None else None
+
+
+def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
+    """The estimates against a truth that varies, and how often they occur for one that does not; returns what the legend needs."""
+    off = "truth 0" if function.relative is None else f"error {percent(function.relative)}"
+    axes.set_title(f"{function.name}: {off}")
+    power = _power(np.concatenate([function.truth, function.estimate]))
+    truth, estimate = function.truth / 10.0**power, function.estimate / 10.0**power
+    alone = _constant(truth) and _constant(estimate)
+    if _constant(truth):
+        numbers = f"{_range('truth', function.truth)}\n{_range('estimate', function.estimate)}"
+        axes.text(0.04, 0.97, numbers, transform=axes.transAxes, va="top", fontsize=9, color=QUIET)
+    if _constant(truth) and not alone:
+        axes.hist(estimate, bins=30, color=COLORS[0], alpha=0.6)
+        axes.axvline(truth[0], ymax=1.0 / _HEADROOM, color=_TRUTH, linewidth=1.4)
+        axes.set(xlabel=_label("estimate", function.unit, power), ylabel="states", ylim=(0.0, _HEADROOM * axes.get_ylim()[1]))
+        _tidy(axes)
+        return _COUNTS_HANDLE
+    both = np.concatenate([truth, estimate])
+    # Around a single point there is no scale but that of the value itself, unless the error is larger.
+    room = max(np.ptp(both), _AROUND * abs(both).max()) if alone else 0.05 * np.ptp(both)
+    limits = (both.min() - room, both.max() + room)
+    axes.plot(limits, limits, color=_TRUTH, linewidth=1.0)
+    size, opacity = (6.0, 1.0) if alone else (2.5, 0.45)
+    axes.plot(truth, estimate, "o", color=COLORS[0], markersize=size, markeredgewidth=0, alpha=opacity, rasterized=True)
+    axes.set(xlim=limits, ylim=limits, xlabel=_label("truth", function.unit, power), ylabel=_label("estimate", function.unit, power))
+    _tidy(axes)
+    return _ESTIMATE_HANDLE
+
+
+def _draw_level(axes: Axes, found: Identification, index: int, function: Function) -> None:
+    """What is believed of the noise of a state, as in Fig. 6.2 of the thesis."""
+    noise, state = _constant_noise(found), found.problem.states[index]
+    assert noise is not None
+    samples = sigma_samples(noise.squares[index], noise.count, noise.alpha, noise.beta, _SAMPLES, np.random.default_rng(found.seed))
+    power = _power(samples)
+    axes.hist(samples / 10.0**power, bins=40, density=True, color=COLORS[1], alpha=0.6)
+    axes.axvline(float(np.sqrt(function.truth[0])) / 10.0**power, color=_TRUTH, linewidth=1.4)
+    axes.set(title=f"sigma of {state.symbol}", xlabel=_label("sigma", f"{state.unit or 1}/√s", power), ylabel="density")
+    _tidy(axes)
+
+
+def _tidy(axes: Axes) -> None:
+    """A square panel with few ticks, so that long numbers do not meet."""
+    axes.set_box_aspect(1)
+    axes.xaxis.set_major_locator(MaxNLocator(3))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.ticklabel_format(style="plain", useOffset=False)
+
+
+def _power(values: np.ndarray) -> int:
+    """The power of ten to be taken out of values that are tiny or huge; 0 for others."""
+    largest = abs(values).max()
+    return 0 if not largest or _TINY <= largest < _HUGE else math.floor(math.log10(largest))
+
+
+def _label(name: str, unit: str, power: int) -> str:
+    raised = re.sub(r"\^(\d+)", r"$^{\1}$", unit)
+    inside = (f"$10^{{{power}}}$ {raised}" if power else raised).strip()
+    return f"{name} ({inside})" if inside else name
+
+
+def _range(name: str, values: np.ndarray) -> str:
+    """Values in words: the number where they are constant, else from where to where they reach."""
+    return f"{name} {values[0]:.4g}" if _constant(values) else f"{name} {values.min():.3g} to {values.max():.3g}"
+
+
+def _constant(values: np.ndarray) -> bool:
+    return bool(np.ptp(values) <= _CONSTANT * abs(values).max())

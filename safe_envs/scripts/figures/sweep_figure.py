@@ -1,0 +1,192 @@
+"""The picture of a sweep: safety rates over a swept setting, with bands."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
+from safe_envs.atomic_io import write_atomically
+from safe_envs.scripts.figures.evaluation_figure import COLORS, STYLE, add_legend
+
+_BARE_COLOR = "#D55E00"
+_SEED = "seed"
+_MOST_PANELS = 12
+_COLUMNS = 3
+
+Row = dict[str, Any]
+Rate = tuple[float, float, float]
+"""Of safe episodes, and the ends of its interval."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Which swept setting is where.
+
+    Attributes:
+        x: across; None where nothing but seeds was swept.
+        lines: a line for each of its values; None for a single one.
+        panels: a panel for each combination of their values.
+    """
+
+    x: str | None
+    lines: str | None
+    panels: tuple[str, ...]
+
+    @classmethod
+    def of(cls, rows: Sequence[Row], swept: Sequence[str], x: str | None = None, lines: str | None = None) -> Layout:
+        """The given settings, or else the one with most numbers across, and the filter, or the one with most values, as lines."""
+        rest = [name for name in swept if name not in (x, lines) and (name != _SEED or _SEED in (x, lines))]
+
+        def variety(name: str) -> tuple[bool, int]:
+            return _is_numeric(rows, name), len(_values(rows, name))
+
+        if x is None and rest:
+            x = max(rest, key=variety)
+            rest.remove(x)
+        if lines is None and rest:
+            lines = "filter" if "filter" in rest else max(rest, key=lambda name: variety(name)[1])
+            rest.remove(lines)
+        return cls(x, lines, tuple(rest))
+
+
+def draw(rows: Sequence[Row], layout: Layout, path: Path) -> int:
+    """Draw cells that are done, and write the picture whole or not at all.
+
+    Args:
+        rows: of `safe_envs.agents.sweeps.store.read`.
+        layout: which setting is where.
+        path: of the picture.
+
+    Returns:
+        How many panels there was no room for.
+
+    Raises:
+        ConfigurationError: the picture cannot be written.
+    """
+    combinations = list(dict.fromkeys(tuple(row[name] for name in layout.panels) for row in rows))
+    shown = combinations[:_MOST_PANELS]
+    columns = min(len(shown), _COLUMNS)
+    count = math.ceil(len(shown) / columns)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(max(6.0, 3.8 * columns), 1.2 + 3.0 * count))
+        grid = figure.subplots(count, columns, sharey=True, squeeze=False)
+        for k, axes in enumerate(grid.flat):
+            if k >= len(shown):
+                axes.set_visible(False)
+                continue
+            chosen = [row for row in rows if tuple(row[name] for name in layout.panels) == shown[k]]
+            _draw_panel(axes, chosen, layout, rows)
+            axes.set_title(_title(layout.panels, shown[k]))
+            axes.set_ylabel("safe (%)" if k % columns == 0 else "")
+        handles, labels = grid.flat[0].get_legend_handles_labels()
+        if labels:
+            add_legend(figure, handles)
+        figure.suptitle(f"{_common(rows)}safety rate, with its pointwise 95 % band", fontsize=11)
+        write_atomically(path, lambda part: figure.savefig(part, dpi=150))
+    return len(combinations) - len(shown)
+
+
+def _common(rows: Sequence[Row]) -> str:
+    """What all cells simulate, if it is one env."""
+    titles = {json.loads(row["config"])["title"] for row in rows}
+    return f"{titles.pop()}: " if len(titles) == 1 else ""
+
+
+def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Sequence[Row]) -> None:
+    """Rates over the setting across: with bands where it is a number, and else with bars."""
+    numeric = layout.x is not None and _is_numeric(everything, layout.x)
+    places = [None] if layout.x is None else _values(everything, layout.x)
+    position: dict[Any, Any] = {value: value if numeric else k for k, value in enumerate(places)}
+    kinds = [None] if layout.lines is None else _values(everything, layout.lines)
+    colors = _shades(len(kinds)) if layout.lines and _is_numeric(everything, layout.lines) else COLORS
+    for k, kind in enumerate(kinds):
+        of_kind = [row for row in rows if layout.lines is None or row[layout.lines] == kind]
+        found = [(position[place], rate) for place in places if (rate := _rate(_at(of_kind, layout.x, place)))]
+        color = _BARE_COLOR if kind == BARE else colors[k % len(colors)]
+        label = None if layout.lines is None else _text(kind) if layout.lines == "filter" else f"{layout.lines} = {_text(kind)}"
+        if numeric:
+            _draw_band(axes, found, color, label)
+        else:
+            # Beside each other, since they would hide each other.
+            _draw_bars(axes, [(at + 0.12 * (k - (len(kinds) - 1) / 2), rate) for at, rate in found], color, label)
+    axes.set_xlabel("" if layout.x is None else layout.x)
+    if numeric and all(isinstance(place, int) for place in places):
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if not numeric:
+        axes.set_xticks(list(position.values()), ["" if layout.x is None else _text(place) for place in places])
+    axes.set_ylim(-3, 103)
+
+
+def _shades(count: int) -> list[Any]:
+    """Colours in the order of numbers."""
+    return [mpl.colormaps["viridis"](0.9 * k / max(count - 1, 1)) for k in range(count)]
+
+
+def _draw_band(axes: Axes, found: Sequence[tuple[float, Rate]], color: Any, label: str | None) -> None:
+    at = [place for place, _ in found]
+    rate, low, high = ([100 * each[i] for _, each in found] for i in range(3))
+    axes.fill_between(at, low, high, color=color, alpha=0.2, linewidth=0)
+    axes.plot(at, rate, "o-", color=color, linewidth=1.8, markersize=3.5, label=label)
+
+
+def _draw_bars(axes: Axes, found: Sequence[tuple[float, Rate]], color: Any, label: str | None) -> None:
+    at = [place for place, _ in found]
+    rate, low, high = ([100 * each[i] for _, each in found] for i in range(3))
+    lengths = [[r - a for r, a in zip(rate, low, strict=True)], [b - r for r, b in zip(rate, high, strict=True)]]
+    axes.errorbar(at, rate, yerr=lengths, fmt="o", color=color, markersize=4, capsize=3, label=label)
+
+
+def _at(rows: Iterable[Row], name: str | None, value: Any) -> list[Row]:
+    return [row for row in rows if name is None or row[name] == value]
+
+
+def _rate(rows: Sequence[Row]) -> Rate | None:
+    """The rate of cells that differ in their seeds only, whose episodes are independent; None without any.
+
+    Where each seed learned anew what its filter rests on, its episodes have that in common, and the interval is over both.
+    """
+    if not rows:
+        return None
+    if len(rows) == 1:
+        return rows[0]["safety_rate"], rows[0]["ci_low"], rows[0]["ci_high"]
+    safe, episodes = sum(row["safe"] for row in rows), sum(row["episodes"] for row in rows)
+    of_episodes = rate_interval(safe, episodes)
+    if len({_learned(row) for row in rows}) == 1:
+        return safe / episodes, *of_episodes
+    return safe / episodes, *repeated_interval([row["safety_rate"] for row in rows], of_episodes, 0.95, (0.0, 1.0))
+
+
+def _learned(row: Row) -> tuple[str, ...]:
+    """Checksums of the models on which the filter of a cell rests; none for one that learned nothing."""
+    return tuple((json.loads(row["row"])["learning"] or {}).get("sha256", ()))
+
+
+def _values(rows: Sequence[Row], name: str) -> list[Any]:
+    """The values of a setting in the order of the cells, numbers by their size."""
+    values = list(dict.fromkeys(row[name] for row in rows))
+    return sorted(values) if _is_numeric(rows, name) else values
+
+
+def _is_numeric(rows: Sequence[Row], name: str) -> bool:
+    return all(isinstance(row[name], int | float) and not isinstance(row[name], bool) for row in rows)
+
+
+def _title(names: Sequence[str], values: Sequence[Any]) -> str:
+    return ", ".join(f"{name} = {_text(value)}" for name, value in zip(names, values, strict=True))
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "env's own"
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,47 @@
+"""What a shell offers after a part of a word. Nothing heavy is imported: it answers between two keystrokes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from safe_envs.systems import ENV_IDS
+
+FILTERS = ("none", "cbf", "ecbf", "hocbf", "rcbf", "srcbf", "szcbf", "scbf", "learned-hocbf", "ddscbf", "bayesian-scbf")
+"""Names of filters, as `safe_envs.wrappers.conditions` knows them: that takes too long to ask."""
+
+POLICIES = ("nominal", "clf", "zero", "random")
+"""Names of policies, as `safe_envs.agents.policies.registry` knows them."""
+
+ALGORITHMS = ("ppo", "a2c", "sac", "td3")
+"""Names of algorithms, as `safe_envs.agents.training.hyperparameters` knows them."""
+
+
+def env_ids(incomplete: str) -> list[str]:
+    """Registered ids, with or without their namespace."""
+    return [name for env_id in ENV_IDS for name in (env_id, env_id.partition("/")[2]) if name.startswith(incomplete)]
+
+
+def words(allowed: Sequence[str]) -> Callable[[str], list[str]]:
+    """Completion by a list of words."""
+
+    def complete(incomplete: str) -> list[str]:
+        return [word for word in allowed if word.startswith(incomplete)]
+
+    return complete
+
+
+filters, policies, algorithms = (words(names) for names in (FILTERS, POLICIES, ALGORITHMS))
+
+
+def artefacts(incomplete: str) -> list[str]:
+    """Tables and figures of the thesis that `reproduce` computes."""
+    return words(("all", *ARTEFACTS))(incomplete)
+
+
+ARTEFACTS = (
+    *(f"figure-{n}" for n in ("3.1", "3.2a", "3.2b", "3.3", "4.1", "4.2", "4.3", "5.1", "5.2", "5.3a", "5.3b", "5.3c", "5.3d")),
+    *(f"figure-6.{n}" for n in range(1, 5)),
+    *(f"table-{n}" for n in ("4.1", "5.1", "5.2", "6.1", "6.2", "6.3", "6.4")),
+    "example-4.2.2",
+)
+"""As `safe_envs.scripts.reproduce.catalogue` has them."""

@@ -1,0 +1,222 @@
+"""The terminal: where output goes, how errors end a command, and the progress bar."""
+
+from __future__ import annotations
+
+import errno
+import functools
+import inspect
+import io
+import json
+import os
+import re
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, TextIO
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from safe_envs.atomic_io import require_writable, write_json
+from safe_envs.errors import SafeEnvsError, shortened
+from safe_envs.scripts.options.number_options import strict
+
+_LEAST_WIDTH = 104
+_PIPE_WIDTH = 240
+_LONGEST = 2000
+"""Characters of an error, at most: what somebody else's code or file says in it may be of any length."""
+
+_TOO_LARGE = ("can't allocate memory", "Maximum allowed dimension exceeded", "Maximum allowed size exceeded", "array is too big")
+"""What PyTorch and NumPy say of sizes beyond the memory, where it is no MemoryError."""
+
+_UNWRITABLE = {errno.ENOSPC, errno.EFBIG, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)}
+"""What the operating system says of a disk that takes no more."""
+
+STDOUT = Path("-")
+"""As the file of --json: the standard output, which has nothing else on it then."""
+
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print the tables only: no progress bar, no headings, no notes.")]
+Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results; - writes them to stdout, and nothing else.")]
+
+
+class _Terminal:
+    """How much is printed just now."""
+
+    quiet = False
+    silent = False
+
+
+class _Tables(Console):
+    """A console that leaves out all but tables."""
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        tables = [found for found in objects if isinstance(found, Table)]
+        if tables:
+            super().print(*tables, **how)
+
+
+class _Trimmed(io.TextIOBase):
+    """A stream without the blanks that fill the lines of a table."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    @property
+    def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """What decides which characters a table is drawn with."""
+        return self._stream.encoding
+
+    def write(self, text: str, /) -> int:
+        """Write whole lines, as a console does."""
+        return self._stream.write(re.sub(r" +$", "", text, flags=re.MULTILINE))
+
+    def flush(self) -> None:
+        """See `io.TextIOBase`."""
+        self._stream.flush()
+
+
+@contextmanager
+def quietly(quiet: bool, silent: bool = False) -> Iterator[None]:
+    """Print less within this context.
+
+    Args:
+        quiet: no progress bar, and of what is printed only the tables.
+        silent: nothing on stdout, which is for `write_result`.
+    """
+    before = (_Terminal.quiet, _Terminal.silent)
+    _Terminal.quiet, _Terminal.silent = before[0] or quiet, before[1] or silent
+    try:
+        yield
+    finally:
+        _Terminal.quiet, _Terminal.silent = before
+
+
+def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
+    """The function of a command with the option --quiet, strict numbers, and no other output where its --json goes to stdout."""
+
+    @functools.wraps(command)
+    def wrapped(*, quiet: bool = False, **arguments: Any) -> None:
+        with quietly(quiet, silent=STDOUT in (arguments.get("json"), arguments.get("json_file"))):
+            command(**arguments)
+
+    option = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Quiet)
+    return with_signature(wrapped, [*map(strict, inspect.signature(command, eval_str=True).parameters.values()), option])
+
+
+def with_signature(function: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
+    """Let a function have these parameters for typer, which asks its signature and its annotations; returns it."""
+    function.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
+    function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return function
+
+
+def stdout() -> Console:
+    """Console for results: wide enough for a table, and on a pipe for whatever is in it."""
+    kind = _Tables if _Terminal.quiet else Console
+    if sys.stdout.isatty():
+        return kind(width=max(Console().width, _LEAST_WIDTH), quiet=_Terminal.silent)
+    trimmed: Any = _Trimmed(sys.stdout)
+    return kind(width=_PIPE_WIDTH, quiet=_Terminal.silent, file=trimmed)
+
+
+def require_result(path: Path | None) -> None:
+    """Raise ConfigurationError if the file of --json cannot be written: asked before a long run, not after it."""
+    if path is not None and path != STDOUT:
+        require_writable(path)
+
+
+def write_result(path: Path | None, document: Callable[[], Any]) -> None:
+    """Write what --json asks for, if it does.
+
+    Args:
+        path: of --json.
+        document: makes what is to be written.
+
+    Raises:
+        ConfigurationError: the file cannot be written.
+    """
+    if path == STDOUT:
+        print(json.dumps(document(), indent=2, allow_nan=False))
+    elif path is not None:
+        write_json(path, document())
+
+
+def run(command: Callable[[], object]) -> None:
+    """Run a command; an error of the user's making ends it with a message and the exit status 2."""
+    try:
+        with _terminable():
+            try:
+                command()
+            finally:
+                sys.stdout.flush()
+    except SafeEnvsError as error:
+        _fail(str(error))
+    except BrokenPipeError:
+        # Who reads the output has read enough.
+        _drop_output()
+        sys.exit(1)
+    except OSError as error:
+        if error.errno not in _UNWRITABLE:
+            raise
+        _drop_output()
+        _fail(f"cannot write {error.filename or 'the output'}: {error.strerror}; make room, or choose another place")
+    except (MemoryError, RuntimeError, ValueError) as error:
+        if not isinstance(error, MemoryError) and not any(text in str(error) for text in _TOO_LARGE):
+            raise
+        reason = str(error) or type(error).__name__
+        _fail(f"not enough memory for what was asked ({reason}); choose smaller settings, or fewer episodes")
+    except Exception as error:
+        # Not imported before it is needed: completion has to be quick.
+        from gymnasium.error import Error
+
+        if not isinstance(error, Error):
+            raise
+        _fail(str(error))
+
+
+def _drop_output() -> None:
+    """Forget what could not be written to stdout, which Python would try again when it ends."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Let a request to terminate, as job managers send it, end like Ctrl-C: with the processes that were started."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def stop(*_: Any) -> NoReturn:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _fail(message: str) -> NoReturn:
+    Console(stderr=True).print(f"[bold red]Error:[/] [red]{escape(shortened(message, _LONGEST))}[/]", soft_wrap=True, highlight=False)
+    sys.exit(2)
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
+    """A progress bar on stderr, if that is a terminal: yields the function to tell which part is done, or None."""
+    if _Terminal.quiet or not sys.stderr.isatty():
+        yield None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda done: bar.update(task, completed=done)

@@ -1,0 +1,47 @@
+"""Options that take a number: read as everywhere in this project, by the one reader of numbers."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import typing
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+
+from safe_envs.errors import shown
+from safe_envs.number_text import whole_or_real
+
+
+def strict(parameter: inspect.Parameter) -> inspect.Parameter:
+    """The parameter of a command; where it is an option that takes a number, one that takes no other text than others do.
+
+    Typer itself takes for a number whatever Python does: digits of other scripts, and 1_000.
+    """
+    if typing.get_origin(parameter.annotation) is not Annotated:
+        return parameter
+    hint, option, *_ = typing.get_args(parameter.annotation)
+    kind = next((kind for kind in (int, float) if kind in (hint, *typing.get_args(hint))), None)
+    if kind is None:
+        return parameter
+    found = copy.copy(option)
+    found.parser = _reader(kind, option.min)
+    found.metavar = option.metavar or ("INTEGER" if kind is int else "FLOAT")
+    return parameter.replace(annotation=Annotated[hint, found])
+
+
+def _reader(kind: type[int] | type[float], least: float | None) -> Callable[[Any], int | float]:
+    def read(text: Any) -> int | float:
+        try:
+            # A default is a number already.
+            number = whole_or_real(text) if isinstance(text, str) else text
+        except ValueError:
+            number = None
+        if number is None or (kind is int and not isinstance(number, int)):
+            raise typer.BadParameter(f"{shown(text)} is not a valid {'integer' if kind is int else 'float'}.")
+        if least is not None and number < least:
+            raise typer.BadParameter(f"{shown(number)} is not in the range x>={least}.")
+        return kind(number)
+
+    return read

@@ -1,0 +1,133 @@
+"""The answer of `safe-envs evaluate --rare` as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
+from safe_envs.agents.evaluation.rollout import Row
+from safe_envs.agents.rare_events.estimate import RareEvaluation, estimate_rare
+from safe_envs.errors import ConfigurationError
+from safe_envs.scripts.options.console import progress_bar, stdout, write_result
+from safe_envs.scripts.reports.evaluation_report import describe_system, early_end, unsafe_starts
+
+_COLUMNS = (
+    "method",
+    "levels",
+    "simulated\nsteps",
+    "plain episodes\nneeded",
+    "violations in\nplain episodes",
+    "steps/s",
+)
+_WIDEST = 1000
+
+
+def run_rare(json: Path | None, refused: Mapping[str, Any], env: Any, policy: str, **arguments: Any) -> None:
+    """Estimate, print the answer and write it.
+
+    Args:
+        json: of --json, if given.
+        refused: options that splitting knows nothing of, and what was given for them.
+        env: id or problem.
+        policy: as for `estimate_rare`.
+        **arguments: of `estimate_rare`; None for its default.
+
+    Raises:
+        ConfigurationError: one of the refused options was given, or as `estimate_rare`.
+    """
+    given = [name for name, value in refused.items() if value]
+    if given:
+        raise ConfigurationError(f"--rare does not go with {', '.join(given)}; leave one of them out")
+    with progress_bar("Splitting") as tell:
+        answer = estimate_rare(env, policy, progress=tell, **{k: v for k, v in arguments.items() if v is not None})
+    print_rare(stdout(), answer)
+    write_result(json, answer.document)
+
+
+def print_rare(console: Console, answer: RareEvaluation) -> None:
+    """Print a heading, a row for each filter, and what has to be known to read them."""
+    config = answer.config
+    interval = f"{100 * config['confidence']:.10g} % interval"
+    console.print(_heading(answer), soft_wrap=True, highlight=False)
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True)
+    table.add_column("filter", overflow="fold", vertical="bottom")
+    table.add_column(f"P(violation) [{interval}]", justify="right", no_wrap=True, vertical="bottom")
+    for name in _COLUMNS:
+        table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
+    for row, speed in zip(answer.rows, answer.timing["rows"], strict=True):
+        table.add_row(Text(row["filter"]), *_cells(row, speed["steps_per_second"]))
+    # A column that is cut off would be a number that is wrong.
+    console.width = max(console.width, console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum)
+    console.print()
+    console.print(table)
+    console.print()
+    reasons = Table.grid()
+    for reason in dict.fromkeys(row["reason"] for row in answer.rows if row["reason"]):
+        names = ", ".join(row["filter"] for row in answer.rows if row["reason"] == reason)
+        reasons.add_row(Text(f"Splitting cannot work here for {names}: {reason}.", overflow="fold"))
+    if reasons.row_count:
+        console.print(reasons)
+    for note in _notes(answer):
+        console.print(note, soft_wrap=True, highlight=False, markup=False)
+
+
+def _heading(answer: RareEvaluation) -> Text:
+    config = answer.config
+    title = Text(config["title"], style="bold")
+    how = f"{config['repetitions']} repetitions of {config['particles']} particles"
+    title.append(f" | policy {config['policy']['name']} | rare violations, {how} | seed {config['seed']}", style="not bold")
+    watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
+    goal = ", joint program with the goal" if config["objective"] == "clf" else ""
+    title.append(f"\n{describe_system(answer.problem)}{watched}; filters know the {config['knowledge']}{goal}", style="not bold")
+    return title
+
+
+def _cells(row: Row, speed: float) -> list[str]:
+    plain = row["plain"]
+    p, needed = row["probability"], row["plain_episodes_needed"]
+    return [
+        "none, see below" if p is None else _probability(row),
+        row["method"] or "-",
+        f"{row['levels']:.1f}" if row["steps"] else "-",
+        _large(row["steps"]) if row["steps"] else "-",
+        _large(needed) if needed else "-",
+        f"{plain['violations']} of {plain['episodes']}" if plain else "-",
+        _large(speed) if row["steps"] else "-",
+    ]
+
+
+def _probability(row: Row) -> str:
+    return f"{row['probability']:.3g} [{row['ci_low']:.3g}, {row['ci_high']:.3g}]"
+
+
+def _notes(answer: RareEvaluation) -> list[str]:
+    rows, steps = answer.rows, answer.problem.steps
+    notes = [f"doubt the estimate of {row['filter']}: {row['doubt']}." for row in rows if row["doubt"]]
+    notes += [f"the check on {row['filter']}, by {row['check']['method']}, is {_probability(row['check'])}" for row in rows if row["check"]]
+    plain = [row["plain"] for row in rows if row["plain"]]
+    if plain:
+        notes += unsafe_starts(plain[0]["outside"] / plain[0]["episodes"])
+    notes += [
+        early_end(row["filter"], "mean episode without a violation", length, steps)
+        for row in rows
+        if row["plain"] and (length := row["plain"]["kept_length"]) is not None and length < 0.99 * steps
+    ]
+    if answer.config["monitoring"] == "continuous":
+        notes += bridge_notes(answer.problem)
+    return [f"Note: {note}" for note in notes]
+
+
+def _large(number: float) -> str:
+    if number >= 1e12:
+        return f"{number:.1e}"
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if number >= size:
+            return f"{number / size:.3g} {letter}"
+    return f"{number:.0f}"

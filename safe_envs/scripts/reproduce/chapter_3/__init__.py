@@ -1,0 +1,1 @@
+"""Artefacts of chapter 3 of the thesis."""

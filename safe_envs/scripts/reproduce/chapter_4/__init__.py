@@ -1,0 +1,1 @@
+"""Artefacts of chapter 4 of the thesis."""

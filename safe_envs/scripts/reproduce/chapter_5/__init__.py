@@ -1,0 +1,1 @@
+"""Artefacts of chapter 5 of the thesis."""

@@ -1,0 +1,1 @@
+"""Artefacts of chapter 6 of the thesis."""

@@ -1,0 +1,65 @@
+"""The measured rates of Table 6.2 beside the worst case h/c, and at one horizon for both starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from safe_envs.agents.evaluation.rollout import Row
+from safe_envs.scripts.reproduce.chapter_6.learned_controllers import PRINTED_EPISODES
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
+from safe_envs.scripts.reproduce.framework.verdict import disagreement
+
+
+def above_worst(horizon: float, each: Mapping[str, tuple[Sequence[Number], float]]) -> Claim:
+    """That measured rates are above the worst case, by the lower ends of their intervals.
+
+    Args:
+        horizon: up to which they were measured, in s.
+        each: the rates and h/c, in per cent, by the start.
+    """
+    lowest = {place: (min(number.low or 0.0 for number in rates), bound) for place, (rates, bound) in each.items()}
+    return Claim(
+        f"Within {horizon:g} s all measured rates are above the worst case h/c.",
+        all(low > bound for low, bound in lowest.values()),
+        "; ".join(f"{place}: lower ends from {low:.1f} %, h/c {bound:.0f} %" for place, (low, bound) in lowest.items()),
+    )
+
+
+def worst_for_ever(seconds: float, each: Mapping[str, tuple[Number, float]]) -> Claim:
+    """That no rate falls below the worst case in a long time, by the upper ends of the intervals.
+
+    Args:
+        seconds: how long.
+        each: the rate after that and h/c, in per cent, by the start.
+    """
+    return Claim(
+        f"h/c is a worst case for ever; here up to {seconds:g} s.",
+        all(rate.high is not None and rate.high >= bound for rate, bound in each.values()),
+        "; ".join(
+            f"{place}: SCBF {rate.ours:.1f} % [{rate.low:.1f}, {rate.high:.1f}], h/c {bound:.0f} %" for place, (rate, bound) in each.items()
+        ),
+    )
+
+
+def at_one_horizon(first: Row, second: Row, printed: tuple[float, float]) -> str:
+    """Whether the rates from two starts are the printed ones at the same horizon, in words.
+
+    Args:
+        first: what was measured from the first start, with its curve of rates over the horizon.
+        second: the same from the second one.
+        printed: of both, in per cent.
+    """
+    times, curves = first["curve"]["time"], [_rates(row, at) for row, at in zip((first, second), printed, strict=True)]
+    both = [time for time, *pair in zip(times, *curves, strict=True) if not any(map(disagreement, pair))]
+    if both:
+        return f"The SCBF has both printed rates at the same horizon at {len(both)} of {len(times)} instants, first at T = {both[0]:.2f} s."
+    k = min(range(len(times)), key=lambda k: abs(curves[0][k].ours - printed[0]))
+    return (
+        f"At none of {len(times)} instants up to T = {times[-1]:g} s has the SCBF both printed rates: from the first start it is nearest "
+        f"to {printed[0]:g} % at T = {times[k]:.2f} s, with {curves[0][k].ours:.1f} %, and has {curves[1][k].ours:.1f} % from the second "
+        f"one then, {printed[1]:g} % in print. At longer horizons it has no more than {curves[0][-1].ours:.1f} % from the first start."
+    )
+
+
+def _rates(row: Row, printed: float) -> list[Number]:
+    return [Number.rate("", safe, row["episodes"], printed, PRINTED_EPISODES) for safe in row["curve"]["safe"]]

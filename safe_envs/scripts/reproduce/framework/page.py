@@ -1,0 +1,124 @@
+"""The page of a reproduction: one file of HTML that needs no network, and the same as Markdown."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from PIL import Image
+
+from safe_envs.agents.evaluation.evaluate import package_versions
+from safe_envs.atomic_io import write_atomically
+from safe_envs.errors import ConfigurationError
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.verdict import RULES, Judgement, judge
+
+_COLOURS = 64
+"""Of a picture on the page, which need not be larger than its lines and few areas ask for."""
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """An artefact on the page."""
+
+    artefact: Artefact
+    outcome: Outcome
+    seconds: float
+    judgement: Judgement
+    picture: str
+
+    @property
+    def settings(self) -> list[tuple[str, Sequence[Number]]]:
+        """The tables of numbers, with their headings."""
+        tables = [
+            ("", self.outcome.numbers),
+            *((f"Other setting: {name}", found.numbers) for name, found in self.outcome.elsewhere.items()),
+        ]
+        tables.append(("By the printed formula", self.outcome.as_printed))
+        return [(heading, numbers) for heading, numbers in tables if numbers]
+
+    @property
+    def checks(self) -> list[tuple[str, list[Claim]]]:
+        """Claims of the thesis and checks of ours, with their headings; those of another setting by its name."""
+        claims = [*self.outcome.claims]
+        for name, found in self.outcome.elsewhere.items():
+            claims += [replace(claim, sentence=f"{claim.sentence} (other setting: {name})") for claim in found.claims]
+        both = [("claim of the thesis", [c for c in claims if c.printed]), ("check of ours", [c for c in claims if not c.printed])]
+        return [(heading, some) for heading, some in both if some]
+
+
+def write_page(folder: Path, found: Sequence[tuple[Artefact, Outcome, float]], sample: Sample) -> None:
+    """Write `index.html` and `index.md` of what was found.
+
+    Args:
+        folder: where pictures are, and the page goes.
+        found: artefacts with their outcomes and the seconds that these took.
+        sample: by which they were computed.
+    """
+    entries = [_Entry(a, o, s, judge(a, o, sample), _picture(folder, a)) for a, o, s in found]
+    environment = Environment(
+        loader=PackageLoader("safe_envs.scripts.reproduce.framework", "templates"),
+        undefined=StrictUndefined,
+        autoescape=_is_html,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"value": _value, "range": _range, "printed": _printed, "cell": _cell}
+    for name in ("index.html", "index.md"):
+        text = environment.get_template(f"{name}.jinja").render(
+            entries=entries, sample=sample, rules=RULES, versions=package_versions(), seconds=sum(e.seconds for e in entries)
+        )
+        write_atomically(folder / name, lambda part, text=text: part.write_text(text))
+
+
+def _is_html(name: str | None) -> bool:
+    return name is not None and ".html" in name
+
+
+def _picture(folder: Path, artefact: Artefact) -> str:
+    """The picture as text for a page without other files."""
+    if artefact.draw is None:
+        return ""
+    light, path = io.BytesIO(), folder / f"{artefact.name}.png"
+    try:
+        with Image.open(path, formats=["png"]) as picture:
+            picture.convert("RGB").quantize(_COLOURS).save(light, "png", optimize=True)
+    except (Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
+        raise ConfigurationError(f"{path} cannot be read ({error}); remove it, and it is drawn again") from error
+    return base64.b64encode(light.getvalue()).decode()
+
+
+def _value(number: Number) -> str:
+    return _quantity(number.ours, number.unit)
+
+
+def _range(number: Number) -> str:
+    if number.low is None or number.high is None:
+        return ""
+    return (
+        f"[{_quantity(number.low, '')}, {_quantity(number.high, '')}]" if number.unit != "%" else f"[{number.low:.1f}, {number.high:.1f}]"
+    )
+
+
+def _printed(number: Number) -> str:
+    if number.printed is None:
+        return "-"
+    size = f" (of {number.printed_trials})" if number.printed_trials else ""
+    return f"{number.printed:g}{_unit(number.unit)}{size}"
+
+
+def _cell(text: str) -> str:
+    """As a cell of a Markdown table."""
+    return text.replace("|", "\\|")
+
+
+def _quantity(value: float, unit: str) -> str:
+    return f"{value:.1f} %" if unit == "%" else f"{value:.3g}{_unit(unit)}"
+
+
+def _unit(unit: str) -> str:
+    return f" {unit}" if unit else ""

@@ -1,0 +1,159 @@
+"""`safe-envs train`: an agent of Stable-Baselines3, with a filter in the loop or without one."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.number_text import real
+from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
+from safe_envs.scripts.options.env_options import EnvOptions, with_env
+from safe_envs.scripts.reports.rates import percent_in
+
+
+@with_env
+def train(
+    algo: Annotated[str, typer.Option(metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="New folder for the policy, its evaluations and the checkpoint.")],
+    env: EnvOptions,
+    filters: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--filter",
+            metavar="NAME",
+            autocompletion=completion.filters,
+            help="Filter in the loop; none by default. A learned one with its file: ddscbf:file=FILE.",
+        ),
+    ] = None,
+    n_timesteps: Annotated[
+        int | None,
+        typer.Option(help="Control periods over all copies, rounded up to whole rollouts; by default that of the hyperparameters."),
+    ] = None,
+    num_envs: Annotated[int | None, typer.Option(help="Copies of the env; by default that of the hyperparameters.")] = None,
+    seed: text_options.Seed = 0,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Hyperparameter in place of the file's, such as learning_rate=3e-4. Repeatable."),
+    ] = None,
+    action: Annotated[
+        str, typer.Option(metavar="executed|proposed|both", help="On which action an off-policy algorithm learns behind a filter.")
+    ] = "executed",
+    intervention_penalty: Annotated[
+        float, typer.Option(metavar="X", help="Taken from the reward for each unit by which the filter moves the action.")
+    ] = 0.0,
+    knowledge: text_options.Knowledge = "model",
+    eval_freq: Annotated[
+        int | None, typer.Option(help="Steps between evaluations and checkpoints; by default a tenth of the training.")
+    ] = None,
+    eval_episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 200,
+    threads: Annotated[int, typer.Option(help="Threads of torch and BLAS.")] = 1,
+    tensorboard: Annotated[Path | None, typer.Option(metavar="DIR", help="Write logs for tensorboard.")] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the unfinished training in --out after its last checkpoint.")
+    ] = False,
+    json_file: Json = None,
+) -> None:
+    """Train an agent, evaluate it on the way, and keep the last and the best policy.
+
+    The hyperparameters are those of agents/hyperparams, in the RL Zoo's format. What is logged goes to progress.jsonl and, if
+    asked for, to tensorboard: the safety rate of the last episodes, their cost and smallest h, and violations, interventions and
+    infeasible steps in the training so far. The folder is what `safe-envs evaluate --policy DIR` reads.
+    """
+    from safe_envs.agents.policies.registry import DESCRIPTION
+    from safe_envs.agents.training.config import Training
+    from safe_envs.agents.training.trainer import train as train_agent
+
+    text_options.require_outputs(json_file, None, inputs=text_options.inputs_of(env.system, filters=filters or ()))
+    if len(filters or []) > 1:
+        raise ConfigurationError(f"--filter was given {len(filters or [])} times; a training has one filter in the loop")
+    training = Training.of(
+        env.full_id,
+        algo,
+        filter=filters[0] if filters else None,
+        options=env.arguments,
+        knowledge=knowledge,
+        n_timesteps=n_timesteps,
+        num_envs=num_envs,
+        settings=_settings(settings or []),
+        seed=seed,
+        action=action,
+        intervention_penalty=intervention_penalty,
+        eval_freq=eval_freq,
+        eval_episodes=eval_episodes,
+        threads=threads,
+    )
+    # The policy itself is written at the very end.
+    finished = resume and os.path.exists(out / DESCRIPTION)
+    with progress_bar("Training") as tell:
+        try:
+            train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)
+        except KeyboardInterrupt:
+            print(f"Stopped. The same command with --resume goes on after the last checkpoint in {out}.", file=sys.stderr)
+            raise
+    if finished:
+        stdout().print(
+            f"The training in {out} was finished already: nothing was left to do.", highlight=False, markup=False, soft_wrap=True
+        )
+    rows = json.loads((out / "evaluations.json").read_text())
+    _report(training.filter or "none", rows)
+    known = [f"--knowledge={knowledge}"] if knowledge != "model" else []
+    command = env.evaluate_command("--policy", str(out), "--filter", training.filter or "none", *known)
+    stdout().print(f"\nTo evaluate the policy: {command}", highlight=False, markup=False)
+    write_result(json_file, lambda: {"folder": str(out), "config": json.loads((out / "config.json").read_text()), "evaluations": rows})
+
+
+def _settings(texts: list[str]) -> dict[str, Any]:
+    """NAME=VALUE entries, the values read as YAML."""
+    import yaml
+
+    from safe_envs.agents.sweeps.document import value_of
+
+    found = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not name:
+            raise ConfigurationError(f"--set {shortened(text)}: give NAME=VALUE, such as learning_rate=0.001")
+        if not value.isascii():
+            raise ConfigurationError(f"--set {shortened(text)} has characters beyond ASCII; write numbers with the digits 0 to 9")
+        try:
+            found[name] = _number(value_of(value, "--set"))
+        except yaml.YAMLError as error:
+            problem = shortened(getattr(error, "problem", error))
+            raise ConfigurationError(f"--set {shortened(text)} is no YAML that a setting may have: {problem}") from error
+    return found
+
+
+def _number(value: Any) -> Any:
+    """What YAML takes for a text although it is a number, such as 3e-4."""
+    try:
+        return real(value) if isinstance(value, str) else value
+    except ValueError:
+        return value
+
+
+def _report(filter_name: str, rows: list[dict[str, Any]]) -> None:
+    """Print how safe and how good the agent was in each evaluation."""
+    console = stdout()
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    for title in ("steps", "safe [95 % interval]", "return", "violations in training"):
+        table.add_column(title, justify="right")
+    for row in rows:
+        rate = percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
+        table.add_row(f"{row['timesteps']:,}", rate, f"{row['return_mean']:.4g}", f"{row['training']['violations']:.0f}")
+    console.print(f"Evaluations with the filter {filter_name}:", highlight=False, markup=False)
+    console.print(table)
+
+
+if __name__ == "__main__":
+    from safe_envs.scripts.cli import main
+
+    main("train")

@@ -1,0 +1,1 @@
+"""Gymnasium wrappers: the safety filter, monitors of third-party envs, and the cost in the return of `step`."""

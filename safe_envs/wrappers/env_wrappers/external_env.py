@@ -1,0 +1,228 @@
+"""How a filter sees an env that was not written for it: a model of it, what is safe, and where its state and its input are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.sde import ControlAffineSDE, finite_number
+from safe_envs.errors import ConfigurationError, InvalidInputError, nearest
+from safe_envs.object_import import load_object
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.builder import law_of, named_barriers, suitable
+from safe_envs.problem.problem import SafetyProblem, Start, Variable
+from safe_envs.problem.validation import degree_of
+
+Map = Callable[[np.ndarray], np.ndarray]
+
+_POINTS = 64
+"""At which an action map is tried."""
+
+
+class ActionMap(NamedTuple):
+    """Between an env's actions and the model's inputs, both of shape (..., m).
+
+    Attributes:
+        to_input: from actions to inputs.
+        to_action: back.
+    """
+
+    to_input: Map
+    to_action: Map
+
+    @classmethod
+    def scaled(cls, factor: Any, offset: Any = 0.0) -> ActionMap:
+        """Input = offset + factor action; numbers, or one for each input."""
+        f, o = np.asarray(factor, dtype=float), np.asarray(offset, dtype=float)
+        if not (np.isfinite(f).all() and np.isfinite(o).all() and f.all()):
+            raise ConfigurationError(f"factor = {factor!r} and offset = {offset!r} of an action map; give finite numbers, and no factor 0")
+        return cls(lambda action: o + f * action, lambda u: (u - o) / f)
+
+
+@dataclass(frozen=True)
+class FilterSpec:
+    """What a filter has to be told of somebody else's env.
+
+    Attributes:
+        model: of the env, continuous in time; nobody checks that the env obeys it.
+        barriers: h, safe where h >= 0: an expression of the model's states or a `Barrier`, or several of them.
+        state_fn: from the observation that the wrapper gets, (..., k) mostly, to states (..., n), over any leading axes: write
+            `observation[..., 0]`.
+        action_map: between the env's actions and the model's inputs; None where they are the same.
+        filter: text of the filter where an evaluation names none, like "hocbf:p=2,8"; None for what suits the model.
+        dt: control period in s; None for the env's own attribute `dt`.
+        gains: rates that the conditions use unless told otherwise; ones by default. See `SafetyProblem`.
+        nominal: a controller to be kept safe, an expression of the model's states and parameters for each input; if any.
+
+    Raises:
+        RelativeDegreeError: no input reaches a barrier.
+        SystemDefinitionError: a barrier or a law has unknown symbols.
+        ConfigurationError: a part is of the wrong kind.
+    """
+
+    model: ControlAffineSDE
+    barriers: Any
+    state_fn: Map
+    action_map: ActionMap | None = None
+    filter: str | None = None
+    dt: float | None = None
+    gains: tuple[Any, ...] | None = None
+    nominal: Any = None
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.model, ControlAffineSDE):
+            raise ConfigurationError(f"model is {type(self.model).__name__}; give a ControlAffineSDE")
+        if not callable(self.state_fn):
+            raise ConfigurationError(f"state_fn = {self.state_fn!r}; give a function of observations (..., k) that returns states")
+        pair = self.action_map
+        if pair is not None and not (isinstance(pair, tuple) and len(pair) == 2 and all(map(callable, pair))):
+            raise ConfigurationError(f"action_map = {pair!r}; give ActionMap(to_input, to_action), or ActionMap.scaled(factor)")
+        for barrier in self.named:
+            degree_of(self.model, barrier.expression)
+
+    @classmethod
+    def of(cls, view: dict[str, Any]) -> FilterSpec:
+        """A spec from arguments by name.
+
+        Raises:
+            ConfigurationError: a name is unknown, or one that is needed is missing.
+        """
+        names = [f.name for f in fields(cls) if f.name != "filter"]
+        for name in view:
+            if name not in names:
+                raise ConfigurationError(f"unknown argument {name!r}; {nearest(name, names)}")
+        missing = [name for name in ("model", "barriers", "state_fn") if name not in view]
+        if missing:
+            raise ConfigurationError(f"a filter over an env that is not this project's needs {', '.join(missing)} too")
+        return cls(**view)
+
+    @classmethod
+    def load(cls, place: str) -> FilterSpec:
+        """Import a spec from FILE.py:NAME or MODULE:NAME, which runs the code there.
+
+        Raises:
+            ConfigurationError: there is none.
+        """
+        found = load_object(place)
+        if not isinstance(found, cls):
+            raise ConfigurationError(f"{place} is {type(found).__name__}; give a FilterSpec")
+        return found
+
+    @property
+    def named(self) -> tuple[Barrier, ...]:
+        """The barriers, each with a name."""
+        return named_barriers(self.barriers)
+
+    def state(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
+        """The state (n,) that an observation shows, or the states (B, n) of a batch.
+
+        Args:
+            observation: of an env, or of a batch of them.
+            batch: its size (B,), if it is one.
+
+        Raises:
+            InvalidInputError: `state_fn` fails, or returns another shape or no finite numbers.
+        """
+        shape = (*batch, self.model.n)
+        try:
+            x = np.array(self.state_fn(observation), dtype=np.float64)
+        except Exception as error:
+            raise InvalidInputError(f"state_fn failed at an observation: {type(error).__name__}: {error}") from error
+        if x.shape != shape:
+            raise InvalidInputError(
+                f"state_fn made {x.shape} of observations {np.shape(observation)}; the model needs {shape}. Write it for any leading axes, "
+                "like np.stack([observation[..., 0], observation[..., 1]], axis=-1)"
+            )
+        if not np.isfinite(x).all():
+            raise InvalidInputError(f"state_fn made {x.tolist()} of {observation!r}; a filter needs finite numbers")
+        return x
+
+    def inputs(self, actions: np.ndarray) -> np.ndarray:
+        """The model's inputs (..., m) for the env's actions."""
+        return np.asarray(actions if self.action_map is None else self.action_map.to_input(actions), dtype=np.float64)
+
+    def actions(self, inputs: np.ndarray) -> np.ndarray:
+        """The env's actions (..., m) for the model's inputs."""
+        return np.asarray(inputs if self.action_map is None else self.action_map.to_action(inputs), dtype=np.float64)
+
+    def problem(self, env: Any, action_space: gym.Space[Any], name: str, steps: int | None) -> SafetyProblem:
+        """The model as a problem of its own, for all that needs one: conditions, the filter, an evaluation.
+
+        Args:
+            env: where the attribute `dt` may be found.
+            action_space: of one env.
+            name: of the env.
+            steps: after which an episode is truncated, if it is.
+
+        Raises:
+            ConfigurationError: the action space is no finite box of as many numbers as the model has inputs, the action map does
+                not take it to a box and back, or the control period is unknown.
+        """
+        period = self._period(env, name)
+        defaults = suitable(self.model, self.named)
+        model, still = self.model, sp.Integer(0)
+        laws = (still,) * model.m if self.nominal is None else _listed(self.nominal)
+        return SafetyProblem(
+            name=name,
+            plant=model,
+            model=model,
+            barriers=self.named,
+            states=tuple(Variable(s, -math.inf, math.inf) for s in model.states),
+            inputs=tuple(Variable(u, *ends) for u, ends in zip(model.inputs, self._box(action_space, name), strict=True)),
+            reward=still,
+            nominal=tuple(law_of(law, model) for law in laws),
+            starts={"of the env": Start.at((0.0,) * model.n)},
+            dt=period,
+            horizon=(steps or 1) * period,
+            **{**defaults, **({} if self.gains is None else {"gains": self.gains})},
+        )
+
+    def _period(self, env: Any, name: str) -> float:
+        given = getattr(env, "dt", None) if self.dt is None else self.dt
+        if given is None:
+            raise ConfigurationError(f"{name} has no attribute dt, so that its control period is unknown; give dt, in s")
+        return finite_number("dt", given)
+
+    def _box(self, space: gym.Space[Any], name: str) -> list[tuple[float, float]]:
+        m = self.model.m
+        if not isinstance(space, gym.spaces.Box) or space.shape != (m,) or not space.is_bounded() or space.dtype.kind != "f":
+            raise ConfigurationError(
+                f"the action space of {name} is {space}; a filter of {m} inputs needs a bounded Box of floats of ({m},)"
+            )
+        low, high = space.low.astype(np.float64), space.high.astype(np.float64)
+        ends = self._mapped(np.stack([low, high]))
+        least, most = ends.min(axis=0), ends.max(axis=0)
+        rng = np.random.default_rng(0)
+        actions = rng.uniform(low, high, (_POINTS, m))
+        inputs = rng.uniform(least, most, (_POINTS, m))
+        width = most - least
+        there, back = self._mapped(actions), self.actions(inputs)
+        fits = (
+            np.allclose((self.actions(there) - actions) / (high - low), 0.0, atol=1e-6)
+            and (there >= least - 1e-6 * width).all()
+            and (there <= most + 1e-6 * width).all()
+            and (back >= low - 1e-6 * (high - low)).all()
+            and (back <= high + 1e-6 * (high - low)).all()
+        )
+        if not fits or not width.all():
+            raise ConfigurationError(
+                f"the action map does not take the action space {space} to a box of inputs and back: to_action is to undo to_input, and "
+                "each action is to move one input alone"
+            )
+        return list(zip(least.tolist(), most.tolist(), strict=True))
+
+    def _mapped(self, actions: np.ndarray) -> np.ndarray:
+        found = self.inputs(actions)
+        if found.shape != actions.shape:
+            raise ConfigurationError(f"to_input of the action map made {found.shape} of actions {actions.shape}; it is to keep the shape")
+        return found
+
+
+def _listed(laws: Any) -> tuple[Any, ...]:
+    return tuple(laws) if isinstance(laws, Sequence) else (laws,)

@@ -1,0 +1,165 @@
+"""The same for vector envs of any make: see `safe_envs.wrappers.env_wrappers.monitor`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+
+from safe_envs.dynamics.codegen import Components
+from safe_envs.envs.info import Info, safety_info, with_masks
+from safe_envs.envs.vector_env import VectorStep
+from safe_envs.errors import ConfigurationError, InvalidInputError
+from safe_envs.rendering.viewer import Viewer
+from safe_envs.validators import real_array
+from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
+from safe_envs.wrappers.env_wrappers.monitor import barrier_table, barriers_of, doubt_layers, ends_of, named_and_limited
+
+
+class SafetyMonitorVector(gym.vector.VectorWrapper):
+    """`SafetyMonitor` over a whole batch: arrays with the batch in front, and Gymnasium's masks.
+
+    A step that only resets an env (next-step autoreset) counts nothing but its start. With same-step autoreset the last step of an
+    episode is in `final_info`.
+
+    Args:
+        env: any vector env with a box of actions, SyncVectorEnv and AsyncVectorEnv among them.
+        spec: how the states are seen, and what is safe; or FILE.py:NAME of that.
+
+    Attributes:
+        problem: the model as a problem.
+        executed: the components of the model's inputs of the last step.
+        viewer: what the pictures are drawn from; None unless the render mode is "rgb_array".
+
+    Raises:
+        ConfigurationError: the spec does not fit the env, or the env does not say how it resets.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv, spec: FilterSpec | str) -> None:
+        super().__init__(env)
+        spec = FilterSpec.load(spec) if isinstance(spec, str) else spec
+        for layer in getattr(env.unwrapped, "envs", [])[:1]:
+            doubt_layers(layer)
+        self.problem = spec.problem(_one_of(env), env.single_action_space, *named_and_limited(env))
+        self._spec = spec
+        try:
+            self._mode = AutoresetMode(env.metadata.get("autoreset_mode"))
+        except ValueError as error:
+            raise ConfigurationError(f"{env} does not say when it resets: its metadata has no autoreset_mode of Gymnasium") from error
+        self._barriers = barriers_of(spec, "arrays")
+        self._low, self._high, self._kind = ends_of(env.single_action_space)
+        self.viewer = Viewer(self.problem, "rgb_array", self.num_envs) if env.render_mode == "rgb_array" else None
+        self._steps = np.zeros(self.num_envs, dtype=np.int64)
+        self.executed: Components = ()
+        self._x: Components = ()
+        self._everywhere = np.ones(self.num_envs, dtype=bool)
+        self._ended = np.zeros(self.num_envs, dtype=bool)
+        self._h_min = np.full(self.num_envs, np.inf)
+        self._episode_cost = np.zeros(self.num_envs)
+
+    @property
+    def components(self) -> Components:
+        """The states that the last observations show, an array (num_envs,) for each of the model's states."""
+        if not self._x:
+            raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
+        return self._x
+
+    def physical_action(self, actions: Any) -> Components:
+        """Components of the model's inputs for actions (num_envs, m); what lies beyond the action space is clipped.
+
+        Raises:
+            InvalidInputError: the actions have another shape or are not finite.
+        """
+        given = np.asarray(real_array("array of actions", actions), dtype=np.float64)
+        if given.shape != self.action_space.shape or not np.isfinite(given).all():
+            raise InvalidInputError(f"actions of shape {given.shape}: the envs take finite numbers of shape {self.action_space.shape}")
+        return _columns(self._spec.inputs(np.clip(given, self._low, self._high)))
+
+    def normalized_action(self, u: Sequence[Any]) -> np.ndarray:
+        """Inverse of `physical_action`: the envs' actions for components of inputs, in the numbers of the action space."""
+        return np.clip(self._spec.actions(np.stack(u, axis=-1)), self._low, self._high).astype(self._kind)
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+        """Start episodes in every env, or in those of `options["reset_mask"]`."""
+        # Gymnasium's own vector envs take the mask out of the mapping that they are given.
+        anew = np.array((options or {}).get("reset_mask", self._everywhere), dtype=bool)
+        observation, info = self.env.reset(seed=seed, options=None if options is None else dict(options))
+        self._forget(anew)
+        seen = self._seen(observation, anew)
+        if self.viewer is not None:
+            self.viewer.restart(np.stack(self._x, axis=-1), self._steps * self.problem.dt, np.flatnonzero(anew).tolist())
+        return observation, {**info, **with_masks(seen, anew)}
+
+    def step(self, actions: Any) -> VectorStep:
+        """Pass on actions, and look at what comes of them."""
+        self.executed = self.physical_action(actions)
+        observation, reward, terminated, truncated, info = self.env.step(actions)
+        ended = terminated | truncated
+        if self._mode == AutoresetMode.SAME_STEP:
+            anew, shown = ended, self._of_same_step(observation, ended, info)
+        else:
+            anew = self._ended
+            self._forget(anew)
+            self._ended = ended.copy()
+            shown = self._seen(observation, self._everywhere)
+        if self.viewer is not None:
+            self._steps += ~anew
+            times, begun = self._steps * self.problem.dt, np.flatnonzero(anew).tolist()
+            self.viewer.advance(np.stack(self._x, axis=-1), times, np.stack(self.executed, axis=-1), begun)
+        return observation, reward, terminated, truncated, {**info, **with_masks(shown, self._everywhere.copy())}
+
+    def step_physical(self, u: Sequence[Any]) -> VectorStep:
+        """`step` for the components of the model's inputs."""
+        return self.step(self.normalized_action(u))
+
+    def render(self) -> Any:
+        """The envs' own pictures, in the mode "rgb_array" with what the filter does and the barrier beside each.
+
+        Raises:
+            gymnasium.error.DependencyNotInstalled: pygame is missing.
+        """
+        pictures: Any = self.env.render()
+        return pictures if self.viewer is None else self.viewer.frames([np.asarray(picture) for picture in pictures])
+
+    def _of_same_step(self, observation: np.ndarray, ended: np.ndarray, info: Info) -> Info:
+        """What is shown after a step that restarted the envs that ended: their last step goes to `final_info`."""
+        if not ended.any():
+            return self._seen(observation, self._everywhere)
+        last = np.array(observation)
+        for i in np.flatnonzero(ended).tolist():
+            last[i] = info["final_obs"][i]
+        info["final_info"] = {**info.get("final_info", {}), **with_masks(self._seen(last, self._everywhere), ended)}
+        self._forget(ended)
+        return self._seen(observation, ended)
+
+    def _seen(self, observation: np.ndarray, counted: np.ndarray) -> Info:
+        """Read the states; `counted` are the envs whose observations are new."""
+        self._x = _columns(self._spec.state(observation, (self.num_envs,)))
+        barrier = barrier_table(self._barriers, self.problem.name, self._x)
+        h = barrier.min(axis=1)
+        violation = h < 0.0
+        cost = violation.astype(np.float64)
+        self._episode_cost += cost * counted
+        # What was counted before cannot lower the smallest h again.
+        np.minimum(self._h_min, h, out=self._h_min)
+        return safety_info(violation, cost, barrier, self._h_min.copy(), self._episode_cost.copy())
+
+    def _forget(self, envs: np.ndarray) -> None:
+        self._h_min[envs] = np.inf
+        self._episode_cost[envs] = 0.0
+        self._steps[envs] = 0
+        self._ended = self._ended & ~envs
+
+
+def _one_of(env: gym.vector.VectorEnv) -> Any:
+    """One of the envs of a batch where they are at hand, as in SyncVectorEnv; the batch itself elsewhere."""
+    envs = getattr(env.unwrapped, "envs", None)
+    return envs[0].unwrapped if envs else env.unwrapped
+
+
+def _columns(table: np.ndarray) -> Components:
+    # A copy in any case: what a caller does to the observation must not reach the state.
+    return tuple(np.array(table.T, order="C"))

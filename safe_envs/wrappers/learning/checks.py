@@ -1,0 +1,78 @@
+"""What every way of learning asks for before it begins: sizes that fit into memory, the right objects; and its randomness."""
+
+from __future__ import annotations
+
+import reprlib
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+
+from safe_envs.dynamics.lie import relative_degree
+from safe_envs.errors import ConfigurationError, require_whole, shown
+from safe_envs.problem.problem import SafetyProblem
+
+_MOST_BYTES = 2e9
+_BYTES = 8
+
+
+class Purpose(IntEnum):
+    """Second entries of the seeds of everything random in learning, so that no two uses of a seed share their randomness.
+
+    None is 0: NumPy takes [s, 0] for s, whose children are those of safe sets and episodes. The small numbers belong to
+    surveys, bounds and the states at which an identification is reported.
+    """
+
+    DATA = 1001
+    PATHS = 1002
+    STATES = 1003
+    TRAINING = 1004
+    HELD_OUT = 1005
+
+
+def random_stream(seed: int, purpose: Purpose) -> np.random.Generator:
+    """The randomness of a seed for a purpose.
+
+    Raises:
+        ConfigurationError: the seed is no whole number from 0.
+    """
+    require_whole("seed", seed, 0)
+    return np.random.default_rng([int(seed), int(purpose)])
+
+
+def require_room(numbers: float, what: str, remedy: str) -> None:
+    """Raise ConfigurationError where numbers would take more than 2 GB of memory.
+
+    Args:
+        numbers: how many.
+        what: they are.
+        remedy: what to lower.
+    """
+    size = _BYTES * numbers
+    if size > _MOST_BYTES:
+        raise ConfigurationError(f"{what} take {size / 1e9:.3g} GB; at most {_MOST_BYTES / 1e9:g} GB are allowed: lower {remedy}")
+
+
+def require_kind(name: str, value: Any, kind: type, source: str) -> None:
+    """Raise ConfigurationError unless a value is of a kind.
+
+    Args:
+        name: of the argument.
+        value: that was given.
+        kind: that it has to be of.
+        source: where such an object comes from.
+    """
+    if not isinstance(value, kind):
+        raise ConfigurationError(f"{name} = {reprlib.repr(value)}, a {type(value).__name__}; give a {kind.__name__}, as {source} makes it")
+
+
+def require_degrees(problem: SafetyProblem, given: Any) -> None:
+    """Raise ValueError unless these are the relative degrees of a problem's barriers: what a file says is to be so before it is used."""
+    wanted = [relative_degree(problem.model, b.expression) for b in problem.barriers]
+    if given != wanted:
+        raise ValueError(f"the degrees {shown(given)}, where the barriers have {wanted}")
+
+
+def require_problem(problem: Any) -> None:
+    """Raise ConfigurationError where something else was given for a problem: the id of an env, or an env."""
+    require_kind("problem", problem, SafetyProblem, "load_problem of safe_envs.registry")

@@ -1,0 +1,1 @@
+"""One-step data of a system, and their collection."""

@@ -1,0 +1,60 @@
+"""Several rows of which a single one binds: its own closed form, where the other rows allow what that gives.
+
+The minimiser under one row alone is that under all rows, if it meets them: so exact, and many times faster than a solver,
+in most states of most filters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from safe_envs.wrappers.qp.one_row import project_arrays as project_onto_row
+from safe_envs.wrappers.qp.rows import ROUNDING, stack, total
+
+Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def project_arrays(
+    a: Sequence[np.ndarray], b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: Sequence[Any]
+) -> tuple[Answer, np.ndarray]:
+    """Project the proposed inputs of the states in which at most one row binds.
+
+    Args:
+        a: k rows, each (m, B).
+        b: offsets, shape (k, B).
+        v: proposed inputs, shape (m, B).
+        low: lower bounds, shape (m, B).
+        high: upper bounds, shape (m, B).
+        w: m positive weights, each a float or an array (B,).
+
+    Returns:
+        Inputs (m, B), margins and binding rows (k, B) and feasibility (B,), as far as solved; and the states (indices) that
+        are left for a solver.
+    """
+    u = np.minimum(np.maximum(v, low), high)
+    margin, active, feasible = np.array([total(r * u) for r in a]) + b, np.zeros(b.shape, dtype=bool), np.ones(b.shape[1], dtype=bool)
+    missed = margin < 0.0
+    left = np.flatnonzero(missed.any(axis=0))
+    weights = stack(w, b.shape[1])
+    for i, row in enumerate(a):
+        tried = left[missed[i, left]]
+        if not tried.size:
+            continue
+        found, _, _, met = project_onto_row(
+            list(row[:, tried]), b[i, tried], list(v[:, tried]), list(low[:, tried]), list(high[:, tried]), list(weights[:, tried])
+        )
+        at = np.array(found)
+        products = [r[:, tried] * at for r in a]
+        reached = np.array([total(p) for p in products]) + b[:, tried]
+        # As `tolerances`, from the same products.
+        rounding = ROUNDING * np.abs(b[:, tried]) + np.array([total(ROUNDING * np.abs(p)) for p in products])
+        allowed = met & (reached >= -rounding).all(axis=0)
+        solved = tried[allowed]
+        u[:, solved] = at[:, allowed]
+        margin[:, solved] = reached[:, allowed]
+        active[:, solved] = (reached <= rounding)[:, allowed]
+        left = np.setdiff1d(left, solved, assume_unique=True)
+    return (u, margin, active, feasible), left

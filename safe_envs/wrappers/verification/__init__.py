@@ -1,0 +1,1 @@
+"""Bounds on the probability of safety, their assumptions, and where a condition can be met."""

@@ -1,0 +1,198 @@
+"""Points of a safe set: quasi-random draws from a box of states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.envs.simulation import Simulation
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.verification.search import Score, search
+
+_PERIOD = 2.0 * math.pi
+_STARTS = 64
+_FIRST_LOG2, _LAST_LOG2 = 12, 18
+_FEW = 16
+
+
+@dataclass(frozen=True)
+class Region:
+    """A box of states.
+
+    Attributes:
+        low: lower ends, shape (n,).
+        high: upper ends, shape (n,).
+        periodic: the states of which the box holds a whole period, shape (n,).
+        chosen: the states whose range was chosen here, since the workspace is unbounded, shape (n,).
+        notes: which of the ranges are not the workspace, in words.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    periodic: np.ndarray
+    chosen: np.ndarray
+    notes: tuple[str, ...] = ()
+
+    def scaled(self, factor: float) -> Region:
+        """The box that is larger by a factor about the same centre; a period stays one."""
+        half = np.where(self.periodic, 1.0, factor) * (self.high - self.low) / 2.0
+        center = (self.high + self.low) / 2.0
+        return replace(self, low=center - half, high=center + half)
+
+    def within(self, low: np.ndarray, high: np.ndarray) -> Region:
+        """The part of the box between ends, shape (n,), which may be infinite."""
+        return replace(self, low=np.maximum(self.low, low), high=np.minimum(self.high, high))
+
+    def around(self, points: np.ndarray, widened: float) -> Region:
+        """The part of the box around points, wider than they are by a factor."""
+        low, high = points.min(axis=0), points.max(axis=0)
+        more = (widened - 1.0) * (high - low) / 2.0 + 1e-6 * (self.high - self.low)
+        return replace(self, low=np.maximum(self.low, low - more), high=np.minimum(self.high, high + more))
+
+    def inside(self, x: np.ndarray) -> np.ndarray:
+        """States (B, n) moved into the box: by whole periods, and to its nearest end."""
+        clipped = x.clip(self.low, self.high)
+        if not self.periodic.any():
+            return clipped
+        return np.where(self.periodic, self.low + (x - self.low) % (self.high - self.low), clipped)
+
+    def draw(self, log2: int, rng: np.random.Generator) -> np.ndarray:
+        """Draw 2^log2 points that fill the box evenly: a Sobol sequence, shifted at random; shape (2^log2, n)."""
+        from scipy.stats import qmc
+
+        unit = qmc.Sobol(len(self.low), scramble=False).random_base2(log2)
+        return self.low + (self.high - self.low) * ((unit + rng.random(len(self.low))) % 1.0)
+
+
+def workspace_of(problem: SafetyProblem) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper ends of the workspace, shape (n,); infinite where it has none. To leave it ends an episode."""
+    return np.array([v.low for v in problem.states]), np.array([v.high for v in problem.states])
+
+
+def in_workspace(x: np.ndarray, ends: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """Which states (B, n) are between the ends of a workspace, which the last step of an episode may leave, shape (B,)."""
+    low, high = ends
+    return np.all((x >= low) & (x <= high), axis=1)
+
+
+def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Sequence[sp.Expr]) -> Region:
+    """The workspace of a problem, with a finite range for what it leaves unbounded.
+
+    Args:
+        problem: whose ranges are taken.
+        system: whose parameters are in the expressions.
+        expressions: all that will be asked of a state: where they repeat after 2 pi, a period is enough.
+    """
+    low, high = workspace_of(problem)
+    periodic, chosen = np.zeros(len(low), dtype=bool), np.zeros(len(low), dtype=bool)
+    unbounded = np.flatnonzero(~(np.isfinite(low) & np.isfinite(high)))
+    for i in unbounded.tolist():
+        s = problem.states[i].symbol
+        if not (np.isfinite(low[i]) or np.isfinite(high[i])) and all(repeats(system.numeric(e), s) for e in expressions):
+            periodic[i], low[i], high[i] = True, -_PERIOD / 2.0, _PERIOD / 2.0
+            continue
+        chosen[i] = True
+        starts = draw_starts(problem, _STARTS)[:, i]
+        reach = 10.0 * max(float(np.ptp(starts)), float(abs(starts).max()), 1.0)
+        low[i] = low[i] if np.isfinite(low[i]) else starts.min() - reach
+        high[i] = high[i] if np.isfinite(high[i]) else starts.max() + reach
+    notes = []
+    if chosen.any():
+        ranges = [f"{problem.states[i].symbol} in [{low[i]:.4g}, {high[i]:.4g}]" for i in np.flatnonzero(chosen).tolist()]
+        whose = "its workspace is" if len(ranges) == 1 else "their workspace is"
+        notes.append(f"{', '.join(ranges)}, chosen around the starts: {whose} unbounded")
+    if periodic.any():
+        names = ", ".join(str(problem.states[i].symbol) for i in np.flatnonzero(periodic))
+        notes.append(f"{names} over a period of 2 pi, since nothing here tells the periods apart")
+    return Region(low, high, periodic, chosen, tuple(notes))
+
+
+def repeats(expression: Any, s: sp.Symbol) -> bool:
+    """Whether a state appears only within sines, cosines and tangents of whole multiples of it: then 2 pi more change nothing.
+
+    A look at values would not do: what is constant over some of the states may not be elsewhere.
+    """
+
+    def is_wave(part: Any) -> bool:
+        if not isinstance(part, (sp.sin, sp.cos, sp.tan)):
+            return False
+        slope = sp.diff(part.args[0], s)
+        return bool(slope.is_number and float(slope).is_integer())
+
+    return s not in expression.replace(is_wave, lambda _: sp.Integer(1)).free_symbols
+
+
+def draw_starts(problem: SafetyProblem, count: int, seed: int = 0) -> np.ndarray:
+    """Draw initial states of a problem, shape (count, n)."""
+    rngs: list[Any] = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)]
+    return Simulation(problem, "floats").draw_starts(rngs).T
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Points of a set.
+
+    Attributes:
+        points: evenly spread over the set, shape (B, n).
+        drawn: how many points of a box were tried for them.
+        share: part of the whole region that the set is, as found in the first pass.
+    """
+
+    points: np.ndarray
+    drawn: int
+    share: float
+
+
+def sample(what: str, level: Score, region: Region, wanted: int, rng: np.random.Generator) -> Sample:
+    """Draw points of the set {level >= 0}, in smaller and smaller boxes if it is a small part of the region.
+
+    Args:
+        what: the set, for the message.
+        level: of a state; NaN counts as outside.
+        region: where to look.
+        wanted: number of points at which the drawing ends.
+        rng: of all randomness.
+
+    Raises:
+        ConfigurationError: no point of the set was found.
+    """
+    box, drawn, share = region, 0, None
+    found = np.empty((0, len(region.low)))
+    for log2 in range(max(_FIRST_LOG2, math.ceil(math.log2(wanted))), _LAST_LOG2 + 1):
+        tried = box.draw(log2, rng)
+        levels = level(tried)
+        inside = tried[levels >= 0.0]
+        drawn += len(tried)
+        share = len(inside) / len(tried) if share is None else share
+        found = inside if box is not region else np.concatenate([found, inside])
+        if len(found) >= wanted and (box is region or _covers(box, region, found)):
+            return Sample(found, drawn, share)
+        enough = len(found) >= _FEW
+        seeds = found if enough else _climbed(level, tried, region, rng)
+        if not len(seeds):
+            break
+        box = region.around(seeds, 1.2 if enough else 4.0)
+    if not len(found):
+        raise ConfigurationError(f"no point of {what} was found among {drawn} of the workspace; is the set empty?")
+    return Sample(found, drawn, share or 0.0)
+
+
+def _covers(box: Region, region: Region, points: np.ndarray) -> bool:
+    """Whether the points keep away from those ends of a box that are not the region's: then nothing is cut off."""
+    width = 0.01 * (box.high - box.low)
+    below = (points.min(axis=0) > box.low + width) | (box.low <= region.low)
+    above = (points.max(axis=0) < box.high - width) | (box.high >= region.high)
+    return bool((below & above).all())
+
+
+def _climbed(level: Score, tried: np.ndarray, region: Region, rng: np.random.Generator) -> np.ndarray:
+    """Points with level >= 0, from the population of a search for the largest level, as soon as there are enough."""
+    population, values = search(level, tried, region, rng, until=lambda values: int(np.count_nonzero(values >= 0.0)) >= _FEW)
+    return population[values >= 0.0]

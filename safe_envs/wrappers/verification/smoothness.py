@@ -1,0 +1,135 @@
+"""Where functions are not smooth, by what they are made of: poles, and roots whose radicand reaches 0."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.wrappers.verification.formulas import Formulas
+from safe_envs.wrappers.verification.search import Box, Score, largest
+
+_TOUCHED = 1e-6
+"""Part of its typical size at which a function counts as one that reaches 0."""
+
+_LONGEST = 60
+"""Number of characters of a part that are told."""
+
+
+class Edge(NamedTuple):
+    """A part of an expression that is not smooth where another expression is 0.
+
+    Attributes:
+        part: of the expression.
+        base: which must not reach 0.
+        pole: whether the part has no finite value there, and not only no second derivative.
+    """
+
+    part: sp.Expr
+    base: sp.Expr
+    pole: bool
+
+
+def edges(expression: Any) -> Iterator[Edge]:
+    """The parts of an expression that are smooth in the inside of their domains only, each once."""
+    part: Any
+    for part in dict.fromkeys(sp.preorder_traversal(expression)):
+        arguments: tuple[Any, ...] = part.args
+        match part:
+            case sp.Pow() if part.base.free_symbols and not (part.exp.is_Integer and part.exp >= 0):
+                yield Edge(part, part.base, not part.exp.is_nonnegative)
+            case sp.log():
+                yield Edge(part, arguments[0], True)
+            case sp.tan() | sp.sec():
+                yield Edge(part, sp.cos(arguments[0]), True)
+            case sp.cot() | sp.csc():
+                yield Edge(part, sp.sin(arguments[0]), True)
+            case sp.asin() | sp.acos() | sp.atanh():
+                yield Edge(part, 1 - arguments[0] ** 2, isinstance(part, sp.atanh))
+            case sp.acosh():
+                yield Edge(part, arguments[0] - 1, False)
+            case sp.atan2():
+                # It jumps where y = 0 and x <= 0.
+                y, x = arguments
+                yield Edge(part, sp.sqrt(x**2 + y**2) + x, True)
+
+
+class Asked(NamedTuple):
+    """What has to be smooth.
+
+    Attributes:
+        name: of the function.
+        expression: of the states, with numbers for all parameters.
+        only_poles: whether a second derivative does not matter, but a finite value does.
+    """
+
+    name: str
+    expression: sp.Expr
+    only_poles: bool
+
+
+def asked_of(formulas: Formulas) -> list[Asked]:
+    """What the bounds of conditions ask to be smooth: the chains, which without noise need no derivative; the rows need values."""
+    found = []
+    numeric = formulas.system.numeric
+    for barrier, row in zip(formulas.problem.barriers, formulas.safety_filter.constraints, strict=True):
+        for j, function in enumerate(row.chain):
+            found.append(Asked(barrier.name if j == 0 else f"b_{j} of {barrier.name}", numeric(function), not formulas.noisy))
+        found += [Asked(f"the condition on {barrier.name}", numeric(entry), True) for entry in (*row.coefficient, row.offset)]
+    return found
+
+
+def roughness(
+    asked: Sequence[Asked], states: Sequence[sp.Symbol], level: Score, points: np.ndarray, region: Box, rng: np.random.Generator
+) -> str:
+    """Which function is not smooth somewhere in a set, and where; "" if none was found.
+
+    Ito's formula asks for two continuous derivatives, and without noise paths may not pass a pole. What is a function with a kink
+    by its name is found by `safe_envs.dynamics.lie.has_kinks`.
+
+    Args:
+        asked: what has to be smooth.
+        states: symbols.
+        level: nonnegative in the set.
+        points: of the set, shape (B, n).
+        region: where to look.
+        rng: of the search.
+    """
+    for name, expression, only_poles in asked:
+        for edge in edges(expression):
+            if only_poles and not edge.pole:
+                continue
+            state = _reaches_zero(edge.base, states, level, points, region, rng)
+            if state is not None:
+                at = ", ".join(f"{s} = {value + 0.0:.4g}" for s, value in zip(states, state.tolist(), strict=True))
+                what = "has a pole" if edge.pole else "is not twice differentiable, which Ito's formula asks for,"
+                return f"{name} {what} near {at}, by {_short(edge.part)}"
+    return ""
+
+
+def _reaches_zero(
+    base: sp.Expr, states: Sequence[sp.Symbol], level: Score, points: np.ndarray, region: Box, rng: np.random.Generator
+) -> np.ndarray | None:
+    """A state (n,) of the set where a function is 0 to rounding, as far as a search finds one."""
+    compiled = compile_function(tuple(states), [base], "arrays")
+
+    def size(x: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            return abs(stacked(compiled(*np.ascontiguousarray(x.T)), len(x))[:, 0])
+
+    def score(x: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            return np.where(level(x) >= 0.0, -size(x), -np.inf)
+
+    sizes = size(points)
+    sizes = sizes[np.isfinite(sizes)]
+    least, state = largest(score, points, region, rng)
+    return state if sizes.size and -least <= _TOUCHED * float(np.median(sizes)) else None
+
+
+def _short(part: sp.Expr) -> str:
+    text = str(part)
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."

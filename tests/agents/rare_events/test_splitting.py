@@ -1,0 +1,219 @@
+"""Rare violations by splitting, against exact laws and plain episodes."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import sympy as sp
+from scipy.stats import t as student
+
+from safe_envs import ConfigurationError
+from safe_envs.agents import NominalController, ZeroController, evaluate
+from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
+from safe_envs.agents.evaluation.statistics import log_normal_interval
+from safe_envs.agents.rare_events import splitting
+from safe_envs.agents.rare_events.estimate import estimate_rare
+from safe_envs.agents.rare_events.importance_sampling import Drifting, TiltedNoiseEnv
+from safe_envs.agents.rare_events.splitting import Splitting
+from safe_envs.problem.barrier import Barrier
+from safe_envs.scripts.reproduce.chapter_4.martingale import attaining_problem
+from tests.oracles.laws import X, brownian, first_passage, martingale_passage, walk_passage
+
+pytestmark = pytest.mark.slow
+
+SHORT: dict[str, Any] = {"particles": 100, "repetitions": 10}
+
+
+def row_of(problem, filter_name="none", **arguments):
+    (row,) = estimate_rare(problem, filters=[filter_name], **arguments).rows
+    return row
+
+
+def splitting_of(problem, bridge=None):
+    return Splitting(lambda lengths: TiltedNoiseEnv(problem, lengths), NominalController(problem), 0, 4096, bridge)
+
+
+def assert_holds(row, exact, within):
+    """The interval holds the exact probability, and is narrow enough for that to mean something."""
+    assert row["status"] == "estimated"
+    assert row["doubt"] is None
+    assert_near(row, exact, within)
+
+
+def assert_near(row, exact, within):
+    assert row["ci_low"] < exact < row["ci_high"]
+    assert row["ci_high"] / row["ci_low"] < within
+
+
+@pytest.mark.slow
+def test_gaussian_walk_of_probability_1e_8():
+    exact = walk_passage(1.0, 40, -0.005, 0.15 * math.sqrt(0.05))
+    assert 1e-8 < exact < 2e-8
+    row = row_of(brownian(0.05, 2.0, -0.1, 0.15))
+    assert_holds(row, exact, 2.0)
+    assert row["method"].startswith("drift of ")
+    assert row["check"]["method"] == "splitting on h/sqrt(T - t)"
+    assert_near(row["check"], exact, 2.0)
+    assert row["plain"]["violations"] == 0
+    # What plain episodes need for the same relative error, and how many steps these are.
+    assert row["plain_episodes_needed"] == pytest.approx(1 / (row["probability"] * row["relative_error"] ** 2), rel=1e-6)
+    assert row["plain_steps_needed"] == pytest.approx(40 * row["plain_episodes_needed"])
+    assert row["probability"] == pytest.approx(np.mean(row["estimates"]))
+
+
+@pytest.mark.slow
+def test_first_passage_of_probability_1e_8_with_continuous_monitoring():
+    exact = first_passage(1.0, -0.1, 0.15, 2.0)
+    row = row_of(brownian(0.1, 2.0, -0.1, 0.15), monitoring="continuous", seed=1)
+    assert_holds(row, exact, 2.0)
+    # Looks at control instants only would see about half of it.
+    assert walk_passage(1.0, 20, -0.01, 0.15 * math.sqrt(0.1)) < row["ci_low"]
+
+
+@pytest.mark.slow
+def test_geometric_martingale_of_probability_1e_8():
+    problem = replace(attaining_problem(1e-4), dt=0.1, horizon=14.0)
+    exact = martingale_passage(1e-4, 140, 0.1)
+    row = row_of(problem, "scbf", particles=120)
+    assert_holds(row, exact, 3.0)
+    assert_near(row["check"] if "drift" in row["method"] else row, exact, 4.0)
+
+
+@pytest.mark.slow
+def test_cruise_control_under_its_filter_has_the_gaussian_law():
+    # At 10 m/s the desired speed is far off, so that the filter acts all the time and A h = 0: h is a walk.
+    exact = walk_passage(32.0, 50, 0.0, 1.8 * math.sqrt(0.2))
+    assert 1e-8 < exact < 2e-8
+    options = {"start": [10.0, 10.0, 50.0], "horizon": 10.0, "dt": 0.2}
+    assert_holds(row_of("safe_envs/ACC-v0", "scbf", options=options, particles=120), exact, 3.0)
+
+
+@pytest.mark.slow
+def test_splitting_is_unbiased_and_its_interval_covers():
+    problem, exact = brownian(0.1, 1.0, 0.0, 0.3), walk_passage(1.0, 10, 0.0, 0.3 * math.sqrt(0.1))
+    found = splitting_of(problem).estimate(0.5, 60, 400)
+    assert found.estimates.mean() == pytest.approx(exact, abs=3 * found.estimates.std() / 20)
+    intervals = [log_normal_interval(part) for part in np.split(found.estimates, 40)]
+    # 33 of 40 or less has a probability of .003 if 95 % are held.
+    assert sum(low < exact < high for low, high in intervals) >= 34
+    assert math.fsum(found.shares) == pytest.approx(found.estimates.mean())
+
+
+def test_splitting_looks_between_instants():
+    problem = brownian(0.1, 1.0, 0.0, 0.3)
+    found = splitting_of(problem, BrownianBridge(problem)).estimate(0.5, 100, 150)
+    low, high = log_normal_interval(found.estimates, 0.99)
+    assert low < first_passage(1.0, 0.0, 0.3, 1.0) < high
+    assert walk_passage(1.0, 10, 0.0, 0.3 * math.sqrt(0.1)) < low
+
+
+def test_pilots_and_estimates_have_noise_of_their_own():
+    problem, seeds = brownian(0.1, 1.0, 0.0, 0.3), []
+
+    class Noting(TiltedNoiseEnv):
+        def reset(self, *, seed=None, options=None):
+            if seed is not None:
+                seeds.append(set(np.atleast_1d(seed).tolist()))
+            return super().reset(seed=seed, options=options)
+
+    how = (lambda lengths: Noting(problem, lengths), ZeroController(problem), 0, 64)
+    Splitting(*how).choose(50)
+    Splitting(*how).estimate(0.0, 50, 10)
+    Drifting(*how).estimate(3.0, 50, 2)
+    assert len(seeds) == 4
+    assert len(set.union(*seeds)) == sum(len(each) for each in seeds)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("episodes", [6_000, pytest.param(100_000, marks=pytest.mark.oracle)])
+@pytest.mark.parametrize(("policy", "monitoring"), [("nominal", "discrete"), ("random", "discrete"), ("nominal", "continuous")])
+def test_agrees_with_plain_episodes_where_these_do(policy, monitoring, episodes):
+    # Random starts, and a box that is too small for some of them.
+    options = {"noise": 0.3, "horizon": 1.0, "dt": 0.05, "box": [-1.0, 1.0]}
+    arguments = {"filters": ["szcbf"], "options": options, "monitoring": monitoring}
+    (plain,) = evaluate("Scalar-v0", policy, episodes=episodes, confidence=0.99, bounds=False, **arguments).rows
+    (rare,) = estimate_rare("Scalar-v0", policy, seed=3, particles=100, **arguments).rows
+    assert rare["ci_low"] < 1 - plain["ci_low"]
+    assert rare["ci_high"] > 1 - plain["ci_high"]
+    assert 0 < rare["plain"]["violations"] < rare["plain"]["episodes"]
+    assert rare["levels"] > 0
+
+
+def test_what_is_sure_needs_no_level():
+    row = row_of(brownian(0.1, 1.0, 9.0, 0.1), **SHORT)
+    assert (row["probability"], row["levels"], row["plain_episodes_needed"]) == (1.0, 0.0, None)
+    assert row["ci_low"] > 0.99
+    assert row["ci_high"] == 1.0
+
+
+def test_same_seed_is_the_same_answer_and_is_json():
+    arguments = {"filters": ["none"], **SHORT}
+    first, second, other = (estimate_rare(brownian(0.1, 1.0, 0.0, 0.3), seed=s, **arguments) for s in (1, 1, 2))
+    assert first.rows == second.rows
+    assert first.rows != other.rows
+    document = json.loads(json.dumps(first.document(), allow_nan=False))
+    assert list(document) == ["config", "versions", "rows", "timing"]
+    assert document["config"]["particles"] == 100
+
+
+def test_batches_do_not_change_what_is_estimated():
+    problem, exact = brownian(0.1, 1.0, 0.0, 0.3), walk_passage(1.0, 10, 0.0, 0.3 * math.sqrt(0.1))
+    assert_holds(row_of(problem, num_envs=300), exact, 2.0)
+
+
+def test_where_h_jumps_it_says_so():
+    step = Barrier(sp.Piecewise((1, X < 1), (-1, True)))
+    row = row_of(replace(brownian(0.1, 1.0, 0.0, 0.3), barriers=(step,)), **SHORT)
+    assert row["status"] == "none"
+    assert row["probability"] is row["ci_low"] is row["plain_episodes_needed"] is None
+    assert "stood at one level and none came below h = 1." in row["reason"]
+
+
+def test_where_a_level_is_out_of_reach_it_says_so(monkeypatch):
+    monkeypatch.setattr(splitting, "LEAST", 0.01)
+    row = row_of(brownian(0.05, 1.0, 0.0, 0.25), **SHORT)
+    assert row["status"] == "none"
+    assert "in 10 of 10 repetitions the probability to come below h = 0." in row["reason"]
+    assert "may never be reached" in row["reason"]
+
+
+def test_without_noise_there_is_nothing_to_split():
+    row = row_of("DubinsDisk-v0", "hocbf")
+    assert row["status"] == "none"
+    assert "nothing is random after the start" in row["reason"]
+
+
+class Remembering(ZeroController):
+    """A policy with a hidden state."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return super().predict(observation)[0], np.zeros(len(observation))
+
+
+def test_what_cannot_be_taken_up_again_is_refused():
+    problem = brownian(0.1, 1.0, 0.0, 0.3)
+    with pytest.raises(ConfigurationError, match="has a memory"):
+        estimate_rare(problem, Remembering(problem), filters=["none"])
+
+
+@pytest.mark.parametrize(("name", "value"), [("particles", 19), ("repetitions", 9), ("num_envs", 0), ("particles", 2.5)])
+def test_numbers_out_of_range_are_refused(name, value):
+    with pytest.raises(ConfigurationError, match=f"{name} = {value}"):
+        estimate_rare("Scalar-v0", **{name: value})
+
+
+def test_log_normal_interval_is_coxs_around_the_mean():
+    values = [1e-8, 2e-8, 4e-8]
+    s = math.log(2)
+    half = student.ppf(0.975, 2) * math.sqrt(s**2 / 3 + s**4 / 4)
+    mean = 7e-8 / 3
+    assert log_normal_interval(values) == (pytest.approx(mean * math.exp(-half)), pytest.approx(mean * math.exp(half)))
+    assert log_normal_interval([3.0, 3.0]) == (3.0, 3.0)
+    for wrong in ([1.0], [1.0, 0.0]):
+        with pytest.raises(ConfigurationError, match="at least two, all above 0"):
+            log_normal_interval(wrong)

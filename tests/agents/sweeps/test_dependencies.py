@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from safe_envs.agents.sweeps.cell import compute
+from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_imported
+from safe_envs.agents.sweeps.spec import sweep_of
+
+FILES = {
+    "mine.py": "import os, numpy as np, near.inner\nfrom other import x\nfrom bare import part\ndef problem():\n    import late, broken",
+    "near/__init__.py": "from . import beside",
+    "near/beside.py": "from .deep.end import y",
+    "near/inner.py": "",
+    "near/deep/__init__.py": "",
+    "near/deep/end.py": "from ..inner import z\nimport near",
+    "other.py": "import mine\nx = '\\d'",
+    "bare/part.py": "",
+    "late.py": "",
+    "broken.py": "(",
+}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name, text in {**FILES, "unused.py": "", "near/unused.py": "", "numpy/unused.py": ""}.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    return tmp_path
+
+
+def test_what_a_file_imports_from_its_folder_is_found_without_running_it(folder: Path):
+    found = with_imported(folder / "mine.py")
+    assert sorted(str(path.relative_to(folder)) for path in found) == sorted(FILES)
+    assert with_imported(folder / "none.py") == [folder / "none.py"]
+
+
+def test_paths_mean_the_same_in_every_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "ppo").mkdir()
+    monkeypatch.chdir(tmp_path)
+    given = {"filter": "ddscbf:file=a.npz+bayesian-scbf:file=in/b.npz:delta=0.1", "policy": "ppo", "system": "mine.py:problem"}
+    first, second = tmp_path / "a.npz", tmp_path / "in" / "b.npz"
+    found = absolute({**given, "seed": 1})
+    assert found == {
+        "filter": f"ddscbf:file={first}+bayesian-scbf:file={second}:delta=0.1",
+        "policy": str(tmp_path / "ppo"),
+        "system": f"{tmp_path / 'mine.py'}:problem",
+        "seed": 1,
+    }
+    monkeypatch.chdir("/")
+    assert absolute(found) == found
+    assert list(read_by({"filter": found["filter"], "policy": "nominal"})) == [first, second]
+    assert absolute({"filter": "none", "policy": "nominal"}) == {"filter": "none", "policy": "nominal"}
+
+
+def test_a_cell_is_known_by_what_its_system_imports(folder: Path):
+    document = {"fixed": {"system": f"{folder / 'mine.py'}:problem", "filter": "scbf"}}
+    (cell,) = sweep_of(document).cells
+    (folder / "near" / "deep" / "end.py").write_text("y = 2")
+    assert sweep_of(document).cells[0].key != cell.key
+    assert "another content in" in str(compute(cell).error)
+    assert "end.py" in str(compute(cell).error)

@@ -1,0 +1,302 @@
+"""Which action a learner behind a filter learns on."""
+
+from __future__ import annotations
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import DDPG, PPO, SAC, TD3
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+
+from safe_envs import ConfigurationError
+from safe_envs.agents.training.replay_buffer import FilteredNStepReplayBuffer, FilteredReplayBuffer, replay_options
+from safe_envs.agents.training.vec_env import make_sb3_env
+from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
+
+pytestmark = pytest.mark.slow
+
+ENV_ID = "safe_envs/StochasticDubins-v0"
+BOX = (-3.0, 5.0)
+SETTINGS = {"buffer_size": 600, "learning_starts": 20, "batch_size": 8, "train_freq": 4, "device": "cpu", "seed": 3}
+SPACES = (gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-1.0, 1.0, (2,)))
+TWO_INPUTS = ((0.0, 4.0), (-3.0, 5.0))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def make(horizon=0.5, filtered=True, box=BOX):
+    env = gym.make(ENV_ID, horizon=horizon, box=box)
+    return Monitor(SafetyFilterWrapper(env, "scbf") if filtered else env)
+
+
+def several(count=3, filtered=True):
+    """Envs of which each ends its episodes at other steps."""
+    return DummyVecEnv([lambda k=k: make(0.25 + 0.1 * k, filtered) for k in range(count)])
+
+
+def native():
+    return VecMonitor(make_sb3_env(ENV_ID, 3, "scbf", horizon=0.25, box=BOX))
+
+
+class Witness(BaseCallback):
+    """Keeps what the learner proposed and what the simulations were given (of native ones: what infos say) at every step."""
+
+    def __init__(self):
+        super().__init__()
+        self.proposed, self.executed, self.intervened, self.done = [], [], [], []
+
+    def _on_step(self):
+        envs = [env.unwrapped for env in getattr(self.training_env.unwrapped, "envs", [])]
+        executed = [env.normalized_action(env.executed) for env in envs] or [(info["safe_action"] - 1) / 4 for info in self.locals["infos"]]
+        self.proposed.append(self.locals["buffer_actions"])
+        self.executed.append(np.clip(executed, -1.0, 1.0))
+        self.intervened.append([info.get("intervention") for info in self.locals["infos"]])
+        self.done.append(self.locals["dones"])
+        return True
+
+    def actions(self):
+        return np.array(self.proposed, dtype=np.float32), np.array(self.executed).astype(np.float32)
+
+
+def learned(algorithm, env, **arguments):
+    model = algorithm("MlpPolicy", env, **SETTINGS, policy_kwargs={"net_arch": [8]}, **arguments)
+    model.learn(120, callback=(witness := Witness()))
+    return model, witness
+
+
+def stored(model):
+    return model.replay_buffer.actions[: model.replay_buffer.size()]
+
+
+def assert_same_learning(a, b):
+    for u, v in zip(a.policy.parameters(), b.policy.parameters(), strict=True):
+        assert torch.equal(u, v)
+    for name in ("observations", "actions", "rewards", "next_observations", "dones", "timeouts"):
+        assert getattr(a.replay_buffer, name).tobytes() == getattr(b.replay_buffer, name).tobytes()
+    assert a.replay_buffer.pos == b.replay_buffer.pos > 0
+
+
+@pytest.mark.parametrize("make_envs", [lambda: several(1), several, native], ids=["one", "several", "native"])
+@pytest.mark.parametrize("algorithm", [SAC, TD3, DDPG])
+def test_executed_actions_are_stored_also_at_the_end_of_episodes(algorithm, make_envs):
+    env = make_envs()
+    noise = None if algorithm is SAC else NormalActionNoise(np.zeros(1), np.full(1, 0.5))
+    model, witness = learned(algorithm, env, action_noise=noise, **replay_options(env))
+    proposed, executed = witness.actions()
+    done = np.array(witness.done)
+    differs = np.abs(proposed - executed)[..., 0] > 1e-3
+    assert np.all(np.any(done & differs, axis=0))
+    assert np.any(~done & differs)
+    assert stored(model).tobytes() == executed.tobytes()
+
+
+def test_a_filter_that_does_nothing_changes_actions_by_rounding_only():
+    model, witness = learned(SAC, several(), **replay_options(several()))
+    proposed, free = witness.actions()[0], ~np.array(witness.intervened)
+    assert np.any(free)
+    np.testing.assert_allclose(stored(model)[free], proposed[free], rtol=0, atol=2e-7)
+
+
+def test_proposed_is_what_stable_baselines_stores():
+    plain, _ = learned(SAC, several())
+    proposed, witness = learned(SAC, several(), **replay_options(several(), "proposed"))
+    executed, _ = learned(SAC, several(), **replay_options(several()))
+    assert_same_learning(plain, proposed)
+    assert stored(proposed).tobytes() == witness.actions()[0].tobytes()
+    assert not torch.equal(next(executed.policy.critic.parameters()), next(plain.policy.critic.parameters()))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_both_stores_each_step_with_either_action(count):
+    model, witness = learned(SAC, several(count), **replay_options(several(count), "both"))
+    proposed, executed = witness.actions()
+    buffer = model.replay_buffer
+    assert buffer.size() == 2 * len(proposed)
+    assert stored(model)[0::2].tobytes() == executed.tobytes()
+    assert stored(model)[1::2].tobytes() == proposed.tobytes()
+    for name in ("observations", "next_observations", "rewards", "dones", "timeouts"):
+        rows = getattr(buffer, name)[: buffer.size()]
+        assert rows[0::2].tobytes() == rows[1::2].tobytes()
+
+
+@pytest.mark.parametrize("action", ["executed", "proposed"])
+@pytest.mark.parametrize("algorithm", [SAC, TD3])
+def test_without_a_filter_nothing_changes(algorithm, action):
+    plain, _ = learned(algorithm, several(filtered=False))
+    ours, _ = learned(algorithm, several(filtered=False), **replay_options(several(filtered=False), action))
+    assert type(ours.replay_buffer) is FilteredReplayBuffer
+    assert_same_learning(plain, ours)
+
+
+def test_n_step_returns():
+    env = several()
+    filtered, witness = learned(SAC, env, **replay_options(env, n_steps=3, gamma=0.9))
+    assert stored(filtered).tobytes() == witness.actions()[1].tobytes()
+    assert filtered.gamma == filtered.replay_buffer.gamma == 0.9
+    plain, _ = learned(SAC, several(filtered=False), n_steps=3, gamma=0.9)
+    ours, _ = learned(SAC, several(filtered=False), **replay_options(env, n_steps=3, gamma=0.9))
+    assert_same_learning(plain, ours)
+
+
+def test_memory_optimised_buffer():
+    options = replay_options(several())
+    options["replay_buffer_kwargs"]["handle_timeout_termination"] = False
+    model, witness = learned(SAC, several(), optimize_memory_usage=True, **options)
+    assert stored(model).tobytes() == witness.actions()[1].tobytes()
+
+
+def test_normalized_observations_and_rewards_leave_the_actions():
+    env = several()
+    model, witness = learned(SAC, VecNormalize(env), **replay_options(VecNormalize(env)))
+    assert stored(model).tobytes() == witness.actions()[1].tobytes()
+
+
+def test_ppo_keeps_the_proposals_and_their_probabilities():
+    class BeforeTheUpdate(BaseCallback):
+        def _on_step(self):
+            nominal.append([info["nominal_action"] for info in self.locals["infos"]])
+            interventions.append([info["intervention"] for info in self.locals["infos"]])
+            return True
+
+        def _on_rollout_end(self):
+            rollout = self.model.rollout_buffer
+            actions.append(rollout.actions.copy())
+            observations, sampled = (torch.as_tensor(rows.reshape(-1, rows.shape[-1])) for rows in (rollout.observations, rollout.actions))
+            with torch.no_grad():
+                _, log_probs, _ = self.model.policy.evaluate_actions(observations, sampled)
+            np.testing.assert_allclose(log_probs.numpy(), rollout.log_probs.ravel(), rtol=1e-5, atol=1e-5)
+
+    nominal, interventions, actions = [], [], []
+    PPO("MlpPolicy", several(), n_steps=32, batch_size=48, n_epochs=2, device="cpu", seed=0).learn(192, callback=BeforeTheUpdate())
+    center, half = np.mean(BOX), np.ptp(BOX) / 2
+    assert np.any(interventions)
+    assert len(actions) == 2
+    np.testing.assert_allclose(np.array(nominal), center + half * np.clip(np.concatenate(actions), -1.0, 1.0), atol=1e-5)
+
+
+@pytest.mark.parametrize("action", ["executed", "both"])
+def test_saving_and_loading(tmp_path, action):
+    model, _ = learned(SAC, several(), **replay_options(several(), action))
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "buffer.pkl")
+    again = SAC.load(tmp_path / "model.zip", env=several(), device="cpu")
+    assert again.replay_buffer.size() == 0
+    assert again.replay_buffer.action == action
+    again.load_replay_buffer(tmp_path / "buffer.pkl")
+    assert stored(again).tobytes() == stored(model).tobytes()
+    before = again.replay_buffer.size()
+    again.learn(30, callback=(witness := Witness()), reset_num_timesteps=False)
+    assert stored(again)[before :: 2 if action == "both" else 1].tobytes() == witness.actions()[1].tobytes()
+
+
+def buffer_of(envs=3, action="executed", kind=FilteredReplayBuffer, box=TWO_INPUTS, **arguments):
+    return kind(20 * envs, *SPACES, device="cpu", n_envs=envs, action=action, box=box, **arguments)
+
+
+def add(buffer, infos, rewards=0.0):
+    count = len(infos)
+    rng = np.random.default_rng(1)
+    proposed = rng.uniform(-1.0, 1.0, (count, 2))
+    buffer.add(np.zeros((count, 2)), np.zeros((count, 2)), proposed, np.full(count, rewards), np.zeros(count, dtype=bool), infos)
+    return proposed.astype(np.float32)
+
+
+def test_physical_actions_are_mapped_to_the_unit_box():
+    # So far that it is beyond 1 in single precision as well.
+    beyond = 4.0 + 1e-6
+    buffer = buffer_of()
+    add(buffer, [{"safe_action": np.array(u)} for u in ([0.0, 5.0], [beyond, 1.0], [1.0, -1.0])])
+    assert buffer.actions[0].tolist() == [[-1.0, 1.0], [1.0, 0.0], [-0.5, -0.5]]
+
+
+def test_each_env_without_a_filter_keeps_its_proposal():
+    buffer = buffer_of()
+    proposed = add(buffer, [{}, {"safe_action": np.array([2.0, 1.0])}, {"cost": 0.0}])
+    assert buffer.actions[0].tolist() == [proposed[0].tolist(), [0.0, 0.0], proposed[2].tolist()]
+
+
+class View(dict):
+    """An info that is one row of a batch, of which only what is given is at hand in the row itself."""
+
+    def __init__(self, batch, index, **given):
+        super().__init__(given)
+        self.batch, self.index = batch, index
+
+
+def test_infos_of_one_batch_are_read_at_once():
+    batch = {"safe_action": np.array([[2.0, 1.0], [4.0, 5.0], [0.0, -3.0]])}
+    buffer = buffer_of()
+    add(buffer, [View(batch, k) for k in (0, 2, 1)])
+    assert buffer.actions[0].tolist() == [[0.0, 0.0], [-1.0, -1.0], [1.0, 1.0]]
+
+
+def test_infos_of_several_batches_or_without_a_filter_are_read_one_by_one():
+    given = {"safe_action": np.array([2.0, 1.0])}
+    buffer = buffer_of()
+    add(buffer, [View({"safe_action": np.zeros((3, 2))}, k, **given) for k in range(3)])
+    assert buffer.actions[0].tolist() == [[0.0, 0.0]] * 3
+    proposed = add(buffer, [View({"cost": np.zeros(3)}, k) for k in range(3)])
+    assert buffer.actions[1].tobytes() == proposed.tobytes()
+
+
+def test_a_full_buffer_starts_again():
+    buffer = buffer_of(envs=1, action="both")
+    for k in range(11):
+        add(buffer, [{"safe_action": np.array([0.1 * k, 0.0])}])
+    assert (buffer.full, buffer.pos, buffer.size()) == (True, 2, 20)
+    assert buffer.actions[:3:2, 0, 0].tolist() == pytest.approx([-0.5, -0.95])
+    assert pickle.loads(pickle.dumps(buffer)).actions.tobytes() == buffer.actions.tobytes()
+
+
+def test_options_of_a_problem_and_of_any_env_of_it():
+    env = make()
+    vector = SafetyFilterVectorWrapper(gym.make_vec(ENV_ID, num_envs=2, box=BOX), "scbf")
+    for source in (env.unwrapped.problem, env, vector, several(), VecNormalize(several()), native()):
+        assert replay_options(source, "both") == {
+            "replay_buffer_class": FilteredReplayBuffer,
+            "replay_buffer_kwargs": {"box": (BOX,), "action": "both"},
+        }
+
+
+@pytest.mark.parametrize(
+    "box", [None, (0.0, 4.0), ((0.0, 4.0),), ((0.0, 4.0), (5.0, -3.0)), ((0.0, 4.0), (0.0, np.inf)), "box", ((0,), (1, 2))]
+)
+def test_boxes_that_do_not_fit(box):
+    with pytest.raises(ConfigurationError, match=r"box = .* for each of the 2 inputs"):
+        buffer_of(box=box)
+
+
+def test_actions_and_combinations_that_are_not_allowed():
+    with pytest.raises(ConfigurationError, match=r"action = 'excuted'; did you mean 'executed'\? \(allowed: executed, proposed, both\)"):
+        buffer_of(action="excuted")
+    with pytest.raises(ConfigurationError, match="action = None; "):
+        buffer_of(action=None)
+    with pytest.raises(ConfigurationError, match="set optimize_memory_usage=False"):
+        buffer_of(action="both", optimize_memory_usage=True, handle_timeout_termination=False)
+    with pytest.raises(ConfigurationError, match="set n_steps=1"):
+        buffer_of(action="both", kind=FilteredNStepReplayBuffer, n_steps=2)
+    with pytest.raises(ConfigurationError, match="n_steps = 0; give a whole number from 1"):
+        replay_options(make(), n_steps=0)
+
+
+@pytest.mark.parametrize("executed", [[4.1, 0.0], [2.0, -30.0], [np.nan, 0.0]])
+def test_executed_actions_beyond_the_box(executed):
+    with pytest.raises(ConfigurationError, match=r"not between \[0.0, -3.0\] and \[4.0, 5.0\]; give the box of the env's problem"):
+        add(buffer_of(envs=1), [{"safe_action": np.array(executed)}])
+
+
+def test_envs_without_one_box():
+    for source in (gym.make("CartPole-v1"), DummyVecEnv([lambda: gym.make("CartPole-v1")]), None):
+        with pytest.raises(ConfigurationError, match="not one of this project's envs"):
+            replay_options(source)
+    with pytest.raises(ConfigurationError, match=r"different boxes \[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]"):
+        replay_options(DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))]))

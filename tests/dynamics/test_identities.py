@@ -1,0 +1,106 @@
+"""Formulas that are zero everywhere are told from those that are zero in places, wherever these lie."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import sympy as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from safe_envs import ControlAffineSDE, RelativeDegreeError, SystemDefinitionError, state_problem
+from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
+from safe_envs.dynamics.identities import is_zero
+from safe_envs.dynamics.lie import relative_degree, vanishes
+
+x, y, u, sigma = sp.symbols("x y u sigma", real=True)
+
+ZERO = {
+    "squares": sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1,
+    "hyperbolic": sp.cosh(x * y) ** 2 - sp.sinh(x * y) ** 2 - 1,
+    "maximum and minimum": sp.Max(x, y) + sp.Min(x, y) - x - y,
+    "size": sp.Max(x, -x) - sp.Abs(x),
+    "size by pieces": sp.Piecewise((x, x > 0), (-x, True)) - sp.Abs(x),
+    "step": sp.Heaviside(x - 300) + sp.Heaviside(300 - x) - 1,
+    "pieces": sp.Piecewise((0, sp.Or(x < 500, x > 600)), (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, True)),
+    "conditions": sp.Piecewise((1, sp.And(x > 1, sp.Not(y > 1))), (0, True)) - sp.Heaviside(x - 1) * sp.Heaviside(1 - y),
+    "a product of roots": (sp.sqrt(x**2 + y**2) - 1) * (sp.sqrt(x**2 + y**2) + 1) - x**2 - y**2 + 1,
+    "floats": (0.1 * x + 0.2) ** 2 - 0.01 * x**2 - 0.04 * x - 0.04,
+    "beside an unknown function": (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1) * sp.log(1 + x**2) * sp.floor(x),
+}  # fmt: skip
+
+NOT_ZERO = {
+    "beyond 2": sp.Max(x - 2, 0),
+    "beyond a million": sp.Max(x - 10**6, 0) ** 2,
+    "below": sp.Min(x + 1000, 0),
+    "a piece far away": sp.Piecewise((0, x < 5000), (1, True)),
+    "a hidden kink": sp.sqrt(2 - 2 * sp.cos(x)) - 2 * sp.sin(x / 2),
+    "a hidden kink far away": sp.sqrt(x**2 - 2 * 10**4 * x + 10**8) + x - 10**4,
+    "another branch": sp.atan(1 / x) + sp.atan(x) - sp.pi / 2,
+    "sawtooth": sp.asin(sp.sin(x)) - x,
+    "tiny": sp.exp(-1000 * (2 + sp.cos(x))),
+    "floor": sp.floor(x / 10**6),
+    "impulse": sp.DiracDelta(x - 7),
+    "unknown": sp.Function("f")(x).diff(x),
+}
+
+
+@pytest.mark.parametrize("name", ZERO)
+def test_what_is_zero_is_found(name):
+    assert is_zero(ZERO[name])
+
+
+@pytest.mark.parametrize("name", NOT_ZERO)
+def test_what_is_zero_in_places_only_is_not_zero(name):
+    assert not is_zero(NOT_ZERO[name])
+
+
+@given(st.lists(st.tuples(st.integers(-50, 50), st.integers(-9, 9)), min_size=1, max_size=4, unique_by=lambda p: p[0]), st.booleans())
+@settings(max_examples=20)
+def test_a_piecewise_linear_function_is_zero_where_its_values_are(kinks, differently):
+    """sum c max(x - k, 0), written a second time by sizes; the values at and between the kinks tell whether both are the same."""
+    written = sum(c * sp.Max(x - k, 0) for k, c in kinks)
+    again = sum(sp.Rational(c, 2) * (x - k + sp.Abs(x - k)) for k, c in kinks)
+    left_out = sum(sp.Rational(c, 2) * (x - k + sp.Abs(x - k)) for k, c in kinks[1:]) if differently else again
+    at = [-1000, 1000, *[k + d for k, _ in kinks for d in (-1, 0, 1)]]
+    same = all((written - left_out).subs(x, value) == 0 for value in at)
+    assert is_zero(written - left_out) == same
+
+
+def noisy(diffusion, gain=1):
+    return ControlAffineSDE((x, y), (u,), [0, 0], [gain, 1], [diffusion, 0], {sigma: 0.3})
+
+
+def test_noise_in_a_part_of_the_workspace_reaches_a_barrier():
+    start = {"box": (-1, 1), "start": [0.0, 0.0], "dt": 0.1, "horizon": 1.0}
+    for diffusion in (sp.Max(x - 2, 0), sp.Piecewise((0, x < 50), (sigma, True)), sigma * sp.Heaviside(-x - 1)):
+        bridge = BrownianBridge(state_problem(noisy(diffusion), [5 - x, 5 - y], **start))
+        assert bridge.reached == (True, False)
+    bridge = BrownianBridge(state_problem(noisy(sp.Max(x - 2, 0)), 5 - x, **start))
+    states, ends = (np.array([1.0, 3.0]), np.zeros(2)), np.array([[0.2], [0.2]])
+    # With h = 0.2 at both ends and E = 1 the smallest h is (0.4 - sqrt(2 s^2 dt))/2, s = max(x - 2, 0).
+    expected = [0.2, 0.5 * (0.4 - math.sqrt(2 * 0.1))]
+    np.testing.assert_allclose(bridge.lowest(states, ends, ends, np.ones((2, 1)))[:, 0], expected, rtol=1e-12)
+
+
+def test_an_input_that_counts_in_a_part_of_the_workspace_counts():
+    for gain in (sp.Max(x - 2, 0), sp.Piecewise((0, x < 50), (1, True)), sp.sqrt(2 - 2 * sp.cos(x)) - 2 * sp.sin(x / 2)):
+        assert relative_degree(noisy(0, gain), 5 - x) == 1
+    with pytest.raises(RelativeDegreeError):
+        relative_degree(noisy(0, sp.Max(x, 0) + sp.Min(x, 0) - x), 5 - x)
+
+
+def test_parameters_count_with_their_decimal_values():
+    assert vanishes(noisy(sigma), sigma * x - sp.Rational(3, 10) * x)
+    assert not vanishes(noisy(sigma), sigma * x - sp.Rational(1, 3) * x)
+
+
+@pytest.mark.parametrize("edge", [2, 500])
+def test_a_rate_that_is_not_affine_beyond_some_input_is_refused(edge):
+    for bend in (sp.Max(u - edge, 0), sp.Piecewise((0, u < edge), (1, True)), sp.Abs(u + edge) - edge):
+        with pytest.raises(SystemDefinitionError, match="not affine"):
+            ControlAffineSDE.from_rate((x,), (u,), [u + bend])
+    affine = ControlAffineSDE.from_rate((x,), (u,), [sp.Max(x, 0) * u + sp.Abs(x - edge) + 0.1 * u])
+    assert affine.input_matrix[0] == sp.Max(x, 0) + sp.Float(0.1)

@@ -1,0 +1,93 @@
+"""Construction of a system says what is wrong with it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs import ConfigurationError, ControlAffineSDE, SystemDefinitionError
+from safe_envs.dynamics.codegen import compile_function
+from safe_envs.dynamics.integrators import Integrator
+
+x, y, u, k = sp.symbols("x y u k", real=True)
+
+
+def scalar(**changes):
+    arguments = {
+        "states": (x,),
+        "inputs": (u,),
+        "drift": [k * x],
+        "input_matrix": [1],
+        "diffusion": [0.1],
+        "parameters": {k: 2.0},
+        **changes,
+    }
+    return ControlAffineSDE(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"drift": [x, x]}, "drift has shape 2 x 1"),
+        ({"input_matrix": [[1, 2]]}, "input_matrix has shape 1 x 2"),
+        ({"diffusion": [[1], [2]]}, "diffusion has shape 2 x 1"),
+        ({"drift": [x * u]}, "drift depends on the input u"),
+        ({"input_matrix": [u]}, "input_matrix depends on the input u"),
+        ({"diffusion": [sp.sin(u)]}, "diffusion depends on the input u"),
+        ({"drift": [y]}, "unknown symbol y"),
+        ({"drift": [sp.Symbol("x")]}, "Symbol\\('x'\\)"),
+        ({"parameters": {}}, "unknown symbol k"),
+        ({"states": (x, x), "drift": [k * x, 0], "input_matrix": [1, 0], "diffusion": [0, 0]}, "more than once"),
+        ({"inputs": (), "input_matrix": []}, "needs a state and an input"),
+        ({"drift": "no matrix"}, "drift is no matrix"),
+    ],
+)
+def test_contradictions_are_named(changes, message):
+    with pytest.raises(SystemDefinitionError, match=message):
+        scalar(**changes)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, "two"])
+def test_parameters_are_finite_numbers(value):
+    with pytest.raises(ConfigurationError, match="parameter k"):
+        scalar(parameters={k: value})
+    with pytest.raises(ConfigurationError, match="parameter k"):
+        scalar().with_parameters(k=value)
+
+
+def test_a_diffusion_of_zeros_is_no_noise_however_they_are_written():
+    x, u, sigma = sp.symbols("x u sigma", real=True)
+    for entry, parameters, noisy in ((0, {}, False), (0.0, {}, False), (sigma, {sigma: 0.0}, False), (sigma, {sigma: 0.1}, True)):
+        system = ControlAffineSDE(states=(x,), inputs=(u,), drift=[0], input_matrix=[1], diffusion=[[entry, 0.0]], parameters=parameters)
+        assert system.noisy == noisy
+        assert Integrator(system, 0.1, 1, "floats").channels == noisy
+
+
+def test_with_parameters_returns_another_system_and_knows_its_names():
+    system = scalar()
+    other = system.with_parameters(k=3)
+    assert system.parameters == {k: 2.0}
+    assert other.parameters == {k: 3.0}
+    with pytest.raises(ConfigurationError, match="unknown parameter 'kk'; did you mean 'k'"):
+        system.with_parameters(kk=1.0)
+
+
+def test_numbers_take_the_place_of_parameters_in_a_matrix_that_may_change_later():
+    a, x = sp.symbols("a x", real=True)
+    system = ControlAffineSDE((x,), (sp.Symbol("u", real=True),), [a * x], [1], [0], {a: 2.0})
+    matrix = sp.Matrix([a, x])
+    assert system.numeric(matrix) == sp.Matrix([2, x])
+    matrix[0] = 3 * a
+    assert system.numeric(matrix) == sp.Matrix([6, x])
+
+
+def test_functions_by_pieces_compile():
+    x = sp.Symbol("x", real=True)
+    pieces = sp.Piecewise((1 - x**2, x > 0), ((1 + x) ** 3, True))
+    floats, arrays = (compile_function((x,), [pieces], flavour) for flavour in ("floats", "arrays"))
+    for value, expected in ((0.5, 0.75), (-0.5, 0.125)):
+        assert floats(value)[0] == pytest.approx(expected)
+        assert arrays(np.array([value]))[0] == pytest.approx(expected)

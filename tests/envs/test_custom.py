@@ -1,0 +1,209 @@
+"""Systems of one's own behind `gym.make`: from a file, from a module, and under an id of their own."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import sympy as sp
+from gymnasium.utils.env_checker import check_env
+
+import safe_envs
+from safe_envs import ConfigurationError, SafetyProblem, SystemDefinitionError, state_problem
+from safe_envs.envs.custom import Custom, load_system
+from safe_envs.object_import import load_object
+from safe_envs.systems import CUSTOM_ID
+
+STATEMENT = """
+import sympy as sp
+from safe_envs import ControlAffineSDE, state_problem
+
+x, u, s = sp.symbols("x u s", real=True)
+
+def problem(*, edge: float = 1.0):
+    system = ControlAffineSDE((x,), (u,), [x], [1], [s], {s: 0.1})
+    return state_problem(system, SIGN * (edge - x), box=(-5, 5), start=[(-0.5, 0.5)], dt=0.05, horizon=1.0, workspace={x: (-5, 5)})
+
+ready = problem()
+number = 3
+def wrong():
+    return 3
+"""
+
+
+def place(folder: Path, name: str = "problem", statement: str = STATEMENT) -> str:
+    path = folder / "mine.py"
+    path.write_text(statement.replace("SIGN", "1"))
+    return f"{path}:{name}"
+
+
+def stated_here(*, edge: float = 1.0) -> SafetyProblem:
+    x, u = sp.symbols("x u", real=True)
+    system = safe_envs.ControlAffineSDE((x,), (u,), [x], [1], [0])
+    return state_problem(system, edge - x, box=(-5, 5), start=[0.2], dt=0.05, horizon=1.0, workspace={x: (-5, 5)})
+
+
+@pytest.fixture
+def my_id():
+    yield "my_lab/Mine-v0"
+    gym.registry.pop("my_lab/Mine-v0", None)
+
+
+def test_the_arguments_of_every_env_hold_for_it(tmp_path):
+    env = gym.make(CUSTOM_ID, system=place(tmp_path), noise=0.3, edge=2.0, dt=0.1, start=[0.1])
+    problem = env.unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]
+    (barrier,) = problem.barriers
+    assert barrier.expression.subs({sp.Symbol("x", real=True): 0}) == 2.0
+    assert (problem.dt, problem.start) == (0.1, "given")
+    assert list(problem.plant.parameters.values()) == [0.3]
+    check_env(env.unwrapped, skip_render_check=True)
+
+
+def test_a_batch_follows_the_scalar_env(tmp_path):
+    system = place(tmp_path, "ready")
+    env, envs = gym.make(CUSTOM_ID, system=system), gym.make_vec(CUSTOM_ID, num_envs=2, system=system)
+    env.reset(seed=3)
+    envs.reset(seed=3)
+    for _ in range(5):
+        one, many = env.step(np.array([0.5])), envs.step(np.full((2, 1), 0.5))
+    assert np.array_equal(one[0], many[0][0])
+
+
+def test_registered_by_its_place_or_its_function(tmp_path, my_id):
+    for system in (place(tmp_path), stated_here):
+        safe_envs.register(my_id, system)
+        env = gym.make(my_id, edge=3.0)
+        again = gym.make(gym.envs.registration.EnvSpec.from_json(env.spec.to_json()))  # pyright: ignore[reportOptionalMemberAccess]
+        assert again.unwrapped.problem.barriers == env.unwrapped.problem.barriers  # pyright: ignore[reportAttributeAccessIssue]
+        assert gym.make_vec(my_id, num_envs=2).reset(seed=0)[0].shape == (2, 1)
+        gym.registry.pop(my_id)
+
+
+def test_a_file_that_changed_is_read_anew(tmp_path):
+    system = place(tmp_path)
+    assert load_system(system)().horizon == 1.0
+    Path(system.rpartition(":")[0]).write_text(STATEMENT.replace("SIGN", "1").replace("horizon=1.0", "horizon=22.0"))
+    assert load_system(system)().horizon == 22.0
+
+
+def test_modules_beside_the_file_can_be_imported(tmp_path):
+    (tmp_path / "beside_it.py").write_text("EDGE = 1.5")
+    statement = "from beside_it import EDGE\n" + STATEMENT.replace("edge: float = 1.0", "edge: float = EDGE")
+    assert load_system(place(tmp_path, statement=statement))().barriers[0].expression.has(sp.Float(1.5))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "says"),
+    [
+        ("problems", ("", ""), "did you mean 'problem'"),
+        ("number", ("", ""), "is int; give a SafetyProblem"),
+        ("wrong", ("", ""), "returned int"),
+        ("problem", ("import sympy", "import sympyy"), "in line 2: ModuleNotFoundError"),
+        ("problem", ("SIGN *", "1 / 0 +"), "in line 9: ZeroDivisionError"),
+        ("", ("", ""), "no place of a statement"),
+    ],
+)
+def test_what_is_no_statement_is_explained(tmp_path, name, change, says):
+    with pytest.raises(ConfigurationError, match=says):
+        load_system(place(tmp_path, name, STATEMENT.replace(*change) if change[0] else STATEMENT))()
+
+
+def test_a_mistake_in_a_ready_problem_is_found(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(STATEMENT.replace("SIGN", "-1"))
+    with pytest.raises(SystemDefinitionError, match="wrong sign"):
+        load_system(f"{path}:problem")()
+
+
+@pytest.mark.parametrize("given", [lambda: None, 3, "nowhere.py:problem", "no_such_module:problem", "no_colon"])
+def test_what_cannot_be_registered_is_refused(given, my_id):
+    with pytest.raises(ConfigurationError):
+        safe_envs.register(my_id, given)
+    assert my_id not in gym.registry
+
+
+def test_a_problem_itself_is_told_where_to_go(my_id):
+    with pytest.raises(ConfigurationError, match=r"goes into SafeEnv\(problem\)"):
+        safe_envs.register(my_id, stated_here())  # pyright: ignore[reportArgumentType]
+
+
+def test_the_arguments_of_the_env_itself_reach_it(tmp_path):
+    system = place(tmp_path)
+    env = Custom(system, max_episode_steps=3)
+    env.reset(seed=0)
+    assert [env.step([0.0])[3] for _ in range(3)] == [False, False, True]
+    envs = gym.make_vec(CUSTOM_ID, num_envs=1, system=system, autoreset_mode="SameStep", horizon=0.1)
+    envs.reset(seed=0)
+    assert "final_info" not in envs.step([[0.0]])[4]
+    assert "final_info" in envs.step([[0.0]])[4]
+
+
+def test_a_file_leaves_nothing_behind(tmp_path):
+    before = list(sys.path)
+    for text in (STATEMENT, "import nowhere"):
+        with contextlib.suppress(ConfigurationError):
+            load_system(place(tmp_path, statement=text))
+    assert sys.path == before
+
+
+@pytest.mark.parametrize(
+    ("body", "says"),
+    [
+        ("1 / 0", "in line 2: ZeroDivisionError"),
+        ("raise SystemExit(0)", "SystemExit"),
+        ("from beside_it import EDGE; return EDGE", "returned float"),
+    ],
+)
+def test_what_goes_wrong_in_the_function_is_explained(tmp_path, body, says):
+    (tmp_path / "beside_it.py").write_text("EDGE = 1.5")
+    (tmp_path / "own.py").write_text(f"def problem():\n    {body}\n")
+    with pytest.raises(ConfigurationError, match=says):
+        load_system(f"{tmp_path / 'own.py'}:problem")()
+
+
+def test_a_missing_argument_is_named(tmp_path):
+    (tmp_path / "own.py").write_text("def problem(*, radius): pass")
+    with pytest.raises(ConfigurationError, match="'radius'; give its arguments by --barrier"):
+        gym.make(CUSTOM_ID, system=f"{tmp_path / 'own.py'}:problem")
+
+
+def test_neighbours_of_one_name_in_two_folders_are_told_apart(tmp_path):
+    found = []
+    for number in (1, 2):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        (folder / "same_name.py").write_text(f"EDGE = {number}")
+        (folder / "own.py").write_text("from same_name import EDGE")
+        found.append(load_object(f"{folder / 'own.py'}:EDGE"))
+    assert found == [1, 2]
+
+
+def test_an_error_of_ours_has_the_line_of_the_file(tmp_path):
+    (tmp_path / "own.py").write_text("import sympy as sp\nfrom safe_envs import Barrier\nBarrier('x')")
+    with pytest.raises(SystemDefinitionError, match=r"own.py in line 3: a barrier is a text"):
+        load_system(f"{tmp_path / 'own.py'}:problem")
+
+
+def test_ids_of_others_are_not_replaced(tmp_path, my_id):
+    with pytest.raises(ConfigurationError, match="is taken"):
+        safe_envs.register("Pendulum-v1", place(tmp_path))
+    for edge in ("1.0", "2.0"):
+        safe_envs.register(my_id, place(tmp_path, statement=STATEMENT.replace("edge: float = 1.0", f"edge: float = {edge}")))
+
+
+@pytest.mark.parametrize("make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)])
+@pytest.mark.parametrize("arguments", [{}, {"system": ""}, {"system": None}, {"system": 3}, {"system": stated_here}])
+def test_the_id_for_any_system_asks_for_one(make, arguments):
+    with pytest.raises(ConfigurationError, match=r"system = .*; give the place of its statement as a text, FILE.py:NAME"):
+        make(CUSTOM_ID, **arguments)
+
+
+@pytest.mark.parametrize("make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)])
+@pytest.mark.parametrize("arguments", [{"barrier": 3}, {"plant": 3}, {"model": [("sigma", 1.0)]}, {"plant": {3: 4.0}}])
+def test_dictionaries_are_asked_for(make, arguments):
+    with pytest.raises(ConfigurationError, match="give a dictionary of names and values"):
+        make("safe_envs/Scalar-v0", **arguments)

@@ -1,0 +1,84 @@
+"""Where and how a problem is explored: what is completed, and what cannot be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs.errors import SystemDefinitionError
+from safe_envs.problem.problem import Variable
+from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.registry import load_problem
+
+DISK = load_problem("safe_envs/CubicSDEDisk-v0")
+x, theta, w = sp.symbols("x theta w", real=True)
+
+
+def bare(**changes):
+    """The disk, of whose exploration nothing is said."""
+    return replace(DISK, **{"explored": SamplingDomain(), **changes})
+
+
+def test_defaults_are_the_workspace_and_halfway_inputs():
+    exploration = bare().exploration
+    assert exploration.region == ((-2.0, 2.0), (-2.0, 2.0))
+    assert exploration.inputs == ((-5.0,), (5.0,))
+    assert exploration.coordinates == DISK.plant.states
+
+
+def test_what_is_given_is_kept():
+    given = SamplingDomain(((0.0, 1.0), (-1.0, 0.0)), ((0.5,),), (DISK.plant.states[0] ** 2,))
+    assert bare(explored=given).exploration == given
+
+
+def test_an_angle_is_explored_over_a_whole_turn():
+    found = SamplingDomain().completed((x, theta), ((-1.0, 3.0), (-math.inf, math.inf)), (False, True), ((-1.0, 1.0),))
+    assert found.region == ((-1.0, 3.0), (-math.pi, math.pi))
+    assert found.coordinates == (x, sp.cos(theta), sp.sin(theta))
+
+
+def test_only_unbounded_radians_are_angles():
+    x_1, x_2 = DISK.plant.states
+    turning = bare(states=(Variable(x_1, -1.0, 1.0, "rad"), Variable(x_2, -math.inf, math.inf, "rad")))
+    assert turning.exploration.region == ((-1.0, 1.0), (-math.pi, math.pi))
+    assert turning.exploration.coordinates == (x_1, sp.cos(x_2), sp.sin(x_2))
+    with pytest.raises(SystemDefinitionError, match=r"cannot explore x_2 in \[-inf, inf\]"):
+        _ = bare(states=(Variable(x_1, -1.0, 1.0), Variable(x_2, -math.inf, math.inf, "m"))).exploration
+    with pytest.raises(SystemDefinitionError, match=r"cannot explore x_2 in \[0\.0, inf\]"):
+        _ = bare(states=(Variable(x_1, -1.0, 1.0), Variable(x_2, 0.0, math.inf, "rad"))).exploration
+
+
+def test_each_input_goes_halfway_with_the_others_at_the_centre():
+    found = SamplingDomain().completed((x,), ((0.0, 1.0),), (False,), ((-2.0, 2.0), (0.0, 8.0)))
+    assert found.inputs == ((-1.0, 4.0), (1.0, 4.0), (0.0, 2.0), (0.0, 6.0))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (SamplingDomain(region=((0.0, 1.0),)), "has 1 ranges for 2 states"),
+        (SamplingDomain(region=((0.0, 1.0),) * 3), "has 3 ranges for 2 states"),
+        (SamplingDomain(region=((0.0, math.inf), (0.0, 1.0))), r"cannot explore x_1 in \[0\.0, inf\]; give SamplingDomain\(region"),
+        (SamplingDomain(region=((0.0, 1.0), (math.nan, 1.0))), "cannot explore x_2"),
+        (SamplingDomain(region=((0.0, 1.0), (1.0, 1.0))), r"cannot explore x_2 in \[1\.0, 1\.0\]"),
+        (SamplingDomain(inputs=((1.0, 2.0),)), "an input of an exploration needs 1 finite numbers"),
+        (SamplingDomain(inputs=((1.0,), ())), "an input of an exploration needs 1 finite numbers"),
+        (SamplingDomain(coordinates=(w,)), r"(?s)a coordinate of the exploration.*w"),
+    ],
+)
+def test_what_does_not_fit_is_refused(given, message):
+    with pytest.raises(SystemDefinitionError, match=message):
+        _ = bare(explored=given).exploration
+
+
+def test_every_problem_can_be_explored(env_id):
+    problem = load_problem(env_id)
+    exploration = problem.exploration
+    assert len(exploration.region) == len(problem.states)
+    low, high = np.array(problem.box).T
+    assert all(((low <= u) & (u <= high)).all() for u in np.array(exploration.inputs))
+    assert set().union(*(c.free_symbols for c in exploration.coordinates)) <= set(problem.plant.states)

@@ -1,0 +1,232 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, SafeEnv, SafetyProblem
+from safe_envs.problem.problem import Feature, Start, Variable
+from safe_envs.rendering import style
+from tests.conftest import problem_of
+from tests.rendering.drawn import SCENE, shown, stepped
+
+
+def test_the_disk_is_to_scale():
+    from safe_envs.rendering.frame import Picture
+
+    for radius in (1.0, 2.5):
+        env = SafeEnv(problem_of("safe_envs/DubinsDisk-v0", radius=radius, start=[0.0, 0.0, 1.0]), render_mode="rgb_array")
+        env.reset(seed=0)
+        frame = env.render()
+        picture = Picture(env.problem)
+        axes = picture._scene._plane.background(picture._canvas, env.viewer._histories[0].moment)
+        assert axes.scale[0] == pytest.approx(axes.scale[1])
+        for angle in (0.3, 2.0, 4.0):
+            x, y = axes.place(radius * np.cos(angle), radius * np.sin(angle))
+            around = frame[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2]
+            assert (np.abs(around.astype(int) - style.EDGE).sum(axis=-1) < 60).any(), "the edge is not where h = 0"
+            for share, safe in ((0.97, True), (1.03, False)):
+                x, y = axes.place(share * radius * np.cos(angle), share * radius * np.sin(angle))
+                pixel = frame[int(y), int(x)].astype(int)
+                assert (pixel[1] > pixel[0]) == safe, "green within, reddish beyond"
+
+
+def test_obstacles_and_goal_are_to_scale():
+    env = SafeEnv(problem_of("safe_envs/DubinsObstacle-v0", radius=0.7), render_mode="rgb_array")
+    env.reset(seed=0)
+    frame = env.render()
+    scene = env.viewer._picture._scene
+    axes = next(iter(scene._plane._views))
+    assert [circle.radius for circle in scene._obstacles] == pytest.approx([0.7])
+    assert scene._goal.radius == pytest.approx(0.3)
+    center = env.state[3:5]
+    x, y = axes.place(center[0], center[1] - 0.7)
+    column = frame[int(y) - 3 : int(y) + 4, int(x)].astype(int)
+    assert (np.abs(column - style.VIOLATION).sum(axis=-1) < 60).any()
+    x, y = axes.place(3.0, 1.5 - 0.3)
+    assert (np.abs(frame[int(y) - 3 : int(y) + 4, int(x)].astype(int) - style.GOAL).sum(axis=-1) < 60).any()
+
+
+def test_required_gap_is_where_the_barrier_vanishes():
+    from safe_envs.rendering.scenes import make_scene
+
+    road = make_scene(problem_of("safe_envs/ACC-v0", tau=1.5))
+    states = np.array([[20.0, 20.0, 100.0], [10.0, 20.0, 3.0]])
+    np.testing.assert_allclose(road.required(states), [30.0, 15.0], atol=1e-3)
+    road = make_scene(problem_of("safe_envs/ACCGap-v0", distance=12.0))
+    np.testing.assert_allclose(road.required(np.array([[20.0, 30.0]])), [12.0], atol=1e-3)
+
+
+def own_problem(**changes) -> SafetyProblem:
+    """A problem of a user: a mass whose drag is a state, with two barriers."""
+    p, v, c, force = sp.symbols("p v c force", real=True)
+    system = ControlAffineSDE((p, v, c), (force,), [v, -c * v, 0], [0, 1, 0], [0, 0, 0])
+    given = {
+        "name": "mine",
+        "plant": system,
+        "model": system,
+        "barriers": (Barrier(1 - p**2 - v**2 / 4), Barrier(2 - c * v, "drag")),
+        "states": tuple(Variable(s, -3.0, 3.0) for s in (p, v, c)),
+        "inputs": (Variable(force, -1.0, 2.0, "N"),),
+        "reward": sp.Integer(0),
+        "nominal": (sp.Integer(1),),
+        "starts": {"origin": Start.at((0.0, 0.0, 1.0))},
+        "dt": 0.1,
+        "horizon": 2.0,
+    }
+    return SafetyProblem(**{**given, **changes})
+
+
+@pytest.mark.parametrize("plane", [None, ("p", "v")])
+def test_any_problem_is_drawn(plane):
+    env = SafeEnv(own_problem(plane=plane), render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert shown(first[:, SCENE], style.EDGE) > 20
+    assert (stepped(env, 3, 1.0).render()[:, SCENE] != first[:, SCENE]).any()
+
+
+@pytest.mark.parametrize("plane", [None, ("p", "v")])
+def test_states_without_bounds_are_drawn(plane):
+    p, v, c = own_problem().plant.states
+    states = tuple(Variable(s, -np.inf, np.inf) for s in (p, v, c))
+    env = SafeEnv(own_problem(plane=plane, states=states, features=(Feature("p", p, -1.0, 1.0),)), render_mode="rgb_array")
+    env.reset(seed=0)
+    before = env.render()
+    assert (stepped(env, 30, 1.0).render()[:, SCENE] != before[:, SCENE]).any()
+    assert env.state[0] > 2.0
+
+
+def test_a_wrong_scene_is_named():
+    for scene, message in (("top", "top-view"), ("road", "has p, v, c"), ("pendulum", "'theta'")):
+        env = SafeEnv(own_problem(scene=scene), render_mode="rgb_array")
+        env.reset(seed=0)
+        with pytest.raises(ConfigurationError, match=message):
+            env.render()
+
+
+def test_the_view_grows_with_the_trail():
+    from safe_envs.rendering.axes import grown
+
+    assert grown((0.0, 2.0), np.array([0.5, 1.9])) == (0.0, 2.0)
+    assert grown((0.0, 2.0), np.array([0.5, 2.1])) == (-1.0, 3.0)
+    assert grown((0.0, 2.0), np.array([8.9, np.inf])) == (-7.0, 9.0)
+
+
+def four_states(**changes) -> SafetyProblem:
+    """A cart with a pole, without a workspace, whose barriers vanish at other scales than 1."""
+    x, v, theta, rate, force = sp.symbols("x v theta rate force", real=True)
+    system = ControlAffineSDE((x, v, theta, rate), (force,), [v, 0, rate, 9 * theta], [0, 1, 0, -1], [0, 0, 0, 0])
+    given = {
+        "plant": system,
+        "model": system,
+        "barriers": (Barrier(900 - x**2, "track"), Barrier(0.04 - theta**2 - rate**2, "capacity")),
+        "states": tuple(Variable(s, -np.inf, np.inf) for s in system.states),
+        "starts": {"aside": Start.at((20.0, 0.0, 0.05, 0.0))},
+    }
+    return own_problem(**{**given, **changes})
+
+
+def test_states_without_a_workspace_are_shown_with_the_edges_of_the_safe_set():
+    from safe_envs.rendering.scenes import make_scene
+
+    scene = make_scene(four_states())
+    x, v, theta, rate = (scene.range_of(i) for i in range(4))
+    assert x[0] < 20.0
+    assert 30.0 < x[1] < 50.0
+    assert v == (-1.0, 1.0)
+    assert -1.0 < theta[0] < 0.05 < 0.2 < theta[1] < 1.0
+    assert -1.0 < rate[0] < -0.19
+    assert 0.19 < rate[1] < 1.0
+    u = sp.Symbol("u")
+    spread = Start((sp.Float(0), 6 * u - 3, sp.Float(0), sp.Float(0)), (u,))
+    low, high = make_scene(four_states(starts={"spread": spread})).range_of(1)
+    assert low <= -3.0
+    assert high >= 3.0
+
+
+def test_bars_fill_the_scene_with_trails():
+    env = SafeEnv(four_states(), render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    # The edges are drawn on the bars of x, theta and rate.
+    assert shown(first[:, SCENE], style.EDGE) > 50
+    stepped(env, 10, 1.0)
+    frame = env.render()
+    for top in (58, 176, 295, 413):
+        below = (slice(top + 58, top + 100), SCENE)
+        assert (frame[below] != first[below]).any(), "no trail below a bar"
+    # Seven states leave no room for trails, and are drawn.
+    states = sp.symbols("a:7", real=True)
+    force = sp.Symbol("force", real=True)
+    chain = ControlAffineSDE(states, (force,), [*states[1:], 0], [0] * 6 + [1], [0] * 7)
+    many = four_states(
+        plant=chain,
+        model=chain,
+        barriers=(Barrier(1 - states[-1]),),
+        states=tuple(Variable(s, -1.0, 1.0) for s in states),
+        starts={"origin": Start.at((0.0,) * 7)},
+    )
+    assert stepped(SafeEnv(many, render_mode="rgb_array"), 1).render().shape == (540, 960, 3)
+
+
+def test_the_name_of_the_smallest_barrier_is_apart_from_its_value(monkeypatch):
+    from safe_envs.rendering.canvas import Canvas
+
+    env = SafeEnv(four_states(), render_mode="rgb_array")
+    env.reset(seed=0)
+    env.render()
+    boxes, blit = {}, Canvas.text
+
+    def kept(self, text, at, *arguments, align=(0.0, 0.0), **options):
+        width = blit(self, text, at, *arguments, align=align, **options)
+        boxes[text] = (at[0] - align[0] * width, at[1], width)
+        return width
+
+    monkeypatch.setattr(Canvas, "text", kept)
+    env.render()
+    (name,) = (box for text, box in boxes.items() if text == "smallest: capacity")
+    for text, (left, top, width) in boxes.items():
+        if text.startswith(("now", "least")) or text in ("0 s", "2 s"):
+            assert abs(top - name[1]) > 15 or left + width < name[0] or left > name[0] + name[2], text
+
+
+def test_an_obstacle_is_outlined_where_the_first_violation_was():
+    env = SafeEnv(problem_of("safe_envs/DubinsObstacle-v0", radius=0.7), render_mode="rgb_array")
+    env.reset(seed=0)
+    state = env.state.copy()
+    ahead = np.array(state)
+    ahead[3:5] += (1.5, -2.0)
+
+    def drawn(*states):
+        env.viewer.restart([states[0]], [0.0], [0])
+        for k, each in enumerate(states[1:], start=1):
+            env.viewer.advance([each], [0.05 * k], [[0.0]])
+        frame = env.render()
+        axes = next(iter(env.viewer._picture._scene._plane._views))
+        x, y = axes.place(state[3] - 0.7, state[4])
+        around = frame[int(y) - 1 : int(y) + 2, int(x) - 3 : int(x) + 4].astype(int)
+        return (np.abs(around - style.mix(style.VIOLATION, style.PAPER, 0.6)).sum(axis=-1) < 90).any()
+
+    hit = np.array(state)
+    hit[:2] = state[3:5] + 0.1
+    away = np.array(ahead)
+    away[:2] = ahead[3:5] + 3.0
+    assert drawn(hit, away)
+    apart = np.array(state)
+    apart[:2] = state[3:5] + 3.0
+    assert not drawn(apart, away), "there was no violation"
+
+
+def test_charts_of_roads_are_bounded():
+    from safe_envs.rendering.scenes import road
+
+    env = stepped(SafeEnv(problem_of("safe_envs/ACC-v0", horizon=0.5), render_mode="rgb_array"), 1)
+    env.render()
+    road._furniture.cache_clear()
+    for _ in range(30):
+        env.step([0.0])
+        env.render()
+    assert 1 <= road._furniture.cache_info().currsize <= 8
+    (scene,) = (env.viewer._picture._scene,)
+    assert not any(len(value) > 8 for value in vars(scene).values() if isinstance(value, dict))

@@ -1,0 +1,156 @@
+"""Pictures of envs: what they show, and of what."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs import ConfigurationError, ControlAffineSDE, SafeEnv, SafeVectorEnv
+from safe_envs.rendering import style
+from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
+from tests.conftest import problem_of
+from tests.rendering.drawn import DUBINS, FILTER_STATUS, PANEL, SAFETY_STATUS, SCENE, shown, stepped
+
+pytestmark = pytest.mark.slow
+
+
+def test_every_env_is_drawn(env_id):
+    env = SafeEnv(problem_of(env_id), render_mode="rgb_array")
+    env.reset(seed=1)
+    first = env.render()
+    assert first.shape == (540, 960, 3)
+    assert first.dtype == np.uint8
+    assert first.flags.writeable
+    env = stepped(env)
+    second = env.render()
+    assert (first[:, SCENE] != second[:, SCENE]).any(), "the scene does not show that the state has moved"
+    assert (first[:, PANEL] != second[:, PANEL]).any(), "the panel does not show that time has passed"
+    np.testing.assert_array_equal(stepped(SafeEnv(problem_of(env_id), render_mode="rgb_array")).render(), second)
+    # An episode that begins has neither a trail nor a past of h.
+    env.reset(seed=1)
+    np.testing.assert_array_equal(env.render(), first)
+    edges = style.VIOLATION if "Obstacle" in env_id else style.EDGE
+    for color in (edges, style.INK):
+        assert shown(first[:, SCENE], color) > 0
+
+
+def test_a_vector_env_draws_what_the_scalar_one_draws(env_id):
+    problem = problem_of(env_id)
+    envs = stepped(SafeVectorEnv(problem, 2, render_mode="rgb_array"), 3)
+    frames = envs.render()
+    assert len(frames) == 2
+    for i, frame in enumerate(frames):
+        env = SafeEnv(problem, render_mode="rgb_array")
+        env.reset(seed=1 + i)
+        for _ in range(3):
+            env.step(np.full(env.action_space.shape, 0.5, dtype=np.float32))
+        np.testing.assert_array_equal(frame, env.render())
+
+
+def test_a_reset_in_the_step_leaves_no_trace():
+    problem = problem_of(DUBINS, horizon=0.1)
+    envs = SafetyFilterVectorWrapper(SafeVectorEnv(problem, 1, "SameStep", render_mode="rgb_array"), "scbf")
+    envs.reset(seed=0)
+    for _ in range(2):
+        envs.step(np.ones((1, 1), dtype=np.float32))
+    (frame,) = envs.render()
+    env = SafeEnv(problem, render_mode="rgb_array")
+    env.reset(options=None)
+    env._x = tuple(float(x[0]) for x in envs.unwrapped.components)
+    env.viewer.restart([env._x], [0.0], [0])
+    env.viewer.caption = "scbf"
+    np.testing.assert_array_equal(frame, env.render())
+
+
+def test_warning_colors_say_what_the_filter_does():
+    env = SafetyFilterWrapper(gym.make(DUBINS, render_mode="rgb_array", start=[2.5, 0.0, 0.0]), "scbf")
+    env.reset(seed=0)
+    assert shown(env.render(), style.INTERVENING) == 0
+    seen = set()
+    for _ in range(60):
+        _, _, _, _, info = env.step(np.zeros(1, dtype=np.float32))
+        frame = env.render()
+        status = frame[FILTER_STATUS]
+        expected = style.INFEASIBLE if not info["feasible"] else style.INTERVENING if info["intervention"] else None
+        for color in (style.INFEASIBLE, style.INTERVENING):
+            assert (shown(status, color) > 1000) == (color == expected)
+        if expected is not None:
+            assert shown(frame[:148, PANEL], expected) < shown(frame[:, PANEL], expected), "the bar of the action has another colour"
+        assert (shown(frame[SAFETY_STATUS], style.VIOLATION) > 1000) == info["violation"]
+        seen.add(expected)
+    assert style.INTERVENING in seen
+    assert style.INFEASIBLE in seen
+
+
+def test_without_a_filter_there_is_no_nominal_action():
+    env = SafeEnv(problem_of(DUBINS), render_mode="rgb_array")
+    bare = stepped(env, 1).render()
+    filtered = SafetyFilterWrapper(gym.make(DUBINS, render_mode="rgb_array"), "szcbf:alphas=9,9")
+    assert (stepped(filtered, 1).render()[170:210, PANEL] != bare[170:210, PANEL]).any()
+    moment = env.viewer._histories[0].moment
+    assert moment.decision is None
+    assert moment.executed is not None
+
+
+@pytest.mark.parametrize("mode", ["ansi", "rgb", 3])
+def test_unknown_modes_are_named(mode):
+    problem = problem_of(DUBINS)
+    with pytest.raises(ConfigurationError, match=r"allowed: None, 'human', 'rgb_array'"):
+        SafeEnv(problem, render_mode=mode)
+    with pytest.raises(ConfigurationError, match=r"allowed: None, 'rgb_array'"):
+        SafeVectorEnv(problem, 2, render_mode=mode)
+
+
+def test_no_mode_draws_nothing(env_id):
+    problem = problem_of(env_id)
+    for env in (SafeEnv(problem), SafeVectorEnv(problem, 2)):
+        env.reset(seed=0)
+        with pytest.warns(UserWarning, match="without a render mode"):
+            assert env.render() is None
+
+
+def test_there_is_nothing_to_draw_before_a_reset():
+    for env in (SafeEnv(problem_of(DUBINS), render_mode="rgb_array"), SafeVectorEnv(problem_of(DUBINS), 2, render_mode="rgb_array")):
+        with pytest.raises(gym.error.ResetNeeded):
+            env.render()
+
+
+def test_a_filter_over_another_env_is_shown_beside_its_picture():
+    theta, rate, torque = sp.symbols("theta rate torque", real=True)
+    view = {
+        "model": ControlAffineSDE((theta, rate), (torque,), [rate, 15 * sp.sin(theta)], [0, 3], [0, 0]),
+        "barriers": 4 - rate**2 + 30 * (1 - sp.cos(theta)),
+        "state_fn": lambda seen: np.stack([np.arctan2(seen[..., 1], seen[..., 0]), seen[..., 2]], axis=-1),
+    }
+    env = SafetyFilterWrapper(gym.make("Pendulum-v1", render_mode="rgb_array"), "cbf:alpha=2:sampling_margin=15", **view)
+    env.reset(seed=1)
+    frames, colors = [], set()
+    for _ in range(60):
+        *_, info = env.step([2.0])
+        frames.append(env.render())
+        assert frames[-1].shape == (540, 960, 3)
+        color = style.INFEASIBLE if not info["feasible"] else style.INTERVENING if info["intervention"] else None
+        colors.add(color)
+        assert color is None or shown(frames[-1][FILTER_STATUS], color)
+    assert colors >= {None, style.INTERVENING}
+    assert (frames[0][:, SCENE] != frames[-1][:, SCENE]).any()
+    envs = gym.make_vec("Pendulum-v1", 2, "sync", vector_kwargs=None, render_mode="rgb_array")
+    batch = SafetyFilterVectorWrapper(envs, "cbf:alpha=2:sampling_margin=15", **view)
+    batch.reset(seed=1)
+    for _ in range(60):
+        batch.step(np.full((2, 1), 2.0, dtype=np.float32))
+    np.testing.assert_array_equal(batch.render()[0], frames[-1])
+
+
+def test_info_is_the_same_with_and_without_pictures():
+    infos = []
+    for mode in (None, "rgb_array"):
+        env = SafetyFilterWrapper(gym.make(DUBINS, render_mode=mode), "scbf")
+        _, at_reset = env.reset(seed=0)
+        infos.append([at_reset, env.step(np.zeros(1, dtype=np.float32))[4]])
+    for bare, drawn in zip(*infos, strict=True):
+        assert list(bare) == list(drawn)
+        for key, value in bare.items():
+            np.testing.assert_array_equal(value, drawn[key])

@@ -1,0 +1,32 @@
+"""Parts of the pictures."""
+
+from __future__ import annotations
+
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from safe_envs.scripts.figures.evaluation_figure import add_legend
+
+
+@pytest.mark.parametrize(
+    ("labels", "columns"),
+    [
+        (["none", "scbf"], 2),
+        (["none", "a", "b", "c", "d"], 4),
+        (["none: 83.0 % safe", "bayesian-scbf:simultaneous=0.9: 88.0 % safe", "bayesian-scbf:confidence=0.95: 85.0 % safe"], 1),
+        ([f"ddscbf:margin=0.{i}: 88.0 % safe" for i in range(4)], 2),
+        (["none: 83.0 % safe", f"bayesian-scbf:file={'long/' * 30}x.npz: 88.0 % safe"], 1),
+    ],
+)
+def test_the_legend_is_not_cut(labels, columns):
+    figure = Figure(figsize=(7.5, 6.6), layout="constrained")
+    figure.subplots()
+    add_legend(figure, [Line2D([], [], label=label) for label in labels])
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == labels
+    assert legend._ncols == columns
+    extent = legend.get_window_extent()
+    assert extent.x0 >= -1
+    assert extent.x1 <= figure.bbox.width + 1

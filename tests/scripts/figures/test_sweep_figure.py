@@ -1,0 +1,94 @@
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
+from safe_envs.scripts.figures import sweep_figure
+from safe_envs.scripts.figures.sweep_figure import Layout, _rate, draw
+
+pytestmark = pytest.mark.slow
+
+FILTERS = ("none", "scbf")
+SWEPT = ("filter", "noise", "dt", "seed")
+
+
+def rows_of(**values: Any) -> list[dict[str, Any]]:
+    names = list(values)
+    rows = [dict(zip(names, each, strict=True)) for each in itertools.product(*values.values())]
+    for k, row in enumerate(rows):
+        low, high = rate_interval(k % 20, 20)
+        row |= {"safe": k % 20, "episodes": 20, "safety_rate": (k % 20) / 20, "ci_low": low, "ci_high": high}
+        row |= {"config": '{"title": "mine"}', "row": '{"learning": null}'}
+    return rows
+
+
+ROWS = rows_of(filter=FILTERS, noise=[0.3, 0.1, 0.2], dt=[0.1, 0.2], seed=[0, 1, 2, 3])
+
+
+@pytest.mark.parametrize(
+    ("given", "layout"),
+    [
+        ((), Layout("noise", "filter", ("dt",))),
+        (("dt",), Layout("dt", "filter", ("noise",))),
+        (("dt", "noise"), Layout("dt", "noise", ("filter",))),
+        (("seed",), Layout("seed", "filter", ("noise", "dt"))),
+        (("filter",), Layout("filter", "noise", ("dt",))),
+    ],
+)
+def test_what_is_across_what_has_lines_and_what_has_panels(given: tuple[str, ...], layout: Layout):
+    assert Layout.of(ROWS, SWEPT, *given) == layout
+
+
+def test_of_seeds_alone_there_is_one_rate():
+    assert Layout.of(ROWS, ("seed",)) == Layout(None, None, ())
+    assert Layout.of(ROWS, ("filter", "seed")) == Layout("filter", None, ())
+
+
+def test_episodes_of_several_seeds_are_put_together():
+    assert _rate([]) is None
+    assert _rate(ROWS[:1]) == (ROWS[0]["safety_rate"], ROWS[0]["ci_low"], ROWS[0]["ci_high"])
+    assert _rate(ROWS[1:4]) == (6 / 60, *rate_interval(6, 60))
+
+
+def test_the_band_of_seeds_that_learned_anew_is_over_what_they_learned_too():
+    rows = [{**row, "row": json.dumps({"learning": {"sha256": [str(k)]}})} for k, row in enumerate(ROWS[1:4])]
+    rate, low, high = _rate(rows) or (0.0, 0.0, 0.0)
+    assert (rate, low, high) == (6 / 60, *repeated_interval([1 / 20, 2 / 20, 3 / 20], rate_interval(6, 60), 0.95, (0.0, 1.0)))
+    # As of a file, which is the same for all of them.
+    same = [{**row, "row": rows[0]["row"]} for row in rows]
+    assert _rate(same) == (6 / 60, *rate_interval(6, 60))
+
+
+def test_what_no_cell_has_yet_is_drawn_as_the_envs_own(tmp_path: Path):
+    rows = [{**row, "start": None} for row in rows_of(noise=[0.1, 0.2])]
+    layout = Layout.of(rows, ("noise", "start"))
+    assert layout == Layout("noise", "start", ())
+    assert draw(rows, layout, tmp_path / "rates.svg") == 0
+
+
+@pytest.mark.parametrize(
+    ("swept", "given", "panels"),
+    [
+        (SWEPT, (), ("dt = 0.1", "dt = 0.2")),
+        (SWEPT, ("filter", "noise"), ("dt = 0.1",)),
+        (("seed",), (), ("mine: safety rate",)),
+    ],
+)
+def test_a_picture_of_each_kind(tmp_path: Path, swept: tuple[str, ...], given: tuple[str, ...], panels: tuple[str, ...]):
+    path = tmp_path / "rates.svg"
+    assert draw(ROWS, Layout.of(ROWS, swept, *given), path) == 0
+    text = path.read_text()
+    assert all(panel in text for panel in panels)
+
+
+def test_panels_without_room_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sweep_figure, "_MOST_PANELS", 3)
+    layout = Layout("dt", "noise", ("filter", "seed"))
+    assert draw(ROWS, layout, tmp_path / "rates.svg") == 5
+    assert "filter = none, seed = 2" in (text := (tmp_path / "rates.svg").read_text())
+    assert "seed = 3" not in text

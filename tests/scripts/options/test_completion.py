@@ -1,0 +1,65 @@
+"""What a shell offers, and that it does so quickly."""
+
+from __future__ import annotations
+
+import io
+import sys
+from contextlib import redirect_stdout
+
+import pytest
+
+import safe_envs
+from safe_envs.agents.policies.registry import POLICIES
+from safe_envs.agents.training.hyperparameters import ALGORITHMS
+from safe_envs.scripts import cli
+from safe_envs.scripts.options import completion
+from safe_envs.scripts.reproduce.catalogue import ARTEFACTS
+from safe_envs.wrappers import CONDITIONS
+from safe_envs.wrappers.conditions import LEARNED
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_words_are_those_that_are_known():
+    assert ("none", *CONDITIONS, *LEARNED) == completion.FILTERS
+    assert sorted(completion.POLICIES) == sorted(POLICIES)
+    assert sorted(completion.ALGORITHMS) == sorted(ALGORITHMS)
+    assert sorted(completion.ARTEFACTS) == sorted(artefact.name for artefact in ARTEFACTS)
+
+
+def offered(monkeypatch, *words):
+    monkeypatch.setenv("_SAFE_ENVS_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", " ".join(words))
+    monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+    monkeypatch.setattr(sys, "argv", ["safe-envs"])
+    with redirect_stdout(io.StringIO()) as printed, pytest.raises(SystemExit):
+        cli.main()
+    return printed.getvalue().split()
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (("safe-envs", "ver"), ["verify"]),
+        (("safe-envs", "evaluate", "Pen"), ["Pendulum-v0"]),
+        (("safe-envs", "evaluate", "safe_envs/Quadrotor-"), ["safe_envs/Quadrotor-v0"]),
+        (("safe-envs", "verify", "--filter", "sz"), ["szcbf"]),
+        (("safe-envs", "train", "--filter", "sr"), ["srcbf"]),
+        (("safe-envs", "evaluate", "--policy", "z"), ["zero"]),
+        (("safe-envs", "train", "--algo", "t"), ["td3"]),
+        (("safe-envs", "leaderboard", "ACC-"), ["ACC-v0"]),
+        (("safe-envs", "identify", "--method", "b"), ["bayesian"]),
+        (("safe-envs", "reproduce", "example"), ["example-4.2.2"]),
+        (("safe-envs", "doctor", "--q"), ["--quiet"]),
+    ],
+)
+def test_what_may_follow_is_offered(monkeypatch, words, expected):
+    assert offered(monkeypatch, *words) == expected
+
+
+def test_the_package_has_all_that_it_names():
+    assert set(safe_envs.__all__) <= set(dir(safe_envs))
+    for name in safe_envs.__all__:
+        assert getattr(safe_envs, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'SafeEnvironment'"):
+        safe_envs.SafeEnvironment  # noqa: B018

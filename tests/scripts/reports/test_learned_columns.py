@@ -1,0 +1,78 @@
+"""What the table of an evaluation says of learning."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from safe_envs.agents import evaluate
+from safe_envs.registry import load_problem
+from safe_envs.scripts.evaluate import LEARNED_PARAMETERS
+from safe_envs.scripts.reports.evaluation_report import heading, print_evaluation
+from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
+from safe_envs.wrappers import LEARNED
+
+NO_BOUND = "no bound for what rests on something learned"
+LEARNING = {"repeats": 1, "transitions": 20, "files": [], "remarks": [], "warnings": [], "rates": [0.9]}
+OFTEN = {**LEARNING, "repeats": 3, "rates": [0.9, 0.5, 0.8]}
+POSTERIOR_BOUND = {"probability": 0.4, "note": "", "delta": 0.1, "shortfall": 0.0, "bias": 0.0, "supremum": 1.0}
+
+
+def row(learning=None, bound=None, name="bayesian-scbf"):
+    return {"filter": name, "learning": learning, "posterior_bound": bound}
+
+
+@pytest.mark.parametrize(
+    ("env_id", "rows", "first"),
+    [
+        ("CubicSDEDisk-v0", [row(LEARNING)], f"{NO_BOUND}; for bayesian-scbf:simultaneous=P one may be estimated over the posterior."),
+        ("CubicSDEDisk-v0", [row(LEARNING), row(LEARNING, POSTERIOR_BOUND)], f"{NO_BOUND}."),
+        ("CubicSDEDisk-v0", [row(LEARNING, {"probability": None, "note": "none"})], f"{NO_BOUND}."),
+        ("StochasticDubins-v0", [row(LEARNING)], f"{NO_BOUND}."),
+        ("DubinsObstacles-v0", [row(LEARNING)], f"{NO_BOUND}."),
+    ],
+)
+def test_a_bound_over_the_posterior_is_proposed_where_there_may_be_one(env_id, rows, first):
+    notes = learned_notes(rows, load_problem(env_id))
+    assert notes[0] == first
+    assert sum(note.startswith(NO_BOUND) for note in notes) == 1
+
+
+def test_nothing_is_said_where_nothing_was_learned():
+    assert not learned_notes([row()], load_problem("CubicSDEDisk-v0"))
+    assert not learned_columns([row()])
+
+
+def test_repeats_are_means_and_their_intervals_have_a_condition():
+    problem = load_problem("CubicSDEDisk-v0")
+    rows = [row(), row(LEARNING), row(OFTEN)]
+    speeds = [{"learning_seconds": seconds} for seconds in (None, 1.5, 1.5)]
+    columns = learned_columns(rows)
+    assert [list(map(cell, rows, speeds)) for cell in columns.values()] == [["-", "1.50 s", "1.50 s"], ["-", "-", "50.0 %"]]
+    assert list(columns) == ["learned in,\nmean", "worst\nident."]
+    assert list(learned_columns([row(LEARNING)])) == ["learned\nin"]
+    assert sum("for nearly normal: bad ones that are rarer than about 1 in 3" in note for note in learned_notes(rows, problem)) == 1
+    assert not any("nearly normal" in note for note in learned_notes([row(LEARNING)], problem))
+
+
+def test_texts_of_the_user_are_no_markup_and_the_heading_counts_what_was_learned():
+    answer = evaluate("CubicSDEDisk-v0", filters=["none", "scbf"], options={"horizon": 0.1}, episodes=2, bounds=False)
+    rows = [answer.rows[0], {**answer.rows[1], "filter": "scbf:file=[red]x.npz", "learning": LEARNING}]
+    console = Console(width=200, file=io.StringIO())
+    changed = replace(answer, rows=rows, config={**answer.config, "repeats": 2})
+    print_evaluation(console, changed)
+    assert "\nscbf:file=[red]x.npz" in console.file.getvalue()
+    assert "identifications" not in heading(changed).plain
+    assert "2 episodes x 3 identifications" in heading(replace(changed, rows=[row(OFTEN)])).plain
+
+
+def test_the_help_names_the_parameters_of_learned_filters():
+    for name, condition in LEARNED.items():
+        assert name in LEARNED_PARAMETERS
+        for field in dataclasses.fields(condition):
+            assert field.name == "learned" or f"{field.name}=" in LEARNED_PARAMETERS
+    assert "file=" in LEARNED_PARAMETERS

@@ -1,0 +1,35 @@
+import pytest
+
+from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.scripts.reports.rates import percent, percent_in
+
+
+@pytest.mark.parametrize(
+    ("safe", "episodes", "text"),
+    [
+        (1000, 1000, "100.0 % [99.6, 100.0]"),
+        (0, 1000, "0.0 % [0.0, 0.4]"),
+        (988, 1000, "98.8 % [97.9, 99.3]"),
+        # By Wilson's formula 99.44 and 99.982.
+        (999, 1000, "99.90 % [99.44, 99.98]"),
+        (9, 100_000, "0.009 % [0.005, 0.017]"),
+        (99_991, 100_000, "99.991 % [99.983, 99.995]"),
+    ],
+)
+def test_what_is_not_certain_does_not_read_so(safe, episodes, text):
+    assert percent_in(safe / episodes, *rate_interval(safe, episodes)) == text
+
+
+def test_a_share_that_is_small_is_not_none():
+    assert [percent(share) for share in (None, 0.0, 0.00004, 0.5, 0.99996, 1.0)] == [
+        "-",
+        "0.0 %",
+        "0.004 %",
+        "50.0 %",
+        "99.996 %",
+        "100.0 %",
+    ]
+
+
+def test_roundings_are_no_digits():
+    assert percent_in(1.0, 1.0 - 1e-16, 1.0) == "100.0 % [100.0, 100.0]"

@@ -1,0 +1,262 @@
+"""Conditions: what they derive, what they refuse, and how they are written as text."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, RelativeDegreeError, SystemDefinitionError
+from safe_envs.wrappers import CBF, CONDITIONS, ECBF, HOCBF, RCBF, SCBF, SRCBF, SZCBF, parse_condition, parse_conditions, spec_of
+from tests.conftest import problem_of
+
+X = sp.Symbol("x", real=True)
+
+
+def constraint(condition, env_id, **arguments):
+    problem = problem_of(env_id, **arguments)
+    return problem, condition.constraint(problem.model, problem.barriers[0])
+
+
+def test_scbf_of_the_noisy_disk_is_eq_4_25():
+    problem, found = constraint(SCBF(), "safe_envs/StochasticDubins-v0")
+    x, y, theta = problem.model.states
+    a = problem.model.exact(found.coefficient[0] - 4 * (x * sp.sin(theta) - y * sp.cos(theta)))
+    assert sp.simplify(a) == 0
+    assert sp.simplify(problem.model.exact(found.offset) + 8) == 0
+    a_h = problem.model.exact(found.chain[1])
+    assert sp.simplify(a_h + 4 * (x * sp.cos(theta) + y * sp.sin(theta)) + sp.Rational(8, 100)) == 0
+
+
+def test_hocbf_of_the_disk_is_the_polynomial_of_its_rates():
+    p1, p2 = 0.7, 3.0
+    problem, found = constraint(HOCBF((p1, p2)), "safe_envs/DubinsDisk-v0")
+    values = dict(zip(problem.model.states, (0.3, -0.4, 1.1), strict=True))
+    x, y, theta, v = 0.3, -0.4, 1.1, 0.5
+    h, hdot = 1 - x * x - y * y, -2 * v * (x * np.cos(theta) + y * np.sin(theta))
+    offset = -2 * v**2 + (p1 + p2) * hdot + p1 * p2 * h
+    assert float(problem.model.numeric(found.offset).subs(values)) == pytest.approx(offset, rel=1e-12)
+    assert float(problem.model.numeric(found.chain[1]).subs(values)) == pytest.approx(hdot + p1 * h, rel=1e-12)
+
+
+@pytest.mark.parametrize("env_id", ["safe_envs/DubinsObstacle-v0", "safe_envs/Quadrotor-v0", "safe_envs/ACC-v0"])
+def test_hocbf_equals_the_ecbf_with_the_gains_of_its_polynomial(env_id):
+    gains = problem_of(env_id).gains
+    problem, hocbf = constraint(HOCBF.for_gains(gains), env_id)
+    _, ecbf = constraint(ECBF.for_gains(gains), env_id)
+    assert hocbf.coefficient == ecbf.coefficient
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        values = dict(zip(problem.model.states, rng.uniform(0.1, 1.0, problem.model.n), strict=True))
+        first, second = (float(problem.model.numeric(c.offset).subs(values)) for c in (hocbf, ecbf))
+        assert first == pytest.approx(second, rel=1e-10)
+
+
+def test_cbf_ignores_the_noise_and_scbf_does_not():
+    problem, cbf = constraint(CBF(2.0), "safe_envs/CubicSDEDisk-v0")
+    _, scbf = constraint(SCBF(), "safe_envs/CubicSDEDisk-v0")
+    h = problem.barriers[0].expression
+    difference = problem.model.exact(cbf.offset - scbf.offset - 2 * h)
+    assert sp.simplify(sp.nsimplify(difference)) == sp.Rational(8, 100)
+
+
+def test_wrong_relative_degrees_are_named():
+    with pytest.raises(RelativeDegreeError, match=r"relative degree 2.*use hocbf or ecbf"):
+        constraint(CBF(1.0), "safe_envs/DubinsDisk-v0")
+    with pytest.raises(RelativeDegreeError, match=r"relative degree 1 and needs as many rates; 2 given"):
+        constraint(HOCBF((1.0, 1.0)), "safe_envs/ACC-v0")
+    with pytest.raises(RelativeDegreeError, match=r"relative degree 2 and needs as many gains; 1 given"):
+        constraint(ECBF((1.0,)), "safe_envs/DubinsDisk-v0")
+
+
+def test_ecbf_needs_real_negative_poles():
+    assert ECBF((1.0, 2.0)).chain_rates(2) == pytest.approx((1.0, 1.0))  # a double pole
+    assert ECBF((6.0, 11.0, 6.0)).chain_rates(3) == pytest.approx((1.0, 2.0, 3.0))
+    rates = np.random.default_rng(0).uniform(0.05, 20.0, 5)
+    for p in rates:
+        ECBF(k=ECBF.for_gains((p, p)).k)  # double poles, which rounding splits
+    for p in rates[:3]:  # 50 digits of multiple roots take their time
+        ECBF(k=ECBF.for_gains((p, p, p)).k)
+    complex_pair = {"k": (1.16, 2.0)}  # -1 +- .4 i
+    for wrong in ({"k": (2.0, 1.0)}, complex_pair, {"poles": (-1 + 1j, -1 - 1j)}, {"poles": (-1.0, 0.0)}, {"poles": (2.0,)}, {"poles": ()}):
+        with pytest.raises(ConfigurationError, match="place real negative ones"):
+            ECBF(**wrong)
+    with pytest.raises(ConfigurationError, match="place real negative ones"):
+        ECBF(poles=(-1 + 9e-4j, -2))
+    with pytest.raises(ConfigurationError, match="positive"):
+        ECBF((-1.0, 2.0))
+    with pytest.raises(ConfigurationError, match="gains or poles"):
+        ECBF((1.0, 2.0), poles=(-1.0, -1.5))
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 7])
+def test_ecbf_takes_multiple_poles_and_its_text_is_read_as_the_same(count):
+    ecbf = ECBF(poles=(-1 / 3,) * count)
+    assert ecbf.chain_rates(count) == (1 / 3,) * count
+    assert parse_condition(ecbf.spec, ()) == ecbf
+    assert parse_condition(f"ecbf:sampling_margin={0.5}", (1 / 3,) * count).chain_rates(count) == (1 / 3,) * count
+
+
+def test_texts_are_never_run(tmp_path):
+    target = tmp_path / "owned"
+    for text in ("ecbf:poles={}", "ecbf:k={}", "cbf:alpha={}", "hocbf:p={}", "rcbf:gamma={}", "rcbf:form={}", "scbf:sampling_margin={}"):
+        with pytest.raises(ConfigurationError):
+            parse_condition(text.format(f"__import__('pathlib').Path('{target}').touch()"), (1.0,))
+    for wrong in (("-1",), (f"__import__('pathlib').Path('{target}').touch()",)):
+        with pytest.raises(ConfigurationError, match="give numbers"):
+            ECBF(poles=wrong)
+    assert not target.exists()
+
+
+def test_single_numbers_do_for_one_rate():
+    assert HOCBF(2.0) == HOCBF((2.0,))
+    assert SZCBF(2.0) == SZCBF((2.0,))
+    assert ECBF(poles=-2.0) == ECBF((2.0,))
+
+
+def test_barriers_with_kinks_are_refused_where_the_chain_meets_them():
+    x, u = sp.symbols("x u", real=True)
+    y = sp.Symbol("y", real=True)
+    noisy = ControlAffineSDE((x,), (u,), [0], [1], [1])
+    for h in (1 - sp.Abs(x), sp.Min(1 - x, 1 + x)):
+        CBF(1.0).constraint(noisy, Barrier(h))
+        for condition in (SCBF(), SRCBF(), CBF(1.0, sampling_margin="first-order")):
+            with pytest.raises(SystemDefinitionError, match="cannot be differentiated"):
+                condition.constraint(noisy, Barrier(h))
+    chain = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1], [0, 0])
+    with pytest.raises(SystemDefinitionError, match="cannot be differentiated as often as is needed"):
+        HOCBF((1.0, 1.0)).constraint(chain, Barrier(1 - sp.Abs(x)))
+
+
+@pytest.mark.parametrize(
+    ("h", "smooth"),
+    [
+        (sp.Piecewise((1 - X, X > 0), (1 + X, True)), 0),
+        (sp.Piecewise((1 - X**2, X > 0), (1, True)), 1),
+        (sp.Piecewise((1, X < 2), (1 - (X - 2) ** 4, X < 3), (12 - 4 * X, True)), 1),
+        (1 - sp.Piecewise((X**4, X > 0), (0, True)), 3),
+        (sp.Piecewise((1 - X, X > 0), (2 + X, True)), -1),
+        (sp.Piecewise((1 - X, X**3 + X > 0), (1 + X, True)), -1),
+        (sp.Piecewise((1 - X, X > 0)), -1),
+    ],
+)
+def test_pieces_of_a_barrier_have_to_meet_as_smoothly_as_the_chain_differentiates(h, smooth):
+    u, y = sp.symbols("u y", real=True)
+    noisy = ControlAffineSDE((X,), (u,), [0], [1], [1])
+    chain = ControlAffineSDE((X, y), (u,), [y, 0], [0, 1], [0, 1])
+    needs = [
+        (CBF(1.0), noisy, 0), (RCBF(), noisy, 0), (CBF(1.0, sampling_margin="first-order"), noisy, 1), (HOCBF((1.0, 1.0)), chain, 1),
+        (SCBF(), noisy, 1), (SRCBF(), noisy, 1), (SZCBF((1.0, 1.0)), chain, 3), (SCBF(sampling_margin="first-order"), noisy, 3),
+    ]  # fmt: skip
+    for condition, system, order in needs:
+        if order <= smooth:
+            condition.constraint(system, Barrier(h))
+        else:
+            with pytest.raises(SystemDefinitionError, match="one barrier for each of its pieces"):
+                condition.constraint(system, Barrier(h))
+
+
+def test_ecbf_by_poles_has_the_gains_of_their_polynomial_and_keeps_the_sets_of_the_hocbf():
+    ecbf = ECBF(poles=(-2.0, -8.0))
+    assert ecbf.k == (16.0, 10.0)
+    assert ecbf == ECBF((16.0, 10.0))
+    problem, placed = constraint(ecbf, "safe_envs/DubinsDisk-v0")
+    _, hocbf = constraint(HOCBF((2.0, 8.0)), "safe_envs/DubinsDisk-v0")
+    difference = problem.model.numeric(placed.chain[1] - hocbf.chain[1])
+    assert abs(float(difference.subs(dict(zip(problem.model.states, (0.3, -0.4, 1.1), strict=True))))) < 1e-9
+
+
+def test_szcbf_has_the_corrected_chain():
+    problem, found = constraint(SZCBF((0.7, 3.0)), "safe_envs/StochasticDubins-v0")
+    at = dict(zip(problem.model.states, (0.3, -0.4, 1.1), strict=True))
+    v, sigma, a_1, a_2 = 2.0, 0.2, 0.7, 3.0
+    h = 9 - 0.3**2 - 0.4**2
+    a_h = -2 * v * (0.3 * np.cos(1.1) - 0.4 * np.sin(1.1)) - 2 * sigma**2
+    h_1 = a_h + a_1 * h
+    offset = -2 * v**2 + a_1 * a_h + a_2 * h_1  # A h_1 + alpha_2 h_1, where the print has alpha_2 h
+    assert float(problem.model.numeric(found.chain[1]).subs(at)) == pytest.approx(h_1, rel=1e-12)
+    assert float(problem.model.numeric(found.offset).subs(at)) == pytest.approx(offset, rel=1e-12)
+
+
+@pytest.mark.parametrize(("corrected", "stays"), [(True, True), (False, False)])
+def test_the_printed_szcbf_leaves_the_set_without_any_noise(corrected, stays):
+    # x' = y, y' = u, h = 1 - x. The printed h_2 = A h_1 + alpha_2 h gives x'' + a_1 x' + a_2 x <= a_2: an oscillator.
+    a_1, a_2, dt = 1.0, 4.0, 1e-3
+    x, y, highest = 0.0, 0.5, 0.0
+    for _ in range(10_000):
+        h, h_1 = 1 - x, -y + a_1 * (1 - x)
+        u = -a_1 * y + a_2 * (h_1 if corrected else h)
+        x, y = x + dt * y + 0.5 * dt**2 * u, y + dt * u
+        highest = max(highest, x)
+    assert (highest <= 1.0) is stays
+
+
+def test_several_barriers_take_one_text_or_one_each():
+    problem = problem_of("safe_envs/QuadrotorLimits-v0")
+    same = parse_conditions("scbf", problem)
+    assert same == (SCBF(),) * 3
+    assert spec_of(same) == "scbf"
+    each = parse_conditions("hocbf:p=1,2+ecbf:poles=-1,-2+hocbf:p=s+s**3,2", problem)
+    assert [c.name for c in each] == ["hocbf", "ecbf", "hocbf"]
+    assert parse_conditions(spec_of(each), problem) == each
+    by_gains = parse_conditions("hocbf", problem)
+    assert [c.p for c in by_gains] == [problem.gains_of(i) for i in range(3)]
+    with pytest.raises(ConfigurationError, match="has 2 conditions; QuadrotorLimits takes one for all 3 barriers, or one for each"):
+        parse_conditions("hocbf+scbf", problem)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "cbf:alpha=0.3",
+        "cbf:alpha=2*s**3",
+        "ecbf:k=2.0,3.0",
+        "hocbf:p=2.0,8.0",
+        "hocbf:p=2.0,tanh(s)",
+        "rcbf:gamma=0.5:form=log",
+        "srcbf:gamma=0.1:form=inverse",
+        "szcbf:alphas=1.0,0.5",
+        "scbf",
+        "scbf:sampling_margin=first-order",
+        "cbf:alpha=1.0:sampling_margin=0.25",
+    ],
+)
+def test_text_round_trips(text):
+    condition = parse_condition(text, (1.0,))
+    assert condition.spec == text
+    assert parse_condition(condition.spec, ()) == condition
+
+
+def test_parameters_default_to_the_gains():
+    assert parse_condition("hocbf", (2.0, 8.0)) == HOCBF((2.0, 8.0))
+    assert parse_condition("cbf", (5.0,)) == CBF(5.0)
+    assert parse_condition("ecbf", (2.0, 8.0)) == ECBF((16.0, 10.0))
+    assert parse_condition("szcbf", (2.0, 8.0)) == SZCBF((2.0, 8.0))
+    assert parse_condition("srcbf", (5.0,)) == SRCBF(1.0)  # gamma is no rate
+    assert set(CONDITIONS) == {"cbf", "ecbf", "hocbf", "rcbf", "srcbf", "scbf", "szcbf"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("scfb", "unknown filter 'scfb'; did you mean 'scbf'"),
+        ("hocbf:q=1", "no parameter 'q'"),
+        ("hocbf:p=1,x", "'x' is not allowed; write arithmetic of s"),
+        ("hocbf:p=", "is no expression of s"),
+        ("hocbf:p=1,-2", "give positive numbers"),
+        ("hocbf:p=nan", "give positive numbers"),
+        ("cbf:alpha=1,2", "alpha takes one value"),
+        ("scbf:alpha=1", "filter scbf has no parameter 'alpha'"),
+        ("hocbf:p=2,8:p=3,3", "names 'p' twice"),
+        ("szcbf:alphas=s", "alphas = s; give positive numbers"),
+        ("srcbf:gamma=0", "gamma = 0.0; give positive numbers"),
+        ("rcbf:form=exp", "form = 'exp'; allowed: inverse, log"),
+        ("cbf:sampling_margin=second-order", "sampling_margin = 'second-order'; allowed: none, first-order, or a number >= 0"),
+        ("cbf:sampling_margin=-1", "sampling_margin = -1.0"),
+        ("ecbf:poles=-1+1j,-1-1j", "place real negative ones"),
+        ("scbf+scbf", "unknown filter 'scbf\\+scbf'|has 2 conditions"),
+    ],
+)
+def test_text_that_makes_no_condition_is_explained(text, message):
+    with pytest.raises(ConfigurationError, match=message):
+        parse_conditions(text, problem_of("safe_envs/StochasticDubins-v0"))

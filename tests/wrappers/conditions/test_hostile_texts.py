@@ -1,0 +1,152 @@
+"""Texts of filters by whoever wants to do harm: each is read, or refused with a message, in no time and without running anything."""
+
+from __future__ import annotations
+
+import time
+
+import hypothesis
+import hypothesis.strategies as st
+import pytest
+import sympy as sp
+
+from safe_envs.errors import ConfigurationError
+from safe_envs.wrappers import ClassK, parse_conditions, spec_of
+from safe_envs.wrappers.conditions.class_k import S
+from tests.conftest import problem_of
+
+pytestmark = pytest.mark.slow
+
+SCALAR = problem_of("safe_envs/Scalar-v0")
+
+_SECONDS = 2.0
+"""Of the processor, that an answer may take; it takes a hundredth of that mostly."""
+
+names = st.sampled_from(["s", "s", "s", "1", "9", "99", "0", "2", "0.5", "1e300", "1e-300", "pi", "E"])
+functions = st.sampled_from(["Abs", "asinh", "atan", "cos", "cosh", "exp", "log", "sin", "sinh", "sqrt", "tanh", "erf", "gamma"])
+
+
+def combined(parts):
+    """Arithmetic of smaller parts; the last way makes functions that increase of whatever is real and finite."""
+    return st.one_of(
+        st.builds("({}{}{})".format, parts, st.sampled_from(["+", "-", "*", "/", "**"]), parts),
+        st.builds("({})**{}".format, parts, st.sampled_from(["2", "3", "99", "(1/3)", "-2", "0.5"])),
+        st.builds("{}({})".format, functions, parts),
+        st.builds("s*(1+({})**2)".format, parts),
+    )
+
+
+expressions = st.recursive(names, combined, max_leaves=12)
+
+
+def alpha_of(text: str) -> ClassK | None:
+    """The function of a text, None where it is refused; whatever else happens fails."""
+    began, message, alpha = time.process_time(), "", None
+    try:
+        alpha = ClassK(text)
+        alpha.is_smooth(2)
+    except ConfigurationError as error:
+        message = str(error)
+    assert time.process_time() - began < _SECONDS
+    assert len(message) < 600
+    return alpha
+
+
+@hypothesis.settings(max_examples=60)
+@hypothesis.given(expressions)
+def test_arithmetic_is_a_class_k_function_or_refused(text):
+    alpha = alpha_of(text)
+    if alpha is not None:
+        assert ClassK(str(alpha)) == alpha
+        assert alpha.expression.free_symbols == {S}
+
+
+@hypothesis.given(st.text() | st.text(alphabet="s0123456789.+-*/^()[]{}_eEjx,'\"\\ ", max_size=30))
+def test_any_text_is_a_class_k_function_or_refused(text):
+    alpha_of(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "(((9**99)**99)**99)**99*s",
+        "(9**99)**99*s",
+        "((9*s)**99)**99",
+        "((1+1/9**99)**99)**99*s",
+        "exp(exp(exp(exp(s))))-exp(exp(E))",
+        "exp(exp(exp(s)))-exp(E)",
+        "exp(exp(exp(9)))*s",
+        "s**exp(exp(exp(9)))",
+        "s+sin(exp(exp(s)))-sin(E)",
+        "tanh(" * 60 + "s" + ")" * 60,
+        "+".join(f"{i}*s" for i in range(1200)),
+        "+".join(f"tanh({i}*s)" for i in range(1, 13)),
+        "-" * 3000 + "s",
+        "-" * 350 + "s",
+        "9" * 5000 + "*s",
+        "9" * 350 + "*s",
+        "1_000*s",
+        "0x10*s",
+        "٣*s",
+        "ｓ",  # noqa: RUF001  (NFKC of it is s)
+        "erf(s)",
+        "s*Abs(sqrt(s))+s",
+        "s\0",
+        "True*s",
+    ],
+    ids=lambda text: text[:24],
+)
+def test_bombs_and_texts_that_only_python_takes_are_refused(text):
+    assert alpha_of(text) is None
+
+
+@pytest.mark.parametrize(
+    "text", ["log(1+exp(s))-log(2)", "exp(exp(s))-E", "tanh(exp(exp(s)))-tanh(E)+s", "s*Abs(s)**(1/3)", "sinh(sinh(s))"]
+)
+def test_functions_that_grow_far_are_still_taken(text):
+    assert alpha_of(text) is not None
+
+
+def test_expressions_of_sympy_are_as_small_as_texts():
+    large = sp.Add(*[sp.Float(i) * S**i for i in range(1, 200, 2)])
+    with pytest.raises(ConfigurationError, match="characters; give at most 400"):
+        ClassK(large)
+
+
+pieces = st.sampled_from(
+    ["cbf", "hocbf", "ecbf", "rcbf", "scbf", "szcbf", "none", ":", "+", ",", "=", "alpha", "p", "k", "poles", "1", "-2", "1_0"]
+)
+
+
+@hypothesis.given(st.lists(pieces | st.text(max_size=3), max_size=12).map("".join))
+def test_any_text_is_a_filter_or_refused(text):
+    began, message, conditions = time.process_time(), "", None
+    try:
+        conditions = parse_conditions(text, SCALAR)
+    except ConfigurationError as error:
+        message = str(error)
+    assert time.process_time() - began < _SECONDS
+    assert len(message) < 1000
+    assert conditions is None or parse_conditions(spec_of(conditions), SCALAR) == conditions
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x" * 10**5, "unknown filter"),
+        ("cbf:" + "x" * 10**5, "no parameter"),
+        ("+".join(["cbf"] * 10**4), "has 10000 conditions"),
+        ("hocbf:p=" + ",".join(["1"] * 10**4), "p takes at most 12 values; 10000 were given"),
+        ("ecbf:k=" + ",".join(f"1e{300 - 50 * i}" for i in range(12)), "poles"),
+        ("szcbf:alphas=1_0", "alphas = 1_0; give positive numbers"),
+        ("cbf:sampling_margin=٣", "sampling_margin = '٣'"),
+        ("ecbf:poles=-1_0", "poles"),
+        ("ddscbf:file=" + "x" * 300, "cannot be read: File name too long"),
+    ],
+    ids=lambda text: text[:20],
+)
+def test_long_texts_and_odd_numbers_are_refused_in_short(text, message):
+    began = time.process_time()
+    with pytest.raises(ConfigurationError, match=message) as raised:
+        parse_conditions(text, SCALAR)
+    assert len(str(raised.value)) < 1000
+    assert time.process_time() - began < _SECONDS

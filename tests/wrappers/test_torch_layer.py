@@ -1,0 +1,297 @@
+"""Filters as layers of a torch network: values of `SafetyFilter`, and gradients as its finite differences are."""
+
+from __future__ import annotations
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import sympy as sp
+import torch
+
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, InvalidInputError
+from safe_envs.agents import load_problem
+from safe_envs.wrappers import CBF, SafetyFilter, parse_conditions
+from safe_envs.wrappers import torch_layer as torch_filter
+from safe_envs.wrappers.torch_layer import TorchFilter
+
+pytestmark = pytest.mark.slow
+
+FILTERS = {
+    "scbf, m = 1": ("StochasticDubins", "scbf"),
+    "scbf, m = 4": ("Quadrotor", "scbf"),
+    "five rows, m = 1": ("DubinsObstacles", "scbf"),
+    "three rows, m = 4": ("QuadrotorLimits", "scbf"),
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread():
+    torch.set_num_threads(1)
+
+
+def visited(env_id, count):
+    """States that random actions lead to."""
+    env = gym.make(env_id)
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    states = []
+    for _ in range(count):
+        *_, terminated, truncated, _ = env.step(env.action_space.sample())
+        states.append(env.unwrapped.state)  # pyright: ignore[reportAttributeAccessIssue]
+        if terminated or truncated:
+            env.reset()
+    return np.array(states)
+
+
+@pytest.fixture(scope="module", params=FILTERS)
+def registered(request):
+    """A filter of a registered env, states on its way and inputs that leave the box sometimes."""
+    name, condition = FILTERS[request.param]
+    problem = load_problem(f"safe_envs/{name}-v0")
+    module = TorchFilter.for_problem(problem, parse_conditions(condition, problem))
+    rng = np.random.default_rng(1)
+    low, high = np.array(problem.box).T
+    x = visited(f"safe_envs/{name}-v0", 200) + 0.05 * rng.normal(size=(200, problem.model.n))
+    return module, x, rng.uniform(1.2 * low - 0.2 * high, 1.2 * high - 0.2 * low, (200, problem.model.m))
+
+
+def planar(m, k, *, contradicting=False, seed=0):
+    """k curved rows on m inputs with all that a filter can weigh; pairs of contradicting ones have opposite coefficients."""
+    rng = np.random.default_rng(seed)
+    x, u = sp.symbols("x:2", real=True), sp.symbols(f"u:{m}", real=True)
+
+    def number():
+        return round(float(rng.normal()), 3)
+
+    drift = [number() * sp.sin(x[1]), number() * x[0]]
+    inputs = [[number() + number() * x[1 - i] for _ in range(m)] for i in range(2)]
+    barriers = [number() * x[0] + number() * x[1] ** 2 + 1.0 for _ in range(k)]
+    if contradicting:
+        barriers[1] = -barriers[0] - 2
+    model = ControlAffineSDE(x, u, drift, inputs, [[0]] * 2)
+    rows = [(Barrier(h, f"h{i}"), CBF(alpha=1.0)) for i, h in enumerate(barriers)]
+    return SafetyFilter(model, rows, [(-1.0, 1.5)] * m, weights=rng.uniform(0.3, 3.0, m), priorities=rng.uniform(0.3, 3.0, k))
+
+
+def differences(safety_filter, x, u, step):
+    """Central differences of the action by state and input, shape (m, n + m)."""
+    z = np.concatenate([x, u])
+    points = np.concatenate([z + step * np.eye(len(z)), z - step * np.eye(len(z))])
+    ahead, behind = np.split(safety_filter.filter(points[:, : len(x)], points[:, len(x) :]).action, 2)
+    return (ahead - behind).T / (2.0 * step)
+
+
+def jacobian(module, x, u):
+    parts = torch.autograd.functional.jacobian(module, (torch.tensor(x), torch.tensor(u)))
+    return np.concatenate([part.numpy() for part in parts], axis=1)
+
+
+def assert_slopes(module, x, u, step=1e-5, tolerance=1e-3):
+    """Compare the gradients of states where differences do not see a kink, and return how many these are."""
+    count = 0
+    for xi, ui in zip(x, u, strict=True):
+        wanted, check = [differences(module.safety_filter, xi, ui, s) for s in (step, step / 2.0)]
+        room = tolerance * (1.0 + np.abs(wanted).max())
+        if np.abs(wanted - check).max() < room:
+            assert np.abs(jacobian(module, xi, ui) - wanted).max() < room
+            count += 1
+    return count
+
+
+def test_values_and_flags_are_those_of_the_filter(registered):
+    module, x, u = registered
+    wanted = module.safety_filter.filter(x, u)
+    found = module(torch.tensor(x, requires_grad=True), torch.tensor(u), return_result=True)
+    np.testing.assert_array_equal(found.action.detach().numpy(), wanted.action)
+    np.testing.assert_array_equal(found.feasible.numpy(), wanted.feasible)
+    np.testing.assert_array_equal(found.active.numpy(), wanted.active)
+    with torch.no_grad():
+        stacked = module(torch.tensor(x).reshape(4, 50, -1), torch.tensor(u).reshape(4, 50, -1))
+    np.testing.assert_array_equal(stacked.numpy().reshape(u.shape), wanted.action)
+
+
+@pytest.mark.slow
+def test_gradients_pass_gradcheck(registered):
+    module, x, u = registered
+    decided = module.safety_filter.filter(x, u)
+    acting = decided.active.any(axis=-1)
+    chosen = np.concatenate([np.flatnonzero(mask)[:3] for mask in (~acting, acting & decided.feasible)])
+    assert acting[chosen].any()
+    # In units of the box, so that an error is judged by what the inputs can do.
+    unit = np.abs(u).max()
+    for i in chosen:
+        given = [torch.tensor(part, requires_grad=True) for part in (x[i], u[i] / unit)]
+        assert torch.autograd.gradcheck(lambda x, u: module(x, unit * u) / unit, given, eps=1e-4, atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("most", [12, pytest.param(60, marks=pytest.mark.oracle)])
+@pytest.mark.parametrize("m", [1, 2, 3])
+@pytest.mark.parametrize("k", [1, 3])
+def test_slopes_are_the_differences_of_the_filter(m, k, most):
+    module = TorchFilter(planar(m, k, seed=m))
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(60, 2)), 1.5 * rng.normal(size=(60, m))
+    acting = module.safety_filter.filter(x, u).active.any(axis=-1)
+    assert np.count_nonzero(acting) > 10
+    chosen = np.concatenate([np.flatnonzero(part)[:most] for part in (acting, ~acting)])
+    assert assert_slopes(module, x[chosen], u[chosen]) > 0.9 * len(chosen)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [16, pytest.param(100, marks=pytest.mark.oracle)])
+@pytest.mark.parametrize("m", [1, 2, 4])
+def test_slopes_of_a_compromise(m, size):
+    module = TorchFilter(planar(m, 3, contradicting=True, seed=3))
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(size, 2)), 1.5 * rng.normal(size=(size, m))
+    assert not module.safety_filter.filter(x, u).feasible.any()
+    assert assert_slopes(module, x, u) > 0.75 * size
+
+
+def test_contradicting_rows_on_many_inputs_have_a_finite_slope():
+    module = TorchFilter(planar(4, 2, contradicting=True, seed=3))
+    rng = np.random.default_rng(0)
+    x, u = (torch.tensor(rng.normal(size=(150, size)), requires_grad=True) for size in (2, 4))
+    result = module(x, u, return_result=True)
+    assert not result.feasible.any()
+    slopes = torch.cat(torch.autograd.grad(result.action.sum(), (x, u)), dim=1)
+    assert slopes.isfinite().all()
+    assert result.differentiable.all()
+
+
+@pytest.mark.slow
+def test_the_flag_of_gradients_does_not_hang_on_whether_one_was_asked_for(monkeypatch):
+    # No formula is exact to the last bit: so some are said not to agree.
+    monkeypatch.setattr(torch_filter, "_AGREED", 0.0)
+    module = TorchFilter(planar(4, 2, contradicting=True, seed=3))
+    rng = np.random.default_rng(0)
+    x, u = (torch.tensor(rng.normal(size=(150, size))) for size in (2, 4))
+    given = x.clone().requires_grad_(), u.clone().requires_grad_()
+    wanted = module(*given, return_result=True)
+    plain = module(x, u, return_result=True)
+    with torch.no_grad():
+        unasked = module(x, u.clone().requires_grad_(), return_result=True)
+    assert 0 < torch.count_nonzero(wanted.differentiable) < 150
+    slopes = torch.cat(torch.autograd.grad(wanted.action.sum(), given), dim=1)
+    assert torch.count_nonzero(slopes[~wanted.differentiable]) == 0
+    for found in (plain, unasked):
+        assert torch.equal(found.differentiable, wanted.differentiable)
+        assert torch.equal(found.action, wanted.action)
+        assert not found.action.requires_grad
+
+
+def test_second_derivatives():
+    module = TorchFilter(planar(2, 3, seed=2))
+    rng = np.random.default_rng(0)
+    x, u = rng.normal(size=(60, 2)), rng.normal(size=(60, 2))
+    decided = module.safety_filter.filter(x, u)
+    for i in np.flatnonzero(decided.active.any(axis=-1) & decided.feasible)[:4]:
+        given = [torch.tensor(part[i], requires_grad=True) for part in (x, u)]
+        assert torch.autograd.gradgradcheck(module, given, atol=1e-4)
+
+
+def test_floats_of_less_precision_are_computed_in_double():
+    problem = load_problem("safe_envs/StochasticDubins-v0")
+    module = TorchFilter.for_problem(problem, "scbf")
+    x = torch.tensor([0.5, 2.5, 1.2])
+    u = torch.tensor([-1.0], requires_grad=True)
+    action = module(x, u)
+    assert action.dtype == torch.float32
+    wanted = module.safety_filter.filter(x.double().numpy(), u.detach().double().numpy()).action
+    assert action.item() == np.float32(wanted[0])
+    action.sum().backward()
+    assert u.grad is not None
+    assert u.grad.dtype == torch.float32
+    assert module(x.double(), u).dtype == torch.float32
+    with pytest.raises(InvalidInputError, match=r"torch\.int64"):
+        module(torch.tensor([0, 0, 0]), u)
+    with pytest.raises(InvalidInputError, match="do not fit"):
+        module(x[:2], u)
+    with pytest.raises(InvalidInputError, match="finite"):
+        module(x * torch.nan, u)
+    for wrong in (None, "text", [0.5, 2.5, 1.2], x.numpy(), x.to(torch.complex64)):
+        with pytest.raises(InvalidInputError, match="give"):
+            module(wrong, u)
+        with pytest.raises(InvalidInputError, match="give"):
+            module(x, wrong)
+
+
+def test_a_state_where_no_row_acts_has_a_gradient_of_zero():
+    module = TorchFilter(planar(2, 1))
+    x = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    barrier = float(module.safety_filter.filter(np.zeros(2), np.zeros(2)).barrier[0])
+    assert barrier > 0.0
+    (slope,) = torch.autograd.grad(module(x, torch.zeros(2, dtype=torch.float64)).sum(), x)
+    assert slope.tolist() == [0.0, 0.0]
+
+
+def test_a_proposal_at_its_bound_can_leave_it():
+    module = TorchFilter(planar(2, 1))
+    x, u = torch.zeros(2, dtype=torch.float64), torch.tensor([1.5, -1.0], dtype=torch.float64, requires_grad=True)
+    module(x, u).sum().backward()
+    assert u.grad is not None
+    assert u.grad.tolist() == [1.0, 1.0]
+
+
+def test_rows_of_functions_with_kinks():
+    x, y, u = sp.symbols("x y u", real=True)
+    model = ControlAffineSDE(
+        (x, y), (u,), [sp.Max(y, 0.5) + sp.Piecewise((0.1, x < 0), (0.3 * y, True)), -sp.Abs(y)], [[1], [0]], [[0], [0]]
+    )
+    module = TorchFilter(SafetyFilter(model, [(Barrier(1 - x - sp.sqrt(2) * y**2), CBF(alpha=1.0))], [(-9.0, 9.0)]))
+    rng = np.random.default_rng(0)
+    assert assert_slopes(module, rng.normal(size=(30, 2)), 4.0 + rng.normal(size=(30, 1))) > 25
+
+
+def test_names_of_symbols_change_nothing():
+    found = []
+    for names in (("y", "z"), ("x0", "x1"), ("x1", "sin"), ("torch", "None")):
+        a, b = (sp.Symbol(name, real=True) for name in names)
+        both, u = a + b, sp.Symbol("u", real=True)
+        model = ControlAffineSDE((a, b), (u,), [(both**2 + 3 * sp.sin(both)) * sp.sin(both), both**2], [[1], [0]], [[0], [0]])
+        module = TorchFilter(SafetyFilter(model, [(Barrier(1 - a - b**2), CBF(alpha=1.0))], [(-9.0, 9.0)]))
+        states = torch.tensor([0.9, 0.4], dtype=torch.float64, requires_grad=True)
+        module(states, torch.tensor([8.0], dtype=torch.float64)).sum().backward()
+        assert states.grad is not None
+        found.append(states.grad.tolist())
+    # u = 1 - a - b^2 - (s^2 + 3 sin s) sin s - 2 b s^2 with s = a + b.
+    s, b = 1.3, 0.4
+    by_both = -(2 * s + 3 * math.cos(s)) * math.sin(s) - (s**2 + 3 * math.sin(s)) * math.cos(s) - 4 * b * s
+    assert found == [pytest.approx([by_both - 1, by_both - 2 * b - 2 * s**2], rel=1e-12)] * 4
+
+
+def test_learning_through_the_filter():
+    module = TorchFilter(planar(2, 3, seed=2))
+    assert not list(module.parameters())
+    x = torch.tensor(0.5 * np.random.default_rng(0).normal(size=(64, 2)), dtype=torch.float32)
+    wanted = module(x, x @ torch.tensor([[1.0, -0.5], [0.3, 1.0]]))
+    weights = torch.zeros(2, 2, requires_grad=True)
+    losses, intervened = [], False
+    for _ in range(15):
+        found = module(x, x @ weights, return_result=True)
+        loss = (found.action - wanted).square().mean()
+        (slope,) = torch.autograd.grad(loss, weights)
+        with torch.no_grad():
+            weights -= 2.0 * slope
+        losses.append(loss.item())
+        intervened |= bool(found.active.any())
+    assert intervened
+    assert losses[-1] < 0.3 * losses[0]
+
+
+def test_what_is_no_plain_row_is_refused():
+    problem = load_problem("safe_envs/CubicSDE-v0")
+    for condition, reason in (("srcbf", "reciprocal"), ("scbf:sampling_margin=first-order", "first order")):
+        with pytest.raises(ConfigurationError, match=reason):
+            TorchFilter.for_problem(problem, parse_conditions(condition, problem))
+    with pytest.raises(ConfigurationError, match="clf"):
+        TorchFilter(SafetyFilter.for_problem(problem, parse_conditions("scbf", problem), objective="clf"))
+
+
+def test_functions_that_torch_lacks_are_refused():
+    x, u = sp.symbols("x u", real=True)
+    model = ControlAffineSDE((x,), (u,), [sp.besselj(0, x)], [[1]], [[0]])
+    with pytest.raises(ConfigurationError, match="besselj"):
+        TorchFilter(SafetyFilter(model, [(Barrier(1 - x), CBF(alpha=1.0))], [(-1.0, 1.0)]))

@@ -1,0 +1,296 @@
+"""Which bounds apply, which fail and why, and the estimated one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import sympy as sp
+
+from safe_envs.problem.barrier import Barrier
+from safe_envs.wrappers import parse_conditions
+from safe_envs.wrappers.verification.estimated_bound import estimated_bound
+from safe_envs.wrappers.verification.feasibility import verify
+from safe_envs.wrappers.verification.formulas import Formulas
+from safe_envs.wrappers.verification.guarantee import best_start, promise
+from safe_envs.wrappers.verification.safe_set import draw_starts
+from safe_envs.wrappers.verification.safe_set_analysis import unbounded
+from tests.conftest import problem_of
+from tests.wrappers.verification.verified import (
+    CUBIC_DISK,
+    DUBINS,
+    STOCHASTIC,
+    by_name,
+    estimated,
+    findings,
+    made,
+    made_bound,
+    problem_with,
+    system_in_a_box,
+    x,
+    y,
+)
+
+pytestmark = pytest.mark.slow
+
+
+def test_scbf_fails_near_the_centre_of_the_cubic_disk():
+    found = findings(CUBIC_DISK)
+    (barrier,) = found.barriers
+    assert barrier.deepest_shortfall == pytest.approx(0.08, abs=1e-9)
+    np.testing.assert_allclose(found.safe.worst, 0.0, atol=1e-4)
+    assert found.kept is not None
+    # C is one with the intersection: the worst of both is the same.
+    assert (found.safe.shortfall, found.safe.infeasible) == (found.kept.shortfall, found.kept.infeasible)
+    assert found.kept.share == 1.0
+    assert found.safe.share == pytest.approx(math.pi / 16, abs=0.01)
+    assert found.safe.shortfall == pytest.approx(0.08)
+    bounds = promise(found, np.array([[-0.1, 0.7]]), 1.0)
+    assert by_name(bounds, "4.2.8").status == "hypothesis fails"
+    assert by_name(bounds, "4.2.8").value == pytest.approx(0.5)
+    assert by_name(bounds, "repaired").status == "estimated"
+    assert by_name(bounds, "repaired").value == pytest.approx(0.42)
+
+
+def endless(env_id):
+    """A registered problem whose workspace has no end."""
+    problem = problem_of(env_id)
+    return replace(problem, states=tuple(replace(s, low=-math.inf, high=math.inf) for s in problem.states))
+
+
+@pytest.mark.parametrize("name", ["ACC", "CubicSDE", "Scalar"])
+def test_unbounded_barriers_have_no_bound_where_no_workspace_ends_them(name):
+    problem = endless(f"safe_envs/{name}-v0")
+    found = made(problem, samples=512)
+    assert math.isinf(found.barriers[0].supremum)
+    (bound,) = promise(found, draw_starts(problem, 8), 1.0)
+    assert (bound.status, bound.value, bound.reason) == ("no bound", None, "sup h is infinite")
+    assert made_bound(problem).note == "sup h is infinite"
+
+
+@pytest.mark.parametrize(
+    ("name", "deepest"),
+    [("Scalar", {"x": "low"}), ("CubicSDE", {"x_1": "low", "x_2": 0.0}), ("ACC", {"x_1": "low", "x_3": "high"})],
+)
+def test_a_supremum_is_that_of_the_workspace(name, deepest):
+    # To leave the workspace ends an episode: what h would be beyond does not matter.
+    found = findings(f"safe_envs/{name}-v0")
+    problem = found.formulas.problem
+    ranges = {s.symbol: s for s in problem.states}
+    state = {s: deepest.get(s.name, 0.0) for s in ranges}
+    h = problem.plant.numeric(problem.barriers[0].expression)
+    highest = h.subs({s: getattr(ranges[s], end) if isinstance(end, str) else end for s, end in state.items()})
+    assert found.beyond
+    assert found.survey.suprema[0] == pytest.approx(float(highest), rel=1e-9)
+    assert found.barriers[0].supremum == pytest.approx(float(highest), rel=1e-9)
+
+
+def test_leaving_the_workspace_counts_as_it_is_evaluated():
+    """Brownian motion in [0, 2] with h = x: the bound x/2 is attained, for h is a martingale that ends at one of the two edges."""
+    problem = problem_with([0 * x], [x], noise=(1.0,), ranges=((-1.0, 2.0),), box=(-1e-9, 1e-9), start=0.5)
+    bound = made_bound(replace(problem, horizon=20.0))
+    assert bound.at(np.array([[0.5]]), 20.0)[0] == pytest.approx(0.25, abs=1e-6)
+
+
+@pytest.mark.parametrize("ends", [(-math.inf, math.inf), (0.0, math.inf)])
+def test_a_barrier_that_another_one_limits_is_not_unbounded(ends):
+    # Along x the first grows without end, and the second ends it.
+    problem = problem_with([0 * x], [x, 4 - x], ranges=(ends,), noise=(0.1,))
+    assert not unbounded(Formulas(problem, parse_conditions("scbf", problem), "model"), 0)
+    alone = problem_with([0 * x], [x], ranges=(ends,), noise=(0.1,))
+    assert unbounded(Formulas(alone, parse_conditions("scbf", alone), "model"), 0)
+
+
+def test_an_endless_range_counts_on_its_endless_side_only():
+    problem = problem_with([0 * x], [x], ranges=((-math.inf, 2.0),), noise=(0.1,))
+    assert not unbounded(Formulas(problem, parse_conditions("scbf", problem), "model"), 0)
+    assert made(problem, samples=256).survey.suprema[0] == pytest.approx(2.0, rel=1e-9)
+
+
+def test_the_attained_bound_is_estimated():
+    problem = system_in_a_box()
+    conditions = parse_conditions("scbf", problem)
+    found = verify(problem, conditions, samples=1024)
+    assert found.safe.shortfall == found.safe.infeasible == 0.0
+    starts = np.array([[0.0], [0.5], [-0.9]])
+    np.testing.assert_allclose(estimated_bound(problem, conditions).at(starts, 7.0), 1 - starts[:, 0] ** 2, rtol=1e-9)
+    (bound,) = promise(found, starts, 7.0)
+    assert (bound.status, bound.forever) == ("estimated", True)
+    assert bound.value == pytest.approx((1 - starts**2).mean())
+
+
+def test_bounds_of_several_barriers_are_put_together_by_the_union():
+    problem = system_in_a_box(count=2)
+    conditions = parse_conditions("scbf", problem)
+    starts = np.array([[0.1, 0.2], [0.7, 0.8], [0.1, 1.1]])
+    expected = np.maximum(0.0, (1 - starts**2).sum(axis=1) - 1) * (abs(starts) < 1).all(axis=1)
+    np.testing.assert_allclose(estimated_bound(problem, conditions).at(starts, 3.0), expected, atol=1e-8)
+    (bound,) = promise(verify(problem, conditions, samples=500), starts, 3.0)
+    assert (bound.status, bound.value) == ("estimated", pytest.approx(expected.mean(), abs=1e-8))
+    assert "33.3 % of the starts" in bound.reason
+
+
+@pytest.mark.parametrize(
+    ("arguments", "note"),
+    [
+        ((STOCHASTIC, "hocbf"), "hocbf ignores the noise"),
+        ((CUBIC_DISK, "cbf"), "cbf ignores the noise"),
+        ((DUBINS, "hocbf"), "the model differs from the plant in v"),
+        ((CUBIC_DISK, "srcbf"), "unbounded control towards the edge"),
+    ],
+)
+def test_what_has_no_bound_says_why(arguments, note):
+    bound = estimated(*arguments)
+    assert bound.note is not None
+    assert note in bound.note
+    starts = draw_starts(problem_of(arguments[0]), 4)
+    np.testing.assert_array_equal(bound.at(starts, 1.0), np.zeros(4))
+
+
+def test_a_model_without_the_noise_breaks_the_hypothesis():
+    bound = estimated("safe_envs/CubicSDEDisk-v0", "scbf", model={"sigma_1": 0.0})
+    assert bound.note == "the model differs from the plant in sigma_1"
+    found = findings(CUBIC_DISK, "scbf", samples=512, model={"sigma_1": 0.0})
+    statuses = {b.status for b in promise(found, np.array([[0.1, 0.1]]), 1.0)}
+    assert statuses == {"hypothesis fails"}
+
+
+def test_a_start_outside_is_said_to_be():
+    found = findings(DUBINS, "hocbf", "plant", samples=512, start="thesis")
+    (bound,) = promise(found, draw_starts(found.formulas.problem, 1), 1.0)
+    assert bound.status == "hypothesis fails"
+    assert bound.reason == "the start is outside C_1: b_1 = -1.26"
+
+
+def test_conditions_without_noise_keep_every_path_if_they_can_be_met():
+    found = findings("safe_envs/Scalar-v0", "cbf", noise=0)
+    (bound,) = promise(found, np.array([[0.0], [0.5]]), 1.0)
+    assert (bound.status, bound.value) == ("estimated", 1.0)
+    weak = findings("safe_envs/Scalar-v0", "cbf:alpha=0.5", noise=0, box=[-0.8, 0.8])
+    near, far = promise(weak, np.array([[0.99]]), 1.0), promise(weak, np.array([[0.0]]), 1.0)
+    assert by_name(near, "no path leaves").status == "hypothesis fails"
+    # Missed by .2 at the edge at most: h >= h_0 e^(-t/2) - .4 (1 - e^(-t/2)) is positive up to 1 s from the middle only.
+    assert weak.safe.shortfall == pytest.approx(0.2)
+    assert (by_name(near, "in spite").value, by_name(far, "in spite").value) == (0.0, 1.0)
+
+
+def test_zeroing_forms_and_the_misprint():
+    bounds = promise(findings(CUBIC_DISK, "szcbf:alphas=2"), np.array([[0.5, 0.0]]), 1.0)
+    assert by_name(bounds, "as printed").status == "not established"
+    assert by_name(bounds, "as printed").value == pytest.approx(0.75 * math.exp(-1.0))
+    assert by_name(bounds, "corrected").status == "estimated"
+    assert by_name(bounds, "corrected").value == pytest.approx(0.75 * math.exp(-2.0))
+    slow = promise(findings(CUBIC_DISK, "szcbf:alphas=0.5"), np.array([[0.5, 0.0]]), 1.0)
+    assert by_name(slow, "as printed").value < by_name(slow, "corrected").value
+    assert by_name(slow, "as printed").status == by_name(slow, "corrected").status
+
+
+def test_the_estimated_bound_is_deterministic():
+    starts = draw_starts(problem_of(CUBIC_DISK), 16)
+    np.testing.assert_array_equal(*(estimated(CUBIC_DISK).at(starts, 1.0) for _ in range(2)))
+
+
+def test_suprema_and_the_product_bound_of_the_stochastic_dubins():
+    found = findings(STOCHASTIC)
+    (barrier,) = found.barriers
+    r, v, sigma = 3.0, 2.0, 0.2
+    # On b_1 >= 0 the centre is just out of reach: -2 v rho cos - 2 sigma^2 >= 0 keeps rho above sigma^2/v.
+    np.testing.assert_allclose(barrier.suprema, [r**2 - (sigma**2 / v) ** 2, 2 * v * r - 2 * sigma**2], rtol=1e-6)
+    assert barrier.supremum == pytest.approx(r**2)
+    assert found.kept is not None
+    assert found.kept.shortfall == pytest.approx(2 * v**2, rel=1e-4)
+    start = best_start(found)
+    assert start is not None
+    assert math.hypot(*start[:2]) == pytest.approx(math.sqrt(3.0), abs=0.02)
+    bounds = promise(found, start[None], 5.0)
+    assert by_name(bounds, "product").value == pytest.approx(0.383, abs=1e-3)
+    assert "conditions on the future" in by_name(bounds, "product").reason
+    assert by_name(bounds, "union").value < by_name(bounds, "product").value
+    assert by_name(bounds, "repaired").value == 0.0
+
+
+@pytest.mark.parametrize(("width", "scale"), [(50.0, 1.0), (1e8, 1.0), (1e8, 1e-6), (50.0, 1e-6), (1e12, 1e-6)])
+def test_no_box_holds_an_srcbf_under_noise(width, scale):
+    problem = problem_with([x], [scale * (1 - x)], noise=(0.2,), box=(-width, width))
+    found = made(problem, "srcbf", samples=1024)
+    (bound,) = promise(found, np.array([[0.5]]), 1.0)
+    assert bound.status == "hypothesis fails"
+    assert "unbounded control towards the edge" in bound.reason
+    assert "unbounded control towards the edge" in (made_bound(problem, "srcbf").note or "")
+
+
+@pytest.mark.parametrize(("noise", "kept"), [(1 - x**2, True), (sp.sqrt(1 - x**2), True), ((1 - x**2) ** sp.Rational(1, 4), False)])
+def test_an_srcbf_is_kept_where_the_noise_fades_at_the_edge(noise, kept):
+    # |sigma' grad h|^2/h is 4 x^2 sigma^2/h, which stays finite for a sigma^2 that falls at least like h.
+    problem = problem_with([0 * x], [1 - x**2], noise=(noise,), box=(-1e6, 1e6))
+    assert made(problem, "srcbf", samples=512).survey.runaway is not kept
+
+
+def test_a_kink_has_no_bound_under_noise():
+    barrier = sp.Piecewise((1 - x**2, x > 0), (1 - 2 * x**2, True))
+    bound = made_bound(problem_with([0 * x], [barrier], noise=(1.0,)))
+    assert bound.note == "h_1 is not twice differentiable, which Ito's formula asks for"
+    assert made_bound(problem_with([0 * x], [barrier]), "cbf").note is None
+
+
+def test_a_range_that_was_chosen_establishes_nothing():
+    problem = problem_with(
+        [-((y / 15) ** 9), sp.Integer(2)],
+        [1 - x**2],
+        noise=(0.1, 0.0),
+        states=(x, y),
+        inputs=((1.0,), (0.0,)),
+        ranges=((-2.0, 2.0), (-math.inf, math.inf)),
+        start=0.0,
+    )
+    reason = "looked at only for y in [-10, 10]: the workspace is unbounded"
+    bounds = promise(made(problem, "szcbf:alphas=.1", samples=512), np.array([[0.0, 0.0]]), 1.0)
+    assert {(b.status, b.reason) for b in bounds} == {("not established", reason)}
+    assert made_bound(problem, "szcbf:alphas=.1").note == reason
+
+
+@pytest.mark.slow
+def test_conditions_that_share_several_inputs_have_no_bound():
+    problem = system_in_a_box(count=2)
+    x_1, x_2 = problem.plant.states
+    coupled = replace(problem, barriers=(Barrier(1 - x_1**2 - x_2**2 / 2, "h_1"), Barrier(1 - x_2**2 - x_1**2 / 2, "h_2")))
+    reason = "the shortfall of several conditions together is not established"
+    assert estimated_bound(coupled, parse_conditions("scbf", coupled)).note == reason
+    bounds = promise(verify(coupled, parse_conditions("scbf", coupled), samples=256), np.array([[0.1, 0.1]]), 1.0)
+    assert all(reason in b.reason and b.status != "estimated" for b in bounds)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("env_id", "text"),
+    [(CUBIC_DISK, "scbf"), (CUBIC_DISK, "szcbf:alphas=2"), (STOCHASTIC, "szcbf:alphas=.1,.1")],
+)
+def test_the_estimated_bound_is_the_best_of_them(env_id, text):
+    found = findings(env_id, text)
+    starts, bound = draw_starts(found.formulas.problem, 64), estimated(env_id, text)
+    for horizon in (0.1, 1.0):
+        best = max((b.value for b in promise(found, starts, horizon) if b.status == "estimated" and b.value is not None), default=0.0)
+        assert bound.at(starts, horizon).mean() == pytest.approx(best, rel=1e-12)
+
+
+def test_what_only_seems_infinite_is_said_to():
+    problem = problem_with([0 * x], [x / (x + 50)], noise=(0.1,), ranges=((0.0, math.inf),))
+    assert made_bound(problem).note == "sup h_1 seems infinite: it grows with the box that is searched"
+
+
+def test_starts_that_are_inside_of_one_set_each_are_said_to_be():
+    found = findings(STOCHASTIC)
+    # Outwards near the middle, and inwards beyond the disk.
+    (bound,) = promise(found, np.array([[2.0, 0.0, 0.0], [3.5, 0.0, math.pi]]), 5.0)
+    assert (bound.status, bound.reason) == ("hypothesis fails", "no start lies in all C_j at once")
+
+
+def test_the_error_of_a_mean_is_known():
+    found = findings(CUBIC_DISK)
+    starts = draw_starts(found.formulas.problem, 256)
+    bound = by_name(promise(found, starts, 1.0), "4.2.8")
+    values = found.formulas.chain(starts)[:, 0]
+    assert bound.error == pytest.approx(values.std(ddof=1) / 16)
+    assert by_name(promise(found, starts[:1], 1.0), "4.2.8").error == 0.0
