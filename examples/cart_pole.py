@@ -1,9 +1,12 @@
-"""A cart that balances a pole, pushed by gusts: the pole is to stay within 15 degrees, the cart on its track.
+"""A cart that balances a pole, pushed by gusts: the pole is to stay within 15 degrees, the cart on
+its track.
 
-    safe-envs evaluate --system examples/cart_pole.py:problem --filter none --filter hocbf --filter szcbf
+    safe-envs evaluate --system examples/cart_pole.py:problem --filter none --filter hocbf --filter
+    szcbf
 
-The equations are those of A. G. Barto, R. S. Sutton and C. W. Anderson, "Neuronlike adaptive elements that can solve
-difficult learning control problems", IEEE Trans. SMC 13 (1983), without friction.
+The equations are those of A. G. Barto, R. S. Sutton and C. W. Anderson, "Neuronlike adaptive
+elements that can solve difficult learning control problems", IEEE Trans. SMC 13 (1983), without
+friction.
 """
 
 import math
@@ -17,7 +20,9 @@ M, m, length = sp.symbols("M m l", positive=True)
 gust = sp.Symbol("gust", nonnegative=True)
 
 swing = (force + m * length * omega**2 * sp.sin(theta)) / (M + m)
-turn = (9.81 * sp.sin(theta) - sp.cos(theta) * swing) / (length * (sp.Rational(4, 3) - m * sp.cos(theta) ** 2 / (M + m)))
+turn = (9.81 * sp.sin(theta) - sp.cos(theta) * swing) / (
+    length * (sp.Rational(4, 3) - m * sp.cos(theta) ** 2 / (M + m))
+)
 cart_pole = ControlAffineSDE.from_rate(
     states=(x, v, theta, omega),
     inputs=(force,),
@@ -28,7 +33,8 @@ cart_pole = ControlAffineSDE.from_rate(
 
 
 def problem(*, limit: float = 15.0) -> SafetyProblem:
-    """The pole within a limit in degrees; the nominal controller hurries to the middle of the track and leans too far."""
+    """The pole within a limit in degrees; the nominal controller hurries to the middle of the track
+    and leans too far."""
     widest = math.radians(limit)
     return state_problem(
         cart_pole,
@@ -40,7 +46,12 @@ def problem(*, limit: float = 15.0) -> SafetyProblem:
         name="CartPole",
         nominal=60 * theta + 14 * omega + 6 * x + 8 * v,
         reward=sp.exp(-(x**2)),
-        workspace={x: (-10.0, 10.0), v: (-20.0, 20.0), theta: (-0.5 * math.pi, 0.5 * math.pi), omega: (-20.0, 20.0)},
+        workspace={
+            x: (-10.0, 10.0),
+            v: (-20.0, 20.0),
+            theta: (-0.5 * math.pi, 0.5 * math.pi),
+            omega: (-20.0, 20.0),
+        },
         units={x: "m", v: "m/s", theta: "rad", omega: "rad/s", force: "N"},
         gains=(5.0, 5.0),
     )

@@ -1,4 +1,5 @@
-"""A point in the plane, pushed in both directions, that is to pass a round obstacle on its way to a goal behind it.
+"""A point in the plane, pushed in both directions, that is to pass a round obstacle on its way to a
+goal behind it.
 
 safe-envs evaluate --system examples/double_integrator.py:problem --filter none --filter hocbf
 """

@@ -2,8 +2,9 @@
 
     safe-envs evaluate Pendulum-v1 --filter-spec examples/pendulum_v1.py:spec
 
-The barrier bounds the energy: at the top (theta = 0) the rate is to stay below 2 rad/s. A motor that does nothing keeps the energy, so
-that some torque meets the condition everywhere, weak as the motor is.
+The barrier bounds the energy: at the top (theta = 0) the rate is to stay below 2 rad/s. A motor
+that does nothing keeps the energy, so that some torque meets the condition everywhere, weak as the
+motor is.
 """
 
 import numpy as np
@@ -25,7 +26,9 @@ pendulum = ControlAffineSDE(
 
 def state(observation: np.ndarray) -> np.ndarray:
     """The observation is (cos theta, sin theta, rate)."""
-    return np.stack([np.arctan2(observation[..., 1], observation[..., 0]), observation[..., 2]], axis=-1)
+    return np.stack(
+        [np.arctan2(observation[..., 1], observation[..., 0]), observation[..., 2]], axis=-1
+    )
 
 
 spec = FilterSpec(

@@ -16,7 +16,8 @@ _STEM = 40
 
 
 def require_writable(path: Path) -> None:
-    """Raise ConfigurationError unless a file can be created at `path`: asked before a long run, not after it."""
+    """Raise ConfigurationError unless a file can be created at `path`: asked before a long run, not
+    after it."""
     folder, name = path.absolute().parent, shortened(path)
     # The functions of os.path take any text for a path, also one that is too long to be one.
     if os.path.isdir(path):
@@ -24,21 +25,33 @@ def require_writable(path: Path) -> None:
     if not os.path.isdir(folder):
         there = next(place for place in (folder, *folder.parents) if os.path.exists(place))
         if not there.is_dir():
-            raise ConfigurationError(f"cannot write {name}: {there} is a file and no folder; choose another folder")
-        raise ConfigurationError(f"cannot write {name}: the folder {shortened(folder)} does not exist; create it or choose another")
+            raise ConfigurationError(
+                f"cannot write {name}: {there} is a file and no folder; choose another folder"
+            )
+        raise ConfigurationError(
+            f"cannot write {name}: the folder {shortened(folder)} does not exist; create it or"
+            " choose another"
+        )
     if os.path.exists(path) and not os.path.isfile(path):
-        raise ConfigurationError(f"cannot write {name}: it is a pipe or a device, which a file would replace; name a file")
+        raise ConfigurationError(
+            f"cannot write {name}: it is a pipe or a device, which a file would replace; name a"
+            " file"
+        )
     try:
         path.lstat()
     except FileNotFoundError:
         pass
     except (OSError, ValueError) as error:
-        raise ConfigurationError(f"cannot write {name}: {getattr(error, 'strerror', error)}; choose another name") from error
+        raise ConfigurationError(
+            f"cannot write {name}: {getattr(error, 'strerror', error)}; choose another name"
+        ) from error
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise ConfigurationError(f"cannot write {name}: no file can be created in {folder} ({error.strerror})") from error
+        raise ConfigurationError(
+            f"cannot write {name}: no file can be created in {folder} ({error.strerror})"
+        ) from error
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
@@ -49,13 +62,15 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
         write: is given the temporary path, which has the suffix of `path`.
 
     Raises:
-        ConfigurationError: the folder does not exist or is not writable, or the file cannot be written, as on a full disk; what was
-            at `path` before is still there.
+        ConfigurationError: the folder does not exist or is not writable, or the file cannot be
+            written, as on a full disk; what was at `path` before is still there.
     """
     require_writable(path)
     with writing(path):
         # With more of its name, the temporary one could be too long.
-        handle, name = tempfile.mkstemp(prefix=f".{path.stem[:_STEM]}.", suffix=path.suffix[-_STEM:], dir=path.absolute().parent)
+        handle, name = tempfile.mkstemp(
+            prefix=f".{path.stem[:_STEM]}.", suffix=path.suffix[-_STEM:], dir=path.absolute().parent
+        )
         os.close(handle)
         temporary = Path(name)
         try:
@@ -68,12 +83,14 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn what the operating system says of a full disk or a missing permission into a ConfigurationError that names `path`."""
+    """Turn what the operating system says of a full disk or a missing permission into a
+    ConfigurationError that names `path`."""
     try:
         yield
     except OSError as error:
         raise ConfigurationError(
-            f"cannot write {path}: {error.strerror or error}; see to it that there is room and that files may be written there"
+            f"cannot write {path}: {error.strerror or error}; see to it that there is room and that"
+            " files may be written there"
         ) from error
 
 

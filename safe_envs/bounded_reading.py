@@ -1,4 +1,5 @@
-"""Files of others, read without hanging and without taking all memory: only regular files, up to a size."""
+"""Files of others, read without hanging and without taking all memory: only regular files, up to a
+size."""
 
 from __future__ import annotations
 
@@ -24,20 +25,28 @@ _UNKNOWN = 0xFFFFFFFF
 """Size that only the record for large files tells."""
 
 _END = struct.Struct("<4s4H2LH")
-"""The record that ends a zip: signature, disks, entries, size and place of the directory, length of a comment."""
+"""The record that ends a zip: signature, disks, entries, size and place of the directory, length of
+a comment."""
 
 _LARGE_END = struct.Struct("<4sQ2H2L4Q")
-"""That of archives in the format for large files, which torch writes always: the size of the directory is the last but one."""
+"""That of archives in the format for large files, which torch writes always: the size of the
+directory is the last but one."""
 
 _LOCATOR = 20
 """Bytes between the two, which point to the latter."""
 
 # They do not exist on every system.
-_FLAGS = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
+_FLAGS = (
+    os.O_RDONLY
+    | getattr(os, "O_BINARY", 0)
+    | getattr(os, "O_NONBLOCK", 0)
+    | getattr(os, "O_NOCTTY", 0)
+)
 
 
 def open_regular(path: Path | str, most: int = MOST_BYTES) -> BinaryIO:
-    """Open a regular file to read it. A pipe, which might wait for ever, or a device, which might never end, is refused.
+    """Open a regular file to read it. A pipe, which might wait for ever, or a device, which might
+    never end, is refused.
 
     Args:
         path: of the file.
@@ -87,13 +96,18 @@ def read_json(path: Path, advice: str) -> Any:
     try:
         return json.loads(read_bytes(path, MOST_BYTES_OF_TEXT))
     except OSError as error:
-        raise ConfigurationError(f"{shortened(path)} cannot be read: {error.strerror}; {advice}") from error
+        raise ConfigurationError(
+            f"{shortened(path)} cannot be read: {error.strerror}; {advice}"
+        ) from error
     except (ValueError, RecursionError) as error:
-        raise ConfigurationError(f"{shortened(path)} is no JSON ({shortened(error)}); {advice}") from error
+        raise ConfigurationError(
+            f"{shortened(path)} is no JSON ({shortened(error)}); {advice}"
+        ) from error
 
 
 def open_archive(stream: BinaryIO, most: int = MOST_BYTES) -> zipfile.ZipFile:
-    """Open a zip without unpacking anything, of which all parts together have at most so many bytes.
+    """Open a zip without unpacking anything, of which all parts together have at most so many
+    bytes.
 
     Args:
         stream: of the file.

@@ -1,4 +1,5 @@
-"""Imports through the links at the top level of a checkout: `wrappers`, `agents` and `scripts` name the modules of `safe_envs`."""
+"""Imports through the links at the top level of a checkout: `wrappers`, `agents` and `scripts` name
+the modules of `safe_envs`."""
 
 from __future__ import annotations
 
@@ -12,7 +13,8 @@ from typing import Any
 
 
 class _SameModule(Loader):
-    """Return the module of `safe_envs` itself, never a second copy of it, whose classes would be others."""
+    """Return the module of `safe_envs` itself, never a second copy of it, whose classes would be
+    others."""
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         module = import_module(f"safe_envs.{spec.name}")
@@ -32,12 +34,15 @@ class _LinkFinder(MetaPathFinder):
     def __init__(self, name: str) -> None:
         self._below = f"{name}."
 
-    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
         return ModuleSpec(fullname, _SameModule()) if fullname.startswith(self._below) else None
 
 
 def redirect(name: str) -> None:
-    """Make a package that was imported through its link the package of the same name in `safe_envs`.
+    """Make a package that was imported through its link the package of the same name in
+    `safe_envs`.
 
     Args:
         name: of the link: "wrappers", "agents" or "scripts".

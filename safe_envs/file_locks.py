@@ -20,7 +20,8 @@ _HELD = (errno.EACCES, errno.EAGAIN, errno.EDEADLK)
 def locked(path: Path, taken: str) -> Iterator[None]:
     """Hold the lock of a file, which is made for it and removed with it.
 
-    The operating system releases it when the process ends, however that ends. On a file system without locks there is none.
+    The operating system releases it when the process ends, however that ends. On a file system
+    without locks there is none.
 
     Args:
         path: of the file.

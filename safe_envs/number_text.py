@@ -12,14 +12,16 @@ def real(text: str) -> float:
     """Read a real number, such as 2, -.5, 1e-3 or inf.
 
     Raises:
-        ValueError: the text is none. Digits of other scripts and underscores between digits, which Python takes, are refused: they
-            come from slips, and other programs read the same text as something else.
+        ValueError: the text is none. Digits of other scripts and underscores between digits, which
+            Python takes, are refused: they come from slips, and other programs read the same text
+            as something else.
     """
     return float(_plain(text))
 
 
 def whole_or_real(text: str) -> int | float:
-    """Read a number: an int where the text has the form of one and a float can hold it, and else a float; errors as for `real`."""
+    """Read a number: an int where the text has the form of one and a float can hold it, and else a
+    float; errors as for `real`."""
     value = real(text)
     return int(text) if _WHOLE.fullmatch(text.strip()) and math.isfinite(value) else value
 

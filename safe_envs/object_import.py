@@ -26,7 +26,8 @@ _ADVICE = "give the path of a Python file, as in my_system.py:problem"
 def load_object(place: str) -> Any:
     """Import what stands at a place, which runs the code there.
 
-    A file is read anew when it has changed; modules beside it are imported afresh with it, and stay as they are until then.
+    A file is read anew when it has changed; modules beside it are imported afresh with it, and stay
+    as they are until then.
 
     Args:
         place: FILE.py:NAME or MODULE:NAME.
@@ -36,10 +37,15 @@ def load_object(place: str) -> Any:
     """
     source, colon, name = place.rpartition(":")
     if not (colon and source and name):
-        raise ConfigurationError(f"{shown(place)} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like my_system.py:problem")
+        raise ConfigurationError(
+            f"{shown(place)} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like"
+            " my_system.py:problem"
+        )
     module = _of_file(Path(source)) if source.endswith(".py") else _of_module(source)
     if not hasattr(module, name):
-        raise ConfigurationError(f"{shortened(source)} has no {shown(name)}; {nearest(name, _stated_in(module))}")
+        raise ConfigurationError(
+            f"{shortened(source)} has no {shown(name)}; {nearest(name, _stated_in(module))}"
+        )
     return getattr(module, name)
 
 
@@ -58,14 +64,18 @@ def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) 
     try:
         inspect.signature(function).bind(**arguments)
     except TypeError as error:
-        raise ConfigurationError(f"{place}: {error}; give its arguments by --barrier NAME=VALUE (in Python: barrier={{...}})") from error
+        raise ConfigurationError(
+            f"{place}: {error}; give its arguments by --barrier NAME=VALUE (in Python:"
+            " barrier={...})"
+        ) from error
     source = place.rpartition(":")[0]
     with _running(Path(source).resolve() if source.endswith(".py") else None, place):
         return function(**arguments)
 
 
 def _stated_in(module: ModuleType) -> list[str]:
-    """Names of what a module states itself: its functions, and objects that are neither modules nor classes nor symbols."""
+    """Names of what a module states itself: its functions, and objects that are neither modules nor
+    classes nor symbols."""
     return [
         name
         for name, value in vars(module).items()
@@ -73,7 +83,11 @@ def _stated_in(module: ModuleType) -> list[str]:
         and not inspect.ismodule(value)
         and not inspect.isclass(value)
         and getattr(value, "__module__", module.__name__)
-        in (module.__name__, "safe_envs.problem.problem", "safe_envs.wrappers.env_wrappers.external_env")
+        in (
+            module.__name__,
+            "safe_envs.problem.problem",
+            "safe_envs.wrappers.env_wrappers.external_env",
+        )
     ]
 
 
@@ -84,13 +98,16 @@ def _of_file(path: Path) -> ModuleType:
     except FileNotFoundError as error:
         raise ConfigurationError(f"there is no file {shortened(path)}; {_ADVICE}") from error
     except OSError as error:
-        raise ConfigurationError(f"{shortened(path)} cannot be read: {error.strerror}; {_ADVICE}") from error
+        raise ConfigurationError(
+            f"{shortened(path)} cannot be read: {error.strerror}; {_ADVICE}"
+        ) from error
     return _loaded(path.resolve(), changed)
 
 
 @lru_cache(maxsize=32)
 def _loaded(path: Path, _changed: int) -> ModuleType:
-    """Remembered until the file changes, so that the symbols of all envs of a file are compiled once."""
+    """Remembered until the file changes, so that the symbols of all envs of a file are compiled
+    once."""
     name = f"_{path.stem}_{zlib.crc32(bytes(path)):08x}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -117,7 +134,8 @@ def _of_module(name: str) -> ModuleType:
 
 @contextmanager
 def _running(path: Path | None, what: str) -> Iterator[None]:
-    """Run a user's code: its errors become ours, with the line, and modules beside its file can be imported, as when Python runs it."""
+    """Run a user's code: its errors become ours, with the line, and modules beside its file can be
+    imported, as when Python runs it."""
     folder = None if path is None else str(path.parent)
     known = set(sys.modules)
     if folder is not None:
@@ -128,13 +146,18 @@ def _running(path: Path | None, what: str) -> Iterator[None]:
         raise type(error)(f"{what}{_line(error, path)}: {error}") from error
     except (Exception, SystemExit) as error:
         reason = f"{type(error).__name__}: {shortened(error, 400)}"
-        raise ConfigurationError(f"{what} ended with an error{_line(error, path)}: {reason}") from error
+        raise ConfigurationError(
+            f"{what} ended with an error{_line(error, path)}: {reason}"
+        ) from error
     finally:
         if folder is not None:
             sys.path.remove(folder)
             # Another file may have a neighbour of the same name.
             for name in set(sys.modules) - known:
-                if Path(getattr(sys.modules[name], "__file__", None) or "/").parent == Path(folder) and sys.modules[name].__name__ == name:
+                if (
+                    Path(getattr(sys.modules[name], "__file__", None) or "/").parent == Path(folder)
+                    and sys.modules[name].__name__ == name
+                ):
                     del sys.modules[name]
 
 

@@ -38,7 +38,9 @@ def which_env(env_id: str | None, system: str | None) -> str:
     """
     if (env_id is None) == (system is None):
         what = "neither is there" if env_id is None else f"both are there, {env_id} and {system}"
-        raise ConfigurationError(f"name an env by ENV_ID, or a system of your own by --system FILE.py:NAME; {what}")
+        raise ConfigurationError(
+            f"name an env by ENV_ID, or a system of your own by --system FILE.py:NAME; {what}"
+        )
     return CUSTOM_ID if env_id is None else full_id(env_id)
 
 
@@ -50,11 +52,16 @@ def title_of(env_id: str, options: Mapping[str, Any]) -> str:
 def require_ours(env_id: str) -> None:
     """Raise ConfigurationError unless an id is registered, and of this project."""
     spec = gym.spec(full_id(env_id))
-    creator = load_env_creator(spec.entry_point) if isinstance(spec.entry_point, str) else spec.entry_point
+    creator = (
+        load_env_creator(spec.entry_point)
+        if isinstance(spec.entry_point, str)
+        else spec.entry_point
+    )
     if not (isinstance(creator, type) and issubclass(creator, SafeEnv)):
         raise ConfigurationError(
-            f"{env_id} is not one of this project's envs. `safe-envs evaluate {env_id} --filter-spec FILE.py:NAME` puts a filter over any "
-            f"env of Gymnasium's. For an env of this project: {nearest(env_id, ENV_IDS)}"
+            f"{env_id} is not one of this project's envs. `safe-envs evaluate {env_id}"
+            " --filter-spec FILE.py:NAME` puts a filter over any env of Gymnasium's. For an env of"
+            f" this project: {nearest(env_id, ENV_IDS)}"
         )
 
 
@@ -80,5 +87,7 @@ def load_problem(env_id: str, options: Mapping[str, Any] | None = None) -> Safet
         ConfigurationError: `max_episode_steps` is given, which is no property of a problem.
     """
     if (options or {}).get("max_episode_steps") is not None:
-        raise ConfigurationError("max_episode_steps is not part of a problem; shorten its episodes by horizon")
+        raise ConfigurationError(
+            "max_episode_steps is not part of a problem; shorten its episodes by horizon"
+        )
     return make_env(env_id, options).problem

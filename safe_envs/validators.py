@@ -1,4 +1,5 @@
-"""What comes from outside as numbers: converted in one place, or refused by an error of this project's own."""
+"""What comes from outside as numbers: converted in one place, or refused by an error of this
+project's own."""
 
 from __future__ import annotations
 
@@ -12,14 +13,16 @@ from safe_envs.errors import InvalidInputError
 
 
 def real_array(what: str, given: Any) -> np.ndarray:
-    """Return a state, an action or a batch of them as an array of floats; float32 and float64 come back as they are.
+    """Return a state, an action or a batch of them as an array of floats; float32 and float64 come
+    back as they are.
 
     Args:
         what: name of the argument, for the error.
         given: an array, a number, or nested sequences of numbers.
 
     Raises:
-        InvalidInputError: it is no array of real numbers: text, None, complex, masked, ragged, or beyond the range of floats.
+        InvalidInputError: it is no array of real numbers: text, None, complex, masked, ragged, or
+            beyond the range of floats.
     """
     if type(given) is np.ndarray and given.dtype.char in "fd":
         return given
@@ -33,7 +36,10 @@ def real_array(what: str, given: Any) -> np.ndarray:
             raise TypeError(f"its entries are of the type {array.dtype}")
         return array.astype(np.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-        raise InvalidInputError(f"the {what} is {_shown(given)}: {error}; give an array of real numbers, such as np.zeros(2)") from error
+        raise InvalidInputError(
+            f"the {what} is {_shown(given)}: {error}; give an array of real numbers, such as"
+            " np.zeros(2)"
+        ) from error
 
 
 def _shown(given: Any) -> str:

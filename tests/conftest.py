@@ -5,10 +5,11 @@ from __future__ import annotations
 import gc
 import os
 
-# Before NumPy and torch are imported, and for processes that tests start: on small matrices, threads that wait for each other
-# take most of the processors from the other tests.
+# Before NumPy and torch are imported, and for processes that tests start: on small matrices,
+# threads that wait for each other take most of the processors from the other tests.
 os.environ["OMP_NUM_THREADS"] = "1"
-# Before SymPy is imported: it would forget what one test has differentiated before the next one needs it.
+# Before SymPy is imported: it would forget what one test has differentiated before the next one
+# needs it.
 os.environ["SYMPY_CACHE_SIZE"] = "None"
 
 import gymnasium as gym
@@ -18,10 +19,13 @@ import pytest
 import safe_envs
 from safe_envs.problem.problem import SafetyProblem
 
-# The expressions that SymPy keeps are many: to look through all of them for garbage as often as usual takes a tenth of the time.
+# The expressions that SymPy keeps are many: to look through all of them for garbage as often as
+# usual takes a tenth of the time.
 gc.set_threshold(10_000, 20, 50)
 # The same examples on every machine, and no deadline: a busy machine is no failure.
-hypothesis.settings.register_profile("project", derandomize=True, database=None, deadline=None, print_blob=False)
+hypothesis.settings.register_profile(
+    "project", derandomize=True, database=None, deadline=None, print_blob=False
+)
 hypothesis.settings.load_profile("project")
 
 
@@ -35,7 +39,8 @@ _PROBLEMS: dict[str, SafetyProblem] = {}
 
 
 def problem_of(env_id: str, **arguments) -> SafetyProblem:
-    """The problem behind a registered id, made with the arguments of `gym.make`; the same object for the same numbers and texts."""
+    """The problem behind a registered id, made with the arguments of `gym.make`; the same object
+    for the same numbers and texts."""
     key = f"{env_id} {arguments!r}"
     if key not in _PROBLEMS:
         _PROBLEMS[key] = gym.make(env_id, **arguments).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]

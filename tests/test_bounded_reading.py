@@ -1,4 +1,5 @@
-"""Files of others: nothing but regular ones is read, and nothing large is unpacked before its size is known."""
+"""Files of others: nothing but regular ones is read, and nothing large is unpacked before its size
+is known."""
 
 from __future__ import annotations
 
@@ -40,7 +41,14 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path: Path):
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     with (tmp_path / "sparse").open("wb") as stream:
         stream.truncate(10**12)
-    refused = {"pipe": "pipe", "endless": "device", "loop": "symbolic", "sparse": "larger", ".": "directory", "none": "No such file"}
+    refused = {
+        "pipe": "pipe",
+        "endless": "device",
+        "loop": "symbolic",
+        "sparse": "larger",
+        ".": "directory",
+        "none": "No such file",
+    }
     for name, reason in (refused | {"x" * 300: "too long", "a\0b": "null"}).items():
         with pytest.raises(OSError, match=reason):
             read_bytes(tmp_path / name)
@@ -81,20 +89,39 @@ def test_the_directory_of_an_archive_is_not_read_where_it_is_large():
     with pytest.raises(ValueError, match="too many parts"):
         open_archive(io.BytesIO(bytes(whole)))
     # In the format for large files another record says how large it is.
-    large = b"PK\6\6" + struct.pack("<Q2H2L4Q", 44, 45, 45, 0, 0, 1, 1, 2_000_000, 0) + b"PK\6\7" + bytes(16)
+    large = (
+        b"PK\6\6"
+        + struct.pack("<Q2H2L4Q", 44, 45, 45, 0, 0, 1, 1, 2_000_000, 0)
+        + b"PK\6\7"
+        + bytes(16)
+    )
     with pytest.raises(ValueError, match="too many parts"):
-        open_archive(io.BytesIO(bytes(whole[:-22]) + large + bytes(whole[-22:-10]) + b"\xff" * 4 + bytes(whole[-6:])))
+        open_archive(
+            io.BytesIO(
+                bytes(whole[:-22]) + large + bytes(whole[-22:-10]) + b"\xff" * 4 + bytes(whole[-6:])
+            )
+        )
 
 
 @hypothesis.settings(max_examples=50)
 @hypothesis.given(st.data())
 def test_a_damaged_archive_is_the_same_or_refused(data):
-    whole = archive_of({"a": b"some content", "b": b"other content" * 9}, compression=zipfile.ZIP_DEFLATED)
+    whole = archive_of(
+        {"a": b"some content", "b": b"other content" * 9}, compression=zipfile.ZIP_DEFLATED
+    )
     damaged = damaged_by(data, whole)
     try:
         with open_archive(io.BytesIO(damaged)) as archive:
             found = {name: archive.read(name) for name in archive.namelist()}
-    except (ValueError, RuntimeError, EOFError, NotImplementedError, OSError, zipfile.BadZipFile, zipfile.zlib.error):
+    except (
+        ValueError,
+        RuntimeError,
+        EOFError,
+        NotImplementedError,
+        OSError,
+        zipfile.BadZipFile,
+        zipfile.zlib.error,
+    ):
         return
     assert set(found.values()) <= {b"some content", b"other content" * 9}
 
@@ -109,7 +136,11 @@ def damaged_by(data: st.DataObject, whole: bytes) -> bytes:
 
 
 def test_a_name_that_is_too_long_or_a_pipe_is_no_place_for_a_result(tmp_path: Path, pipe: Path):
-    for path, reason in ((tmp_path / ("x" * 300), "too long"), (pipe, "a pipe or a device"), (Path("/dev/null"), "a pipe or a device")):
+    for path, reason in (
+        (tmp_path / ("x" * 300), "too long"),
+        (pipe, "a pipe or a device"),
+        (Path("/dev/null"), "a pipe or a device"),
+    ):
         with pytest.raises(ConfigurationError, match=f"cannot write .*{reason}"):
             require_writable(path)
     # The temporary file beside it has a name of its own.

@@ -23,7 +23,13 @@ SYSTEMS = ("cart_pole.py", "double_integrator.py", "bicycle.py")
 def test_a_filter_keeps_an_example_safe(name):
     path = EXAMPLES / name
     assert len(path.read_text().splitlines()) < 60
-    found = evaluate(CUSTOM_ID, filters=["none", "hocbf"], options={"system": f"{path}:problem"}, episodes=60, bounds=False)
+    found = evaluate(
+        CUSTOM_ID,
+        filters=["none", "hocbf"],
+        options={"system": f"{path}:problem"},
+        episodes=60,
+        bounds=False,
+    )
     bare, filtered = found.rows
     assert bare["ci_high"] < filtered["ci_low"]
     assert found.title == f"{path}:problem"
@@ -36,7 +42,21 @@ def test_a_filter_keeps_an_example_safe(name):
         ("evaluate", ["--episodes", "5", "--noise", "0.1"]),
         ("verify", ["--no-simulate", "--barrier", "radius=1.2"]),
         ("identify", ["--method", "bayesian", "--out", "learned.npz", "--noise", "0.1"]),
-        ("train", ["--algo", "ppo", "--out", "agent", "--n-timesteps", "64", "--num-envs", "2", "--eval-episodes", "2"]),
+        (
+            "train",
+            [
+                "--algo",
+                "ppo",
+                "--out",
+                "agent",
+                "--n-timesteps",
+                "64",
+                "--num-envs",
+                "2",
+                "--eval-episodes",
+                "2",
+            ],
+        ),
     ],
 )
 def test_commands_take_a_system_of_ones_own(command, options, tmp_path, monkeypatch):
@@ -45,6 +65,11 @@ def test_commands_take_a_system_of_ones_own(command, options, tmp_path, monkeypa
     result = CliRunner().invoke(app, [command, "--system", system, *options])
     assert result.exit_code == 0, result.output
     if command == "train":
-        assert json.loads((tmp_path / "agent" / "config.json").read_text())["training"]["options"]["system"] == system
+        assert (
+            json.loads((tmp_path / "agent" / "config.json").read_text())["training"]["options"][
+                "system"
+            ]
+            == system
+        )
     else:
         assert system in result.output

@@ -28,7 +28,8 @@ def test_an_error_releases_it(tmp_path):
 
 
 def test_a_file_that_the_holder_removed_meanwhile_locks_nobody_out(tmp_path, monkeypatch):
-    """Between the opening of the file and its lock, who had it may end, and a third may make another file."""
+    """Between the opening of the file and its lock, who had it may end, and a third may make
+    another file."""
     path, lock, calls = tmp_path / ".lock", file_locks._lock, []
 
     def late(file):
@@ -46,5 +47,8 @@ def test_a_file_that_the_holder_removed_meanwhile_locks_nobody_out(tmp_path, mon
 
 def test_a_folder_that_takes_no_files_is_named(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(ConfigurationError, match="cannot write"), locked(tmp_path / "file" / ".lock", "taken"):
+    with (
+        pytest.raises(ConfigurationError, match="cannot write"),
+        locked(tmp_path / "file" / ".lock", "taken"),
+    ):
         pass

@@ -52,6 +52,12 @@ assert loaded("pygame")
 
 
 def test_nothing_is_imported_before_it_is_needed():
-    done = subprocess.run([sys.executable, "-W", "error", "-c", STAGES], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", STAGES],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.count("Usage: ") == 5

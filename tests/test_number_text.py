@@ -55,7 +55,11 @@ def test_texts_are_no_numbers_in_a_start():
             problem.configured(start=start)
 
 
-@hypothesis.given(st.text(max_size=5).map(lambda text: 50 * text) | st.integers() | st.lists(st.floats(), max_size=20))
+@hypothesis.given(
+    st.text(max_size=5).map(lambda text: 50 * text)
+    | st.integers()
+    | st.lists(st.floats(), max_size=20)
+)
 def test_what_is_shown_is_short_and_whole_where_it_fits(given):
     assert len(shown(given)) <= 170
     if len(repr(given)) <= 120:
@@ -63,5 +67,8 @@ def test_what_is_shown_is_short_and_whole_where_it_fits(given):
 
 
 def test_long_texts_lose_their_middle():
-    assert shortened("a" * 60 + "b" * 1000 + "c" * 60) == "a" * 60 + "...(1000 more characters)..." + "c" * 60
+    assert (
+        shortened("a" * 60 + "b" * 1000 + "c" * 60)
+        == "a" * 60 + "...(1000 more characters)..." + "c" * 60
+    )
     assert nearest("x" * 10**6, ["one"]) == "allowed: one"

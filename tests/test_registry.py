@@ -12,13 +12,19 @@ from tests.conftest import problem_of
 
 def test_problem_is_that_of_the_registered_env(env_id):
     assert load_problem(env_id) == problem_of(env_id)
-    assert load_problem(env_id.split("/")[1], {"noise": 0.05, "dt": None}) == problem_of(env_id, noise=0.05)
+    assert load_problem(env_id.split("/")[1], {"noise": 0.05, "dt": None}) == problem_of(
+        env_id, noise=0.05
+    )
     assert full_id(env_id) == full_id(env_id.split("/")[1]) == env_id
 
 
 def test_unknown_ids_and_arguments_name_the_nearest():
     with pytest.raises(
-        ConfigurationError, match="unknown env 'safe_envs/StochasticDubin-v0'; did you mean 'safe_envs/StochasticDubins-v0'"
+        ConfigurationError,
+        match=(
+            "unknown env 'safe_envs/StochasticDubin-v0'; did you mean"
+            " 'safe_envs/StochasticDubins-v0'"
+        ),
     ):
         load_problem("safe_envs/StochasticDubin-v0")
     with pytest.raises(ConfigurationError, match="not one of this project's envs"):

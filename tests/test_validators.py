@@ -11,7 +11,13 @@ import torch
 
 from safe_envs import InvalidInputError
 from safe_envs.validators import real_array
-from safe_envs.wrappers import FilterSpec, SafetyFilter, SafetyFilterVectorWrapper, SafetyFilterWrapper, SafetyMonitor
+from safe_envs.wrappers import (
+    FilterSpec,
+    SafetyFilter,
+    SafetyFilterVectorWrapper,
+    SafetyFilterWrapper,
+    SafetyMonitor,
+)
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
 from tests.conftest import problem_of
 
@@ -47,24 +53,40 @@ def places():
         SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0", disable_env_checker=True), "cbf"),
         SafetyFilterVectorWrapper(gym.make_vec("safe_envs/Scalar-v0", num_envs=1), "cbf"),
         SafetyMonitor(gym.make("Pendulum-v1", disable_env_checker=True), spec()),
-        SafetyMonitorVector(gym.make_vec("Pendulum-v1", num_envs=1, vectorization_mode="sync"), spec()),
+        SafetyMonitorVector(
+            gym.make_vec("Pendulum-v1", num_envs=1, vectorization_mode="sync"), spec()
+        ),
     ]
     for env in envs:
         env.reset(seed=0)
     steps = {f"{type(env).__name__} of {env.unwrapped}": env.step for env in envs}
-    return {**steps, "input": lambda u: safety_filter.filter([0.0], u), "state": lambda x: safety_filter.filter(x, [0.0])}
+    return {
+        **steps,
+        "input": lambda u: safety_filter.filter([0.0], u),
+        "state": lambda x: safety_filter.filter(x, [0.0]),
+    }
 
 
 @pytest.mark.parametrize("kind", NO_NUMBERS)
 def test_what_is_no_number_is_refused_everywhere(kind, places):
     for name, use in places.items():
-        with pytest.raises(InvalidInputError, match=r"(?s)^the .* is .*; give an array of real numbers") as caught:
+        with pytest.raises(
+            InvalidInputError, match=r"(?s)^the .* is .*; give an array of real numbers"
+        ) as caught:
             use(NO_NUMBERS[kind])
         assert len(str(caught.value)) < 400, name
 
 
 @pytest.mark.parametrize(
-    "given", [np.float32(0.25), 0.25, [0.25], (Fraction(1, 4),), np.array([0.25], dtype=np.longdouble), torch.tensor([0.25])]
+    "given",
+    [
+        np.float32(0.25),
+        0.25,
+        [0.25],
+        (Fraction(1, 4),),
+        np.array([0.25], dtype=np.longdouble),
+        torch.tensor([0.25]),
+    ],
 )
 def test_what_is_a_number_is_converted(given):
     found = real_array("action", given)

@@ -27,19 +27,47 @@ def commands() -> dict[str, Any]:
 
 def options_of(command: Any) -> set[str]:
     """What may follow a command: `--episodes` and the like."""
-    return {"--help", *(text for p in command.params for text in (*p.opts, *p.secondary_opts) if text.startswith("-"))}
+    return {
+        "--help",
+        *(
+            text
+            for p in command.params
+            for text in (*p.opts, *p.secondary_opts)
+            if text.startswith("-")
+        ),
+    }
 
 
 def command_line_page() -> str:
     """Markdown with a section for each command."""
     common = _table(typer.main.get_command(app))
-    return "\n".join([_INTRODUCTION, *common, "", *(_section(name, command) for name, command in commands().items())])
+    return "\n".join(
+        [
+            _INTRODUCTION,
+            *common,
+            "",
+            *(_section(name, command) for name, command in commands().items()),
+        ]
+    )
 
 
 def _section(name: str, command: Any) -> str:
-    arguments = [p.metavar or p.name.upper() for p in command.params if p.param_type_name == "argument"]
+    arguments = [
+        p.metavar or p.name.upper() for p in command.params if p.param_type_name == "argument"
+    ]
     usage = " ".join(["safe-envs", name, *arguments, "[OPTIONS]"])
-    return "\n".join([f"## {name}", "", f"```text\n{usage}\n```", "", inspect.cleandoc(command.help or ""), "", *_table(command), ""])
+    return "\n".join(
+        [
+            f"## {name}",
+            "",
+            f"```text\n{usage}\n```",
+            "",
+            inspect.cleandoc(command.help or ""),
+            "",
+            *_table(command),
+            "",
+        ]
+    )
 
 
 def _table(command: Any) -> list[str]:
@@ -52,11 +80,19 @@ def _table(command: Any) -> list[str]:
 
 def _written(option: Any) -> str:
     names = ", ".join((*option.opts, *option.secondary_opts))
-    return names if option.is_flag else f"{names} {option.metavar or _LETTERS.get(type(option.default), 'X')}"
+    return (
+        names
+        if option.is_flag
+        else f"{names} {option.metavar or _LETTERS.get(type(option.default), 'X')}"
+    )
 
 
 def _default(option: Any) -> str:
-    return "" if option.default is None or option.is_flag or callable(option.default) else f"`{option.default}`"
+    return (
+        ""
+        if option.default is None or option.is_flag or callable(option.default)
+        else f"`{option.default}`"
+    )
 
 
 def _cell(text: str | None) -> str:

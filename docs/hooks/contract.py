@@ -1,4 +1,5 @@
-"""The page of the info contract, from the docstring of `safe_envs.envs.info` and what an env reports."""
+"""The page of the info contract, from the docstring of `safe_envs.envs.info` and what an env
+reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""A page for each env: its picture, its equations from the symbols that are simulated, and its docstring."""
+"""A page for each env: its picture, its equations from the symbols that are simulated, and its
+docstring."""
 
 from __future__ import annotations
 
@@ -19,7 +20,10 @@ from safe_envs.wrappers import SafetyFilterWrapper
 _SHOWN, _MOST_STEPS = 0.4, 400
 """Part of an episode after which the picture is taken, and the most steps until then."""
 
-_HEADER = "| env | what is to be kept safe | states | inputs | degree | filter |\n|---|---|---|---|---|---|"
+_HEADER = (
+    "| env | what is to be kept safe | states | inputs | degree | filter"
+    " |\n|---|---|---|---|---|---|"
+)
 _WORD = re.compile(r"^[A-Za-z]{2,}")
 _FUNCTION = re.compile(r"(?<=[A-Za-z0-9}]) (?=\\(?:sin|cos|tan|exp|log)\b)")
 _LOW = re.compile(r"\\left\(((?:(?!\\left|\\right|\\frac).)*)\\right\)")
@@ -81,11 +85,19 @@ The plant and the barriers, from the symbols that are simulated:
 
 def _row(name: str, problem: SafetyProblem, summary: str) -> str:
     filter_name = f"[`{problem.filter}`](../filters/{problem.filter}.md)"
-    return f"| [{name}]({name}.md) | {summary} | {problem.plant.n} | {problem.plant.m} | {_degrees(problem)} | {filter_name} |"
+    return (
+        f"| [{name}]({name}.md) | {summary} | {problem.plant.n} | {problem.plant.m} |"
+        f" {_degrees(problem)} | {filter_name} |"
+    )
 
 
 def _degrees(problem: SafetyProblem) -> str:
-    return ", ".join(str(degree) for degree in sorted({relative_degree(problem.model, b.expression) for b in problem.barriers}))
+    return ", ".join(
+        str(degree)
+        for degree in sorted(
+            {relative_degree(problem.model, b.expression) for b in problem.barriers}
+        )
+    )
 
 
 def _gains(problem: SafetyProblem) -> str:
@@ -102,15 +114,22 @@ def _equations(problem: SafetyProblem) -> str:
     found = []
     for i, state in enumerate(plant.states):
         terms = [f"{_factor(drift[i])}\\, dt"] if drift[i] != 0 else []
-        terms += [f"{_factor(level)}\\, {dW}" for level, dW in zip(plant.diffusion[i, :], noise, strict=True) if level != 0]
+        terms += [
+            f"{_factor(level)}\\, {dW}"
+            for level, dW in zip(plant.diffusion[i, :], noise, strict=True)
+            if level != 0
+        ]
         found.append(f"d{_latex(state)} = {' + '.join(terms) or '0'}")
     found += [f"{_name(b.name)} = {_latex(b.expression)}" for b in problem.barriers]
     return "\n".join(f"$$\n{equation}\n$$\n" for equation in found)
 
 
 def _latex(expression: Any) -> str:
-    """LaTeX with short numbers, upright words, room before functions, and no tall parentheses around what is not tall."""
-    floats = {f: sp.Integer(int(f)) if f == int(f) else sp.Float(f, 4) for f in expression.atoms(sp.Float)}
+    """LaTeX with short numbers, upright words, room before functions, and no tall parentheses
+    around what is not tall."""
+    floats = {
+        f: sp.Integer(int(f)) if f == int(f) else sp.Float(f, 4) for f in expression.atoms(sp.Float)
+    }
     words = {s: _WORD.sub(r"\\mathrm{\g<0>}", sp.latex(s)) for s in expression.free_symbols}
     latex, count = sp.latex(expression.xreplace(floats), symbol_names=words), 1
     while count:

@@ -14,5 +14,7 @@ from safe_envs.wrappers import CONDITIONS, LEARNED
 def complete(nav: Sequence[dict[str, Any]]) -> None:
     """Add the pages of envs and conditions to the sections of the navigation that are theirs."""
     for section in nav:
-        section.get("Environments", []).extend(f"envs/{short_name(env_id)}.md" for env_id in ENV_IDS)
+        section.get("Environments", []).extend(
+            f"envs/{short_name(env_id)}.md" for env_id in ENV_IDS
+        )
         section.get("Filters", []).extend(f"filters/{name}.md" for name in (*CONDITIONS, *LEARNED))

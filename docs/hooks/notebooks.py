@@ -1,4 +1,5 @@
-"""The notebooks, which are kept without outputs: executed when the site is built, and shown as pages."""
+"""The notebooks, which are kept without outputs: executed when the site is built, and shown as
+pages."""
 
 from __future__ import annotations
 
@@ -26,8 +27,16 @@ def executed(path: Path) -> Any:
     notebook = nbformat.read(path, as_version=4)
     with tempfile.TemporaryDirectory() as folder:
         # Sockets of the machine's own, which nobody on a network can reach.
-        sockets = Config({"AsyncKernelManager": {"transport": "ipc", "ip": str(Path(folder) / "kernel")}})
-        client = NotebookClient(notebook, config=sockets, kernel_name="python3", timeout=_TIMEOUT, resources={"metadata": {"path": folder}})
+        sockets = Config(
+            {"AsyncKernelManager": {"transport": "ipc", "ip": str(Path(folder) / "kernel")}}
+        )
+        client = NotebookClient(
+            notebook,
+            config=sockets,
+            kernel_name="python3",
+            timeout=_TIMEOUT,
+            resources={"metadata": {"path": folder}},
+        )
         return client.execute()
 
 
@@ -48,14 +57,18 @@ def notebook_pages() -> dict[str, str | bytes]:
                     pages[f"notebooks/{name}"] = picture
                     text = f"![What the cell draws](./{name})"
                 parts.append(text)
-        parts.insert(1, f"[Download the notebook](./{path.name}); it was run when this site was built.")
+        parts.insert(
+            1, f"[Download the notebook](./{path.name}); it was run when this site was built."
+        )
         pages[f"notebooks/{path.stem}.md"] = "\n\n".join(parts) + "\n"
     return pages
 
 
 def _joined(outputs: Sequence[Any]) -> list[Any]:
     """The outputs of a cell, with what is printed in one piece."""
-    printed = [output for output in outputs if output.output_type == "stream" and output.name == "stdout"]
+    printed = [
+        output for output in outputs if output.output_type == "stream" and output.name == "stdout"
+    ]
     for output in printed[1:]:
         printed[0].text += output.text
     return [*printed[:1], *(output for output in outputs if output.output_type != "stream")]

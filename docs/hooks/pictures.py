@@ -1,4 +1,5 @@
-"""The pictures of the page of concepts. Every curve, set and number in them is computed when the site is built."""
+"""The pictures of the page of concepts. Every curve, set and number in them is computed when the
+site is built."""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ def _problem(env_id: str) -> SafetyProblem:
 
 
 def _chain() -> Figure:
-    """C_0, C_1 and where no action meets the condition, in the plane of a Dubins vehicle that heads to the right."""
+    """C_0, C_1 and where no action meets the condition, in the plane of a Dubins vehicle that heads
+    to the right."""
     problem = _problem("safe_envs/StochasticDubins-v0")
     figure = Figure(figsize=(10, 4.4))
     for axes, name in zip(figure.subplots(1, 2), ("hocbf", "scbf"), strict=True):
@@ -63,13 +65,20 @@ def _chain() -> Figure:
         result = safety_filter.filter(states, np.zeros((len(states), 1)))
         missed = np.where((h > 0) & (b_1 > 0), ~result.feasible.reshape(x.shape), False)
         axes.contourf(x, y, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35)
-        axes.contourf(x, y, np.minimum(h, b_1), levels=[0.0, np.inf], colors=[COLORS[4]], alpha=0.45)
+        axes.contourf(
+            x, y, np.minimum(h, b_1), levels=[0.0, np.inf], colors=[COLORS[4]], alpha=0.45
+        )
         axes.contourf(x, y, missed.astype(float), levels=[0.5, 1.5], colors=[COLORS[3]], alpha=0.8)
         axes.contour(x, y, h, levels=[0.0], colors="black", linewidths=1.3)
         axes.contour(x, y, b_1, levels=[0.0], colors=COLORS[0], linewidths=1.3)
         axes.annotate("", (0.6, -2.4), (-0.6, -2.4), arrowprops={"arrowstyle": "->"})
         axes.text(0.0, -2.3, "heading", ha="center", color=QUIET)
-        axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", title=_title(name, missed.sum(), ((h > 0) & (b_1 > 0)).sum()))
+        axes.set(
+            aspect="equal",
+            xlabel="x (m)",
+            ylabel="y (m)",
+            title=_title(name, missed.sum(), ((h > 0) & (b_1 > 0)).sum()),
+        )
     figure.legend(
         handles=[
             Line2D([], [], color="black", label="h = 0"),
@@ -88,7 +97,9 @@ def _title(name: str, missed: int, kept: int) -> str:
     return f"{name}: in {100 * missed / kept:.0f} % of it no action meets the row"
 
 
-def _chain_values(safety_filter: SafetyFilter, problem: SafetyProblem, states: np.ndarray) -> np.ndarray:
+def _chain_values(
+    safety_filter: SafetyFilter, problem: SafetyProblem, states: np.ndarray
+) -> np.ndarray:
     """b_0..b_(r-1) at states (B, n), shape (r, B)."""
     chain = [problem.model.numeric(b) for b in safety_filter.constraints[0].chain]
     return np.array(compile_function(problem.model.states, chain, "arrays")(*states.T))
@@ -98,12 +109,19 @@ def _point() -> tuple[ControlAffineSDE, Barrier]:
     """A point in the plane that is pushed, and a round obstacle."""
     x, y, v_x, v_y, a_x, a_y = sp.symbols("x y v_x v_y a_x a_y", real=True)
     gains = [[0, 0], [0, 0], [1, 0], [0, 1]]
-    system = ControlAffineSDE((x, y, v_x, v_y), (a_x, a_y), drift=[v_x, v_y, 0, 0], input_matrix=gains, diffusion=[0, 0, 0, 0])
+    system = ControlAffineSDE(
+        (x, y, v_x, v_y),
+        (a_x, a_y),
+        drift=[v_x, v_y, 0, 0],
+        input_matrix=gains,
+        diffusion=[0, 0, 0, 0],
+    )
     return system, Barrier(x**2 + y**2 - 1)
 
 
 def _program() -> Figure:
-    """The program that a filter solves, in the plane of two inputs: at a state where the row can be met, and where it cannot."""
+    """The program that a filter solves, in the plane of two inputs: at a state where the row can be
+    met, and where it cannot."""
     system, barrier = _point()
     safety_filter = SafetyFilter(system, [(barrier, HOCBF((2.0, 2.0)))], [(-2.0, 2.0)] * 2)
     row = safety_filter.constraints[0]
@@ -116,7 +134,9 @@ def _program() -> Figure:
         _draw_program(axes, np.array(compiled(*state)), nominal, result)
         verdict = "feasible" if result.feasible else f"infeasible, slack {result.slack[0]:.2f}"
         axes.set_title(f"towards the obstacle at {speed:g} m/s: {verdict}")
-    figure.legend(handles=figure.axes[0].get_legend_handles_labels()[0], loc="outside lower center", ncols=3)
+    figure.legend(
+        handles=figure.axes[0].get_legend_handles_labels()[0], loc="outside lower center", ncols=3
+    )
     return figure
 
 
@@ -125,11 +145,23 @@ def _draw_program(axes: Axes, row: np.ndarray, nominal: np.ndarray, result: Any)
     allowed = row[0] * u + row[1] * v + row[2]
     axes.contourf(u, v, allowed, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35)
     axes.contour(u, v, allowed, levels=[0.0], colors="black", linewidths=1.3)
-    axes.add_patch(Rectangle((-2, -2), 4, 4, fill=False, linestyle="--", edgecolor=QUIET, label="box"))
+    axes.add_patch(
+        Rectangle((-2, -2), 4, 4, fill=False, linestyle="--", edgecolor=QUIET, label="box")
+    )
     axes.plot(*nominal, "o", color="#D55E00", markersize=8, label="nominal action")
     axes.plot(*result.action, "s", color=COLORS[0], markersize=8, label="executed action")
-    axes.annotate("", tuple(result.action), tuple(nominal), arrowprops={"arrowstyle": "->", "color": QUIET})
-    axes.text(0.98, 0.02, "grey: a u + b < 0", transform=axes.transAxes, ha="right", va="bottom", color=QUIET)
+    axes.annotate(
+        "", tuple(result.action), tuple(nominal), arrowprops={"arrowstyle": "->", "color": QUIET}
+    )
+    axes.text(
+        0.98,
+        0.02,
+        "grey: a u + b < 0",
+        transform=axes.transAxes,
+        ha="right",
+        va="bottom",
+        color=QUIET,
+    )
     axes.set(aspect="equal", xlabel="$a_x$ (m/s²)", ylabel="$a_y$ (m/s²)")
 
 
@@ -143,13 +175,31 @@ def _promise() -> Figure:
     axes = figure.subplots()
     for row, color in zip(evaluation.rows, ("#D55E00", COLORS[0]), strict=True):
         curve = row["curve"]
-        axes.fill_between(curve["time"], curve["ci_low"], curve["ci_high"], color=color, alpha=0.25, linewidth=0)
-        axes.plot(curve["time"], curve["rate"], color=color, label=f"{row['filter']}: measured, {_EPISODES} episodes, with its 95 % band")
+        axes.fill_between(
+            curve["time"], curve["ci_low"], curve["ci_high"], color=color, alpha=0.25, linewidth=0
+        )
+        axes.plot(
+            curve["time"],
+            curve["rate"],
+            color=color,
+            label=f"{row['filter']}: measured, {_EPISODES} episodes, with its 95 % band",
+        )
     times = np.linspace(0.0, problem.horizon, 41)
     at_times = zip(*[promise(verification, starts, t) for t in times.tolist()], strict=True)
     for bounds, color in zip(at_times, (QUIET, COLORS[1]), strict=True):
         label = f"{bounds[-1].name.split(',')[0]}: {bounds[-1].status}"
-        axes.plot(times, [bound.value or 0.0 for bound in bounds], color=color, linestyle="--", label=label)
-    axes.set(xlim=(0.0, problem.horizon), ylim=(0.0, 1.02), xlabel="horizon T (s)", ylabel="probability of no violation")
+        axes.plot(
+            times,
+            [bound.value or 0.0 for bound in bounds],
+            color=color,
+            linestyle="--",
+            label=label,
+        )
+    axes.set(
+        xlim=(0.0, problem.horizon),
+        ylim=(0.0, 1.02),
+        xlabel="horizon T (s)",
+        ylabel="probability of no violation",
+    )
     figure.legend(handles=axes.get_legend_handles_labels()[0], loc="outside lower center", ncols=2)
     return figure

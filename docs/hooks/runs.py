@@ -1,9 +1,11 @@
-r"""Examples in pages that are run when the site is built, so that what they print is what the program prints.
+r"""Examples in pages that are run when the site is built, so that what they print is what the
+program prints.
 
-A fence that begins with ```python run is executed, one after the other in one namespace for each page. In ```console run
-every line that begins with "$ safe-envs" is a command, "\" at its end goes on with it. What is printed follows in the page.
-Options: `lines=N` shows the first N lines of it only, `fails` says that the command is to end with an error of the user's.
-All runs of a page share a folder of their own, in which `examples` is that of the repository. A line "<!-- file PATH -->"
+A fence that begins with ```python run is executed, one after the other in one namespace for each
+page. In ```console run every line that begins with "$ safe-envs" is a command, "\" at its end goes
+on with it. What is printed follows in the page. Options: `lines=N` shows the first N lines of it
+only, `fails` says that the command is to end with an error of the user's. All runs of a page share
+a folder of their own, in which `examples` is that of the repository. A line "<!-- file PATH -->"
 stands for a Python file of it.
 """
 
@@ -27,7 +29,8 @@ _COMMAND = re.compile(r"^\$ (safe-envs(?:[^\n]*\\\n)*[^\n]*)$", re.MULTILINE)
 
 
 def with_output(markdown: str) -> str:
-    """Run the examples of a page, put what they print behind them, and put in the files that it shows.
+    """Run the examples of a page, put what they print behind them, and put in the files that it
+    shows.
 
     Raises:
         RuntimeError: a command ended otherwise than its fence says.
@@ -51,7 +54,12 @@ def run_python(markdown: str) -> None:
 
 def commands_in(markdown: str) -> list[list[str]]:
     """The words of every `$ safe-envs` command of a page."""
-    return [_words(command) for kind, code in _ANY_FENCE.findall(markdown) if kind == "console" for command in _COMMAND.findall(code)]
+    return [
+        _words(command)
+        for kind, code in _ANY_FENCE.findall(markdown)
+        if kind == "console"
+        for command in _COMMAND.findall(code)
+    ]
 
 
 def _words(command: str) -> list[str]:
@@ -68,15 +76,22 @@ def _folder() -> Iterator[None]:
 
 
 def _shown(kind: str, options: str, code: str, names: dict[str, Any]) -> str:
-    settings = {name: value for name, _, value in (option.partition("=") for option in options.split())}
+    settings = {
+        name: value for name, _, value in (option.partition("=") for option in options.split())
+    }
     if kind == "python":
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):
             exec(code, names)
         return f"```python\n{code}```\n\n```text\n{_first(printed.getvalue(), settings)}\n```"
     # What is printed is no console to Pygments, which would take a % for a prompt.
-    printed = {command: _first(_output(_words(command), "fails" in settings), settings) for command in _COMMAND.findall(code)}
-    return "\n\n".join(f"```console\n$ {command}\n```\n\n```text\n{text}\n```" for command, text in printed.items())
+    printed = {
+        command: _first(_output(_words(command), "fails" in settings), settings)
+        for command in _COMMAND.findall(code)
+    }
+    return "\n\n".join(
+        f"```console\n$ {command}\n```\n\n```text\n{text}\n```" for command, text in printed.items()
+    )
 
 
 def _first(text: str, settings: dict[str, str]) -> str:
@@ -86,7 +101,8 @@ def _first(text: str, settings: dict[str, str]) -> str:
 
 
 def _output(words: Sequence[str], fails: bool) -> str:
-    """What a command prints, run in this process, since importing everything again takes longer than most commands."""
+    """What a command prints, run in this process, since importing everything again takes longer
+    than most commands."""
     import typer
 
     from safe_envs.scripts.cli import app

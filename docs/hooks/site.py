@@ -31,7 +31,13 @@ def on_config(config: Any) -> Any:
 def on_files(files: Any, config: Any) -> Any:
     """Add the pages and pictures that are made from the program."""
     _made.update({**env_pages(), **notebook_pages(), **pictures()})
-    _made.update({"reference/command-line.md": command_line_page(), "reference/info.md": info_page(), "assets/STIXGeneral.ttf": font()})
+    _made.update(
+        {
+            "reference/command-line.md": command_line_page(),
+            "reference/info.md": info_page(),
+            "assets/STIXGeneral.ttf": font(),
+        }
+    )
     for path, content in _made.items():
         if path != "envs/table.md":
             files.append(File.generated(config, path, content=content))
@@ -43,7 +49,9 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     try:
         return with_output(markdown.replace(_TABLE, str(_made["envs/table.md"])))
     except Exception as error:
-        raise PluginError(f"{page.file.src_uri}: an example does not run: {type(error).__name__}: {error}") from error
+        raise PluginError(
+            f"{page.file.src_uri}: an example does not run: {type(error).__name__}: {error}"
+        ) from error
 
 
 def on_page_content(html: str, **_: Any) -> str:

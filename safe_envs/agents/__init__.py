@@ -1,13 +1,20 @@
-"""Who acts, and how well: policies with Stable-Baselines3's `predict`, and the evaluation of filters.
+"""Who acts, and how well: policies with Stable-Baselines3's `predict`, and the evaluation of
+filters.
 
-Nothing here imports torch or Stable-Baselines3 before an agent is trained, or a policy of that library is loaded.
+Nothing here imports torch or Stable-Baselines3 before an agent is trained, or a policy of that
+library is loaded.
 """
 
 from typing import Any
 
 from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate
 from safe_envs.agents.evaluation.refinement import Refinement, refine
-from safe_envs.agents.evaluation.statistics import mcnemar_p, paired_difference_interval, rate_interval, wilson_interval
+from safe_envs.agents.evaluation.statistics import (
+    mcnemar_p,
+    paired_difference_interval,
+    rate_interval,
+    wilson_interval,
+)
 from safe_envs.agents.policies.clf import CLFController
 from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
 from safe_envs.agents.policies.registry import POLICIES, Policy, make_policy

@@ -1,1 +1,2 @@
-"""Control-affine stochastic differential equations: symbols, derivatives, generated code and integrators."""
+"""Control-affine stochastic differential equations: symbols, derivatives, generated code and
+integrators."""

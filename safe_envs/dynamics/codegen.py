@@ -1,7 +1,8 @@
 """From sympy expressions to functions of plain floats, or of NumPy arrays over any batch.
 
-Both flavours take their arguments one by one, component by component, and return a tuple: with arrays, every
-component is an array over the batch, so that elementwise arithmetic runs on contiguous memory.
+Both flavours take their arguments one by one, component by component, and return a tuple: with
+arrays, every component is an array over the batch, so that elementwise arithmetic runs on
+contiguous memory.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ _settled: dict[int, np.ndarray] = {}
 class _Remembering:
     """A costly ufunc that knows its values at the arrays that were last given to `settled`.
 
-    The observation, the filter and the next step ask for the sine of one and the same heading. No other array is
-    remembered: its owner may change it in place between two calls.
+    The observation, the filter and the next step ask for the sine of one and the same heading. No
+    other array is remembered: its owner may change it in place between two calls.
     """
 
     def __init__(self, ufunc: np.ufunc) -> None:
@@ -65,14 +66,21 @@ _ARRAY_FUNCTIONS = {**_REMEMBERING, "erf": _elementwise(math.erf), "erfc": _elem
 
 
 def settled(components: Sequence[Any], shape: tuple[int, ...]) -> Components:
-    """Components as read-only arrays of their own, whose sines and cosines are computed once until the next call.
+    """Components as read-only arrays of their own, whose sines and cosines are computed once until
+    the next call.
 
     Args:
-        components: arrays that were made for the caller, and that nobody else can write to, or numbers.
+        components: arrays that were made for the caller, and that nobody else can write to, or
+            numbers.
         shape: of the arrays returned.
     """
     global _settled
-    arrays = tuple([a if type(a) is np.ndarray and a.base is None and a.ndim else np.array(filled(a, shape)) for a in components])
+    arrays = tuple(
+        [
+            a if type(a) is np.ndarray and a.base is None and a.ndim else np.array(filled(a, shape))
+            for a in components
+        ]
+    )
     for array in arrays:
         array.setflags(False)  # pyright: ignore[reportCallIssue]  (a keyword takes three times as long)
     _settled = {id(array): array for array in arrays}
@@ -81,28 +89,35 @@ def settled(components: Sequence[Any], shape: tuple[int, ...]) -> Components:
     return arrays
 
 
-def compile_function(arguments: Sequence[sp.Symbol], expressions: Sequence[Any], flavour: Flavour) -> Callable[..., Components]:
+def compile_function(
+    arguments: Sequence[sp.Symbol], expressions: Sequence[Any], flavour: Flavour
+) -> Callable[..., Components]:
     """Compile expressions that share their common subexpressions.
 
     Args:
-        arguments: symbols, in the order in which the function takes them; their names may be any texts.
+        arguments: symbols, in the order in which the function takes them; their names may be any
+            texts.
         expressions: what it returns, in order; every free symbol must be an argument.
-        flavour: "floats" for plain floats, "arrays" for NumPy arrays that broadcast against each other.
+        flavour: "floats" for plain floats, "arrays" for NumPy arrays that broadcast against each
+            other.
 
     Returns:
-        A function of `len(arguments)` positional arguments that returns a tuple of `len(expressions)`. An
-        expression without any argument in it comes back as a number without axes. The arrays returned may be those
-        given, and must not be changed in place.
+        A function of `len(arguments)` positional arguments that returns a tuple of
+        `len(expressions)`. An expression without any argument in it comes back as a number without
+        axes. The arrays returned may be those given, and must not be changed in place.
 
     Raises:
-        SystemDefinitionError: an expression holds a symbol that is no argument, a function without a numerical form,
-            or a number that is not real or too large; or a symbol is an argument twice.
+        SystemDefinitionError: an expression holds a symbol that is no argument, a function without
+            a numerical form, or a number that is not real or too large; or a symbol is an argument
+            twice.
     """
     return _compile(tuple(arguments), tuple(sp.sympify(e) for e in expressions), flavour)
 
 
 @lru_cache(maxsize=1024)
-def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], flavour: Flavour) -> Callable[..., Components]:
+def _compile(
+    arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], flavour: Flavour
+) -> Callable[..., Components]:
     names, formulas, numbers, shared = _prepared(arguments, expressions)
     printer = ArrayPrinter() if flavour == "arrays" else FloatPrinter()
     try:
@@ -115,7 +130,9 @@ def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...],
             docstring_limit=0,
         )
     except PrintMethodNotImplementedError as error:
-        raise SystemDefinitionError(f"{_shortened(expressions)} has no numerical form: {str(error).splitlines()[0]}") from error
+        raise SystemDefinitionError(
+            f"{_shortened(expressions)} has no numerical form: {str(error).splitlines()[0]}"
+        ) from error
     if isinstance(printer, ArrayPrinter):
         function.__globals__.update(printer.constants)
     elif any(e.has(sp.Piecewise, sp.Heaviside, sp.sinc) for e in formulas):
@@ -124,10 +141,14 @@ def _compile(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...],
 
 
 @lru_cache(maxsize=256)
-def _prepared(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...]) -> tuple[tuple[sp.Symbol, ...], Any, Any, Any]:
-    """What both flavours have in common: the arguments and formulas in plain names, these with rounded numbers, and what they share.
+def _prepared(
+    arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...]
+) -> tuple[tuple[sp.Symbol, ...], Any, Any, Any]:
+    """What both flavours have in common: the arguments and formulas in plain names, these with
+    rounded numbers, and what they share.
 
-    An env and a batch of it ask for the same formulas, one after the other, and to find what they share takes longest.
+    An env and a batch of it ask for the same formulas, one after the other, and to find what they
+    share takes longest.
     """
     for expression in expressions:
         _require_computable(expression, arguments)
@@ -136,9 +157,16 @@ def _prepared(arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...]
     return names, formulas, numbers, _shared_subexpressions(numbers)
 
 
-def _piece_by_piece(quick: Callable[..., Components], names: Sequence[sp.Symbol], formulas: Sequence[Any]) -> Callable[..., Components]:
-    """A function of floats that evaluates the pieces that apply, where a shared subexpression of others has no value."""
-    careful = lru_cache(maxsize=1)(lambda: sp.lambdify(names, tuple(formulas), modules=[math], printer=FloatPrinter(), docstring_limit=0))
+def _piece_by_piece(
+    quick: Callable[..., Components], names: Sequence[sp.Symbol], formulas: Sequence[Any]
+) -> Callable[..., Components]:
+    """A function of floats that evaluates the pieces that apply, where a shared subexpression of
+    others has no value."""
+    careful = lru_cache(maxsize=1)(
+        lambda: sp.lambdify(
+            names, tuple(formulas), modules=[math], printer=FloatPrinter(), docstring_limit=0
+        )
+    )
 
     def function(*arguments: float) -> Components:
         try:
@@ -153,21 +181,36 @@ def _require_computable(expression: Any, arguments: tuple[sp.Symbol, ...]) -> No
     unknown = expression.free_symbols - set(arguments)
     if unknown:
         raise SystemDefinitionError(
-            f"{_shortened(expression)} holds {', '.join(sorted(map(str, unknown)))}, which is none of {', '.join(map(str, arguments))}"
+            f"{_shortened(expression)} holds {', '.join(sorted(map(str, unknown)))}, which is none"
+            f" of {', '.join(map(str, arguments))}"
         )
     if len(set(arguments)) < len(arguments):
-        raise SystemDefinitionError(f"a symbol stands for two arguments of {_shortened(expression)}: {', '.join(map(str, arguments))}")
+        raise SystemDefinitionError(
+            f"a symbol stands for two arguments of {_shortened(expression)}:"
+            f" {', '.join(map(str, arguments))}"
+        )
     strange = {f.func for f in expression.atoms(sp.Function) if not isinstance(f, SUPPORTED)}
     if strange:
-        advice = "; DiracDelta is the derivative of a jump: use a smooth function" if sp.DiracDelta in strange else ""
+        advice = (
+            "; DiracDelta is the derivative of a jump: use a smooth function"
+            if sp.DiracDelta in strange
+            else ""
+        )
         raise SystemDefinitionError(
-            f"{_shortened(expression)} holds {', '.join(sorted(map(str, strange)))}, which has no numerical form here; "
-            f"write it with {', '.join(f.__name__ for f in SUPPORTED)}, Max and Min{advice}"
+            f"{_shortened(expression)} holds {', '.join(sorted(map(str, strange)))}, which has no"
+            f" numerical form here; write it with {', '.join(f.__name__ for f in SUPPORTED)}, Max"
+            f" and Min{advice}"
         )
     if expression.has(sp.I, sp.zoo):
-        raise SystemDefinitionError(f"{_shortened(expression)} is not real everywhere, or has a division by 0; look at its numbers")
+        raise SystemDefinitionError(
+            f"{_shortened(expression)} is not real everywhere, or has a division by 0; look at its"
+            " numbers"
+        )
     if any(abs(number) > _LARGEST_FLOAT for number in expression.atoms(sp.Float, sp.Rational)):
-        raise SystemDefinitionError(f"{_shortened(expression)} holds a number beyond {float(_LARGEST_FLOAT):.2g}, the largest of floats")
+        raise SystemDefinitionError(
+            f"{_shortened(expression)} holds a number beyond {float(_LARGEST_FLOAT):.2g}, the"
+            " largest of floats"
+        )
 
 
 def _shortened(expression: Any) -> str:
@@ -178,11 +221,15 @@ def _shortened(expression: Any) -> str:
     return text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}..."
 
 
-def in_plain_names(arguments: Sequence[sp.Symbol], expressions: Sequence[Any]) -> tuple[tuple[sp.Symbol, ...], tuple[Any, ...]]:
-    """The same formulas of arguments a000, a001, ..., so that no name in generated code is a user's.
+def in_plain_names(
+    arguments: Sequence[sp.Symbol], expressions: Sequence[Any]
+) -> tuple[tuple[sp.Symbol, ...], tuple[Any, ...]]:
+    """The same formulas of arguments a000, a001, ..., so that no name in generated code is a
+    user's.
 
-    A name of the user's may be a keyword, a function, no identifier at all, or one of those that common subexpressions
-    get. The new names sort like the old ones, for sympy orders the terms of a sum by them, and rounding follows the order.
+    A name of the user's may be a keyword, a function, no identifier at all, or one of those that
+    common subexpressions get. The new names sort like the old ones, for sympy orders the terms of a
+    sum by them, and rounding follows the order.
     """
     ordered = sorted(arguments, key=sp.default_sort_key)
     plain = {s: sp.Symbol(f"a{i:03d}", **s.assumptions0) for i, s in enumerate(ordered)}
@@ -193,7 +240,8 @@ def in_plain_names(arguments: Sequence[sp.Symbol], expressions: Sequence[Any]) -
             return known.get(expression, expression)
         if expression not in known:
             parts = [renamed(part) for part in expression.args]
-            # Sympy would compare all parts with each other once more, which takes longer than all else.
+            # Sympy would compare all parts with each other once more, which takes longer than all
+            # else.
             as_it_is = {"evaluate": False} if isinstance(expression, sp.Max | sp.Min) else {}
             known[expression] = expression.func(*parts, **as_it_is)
         return known[expression]
@@ -201,8 +249,11 @@ def in_plain_names(arguments: Sequence[sp.Symbol], expressions: Sequence[Any]) -
     return tuple(plain[s] for s in arguments), tuple(renamed(e) for e in expressions)
 
 
-def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
-    """Common subexpressions, with small integer powers written as products: `pow` is many times slower."""
+def _shared_subexpressions(
+    expressions: Any,
+) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
+    """Common subexpressions, with small integer powers written as products: `pow` is many times
+    slower."""
     shared: Any
     reduced: Any
     shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("x"), list=False)
@@ -213,7 +264,11 @@ def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.E
         if not expression.args:
             return expression
         arguments = [expand(a) for a in expression.args]
-        if isinstance(expression, sp.Pow) and expression.exp.is_Integer and 2 <= abs(expression.exp) <= _LARGEST_EXPANDED_POWER:
+        if (
+            isinstance(expression, sp.Pow)
+            and expression.exp.is_Integer
+            and 2 <= abs(expression.exp) <= _LARGEST_EXPANDED_POWER
+        ):
             base = arguments[0]
             if not base.is_Symbol:
                 symbol = next(fresh)
@@ -234,12 +289,14 @@ def _shared_subexpressions(expressions: Any) -> tuple[list[tuple[sp.Symbol, sp.E
 
 
 def constants(values: Sequence[float]) -> list[np.ndarray]:
-    """Numbers as arrays without axes: a ufunc converts a Python float anew at every call, for as long as a small batch takes."""
+    """Numbers as arrays without axes: a ufunc converts a Python float anew at every call, for as
+    long as a small batch takes."""
     return [np.array(v) for v in values]
 
 
 def filled(component: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """A component as an array of the batch's shape: what does not depend on the arguments comes back as a float."""
+    """A component as an array of the batch's shape: what does not depend on the arguments comes
+    back as a float."""
     return component if getattr(component, "shape", None) == shape else np.full(shape, component)
 
 
@@ -252,6 +309,7 @@ def stacked(components: Sequence[Any], size: int) -> np.ndarray:
 
 
 def finite(values: np.ndarray) -> bool:
-    """Whether no entry is NaN or infinite; a quick look that may report huge finite entries as infinite."""
+    """Whether no entry is NaN or infinite; a quick look that may report huge finite entries as
+    infinite."""
     flat = values.ravel()
     return math.isfinite(flat.dot(flat))

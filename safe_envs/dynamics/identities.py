@@ -20,16 +20,18 @@ _SCALES = (1, 1, 3)
 
 
 def is_zero(expression: Any) -> bool:
-    """Whether an expression is zero for all real values of its symbols, but for single points of jumps.
+    """Whether an expression is zero for all real values of its symbols, but for single points of
+    jumps.
 
-    An analytic function that is not zero everywhere is zero at random points with probability 0. An expression with kinks
-    and jumps is one in each region of the signs of what switches there: of a for |a|, of a - b for max(a, b), of the
-    root's branch for sqrt(a), which may hide a kink as well. Every region is looked at, wherever it lies; one that is
-    empty, which cannot be told in general, counts like the others.
+    An analytic function that is not zero everywhere is zero at random points with probability 0. An
+    expression with kinks and jumps is one in each region of the signs of what switches there: of a
+    for |a|, of a - b for max(a, b), of the root's branch for sqrt(a), which may hide a kink as
+    well. Every region is looked at, wherever it lies; one that is empty, which cannot be told in
+    general, counts like the others.
 
     Returns:
-        True where that is shown; False also where it is not, because of functions that are not looked into (logarithms,
-        floors, inverse functions) or of too many regions.
+        True where that is shown; False also where it is not, because of functions that are not
+        looked into (logarithms, floors, inverse functions) or of too many regions.
     """
     expression = _rational(expression)
     if expression == 0:
@@ -42,8 +44,11 @@ def is_zero(expression: Any) -> bool:
 
 
 def _rational(expression: Any) -> Any:
-    """The expression with the decimal value of each float as a fraction, so that terms cancel exactly."""
-    return expression.xreplace({f: sp.Rational(repr(float(f))) for f in expression.atoms(sp.Float) if f.is_finite})
+    """The expression with the decimal value of each float as a fraction, so that terms cancel
+    exactly."""
+    return expression.xreplace(
+        {f: sp.Rational(repr(float(f))) for f in expression.atoms(sp.Float) if f.is_finite}
+    )
 
 
 def _nonzero_somewhere(expression: Any) -> bool:
@@ -54,7 +59,10 @@ def _nonzero_somewhere(expression: Any) -> bool:
     symbols = sorted(expression.free_symbols, key=sp.default_sort_key)
     for scale in _SCALES:
         at = {s: sp.Rational(points.randint(-(10**6), 10**6) or 1, 10**6) * scale for s in symbols}
-        if any(_told_from_zero(part) for part in expression.xreplace(at).evalf(30, maxn=200).as_real_imag()):
+        if any(
+            _told_from_zero(part)
+            for part in expression.xreplace(at).evalf(30, maxn=200).as_real_imag()
+        ):
             return True
     return False
 
@@ -65,7 +73,8 @@ def _told_from_zero(value: Any) -> bool:
 
 
 class _Pieces:
-    """The analytic functions that an expression is made of, one for each region; one symbol where there are too many."""
+    """The analytic functions that an expression is made of, one for each region; one symbol where
+    there are too many."""
 
     def __init__(self, expression: Any) -> None:
         self._signs: dict[Any, sp.Dummy] = {}
@@ -81,7 +90,8 @@ class _Pieces:
             yield self._expression.xreplace(dict(zip(signs, values, strict=True)))
 
     def _rewritten(self, e: Any) -> Any:
-        """An expression with signs of what switches in place of kinks and jumps, and a symbol for what is not looked into."""
+        """An expression with signs of what switches in place of kinks and jumps, and a symbol for
+        what is not looked into."""
         if isinstance(e, sp.Piecewise):
             return self._of_pieces(e)
         if not e.args:
@@ -91,10 +101,18 @@ class _Pieces:
         args = [self._rewritten(a) for a in e.args]
         if isinstance(e, sp.Max | sp.Min):
             up = 1 if isinstance(e, sp.Max) else -1
-            return functools.reduce(lambda a, b: (a + b + up * (a - b) * self._sign(a - b)) / 2, args)
+            return functools.reduce(
+                lambda a, b: (a + b + up * (a - b) * self._sign(a - b)) / 2, args
+            )
         if isinstance(e, _SWITCHING):
             sign = self._sign(args[0])
-            return args[0] * sign if isinstance(e, sp.Abs) else sign if isinstance(e, sp.sign) else (1 + sign) / 2
+            return (
+                args[0] * sign
+                if isinstance(e, sp.Abs)
+                else sign
+                if isinstance(e, sp.sign)
+                else (1 + sign) / 2
+            )
         if isinstance(e, sp.Pow) and not (args[1].is_integer or args[0].is_positive):
             root = args[1].is_Rational and args[1].q == 2
             return e.func(*args) * self._sign_of(("root", args[0])) if root else self._symbol(e)
@@ -126,11 +144,14 @@ class _Pieces:
         return self._symbol(condition)
 
     def _sign(self, switch: Any) -> Any:
-        """The sign of an expression: a symbol, the same one for positive multiples of it, and the opposite for negative ones."""
+        """The sign of an expression: a symbol, the same one for positive multiples of it, and the
+        opposite for negative ones."""
         _, switch = sp.expand(switch).as_content_primitive()
         if switch.is_number:
             return sp.sign(switch)
-        return -self._sign_of(-switch) if switch.could_extract_minus_sign() else self._sign_of(switch)
+        return (
+            -self._sign_of(-switch) if switch.could_extract_minus_sign() else self._sign_of(switch)
+        )
 
     def _sign_of(self, key: Any) -> sp.Dummy:
         return self._signs.setdefault(key, sp.Dummy("sign"))
@@ -140,9 +161,11 @@ class _Pieces:
 
 
 def pieces_fit(expression: Any, symbols: Sequence[sp.Symbol], order: int) -> bool:
-    """Whether the pieces of every `Piecewise` meet with the same value and the same derivatives up to an order.
+    """Whether the pieces of every `Piecewise` meet with the same value and the same derivatives up
+    to an order.
 
-    Sympy differentiates each piece by itself, and says nothing of a jump or a kink between two of them.
+    Sympy differentiates each piece by itself, and says nothing of a jump or a kink between two of
+    them.
 
     Args:
         expression: of the symbols.
@@ -164,12 +187,19 @@ def _fits(piecewise: sp.Piecewise, symbols: Sequence[sp.Symbol], order: int) -> 
         edges: Any = condition.atoms(sp.core.relational.Relational)
         for edge in edges:
             difference = edge.lhs - edge.rhs
-            solved = [s for s in symbols if difference.diff(s).is_nonzero and not difference.diff(s).has(s)]
+            solved = [
+                s
+                for s in symbols
+                if difference.diff(s).is_nonzero and not difference.diff(s).has(s)
+            ]
             if not solved or isinstance(edge, sp.Eq | sp.Ne):
                 return False
             s = solved[0]
             at = s - difference / difference.diff(s)
             # A function that is zero on the edge has no slope along it.
-            if not all(is_zero((value.diff(s, k) - others.diff(s, k)).subs(s, sp.simplify(at))) for k in range(order + 1)):
+            if not all(
+                is_zero((value.diff(s, k) - others.diff(s, k)).subs(s, sp.simplify(at)))
+                for k in range(order + 1)
+            ):
                 return False
     return True

@@ -17,14 +17,16 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 class Integrator:
     """Advances a system by dt under a constant input.
 
-    Noise channels whose diffusion is zero are left out, and a system without any is integrated by RK4: an Euler
-    step would leak out of sets that the theory keeps.
+    Noise channels whose diffusion is zero are left out, and a system without any is integrated by
+    RK4: an Euler step would leak out of sets that the theory keeps.
 
     Attributes:
         channels: number of standard normal draws for a control period (0 without noise).
     """
 
-    def __init__(self, system: ControlAffineSDE, dt: float, substeps: int, flavour: Flavour) -> None:
+    def __init__(
+        self, system: ControlAffineSDE, dt: float, substeps: int, flavour: Flavour
+    ) -> None:
         self._substeps = substeps
         h = dt / substeps
         factors = (0.5 * h, h, h / 6.0, 2.0)
@@ -33,7 +35,9 @@ class Integrator:
         self.channels = self._wiener * substeps
         self._euler = self._rate = function
 
-    def step(self, x: Components, u: Sequence[Any], draws: Sequence[Any] | np.ndarray) -> Components:
+    def step(
+        self, x: Components, u: Sequence[Any], draws: Sequence[Any] | np.ndarray
+    ) -> Components:
         """Return the components of the state one control period later.
 
         Args:
@@ -56,12 +60,18 @@ class Integrator:
         k2 = rate(*[a + half * b for a, b in zip(x, k1, strict=True)], *u)
         k3 = rate(*[a + half * b for a, b in zip(x, k2, strict=True)], *u)
         k4 = rate(*[a + h * b for a, b in zip(x, k3, strict=True)], *u)
-        return tuple(a + sixth * (b1 + two * (b2 + b3) + b4) for a, b1, b2, b3, b4 in zip(x, k1, k2, k3, k4, strict=True))
+        return tuple(
+            a + sixth * (b1 + two * (b2 + b3) + b4)
+            for a, b1, b2, b3, b4 in zip(x, k1, k2, k3, k4, strict=True)
+        )
 
 
 @lru_cache(maxsize=128)
-def _compiled(system: ControlAffineSDE, h: float, flavour: Flavour) -> tuple[int, Callable[..., Components]]:
-    """The number of noise channels, and the state after a step of h in s with them, or the rate of the state without any."""
+def _compiled(
+    system: ControlAffineSDE, h: float, flavour: Flavour
+) -> tuple[int, Callable[..., Components]]:
+    """The number of noise channels, and the state after a step of h in s with them, or the rate of
+    the state without any."""
     diffusion = system.numeric(system.diffusion)
     live = list(system.noise_channels)
     rate = system.numeric(system.drift + system.input_matrix * sp.Matrix(system.inputs))
@@ -70,4 +80,6 @@ def _compiled(system: ControlAffineSDE, h: float, flavour: Flavour) -> tuple[int
     draws = sp.symbols(f"_w:{len(live)}", real=True)
     noise = diffusion[:, live] * sp.Matrix(draws) * sp.Float(math.sqrt(h), 17)
     moved = sp.Matrix(system.states) + rate * sp.Float(h, 17) + noise
-    return len(live), compile_function((*system.states, *system.inputs, *draws), tuple(moved), flavour)
+    return len(live), compile_function(
+        (*system.states, *system.inputs, *draws), tuple(moved), flavour
+    )

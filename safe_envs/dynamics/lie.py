@@ -19,7 +19,19 @@ from safe_envs.errors import RelativeDegreeError
 
 Derivative = Callable[[ControlAffineSDE, sp.Expr], sp.Expr]
 
-_KINKED = (sp.Piecewise, sp.Abs, sp.Min, sp.Max, sp.sign, sp.Heaviside, sp.DiracDelta, sp.floor, sp.ceiling, sp.frac, sp.Mod)
+_KINKED = (
+    sp.Piecewise,
+    sp.Abs,
+    sp.Min,
+    sp.Max,
+    sp.sign,
+    sp.Heaviside,
+    sp.DiracDelta,
+    sp.floor,
+    sp.ceiling,
+    sp.frac,
+    sp.Mod,
+)
 _LARGEST_TIDIED = 100
 _MOST_TERMS = 200
 
@@ -31,7 +43,8 @@ def gradient(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatri
 
 @lru_cache(maxsize=512)
 def _gradient(states: tuple[sp.Symbol, ...], expression: sp.Expr) -> sp.ImmutableMatrix:
-    """Remembered: the drift, the input and the noise each ask for the gradient of the same link of a chain."""
+    """Remembered: the drift, the input and the noise each ask for the gradient of the same link of
+    a chain."""
     return sp.ImmutableMatrix([[sp.diff(expression, s) for s in states]])
 
 
@@ -53,7 +66,11 @@ def ito_correction(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
         if all(covariance[i, j] == 0 for j in range(system.n)):
             continue
         slope = sp.diff(expression, row_state)
-        total += sum(covariance[i, j] * sp.diff(slope, s) for j, s in enumerate(system.states) if covariance[i, j] != 0)
+        total += sum(
+            covariance[i, j] * sp.diff(slope, s)
+            for j, s in enumerate(system.states)
+            if covariance[i, j] != 0
+        )
     return total / 2
 
 
@@ -64,12 +81,14 @@ def quadratic_variation_rate(system: ControlAffineSDE, expression: sp.Expr) -> s
 
 
 def has_kinks(expression: Any) -> bool:
-    """Whether functions are in it that are not smooth everywhere, so that its derivatives may not say all."""
+    """Whether functions are in it that are not smooth everywhere, so that its derivatives may not
+    say all."""
     return expression.has(*_KINKED)
 
 
 def generator(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
-    """The part of A phi = L_f phi + L_g phi u + 1/2 tr(sigma sigma' phi_xx) that does not contain the input.
+    """The part of A phi = L_f phi + L_g phi u + 1/2 tr(sigma sigma' phi_xx) that does not contain
+    the input.
 
     Source: thesis Eq. (4.4).
     """
@@ -79,13 +98,15 @@ def generator(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
 def vanishes(system: ControlAffineSDE, expression: Any) -> bool:
     """Whether an expression is zero at every state, for the system's parameters.
 
-    Where that can be neither shown nor refuted, the answer is no, which is the safe one: noise that may reach h is drawn,
-    and an input that may have a say is not taken for one that has none.
+    Where that can be neither shown nor refuted, the answer is no, which is the safe one: noise that
+    may reach h is drawn, and an input that may have a say is not taken for one that has none.
     """
     return is_zero(system.exact(expression))
 
 
-def derivatives(system: ControlAffineSDE, expression: sp.Expr, order: int, derivative: Derivative) -> tuple[sp.Expr, ...]:
+def derivatives(
+    system: ControlAffineSDE, expression: sp.Expr, order: int, derivative: Derivative
+) -> tuple[sp.Expr, ...]:
     """(phi, D phi, ..., D^order phi) for D = `lie_derivative_f` or `generator`."""
     result = [expression]
     for _ in range(order):
@@ -94,12 +115,15 @@ def derivatives(system: ControlAffineSDE, expression: sp.Expr, order: int, deriv
 
 
 def tidied(expression: Any) -> sp.Expr:
-    """An equal expression with fewer operations, if sin^2 + cos^2 = 1 and common factors give one quickly."""
+    """An equal expression with fewer operations, if sin^2 + cos^2 = 1 and common factors give one
+    quickly."""
     if expression.count_ops() > _LARGEST_TIDIED or _expanded_terms(expression) > _MOST_TERMS:
         return expression
     # An exponential that is taken apart may overflow in one factor and vanish in the other.
     expanded = expression if expression.has(sp.exp) else sp.expand(TR5(sp.expand(expression)))
-    return min((expression, sp.factor_terms(expression), sp.factor_terms(expanded)), key=sp.count_ops)
+    return min(
+        (expression, sp.factor_terms(expression), sp.factor_terms(expanded)), key=sp.count_ops
+    )
 
 
 def _expanded_terms(expression: Any) -> int:
@@ -114,27 +138,32 @@ def _expanded_terms(expression: Any) -> int:
     return 1
 
 
-def relative_degree(system: ControlAffineSDE, expression: sp.Expr, derivative: Derivative = lie_derivative_f) -> int:
+def relative_degree(
+    system: ControlAffineSDE, expression: sp.Expr, derivative: Derivative = lie_derivative_f
+) -> int:
     """Smallest r with L_g D^(r-1) h not identically zero.
 
     Args:
         system: with the parameters for which the degree is asked.
         expression: h.
-        derivative: D; `lie_derivative_f` for the deterministic degree (thesis Def. 3.1.3), `generator` for the
-            stochastic one. Thesis Def. 4.2.9 prints A^j h = 0 as the condition below r, where L_g A^(j-1) h = 0
-            is meant.
+        derivative: D; `lie_derivative_f` for the deterministic degree (thesis Def. 3.1.3),
+            `generator` for the stochastic one. Thesis Def. 4.2.9 prints A^j h = 0 as the condition
+            below r, where L_g A^(j-1) h = 0 is meant.
 
     Raises:
-        RelativeDegreeError: the input reaches none of the first n derivatives (3 n with the generator), or h does not depend on the states.
+        RelativeDegreeError: the input reaches none of the first n derivatives (3 n with the
+            generator), or h does not depend on the states.
     """
     system.require_known("the barrier", expression.free_symbols, system.states)
-    # Differentiation along a flow leaves nothing new after n orders; the Ito term has no such bound.
+    # Differentiation along a flow leaves nothing new after n orders; the Ito term has no such
+    # bound.
     orders = system.n if derivative is lie_derivative_f else 3 * system.n
     for order in range(orders):
         if any(not vanishes(system, entry) for entry in lie_derivative_g(system, expression)):
             return order + 1
         expression = derivative(system, expression)
     raise RelativeDegreeError(
-        f"no input ({', '.join(map(str, system.inputs))}) appears in the first {orders} derivatives of the barrier: "
-        "it has no relative degree, and no action can keep it positive. Check the barrier and the input matrix"
+        f"no input ({', '.join(map(str, system.inputs))}) appears in the first {orders} derivatives"
+        " of the barrier: it has no relative degree, and no action can keep it positive. Check the"
+        " barrier and the input matrix"
     )

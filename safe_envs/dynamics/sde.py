@@ -18,7 +18,8 @@ _REAL = sp.Symbol("real", real=True).assumptions0
 
 
 def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
-    """Read a list, nested list or matrix as an immutable matrix of the required shape (None: any width)."""
+    """Read a list, nested list or matrix as an immutable matrix of the required shape (None: any
+    width)."""
     try:
         matrix = sp.ImmutableMatrix(entries)
     except (TypeError, ValueError) as error:
@@ -26,9 +27,13 @@ def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.Immuta
     rows, columns = shape
     if matrix.rows != rows or (columns is not None and matrix.cols != columns):
         wanted = f"{rows} x {'any' if columns is None else columns}"
-        raise SystemDefinitionError(f"{name} has shape {matrix.rows} x {matrix.cols}; the states and inputs need {wanted}")
+        raise SystemDefinitionError(
+            f"{name} has shape {matrix.rows} x {matrix.cols}; the states and inputs need {wanted}"
+        )
     # To sympy 0.0 is not 0, and a channel of such entries would count as noise.
-    return sp.ImmutableMatrix(matrix.applyfunc(lambda entry: sp.Integer(0) if entry.is_Float and entry.is_zero else entry))
+    return sp.ImmutableMatrix(
+        matrix.applyfunc(lambda entry: sp.Integer(0) if entry.is_Float and entry.is_zero else entry)
+    )
 
 
 def finite_number(name: str, value: Any) -> float:
@@ -47,21 +52,30 @@ def _require_real(states: Iterable[Any], inputs: Iterable[Any], parameters: Iter
     wrong = []
     for symbol in (*states, *inputs, *parameters):
         if not isinstance(symbol, sp.Symbol):
-            raise SystemDefinitionError(f"{symbol!r} among states, inputs and parameters is no symbol; make it by sympy.symbols")
+            raise SystemDefinitionError(
+                f"{symbol!r} among states, inputs and parameters is no symbol; make it by"
+                " sympy.symbols"
+            )
         if symbol.assumptions0 != _REAL and not (symbol.is_real and symbol in parameters):
             wrong.append(symbol)
     if wrong:
-        told = "; ".join(f"{s} is declared {_declared(s) or 'nothing, so that it may be complex'}" for s in wrong)
+        told = "; ".join(
+            f"{s} is declared {_declared(s) or 'nothing, so that it may be complex'}" for s in wrong
+        )
         names = " ".join(s.name for s in wrong)
         raise SystemDefinitionError(
-            f"states and inputs are to be declared real and nothing more, parameters real at least, for sympy simplifies by that: {told}. "
-            f"Make them by sympy.symbols({names!r}, real=True), in the system and in all that is said of it"
+            "states and inputs are to be declared real and nothing more, parameters real at least,"
+            f" for sympy simplifies by that: {told}. Make them by sympy.symbols({names!r},"
+            " real=True), in the system and in all that is said of it"
         )
 
 
 def _declared(symbol: sp.Symbol) -> str:
     """What a symbol was declared to be, like "positive=True"."""
-    return ", ".join(f"{word}={value}" for word, value in getattr(symbol, "_assumptions_orig", symbol.assumptions0).items())
+    return ", ".join(
+        f"{word}={value}"
+        for word, value in getattr(symbol, "_assumptions_orig", symbol.assumptions0).items()
+    )
 
 
 def _fitting(symbol: sp.Symbol, value: Any) -> float:
@@ -69,11 +83,16 @@ def _fitting(symbol: sp.Symbol, value: Any) -> float:
     number = finite_number(f"parameter {symbol}", value)
     if symbol.assumptions0 != _REAL:
         exact = sp.Rational(number)
-        wrong = [word for word, holds in symbol.assumptions0.items() if getattr(exact, f"is_{word}") is (not holds)]
+        wrong = [
+            word
+            for word, holds in symbol.assumptions0.items()
+            if getattr(exact, f"is_{word}") is (not holds)
+        ]
         if wrong:
             raise ConfigurationError(
-                f"parameter {symbol} = {number:g}, but its symbol is declared {_declared(symbol)}, and sympy simplifies by that; "
-                f"give another value, or make the symbol by sympy.symbols({symbol.name!r}, real=True)"
+                f"parameter {symbol} = {number:g}, but its symbol is declared {_declared(symbol)},"
+                " and sympy simplifies by that; give another value, or make the symbol by"
+                f" sympy.symbols({symbol.name!r}, real=True)"
             )
     return number
 
@@ -82,24 +101,28 @@ def _fitting(symbol: sp.Symbol, value: Any) -> float:
 class ControlAffineSDE:
     """dx = (f(x) + g(x) u) dt + sigma(x) dW.
 
-    Exogenous motion, a moving obstacle say, is a state of its own with a known drift, so that no time derivative
-    of a barrier can be forgotten.
+    Exogenous motion, a moving obstacle say, is a state of its own with a known drift, so that no
+    time derivative of a barrier can be forgotten.
 
-    States and inputs are symbols that are declared real and nothing more, parameters real or whatever else their values are:
-    sympy simplifies by these words, sqrt(x**2) to |x| for a real x, to x for a positive one, and not at all without.
+    States and inputs are symbols that are declared real and nothing more, parameters real or
+    whatever else their values are: sympy simplifies by these words, sqrt(x**2) to |x| for a real x,
+    to x for a positive one, and not at all without.
 
     Attributes:
         states: n symbols x.
         inputs: m symbols u.
-        drift: f, n x 1 expressions of the states and parameters. Lists are read as matrices, here and below.
+        drift: f, n x 1 expressions of the states and parameters. Lists are read as matrices, here
+            and below.
         input_matrix: g, n x m.
         diffusion: sigma, n x d, for a d-dimensional standard Wiener process W.
         parameters: value of every other symbol that occurs.
 
     Raises:
-        SystemDefinitionError: a shape does not fit, a symbol is unknown, defined twice or not declared real, or an input
-            occurs in f, g or sigma, so that the system is not control-affine.
-        ConfigurationError: a parameter is no finite number, or not what its symbol is declared to be.
+        SystemDefinitionError: a shape does not fit, a symbol is unknown, defined twice or not
+            declared real, or an input occurs in f, g or sigma, so that the system is not
+            control-affine.
+        ConfigurationError: a parameter is no finite number, or not what its symbol is declared to
+            be.
 
     Source: thesis Eq. (4.1).
     """
@@ -115,7 +138,9 @@ class ControlAffineSDE:
         _require_real(self.states, self.inputs, self.parameters)
         n, m = len(self.states), len(self.inputs)
         if not n or not m:
-            raise SystemDefinitionError(f"a system needs a state and an input; given {n} states and {m} inputs")
+            raise SystemDefinitionError(
+                f"a system needs a state and an input; given {n} states and {m} inputs"
+            )
         fields: dict[str, Any] = {
             "states": tuple(self.states),
             "inputs": tuple(self.inputs),
@@ -150,45 +175,71 @@ class ControlAffineSDE:
             SystemDefinitionError: the rate is not affine in the inputs, or see the class.
         """
         if not all(isinstance(given, list | tuple) and given for given in (states, inputs)):
-            raise SystemDefinitionError(f"states = {states!r} and inputs = {inputs!r}; give lists of symbols, not empty")
+            raise SystemDefinitionError(
+                f"states = {states!r} and inputs = {inputs!r}; give lists of symbols, not empty"
+            )
         _require_real(states, inputs, parameters or {})
         column = _matrix("rate", rate, (len(states), 1))
         used = set(inputs)
-        effect = column.jacobian(list(inputs)).applyfunc(lambda e: sp.simplify(e) if e.free_symbols & used else e)
+        effect = column.jacobian(list(inputs)).applyfunc(
+            lambda e: sp.simplify(e) if e.free_symbols & used else e
+        )
         for i, state in enumerate(states):
             for j, u in enumerate(inputs):
                 if effect[i, j].free_symbols & used:
                     raise SystemDefinitionError(
-                        f"the rate of {state} is not affine in the input {u}: its derivative is {effect[i, j]}. Take what is not affine "
-                        "for the input, or make the input a state whose rate is the new input"
+                        f"the rate of {state} is not affine in the input {u}: its derivative is"
+                        f" {effect[i, j]}. Take what is not affine for the input, or make the input"
+                        " a state whose rate is the new input"
                     )
         drift = column.subs(dict.fromkeys(inputs, 0))
         rest = column - drift - effect * sp.Matrix(inputs)
         for state, entry, at_zero in zip(states, rest, drift, strict=True):
             if at_zero.has(sp.nan, sp.zoo, sp.oo, -sp.oo):
-                raise SystemDefinitionError(f"the rate of {state} has no value where the inputs are 0; cancel what divides by an input")
+                raise SystemDefinitionError(
+                    f"the rate of {state} has no value where the inputs are 0; cancel what divides"
+                    " by an input"
+                )
             if not is_zero(sp.expand(entry)):
                 raise SystemDefinitionError(
-                    f"the rate of {state} is not affine in the inputs: beside f + g u there is {entry}. Give f and g themselves where a "
-                    "system has several pieces"
+                    f"the rate of {state} is not affine in the inputs: beside f + g u there is"
+                    f" {entry}. Give f and g themselves where a system has several pieces"
                 )
-        return cls(tuple(states), tuple(inputs), drift, effect, [[0]] * len(states) if diffusion is None else diffusion, parameters or {})
+        return cls(
+            tuple(states),
+            tuple(inputs),
+            drift,
+            effect,
+            [[0]] * len(states) if diffusion is None else diffusion,
+            parameters or {},
+        )
 
     def __hash__(self) -> int:
-        return hash((self.states, self.inputs, self.drift, self.input_matrix, self.diffusion, tuple(self.parameters.items())))
+        return hash(
+            (
+                self.states,
+                self.inputs,
+                self.drift,
+                self.input_matrix,
+                self.diffusion,
+                tuple(self.parameters.items()),
+            )
+        )
 
     def _check_symbols(self) -> None:
         symbols = [*self.states, *self.inputs, *self.parameters]
         names = [s.name for s in symbols]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise SystemDefinitionError(f"defined more than once among states, inputs and parameters: {', '.join(twice)}")
+            raise SystemDefinitionError(
+                f"defined more than once among states, inputs and parameters: {', '.join(twice)}"
+            )
         for name in ("drift", "input_matrix", "diffusion"):
             used: set[Any] = getattr(self, name).free_symbols
             if used & set(self.inputs):
                 raise SystemDefinitionError(
-                    f"{name} depends on the input {_names(used & set(self.inputs))}; the system must be affine in "
-                    "the input: put what multiplies it into input_matrix"
+                    f"{name} depends on the input {_names(used & set(self.inputs))}; the system"
+                    " must be affine in the input: put what multiplies it into input_matrix"
                 )
             self.require_known(name, used, allowed=(*self.states, *self.parameters))
 
@@ -198,11 +249,15 @@ class ControlAffineSDE:
         if unknown:
             twins = {s.name for s in unknown} & {s.name for s in allowed}
             hint = (
-                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not Symbol('x'); the time is problem.TIME"
+                f"{_names(twins)} has other assumptions there: Symbol('x', real=True) is not"
+                " Symbol('x'); the time is problem.TIME"
                 if twins
                 else "a parameter gets its value in parameters={...} of the system"
             )
-            raise SystemDefinitionError(f"{what} uses the unknown symbol {_names(unknown)}; allowed: {_names(allowed)}. Note: {hint}")
+            raise SystemDefinitionError(
+                f"{what} uses the unknown symbol {_names(unknown)}; allowed: {_names(allowed)}."
+                f" Note: {hint}"
+            )
 
     @property
     def n(self) -> int:
@@ -218,7 +273,9 @@ class ControlAffineSDE:
     def noise_channels(self) -> tuple[int, ...]:
         """The columns of the diffusion that are not zero, for the parameters as they are."""
         diffusion = self.numeric(self.diffusion)
-        return tuple(j for j in range(diffusion.cols) if any(entry != 0 for entry in diffusion[:, j]))
+        return tuple(
+            j for j in range(diffusion.cols) if any(entry != 0 for entry in diffusion[:, j])
+        )
 
     @property
     def noisy(self) -> bool:
@@ -229,31 +286,44 @@ class ControlAffineSDE:
         """Return the same system with other parameter values.
 
         Raises:
-            ConfigurationError: a name is no parameter of the system, or a value is no finite number.
+            ConfigurationError: a name is no parameter of the system, or a value is no finite
+                number.
         """
         by_name = {p.name: p for p in self.parameters}
         for name in values:
             if name not in by_name:
-                raise ConfigurationError(f"unknown parameter {shown(name)}; {nearest(name, by_name)}")
-        return replace(self, parameters={**self.parameters, **{by_name[k]: v for k, v in values.items()}})
+                raise ConfigurationError(
+                    f"unknown parameter {shown(name)}; {nearest(name, by_name)}"
+                )
+        return replace(
+            self, parameters={**self.parameters, **{by_name[k]: v for k, v in values.items()}}
+        )
 
     def numeric(self, expression: Any) -> Any:
         """Return an expression or matrix with the parameters' values in place of their symbols."""
         # What is remembered must not change: a matrix is frozen first.
-        given: Any = sp.ImmutableMatrix(expression) if isinstance(expression, sp.MatrixBase) else expression
+        given: Any = (
+            sp.ImmutableMatrix(expression) if isinstance(expression, sp.MatrixBase) else expression
+        )
         return _numeric(given, tuple(self.parameters.items()))
 
     def exact(self, expression: Any) -> Any:
-        """Like `numeric`, with the decimal value of each parameter as a rational, so that terms cancel exactly."""
+        """Like `numeric`, with the decimal value of each parameter as a rational, so that terms
+        cancel exactly."""
         return expression.subs({p: sp.Rational(repr(v)) for p, v in self.parameters.items()})
 
 
 @lru_cache(maxsize=1024)
 def _numeric(expression: Any, parameters: tuple[tuple[sp.Symbol, float], ...]) -> Any:
-    found = expression.subs({p: sp.Float(v, 17) if v != int(v) else sp.Integer(int(v)) for p, v in parameters})
+    found = expression.subs(
+        {p: sp.Float(v, 17) if v != int(v) else sp.Integer(int(v)) for p, v in parameters}
+    )
     if found.has(sp.zoo, sp.nan, sp.oo, -sp.oo):
         values = ", ".join(f"{p} = {v:g}" for p, v in parameters)
-        raise ConfigurationError(f"the system has no finite value for its parameters ({values}); look for a division by 0")
+        raise ConfigurationError(
+            f"the system has no finite value for its parameters ({values}); look for a division"
+            " by 0"
+        )
     return found
 
 

@@ -1,4 +1,5 @@
-"""Systems of your own behind `gym.make`: from the place of their statement, FILE.py:NAME or MODULE:NAME, to an env."""
+"""Systems of your own behind `gym.make`: from the place of their statement, FILE.py:NAME or
+MODULE:NAME, to an env."""
 
 from __future__ import annotations
 
@@ -26,25 +27,30 @@ def load_system(place: Any) -> Factory:
     """Import the statement of a system.
 
     Args:
-        place: FILE.py:NAME or MODULE:NAME of a `SafetyProblem`, or of a function that returns one. Importing runs the code there.
+        place: FILE.py:NAME or MODULE:NAME of a `SafetyProblem`, or of a function that returns one.
+            Importing runs the code there.
 
     Returns:
-        The function, whose keyword arguments are those of `--barrier`; one without any for a problem.
+        The function, whose keyword arguments are those of `--barrier`; one without any for a
+        problem.
 
     Raises:
         ConfigurationError: there is no such place, or the code there ends with an error.
     """
     if not isinstance(place, str) or not place:
         raise ConfigurationError(
-            f"system = {place!r}; give the place of its statement as a text, FILE.py:NAME or MODULE:NAME, like "
-            f"gym.make({CUSTOM_ID!r}, system='cart_pole.py:problem')"
+            f"system = {place!r}; give the place of its statement as a text, FILE.py:NAME or"
+            f" MODULE:NAME, like gym.make({CUSTOM_ID!r}, system='cart_pole.py:problem')"
         )
     found = load_object(place)
     if isinstance(found, SafetyProblem):
         require_sound(found)
         return lambda: found
     if not inspect.isfunction(found):
-        raise ConfigurationError(f"{place} is {type(found).__name__}; give a SafetyProblem, or a function that returns one")
+        raise ConfigurationError(
+            f"{place} is {type(found).__name__}; give a SafetyProblem, or a function that"
+            " returns one"
+        )
 
     def factory(**arguments: Any) -> SafetyProblem:
         given = tuple(sorted(arguments.items()))
@@ -56,42 +62,59 @@ def load_system(place: Any) -> Factory:
 
 
 @lru_cache(maxsize=64)
-def _stated(function: Callable[..., Any], place: str, arguments: tuple[tuple[str, Any], ...]) -> SafetyProblem:
-    """Remembered: an env is often made more than once, and stating its problem takes longer than all else."""
+def _stated(
+    function: Callable[..., Any], place: str, arguments: tuple[tuple[str, Any], ...]
+) -> SafetyProblem:
+    """Remembered: an env is often made more than once, and stating its problem takes longer than
+    all else."""
     problem = called(function, place, dict(arguments))
     if not isinstance(problem, SafetyProblem):
-        raise ConfigurationError(f"{place} returned {type(problem).__name__}; it is to return a SafetyProblem")
+        raise ConfigurationError(
+            f"{place} returned {type(problem).__name__}; it is to return a SafetyProblem"
+        )
     require_sound(problem)
     return problem
 
 
 def register(env_id: str, system: str | Factory) -> None:
-    """Register an id with Gymnasium for a system of your own: `gym.make`, `gym.make_vec` and all commands know it then.
+    """Register an id with Gymnasium for a system of your own: `gym.make`, `gym.make_vec` and all
+    commands know it then.
 
     Args:
         env_id: like "my_lab/CartPole-v0"; one that was registered here before is replaced.
-        system: where it is stated, see `load_system`; or the function itself, if it is at the top of a module. An env's spec
-            holds the place as text, so that it can be made again elsewhere.
+        system: where it is stated, see `load_system`; or the function itself, if it is at the top
+            of a module. An env's spec holds the place as text, so that it can be made again
+            elsewhere.
 
     Raises:
-        ConfigurationError: there is no such place, what is there is neither a problem nor a function, or the id is another env's.
+        ConfigurationError: there is no such place, what is there is neither a problem nor a
+            function, or the id is another env's.
     """
     if isinstance(system, SafetyProblem):
         raise ConfigurationError(
-            "register takes FILE.py:NAME or a function that returns a problem; a problem itself goes into SafeEnv(problem)"
+            "register takes FILE.py:NAME or a function that returns a problem; a problem itself"
+            " goes into SafeEnv(problem)"
         )
     if not isinstance(system, str):
         name = getattr(system, "__qualname__", "")
         if not name.isidentifier():
-            raise ConfigurationError(f"{system!r} is no function at the top of a module, so that others could find it; define it there")
+            raise ConfigurationError(
+                f"{system!r} is no function at the top of a module, so that others could find it;"
+                " define it there"
+            )
         system = f"{system.__module__}:{name}"
     place = resolved(system)
     load_system(place)
     taken = gym.registry.get(env_id)
     if taken is not None and taken.entry_point != _ENTRY:
-        raise ConfigurationError(f"the id {env_id} is taken by {taken.entry_point}; choose another, like my_lab/{env_id.split('/')[-1]}")
+        raise ConfigurationError(
+            f"the id {env_id} is taken by {taken.entry_point}; choose another, like"
+            f" my_lab/{env_id.split('/')[-1]}"
+        )
     gym.registry.pop(env_id, None)
-    gym.register(env_id, entry_point=_ENTRY, vector_entry_point=f"{_ENTRY}Vector", kwargs={"system": place})
+    gym.register(
+        env_id, entry_point=_ENTRY, vector_entry_point=f"{_ENTRY}Vector", kwargs={"system": place}
+    )
 
 
 class Custom(SafeEnv):
@@ -99,10 +122,12 @@ class Custom(SafeEnv):
 
     Args:
         system: where it is stated: see `load_system`.
-        barrier: arguments of the function that states it, by name; each may also be given by itself.
+        barrier: arguments of the function that states it, by name; each may also be given by
+            itself.
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
         render_mode: see `SafeEnv`.
-        **options: `noise`, `plant`, `model`, `dt`, `substeps`, `horizon`, `box` and `start` as for `SystemEnv`.
+        **options: `noise`, `plant`, `model`, `dt`, `substeps`, `horizon`, `box` and `start` as for
+          `SystemEnv`.
 
     Raises:
         ConfigurationError: the place or an argument is unknown or out of range.
@@ -117,7 +142,11 @@ class Custom(SafeEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(make_problem(system, load_system(system), barrier, options), max_episode_steps, render_mode)
+        super().__init__(
+            make_problem(system, load_system(system), barrier, options),
+            max_episode_steps,
+            render_mode,
+        )
 
 
 class CustomVector(SafeVectorEnv):

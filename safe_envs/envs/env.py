@@ -31,7 +31,9 @@ def action_box(problem: SafetyProblem) -> gym.spaces.Box:
     return gym.spaces.Box(-1.0, 1.0, (len(problem.inputs),), dtype=np.float32)
 
 
-def make_problem(name: str, factory: Any, barrier: Mapping[str, Any] | None, options: Mapping[str, Any]) -> SafetyProblem:
+def make_problem(
+    name: str, factory: Any, barrier: Mapping[str, Any] | None, options: Mapping[str, Any]
+) -> SafetyProblem:
     """Build a problem with the arguments of `gym.make`.
 
     Args:
@@ -44,21 +46,37 @@ def make_problem(name: str, factory: Any, barrier: Mapping[str, Any] | None, opt
         ConfigurationError: an argument is unknown or out of range.
     """
     of_factory = inspect.signature(factory).parameters
-    of_problem = [name for name in inspect.signature(SafetyProblem.configured).parameters if name != "self"]
-    for what, values in (("barrier", barrier), *((what, options.get(what)) for what in ("plant", "model"))):
-        if values is not None and not (isinstance(values, Mapping) and all(isinstance(key, str) for key in values)):
+    of_problem = [
+        name for name in inspect.signature(SafetyProblem.configured).parameters if name != "self"
+    ]
+    for what, values in (
+        ("barrier", barrier),
+        *((what, options.get(what)) for what in ("plant", "model")),
+    ):
+        if values is not None and not (
+            isinstance(values, Mapping) and all(isinstance(key, str) for key in values)
+        ):
             raise ConfigurationError(f"{what} = {values!r}; give a dictionary of names and values")
-    shape = {**(barrier or {}), **{key: value for key, value in options.items() if key in of_factory}}
+    shape = {
+        **(barrier or {}),
+        **{key: value for key, value in options.items() if key in of_factory},
+    }
     settings = {key: value for key, value in options.items() if key not in of_factory}
-    for what, allowed, given in (("barrier argument", of_factory, shape), ("argument", (*of_problem, *of_factory), settings)):
+    for what, allowed, given in (
+        ("barrier argument", of_factory, shape),
+        ("argument", (*of_problem, *of_factory), settings),
+    ):
         for key in given:
             if key not in allowed:
-                raise ConfigurationError(f"{name} has no {what} {shown(key)}; {nearest(key, allowed)}")
+                raise ConfigurationError(
+                    f"{name} has no {what} {shown(key)}; {nearest(key, allowed)}"
+                )
     return factory(**shape).configured(**settings)
 
 
 def _remembering(factory: Callable[..., SafetyProblem]) -> Callable[..., SafetyProblem]:
-    """The factory, which answers with the very object of the last time: its symbols take most of the time that an env takes to make."""
+    """The factory, which answers with the very object of the last time: its symbols take most of
+    the time that an env takes to make."""
     remembered = lru_cache(maxsize=32, typed=True)(factory)
 
     @wraps(factory)
@@ -72,12 +90,12 @@ def _remembering(factory: Callable[..., SafetyProblem]) -> Callable[..., SafetyP
 class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     """Any `SafetyProblem` as a Gymnasium env.
 
-    Actions are in [-1, 1] for every input and stand for the physical box; what lies beyond is clipped. Actions may
-    be given in double precision. The observation holds the problem's features as float32, `state` the exact state.
-    The keys of `info` are those of `safe_envs.envs.info`.
+    Actions are in [-1, 1] for every input and stand for the physical box; what lies beyond is
+    clipped. Actions may be given in double precision. The observation holds the problem's features
+    as float32, `state` the exact state. The keys of `info` are those of `safe_envs.envs.info`.
 
-    The episode is terminated when the goal is reached or the state leaves the workspace, and truncated after
-    `horizon`. A violation does not end it.
+    The episode is terminated when the goal is reached or the state leaves the workspace, and
+    truncated after `horizon`. A violation does not end it.
 
     Attributes:
         executed: the physical input of the last step.
@@ -86,16 +104,25 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     Args:
         problem: what to simulate.
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
-        render_mode: "rgb_array" for pictures by `render()`, "human" for a window that every step is drawn to, or None.
+        render_mode: "rgb_array" for pictures by `render()`, "human" for a window that every step is
+            drawn to, or None.
 
     Raises:
         ConfigurationError: an argument is out of range.
     """
 
     # The frame rate of an env is that of its own control period.
-    metadata: dict[str, Any] = {"render_modes": [*RENDER_MODES], "render_fps": 20}  # noqa: RUF012  (as in the base class)
+    metadata: dict[str, Any] = {  # noqa: RUF012
+        "render_modes": [*RENDER_MODES],
+        "render_fps": 20,
+    }
 
-    def __init__(self, problem: SafetyProblem, max_episode_steps: int | None = None, render_mode: str | None = None) -> None:
+    def __init__(
+        self,
+        problem: SafetyProblem,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+    ) -> None:
         self.viewer = open_viewer(problem, render_mode)
         self.metadata = {**self.metadata, "render_fps": frames_a_second(problem)}
         self.problem = problem
@@ -130,15 +157,24 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         """Map an action in [-1, 1] to the physical box; what lies beyond is clipped.
 
         Raises:
-            InvalidInputError: the action has another shape than (m,), or does not hold finite real numbers.
+            InvalidInputError: the action has another shape than (m,), or does not hold finite real
+                numbers.
         """
-        given = action if type(action) is np.ndarray and action.dtype.char in "fd" else real_array("action", action)
+        given = (
+            action
+            if type(action) is np.ndarray and action.dtype.char in "fd"
+            else real_array("action", action)
+        )
         if given.shape != self._action_shape:
-            raise InvalidInputError(f"action has shape {given.shape}; the env takes {self._action_shape}")
+            raise InvalidInputError(
+                f"action has shape {given.shape}; the env takes {self._action_shape}"
+            )
         physical = []
         for a, (c, w) in zip(given.tolist(), self._scales, strict=True):
             if not -math.inf < a < math.inf:
-                raise InvalidInputError(f"action {given.tolist()} is not finite; give numbers in [-1, 1]")
+                raise InvalidInputError(
+                    f"action {given.tolist()} is not finite; give numbers in [-1, 1]"
+                )
             physical.append(c + w if a > 1.0 else c - w if a < -1.0 else c + w * a)
         return physical
 
@@ -146,7 +182,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         """Inverse of `physical_action`, in double precision."""
         return np.array([(u - c) / w for u, (c, w) in zip(physical, self._scales, strict=True)])
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Start an episode from the problem's initial distribution."""
         super().reset(seed=seed)
         if seed is not None:
@@ -173,11 +211,15 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         """`step` for a physical input inside the box, as a filter has it."""
         self.executed = u
         try:
-            self._x = self._simulation.integrator.step(self.components, u, self._noise.next(self.np_random))
+            self._x = self._simulation.integrator.step(
+                self.components, u, self._noise.next(self.np_random)
+            )
             self._steps += 1
             observation, reward, terminated, info = self._observe(u)
         except (OverflowError, ZeroDivisionError, ValueError) as error:
-            raise NumericalError(f"the simulation of {self.problem.name!r} broke down at {self._x}: {error}") from error
+            raise NumericalError(
+                f"the simulation of {self.problem.name!r} broke down at {self._x}: {error}"
+            ) from error
         if self.viewer is not None:
             self.viewer.advance([self._x], [self._steps * self.problem.dt], [u])
         return observation, reward, terminated, self._steps >= self._limit, info
@@ -186,7 +228,8 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         """Draw the state, with the trail of the episode and what a filter decided.
 
         Returns:
-            uint8 of shape (height, width, 3) in the mode "rgb_array"; None in the mode "human", which draws to its window.
+            uint8 of shape (height, width, 3) in the mode "rgb_array"; None in the mode "human",
+            which draws to its window.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.
@@ -194,7 +237,10 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             ConfigurationError: there is no display for a window.
         """
         if self.viewer is None:
-            gym.logger.warn('render() draws nothing without a render mode; make the env with render_mode="rgb_array" or "human"')
+            gym.logger.warn(
+                "render() draws nothing without a render mode; make the env with"
+                ' render_mode="rgb_array" or "human"'
+            )
             return None
         if self._x is None:
             raise gym.error.ResetNeeded("the env has no state yet: call reset() first")
@@ -207,10 +253,15 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
 
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
         x = self.components
-        features, barriers, reward, outside, goal = self._simulation.measure(x, u, self._steps * self.problem.dt)
+        features, barriers, reward, outside, goal = self._simulation.measure(
+            x, u, self._steps * self.problem.dt
+        )
         h = min(barriers)
         if not math.isfinite(h + sum(x)):
-            raise NumericalError(f"the state {x} of {self.problem.name!r} has left the finite numbers; reduce dt or raise substeps")
+            raise NumericalError(
+                f"the state {x} of {self.problem.name!r} has left the finite numbers; reduce dt or"
+                " raise substeps"
+            )
         violation = h < 0.0
         cost = 1.0 if violation else 0.0
         self._episode_cost += cost
@@ -234,10 +285,12 @@ class SystemEnv(SafeEnv):
     """Base of the registered envs: a system's problem behind the arguments of `gym.make`.
 
     Args:
-        noise: diffusion of plant and model, one number for all channels or one for each; 0 turns it off.
+        noise: diffusion of plant and model, one number for all channels or one for each; 0 turns it
+            off.
         plant: parameters of the simulated system, by name.
         model: parameters that the designer believes, by name.
-        barrier: arguments of the problem's factory (of the barrier, mostly), by name; each may also be given by itself.
+        barrier: arguments of the problem's factory (of the barrier, mostly), by name; each may also
+            be given by itself.
         dt: control period in s.
         substeps: integration steps in a control period.
         horizon: length of an episode in s.
@@ -266,4 +319,8 @@ class SystemEnv(SafeEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(make_problem(type(self).__name__, type(self).problem_factory, barrier, options), max_episode_steps, render_mode)
+        super().__init__(
+            make_problem(type(self).__name__, type(self).problem_factory, barrier, options),
+            max_episode_steps,
+            render_mode,
+        )

@@ -1,7 +1,7 @@
 """The info contract: which keys an env and a filter report, and of which type.
 
-Every key is present at reset and at every step, with one type throughout: Python scalars and float64 arrays from a
-scalar env, arrays with the batch in front from a vector env. No value is NaN.
+Every key is present at reset and at every step, with one type throughout: Python scalars and
+float64 arrays from a scalar env, arrays with the batch in front from a vector env. No value is NaN.
 
 | key | type | meaning |
 |---|---|---|
@@ -13,18 +13,14 @@ scalar env, arrays with the batch in front from a vector env. No value is NaN.
 
 and with a filter
 
-| key | type | meaning |
-|---|---|---|
-| `nominal_action` | float64 (m,) | what the policy proposed, or the goal of a joint program asks for, in physical units |
-| `safe_action` | float64 (m,) | what was executed, in physical units |
-| `intervention` | bool | the two differ |
-| `filter_active` | bool | a barrier row is binding or cannot be met |
-| `feasible` | bool | some action in the box meets every row |
-| `slack` | float | by how much the worst row is violated by the executed action |
-| `slacks` | float64 (k,) | the same for each row |
-| `active_barrier` | int | index of the barrier that caused the intervention, -1 without one |
-| `episode_interventions` | int | interventions of the episode so far |
-| `episode_infeasible` | int | infeasible steps of the episode so far |
+| key | type | meaning | |---|---|---| | `nominal_action` | float64 (m,) | what the policy proposed,
+or the goal of a joint program asks for, in physical units | | `safe_action` | float64 (m,) | what
+was executed, in physical units | | `intervention` | bool | the two differ | | `filter_active` |
+bool | a barrier row is binding or cannot be met | | `feasible` | bool | some action in the box
+meets every row | | `slack` | float | by how much the worst row is violated by the executed action |
+| `slacks` | float64 (k,) | the same for each row | | `active_barrier` | int | index of the barrier
+that caused the intervention, -1 without one | | `episode_interventions` | int | interventions of
+the episode so far | | `episode_infeasible` | int | infeasible steps of the episode so far |
 
 At reset, where nothing was executed yet, the actions are the point of the box nearest to 0.
 """
@@ -39,7 +35,9 @@ import numpy as np
 Info = dict[str, Any]
 
 
-def safety_info(violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any) -> Info:
+def safety_info(
+    violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any
+) -> Info:
     """What every env reports; values as in the table above."""
     return {
         "cost": cost,

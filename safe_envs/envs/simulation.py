@@ -1,4 +1,5 @@
-"""The one implementation of physics, reward, start and observation, over floats or over a batch of arrays."""
+"""The one implementation of physics, reward, start and observation, over floats or over a batch of
+arrays."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ _MOST_TRIES = 10_000
 
 
 class Simulation:
-    """The formulas of a problem, compiled: they hold no state, so that one object serves any number of envs."""
+    """The formulas of a problem, compiled: they hold no state, so that one object serves any number
+    of envs."""
 
     def __init__(self, problem: SafetyProblem, flavour: Flavour) -> None:
         self.problem = problem
@@ -34,11 +36,14 @@ class Simulation:
             -1 if problem.goal is None else problem.goal,
         )
         self.timed = TIME in set().union(*(sp.sympify(e).free_symbols for e in read))
-        self._measure = compile_function((*problem.plant.states, *problem.plant.inputs, TIME), read, flavour)
+        self._measure = compile_function(
+            (*problem.plant.states, *problem.plant.inputs, TIME), read, flavour
+        )
         start = problem.starts[problem.start]
         self._uniforms = len(start.uniforms)
         self._tries = 1 if start.condition is None else _TRIES_AT_ONCE
-        # Few envs start together, and each from numbers of its own: plain floats are the quickest way.
+        # Few envs start together, and each from numbers of its own: plain floats are the quickest
+        # way.
         self._start = compile_function(start.uniforms, start.state, "floats")
         if start.condition is not None:
             condition = problem.model.numeric(start.condition)
@@ -46,7 +51,9 @@ class Simulation:
         else:
             self._accept = None
 
-    def measure(self, x: Components, u: Sequence[Any], time: Any) -> tuple[Components, Components, Any, Any, Any]:
+    def measure(
+        self, x: Components, u: Sequence[Any], time: Any
+    ) -> tuple[Components, Components, Any, Any, Any]:
         """Read off a state what there is to see.
 
         Args:
@@ -55,8 +62,8 @@ class Simulation:
             time: since the start of the episode, in s.
 
         Returns:
-            The features, the barriers, the reward, the distance by which the workspace was left (> 0 outside), and the
-            goal (>= 0 where it is reached).
+            The features, the barriers, the reward, the distance by which the workspace was left (>
+            0 outside), and the goal (>= 0 where it is reached).
         """
         values = self._measure(*x, *u, time)
         f, b = self._features, self._barriers
@@ -70,8 +77,9 @@ class Simulation:
                 if self._accept is None or self._accept(*x)[0] > 0:
                     return x
         raise ConfigurationError(
-            f"no start of {self.problem.name!r} met the condition of the distribution {self.problem.start!r} in "
-            f"{_MOST_TRIES} tries; give a fixed start or another distribution"
+            f"no start of {self.problem.name!r} met the condition of the distribution"
+            f" {self.problem.start!r} in {_MOST_TRIES} tries; give a fixed start or another"
+            " distribution"
         )
 
     def draw_starts(self, rngs: Sequence[np.random.Generator]) -> np.ndarray:
@@ -83,7 +91,8 @@ class Simulation:
 
 
 def proposed_starts(problem: SafetyProblem, count: int) -> np.ndarray:
-    """Some states of a problem's start, whether or not they meet its condition: always the same, shape (count, n)."""
+    """Some states of a problem's start, whether or not they meet its condition: always the same,
+    shape (count, n)."""
     start = problem.starts[problem.start]
     uniforms = np.random.default_rng(0).random((len(start.uniforms), count))
     return stacked(compile_function(start.uniforms, start.state, "arrays")(*uniforms), count)
@@ -113,7 +122,8 @@ class NoiseStream:
 
 
 class NoiseStreams:
-    """The same for a batch: each env keeps its own stream, so that its noise does not depend on its neighbours."""
+    """The same for a batch: each env keeps its own stream, so that its noise does not depend on its
+    neighbours."""
 
     def __init__(self, num_envs: int, channels: int) -> None:
         self._buffer = np.empty((num_envs, _CHUNK, channels))
@@ -132,14 +142,17 @@ class NoiseStreams:
 
         Args:
             rngs: generator of each env.
-            stepping: the envs whose stream moves on; None for all. The others get draws that are to be ignored.
+            stepping: the envs whose stream moves on; None for all. The others get draws that are to
+                be ignored.
         """
         if not self._buffer.shape[2]:
             return self._rows.T[:0]
         if not self._before_refill:
             self._refill(rngs, stepping)
         self._before_refill -= 1
-        draws = self._rows.take(self._row if stepping is None else np.where(stepping, self._row, 0), axis=0).T
+        draws = self._rows.take(
+            self._row if stepping is None else np.where(stepping, self._row, 0), axis=0
+        ).T
         self._row += 1 if stepping is None else stepping
         return draws
 
@@ -156,7 +169,9 @@ def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
     if max_episode_steps is None:
         return problem.steps
     if not isinstance(max_episode_steps, int) or max_episode_steps < 1:
-        raise ConfigurationError(f"max_episode_steps = {max_episode_steps!r}; give a whole number from 1")
+        raise ConfigurationError(
+            f"max_episode_steps = {max_episode_steps!r}; give a whole number from 1"
+        )
     return min(problem.steps, max_episode_steps)
 
 

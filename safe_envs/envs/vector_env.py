@@ -30,8 +30,9 @@ VectorStep = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]
 class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """`num_envs` copies of a problem, stepped together.
 
-    Env i, reset with seed s, follows the same trajectory as the scalar env reset with seed s + i, as in Gymnasium's
-    own SyncVectorEnv, whatever `num_envs` is. Infos are those of `SafeEnv` with the batch in front.
+    Env i, reset with seed s, follows the same trajectory as the scalar env reset with seed s + i,
+    as in Gymnasium's own SyncVectorEnv, whatever `num_envs` is. Infos are those of `SafeEnv` with
+    the batch in front.
 
     Attributes:
         executed: the components of the physical inputs of the last step.
@@ -40,10 +41,10 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Args:
         problem: what to simulate.
         num_envs: size of the batch.
-        autoreset_mode: when ended episodes start anew: "NextStep" (Gymnasium's default: the following step ignores
-            the action and returns the reset observation, with reward 0), "SameStep" (the last observation and info
-            of the episode are in `infos["final_obs"]` and `infos["final_info"]`) or "Disabled" (reset by
-            `options={"reset_mask": mask}`).
+        autoreset_mode: when ended episodes start anew: "NextStep" (Gymnasium's default: the
+            following step ignores the action and returns the reset observation, with reward 0),
+            "SameStep" (the last observation and info of the episode are in `infos["final_obs"]` and
+            `infos["final_info"]`) or "Disabled" (reset by `options={"reset_mask": mask}`).
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
         render_mode: "rgb_array" for pictures by `render()`, or None.
 
@@ -67,10 +68,16 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._autoreset = AutoresetMode(autoreset_mode)
         except ValueError as error:
             allowed = ", ".join(mode.value for mode in AutoresetMode)
-            raise ConfigurationError(f"autoreset_mode = {autoreset_mode!r}; allowed: {allowed}") from error
+            raise ConfigurationError(
+                f"autoreset_mode = {autoreset_mode!r}; allowed: {allowed}"
+            ) from error
         self.problem = problem
         self.num_envs = num_envs
-        self.metadata = {"render_modes": [*RENDER_MODES[1:]], "render_fps": frames_a_second(problem), "autoreset_mode": self._autoreset}
+        self.metadata = {
+            "render_modes": [*RENDER_MODES[1:]],
+            "render_fps": frames_a_second(problem),
+            "autoreset_mode": self._autoreset,
+        }
         self.single_observation_space = self._bounds = observation_box(problem)
         self.single_action_space = action_box(problem)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -79,7 +86,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._noise = NoiseStreams(num_envs, self._simulation.integrator.channels)
         self._center, self._half = (constants(c) for c in center_and_half_width(problem))
         observed = {f.expression for f in problem.features}
-        self._unobserved = [i for i, state in enumerate(problem.plant.states) if state not in observed]
+        self._unobserved = [
+            i for i, state in enumerate(problem.plant.states) if state not in observed
+        ]
         self._limit = steps_until(problem, max_episode_steps)
         self._rngs: list[np.random.Generator] = []
         self._seeds: list[int] = []
@@ -93,7 +102,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @property
     def components(self) -> Components:
-        """The exact states, an array of shape (num_envs,), not to be written to, for each of the problem's states."""
+        """The exact states, an array of shape (num_envs,), not to be written to, for each of the
+        problem's states."""
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
         return self._x
@@ -104,34 +114,46 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return np.stack(self.components, axis=-1)
 
     @property
-    def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def np_random(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+    ) -> tuple[np.random.Generator, ...]:
         """The generator of each env."""
         self._seed([None] * self.num_envs)
         return tuple(self._rngs)
 
     @property
-    def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def np_random_seed(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self,
+    ) -> tuple[int, ...]:
         """The seed of each env."""
         self._seed([None] * self.num_envs)
         return tuple(self._seeds)
 
     def physical_action(self, actions: Any) -> Components:
-        """Map actions in [-1, 1], shape (num_envs, m), to the components of the physical inputs, clipped to the box.
+        """Map actions in [-1, 1], shape (num_envs, m), to the components of the physical inputs,
+        clipped to the box.
 
         Raises:
             InvalidInputError: the actions have another shape, or are not finite real numbers.
         """
         given = np.asarray(real_array("array of actions", actions), dtype=np.float64)
         if given.shape != self.action_space.shape:
-            raise InvalidInputError(f"actions have shape {given.shape}; the envs take {self.action_space.shape}")
+            raise InvalidInputError(
+                f"actions have shape {given.shape}; the envs take {self.action_space.shape}"
+            )
         with np.errstate(over="ignore"):
             suspicious = not finite(given)
         if suspicious and not np.isfinite(given).all():
             bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
-            raise InvalidInputError(f"the actions of envs {bad[:5].tolist()} are not finite; give numbers in [-1, 1]")
+            raise InvalidInputError(
+                f"the actions of envs {bad[:5].tolist()} are not finite; give numbers in [-1, 1]"
+            )
         clipped = np.minimum(np.maximum(given, _LOWEST), _HIGHEST)
         return tuple(
-            [c + w * clipped[:, j] if c else w * clipped[:, j] for j, (c, w) in enumerate(zip(self._center, self._half, strict=True))]
+            [
+                c + w * clipped[:, j] if c else w * clipped[:, j]
+                for j, (c, w) in enumerate(zip(self._center, self._half, strict=True))
+            ]
         )
 
     def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
@@ -141,7 +163,12 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             np.divide(u - c, w, out=actions[:, j])
         return actions
 
-    def reset(self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`.
 
         Args:
@@ -154,26 +181,37 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._restart(np.flatnonzero(mask))
         observation, _, _, _, info = self._observe(tuple(self._center), counted=mask)
         if self.viewer is not None:
-            self.viewer.restart(self.state, self._steps * self.problem.dt, np.flatnonzero(mask).tolist())
+            self.viewer.restart(
+                self.state, self._steps * self.problem.dt, np.flatnonzero(mask).tolist()
+            )
         return observation, with_masks(info, mask)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Where each episode stands: arrays with the batch in front, from which `restore` goes on."""
-        return {"state": self.state, **{name: getattr(self, f"_{name}").copy() for name in _OF_EPISODES}}
+        return {
+            "state": self.state,
+            **{name: getattr(self, f"_{name}").copy() for name in _OF_EPISODES},
+        }
 
-    def restore(self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None) -> None:
+    def restore(
+        self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None
+    ) -> None:
         """Put each episode where a snapshot has it.
 
         Args:
             snapshot: of an env of the same problem and size.
-            seed: of the noise and of the starts from then on; see `reset`. The generators are no part of a snapshot.
+            seed: of the noise and of the starts from then on; see `reset`. The generators are no
+                part of a snapshot.
 
         Raises:
             InvalidInputError: the snapshot is of an env of another size or problem.
         """
         shape = np.shape(snapshot["state"])
         if shape != (self.num_envs, self.problem.plant.n):
-            raise InvalidInputError(f"the snapshot has states of shape {shape}; these envs have {(self.num_envs, self.problem.plant.n)}")
+            raise InvalidInputError(
+                f"the snapshot has states of shape {shape}; these envs have"
+                f" {(self.num_envs, self.problem.plant.n)}"
+            )
         self._seed(self._one_seed_each(seed))
         self._x = tuple(np.array(snapshot["state"], dtype=float).T.copy())
         for name in _OF_EPISODES:
@@ -197,7 +235,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.executed = u
         anew = self._ended.copy() if np.count_nonzero(self._ended) else None
         if anew is not None and self._autoreset == AutoresetMode.DISABLED:
-            raise gym.error.ResetNeeded(f"the episodes of envs {np.flatnonzero(anew)[:5].tolist()} have ended: reset them")
+            raise gym.error.ResetNeeded(
+                f"the episodes of envs {np.flatnonzero(anew)[:5].tolist()} have ended: reset them"
+            )
         draws = self._noise.next(self._rngs, None if anew is None else ~anew)
         # A state that overflows is found by `_observe`, which says so better than a warning.
         with np.errstate(over="ignore", invalid="ignore"):
@@ -219,21 +259,33 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._ended = ended
         if self.viewer is not None:
             fresh = [] if anew is None else np.flatnonzero(anew).tolist()
-            self.viewer.advance(self.state, self._steps * self.problem.dt, np.stack(u, axis=-1), fresh)
-        return observation, reward, terminated, truncated, {**with_masks(info, self._everywhere.copy()), **last}
+            self.viewer.advance(
+                self.state, self._steps * self.problem.dt, np.stack(u, axis=-1), fresh
+            )
+        return (
+            observation,
+            reward,
+            terminated,
+            truncated,
+            {**with_masks(info, self._everywhere.copy()), **last},
+        )
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw every env, with the trail of its episode and what a filter decided.
 
         Returns:
-            For each env uint8 of shape (height, width, 3); None, with a warning, without a render mode.
+            For each env uint8 of shape (height, width, 3); None, with a warning, without a render
+            mode.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.
             ResetNeeded: there is no state yet.
         """
         if self.viewer is None:
-            gym.logger.warn('render() draws nothing without a render mode; make the envs with render_mode="rgb_array"')
+            gym.logger.warn(
+                "render() draws nothing without a render mode; make the envs with"
+                ' render_mode="rgb_array"'
+            )
             return None
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
@@ -271,9 +323,14 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return self._everywhere.copy()
         mask = np.asarray(given)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-            raise ConfigurationError(f"reset_mask must be a bool array of shape ({self.num_envs},) with a True in it; given {given!r}")
+            raise ConfigurationError(
+                f"reset_mask must be a bool array of shape ({self.num_envs},) with a True in it;"
+                f" given {given!r}"
+            )
         if not self._x and not mask.all():
-            raise gym.error.ResetNeeded("some envs have no state yet: the first reset takes no reset_mask")
+            raise gym.error.ResetNeeded(
+                "some envs have no state yet: the first reset takes no reset_mask"
+            )
         return mask
 
     def _restart(self, envs: np.ndarray) -> None:
@@ -317,19 +374,28 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if self.problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
         info = safety_info(violation, cost, barrier, self._h_min.copy(), self._episode_cost.copy())
-        return observation, filled(reward, (self.num_envs,)).copy(), terminated, self._steps >= self._limit, info
+        return (
+            observation,
+            filled(reward, (self.num_envs,)).copy(),
+            terminated,
+            self._steps >= self._limit,
+            info,
+        )
 
     def _report_breakdown(self, h: np.ndarray, observation: np.ndarray) -> None:
-        broken = ~(np.isfinite(self._x).all(axis=0) & np.isfinite(h) & np.isfinite(observation).all(axis=1))
+        broken = ~(
+            np.isfinite(self._x).all(axis=0) & np.isfinite(h) & np.isfinite(observation).all(axis=1)
+        )
         if broken.any():
             raise NumericalError(
-                f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r} have left the finite numbers; "
-                "reduce dt or raise substeps"
+                f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r}"
+                " have left the finite numbers; reduce dt or raise substeps"
             )
 
 
 class SystemVectorEnv(SafeVectorEnv):
-    """Base of the registered vector envs; arguments as for `SystemEnv`, and `num_envs` and `autoreset_mode`."""
+    """Base of the registered vector envs; arguments as for `SystemEnv`, and `num_envs` and
+    `autoreset_mode`."""
 
     env_class: ClassVar[type[Any]]
 
@@ -342,5 +408,7 @@ class SystemVectorEnv(SafeVectorEnv):
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        problem = make_problem(self.env_class.__name__, self.env_class.problem_factory, barrier, options)
+        problem = make_problem(
+            self.env_class.__name__, self.env_class.problem_factory, barrier, options
+        )
         super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)

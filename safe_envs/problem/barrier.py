@@ -15,8 +15,8 @@ from safe_envs.errors import SystemDefinitionError
 class Barrier:
     """h, with the safe set C = {x : h(x) >= 0}; a violation is h < 0.
 
-    It is a function of the states alone, with numbers for its constants: plant and model may differ, what is safe
-    is the same for both.
+    It is a function of the states alone, with numbers for its constants: plant and model may
+    differ, what is safe is the same for both.
 
     Attributes:
         expression: h(x).
@@ -44,8 +44,20 @@ def formula(what: str, given: Any) -> sp.Expr:
     if isinstance(given, sp.Expr):
         return given
     if isinstance(given, sp.logic.boolalg.Boolean):
-        raise SystemDefinitionError(f"{what} is {given}, which is true or false; give the expression itself, 1 - x**2 for 1 - x**2 >= 0")
+        raise SystemDefinitionError(
+            f"{what} is {given}, which is true or false; give the expression itself, 1 - x**2 for 1"
+            " - x**2 >= 0"
+        )
     if isinstance(given, numbers.Real) and not isinstance(given, bool):
         return sp.sympify(given)  # pyright: ignore[reportReturnType]
-    kind = "a text" if isinstance(given, str) else "a function" if callable(given) else type(given).__name__
-    raise SystemDefinitionError(f"{what} is {kind}, {given!r}; give a sympy expression of the symbols of the system, like 1 - x**2")
+    kind = (
+        "a text"
+        if isinstance(given, str)
+        else "a function"
+        if callable(given)
+        else type(given).__name__
+    )
+    raise SystemDefinitionError(
+        f"{what} is {kind}, {given!r}; give a sympy expression of the symbols of the system, like 1"
+        " - x**2"
+    )

@@ -1,4 +1,5 @@
-"""A problem of your own from a system, its barriers and a few numbers; what is left out gets what suits."""
+"""A problem of your own from a system, its barriers and a few numbers; what is left out gets what
+suits."""
 
 from __future__ import annotations
 
@@ -18,7 +19,20 @@ from safe_envs.problem.validation import degree_of, require_sound
 
 _UNBOUNDED = (-math.inf, math.inf)
 
-_STATED = ("name", "plant", "model", "barriers", "states", "inputs", "reward", "nominal", "starts", "start", "dt", "horizon")
+_STATED = (
+    "name",
+    "plant",
+    "model",
+    "barriers",
+    "states",
+    "inputs",
+    "reward",
+    "nominal",
+    "starts",
+    "start",
+    "dt",
+    "horizon",
+)
 """Attributes of a problem that are made of the arguments."""
 
 Range = tuple[float, float]
@@ -44,25 +58,31 @@ def state_problem(
 
     Args:
         system: what is simulated.
-        barriers: h, safe where h >= 0: an expression of the states or a `Barrier`, or several of them.
+        barriers: h, safe where h >= 0: an expression of the states or a `Barrier`, or several of
+            them.
         box: physical bounds (low, high) of every input, or one such pair for each.
-        start: of each state a number, or (low, high) to draw it from, uniformly, where every barrier is positive; always one entry
-            for each state.
+        start: of each state a number, or (low, high) to draw it from, uniformly, where every
+            barrier is positive; always one entry for each state.
         dt: control period in s.
         horizon: length of an episode in s.
         name: of the problem, for tables and pictures.
-        model: what filters and the nominal controller believe, with the same states and inputs; `system` itself by default.
-        nominal: the controller that is to be kept safe, an expression of the states and of parameters for each input; where
-            `features` are given, of their symbols in place of the states'.
-        reward: of a step, an expression of the state that it reaches, of the input and of `safe_envs.problem.problem.TIME`.
-        workspace: (low, high) of states; an episode ends when one leaves it. The others are unbounded.
+        model: what filters and the nominal controller believe, with the same states and inputs;
+            `system` itself by default.
+        nominal: the controller that is to be kept safe, an expression of the states and of
+            parameters for each input; where `features` are given, of their symbols in place of the
+            states'.
+        reward: of a step, an expression of the state that it reaches, of the input and of
+            `safe_envs.problem.problem.TIME`.
+        workspace: (low, high) of states; an episode ends when one leaves it. The others are
+            unbounded.
         units: of states and inputs, by symbol. A state in "rad" without bounds is an angle.
-        **rest: other attributes of `SafetyProblem`. By default `noise` are the parameters that occur in the diffusion alone,
-            `gains` ones for every barrier's relative degree, `filter` "szcbf" with noise and "hocbf" without, and
-            `plane` the states if they are two.
+        **rest: other attributes of `SafetyProblem`. By default `noise` are the parameters that
+            occur in the diffusion alone, `gains` ones for every barrier's relative degree, `filter`
+            "szcbf" with noise and "hocbf" without, and `plane` the states if they are two.
 
     Raises:
-        SystemDefinitionError: the parts do not fit together, or hold a mistake: see `safe_envs.problem.validation`.
+        SystemDefinitionError: the parts do not fit together, or hold a mistake: see
+            `safe_envs.problem.validation`.
         RelativeDegreeError: no input reaches a barrier.
         ConfigurationError: a number is out of range.
     """
@@ -74,16 +94,24 @@ def state_problem(
     bounds, unit = dict(workspace or {}), dict(units or {})
     _require_symbols("workspace", bounds, system.states)
     _require_symbols("units", unit, (*system.states, *system.inputs))
-    states = tuple(Variable(s, *_ends(f"workspace of {s}", bounds.get(s, _UNBOUNDED)), unit.get(s, "")) for s in system.states)
+    states = tuple(
+        Variable(s, *_ends(f"workspace of {s}", bounds.get(s, _UNBOUNDED)), unit.get(s, ""))
+        for s in system.states
+    )
     problem = SafetyProblem(
         name=name or "problem",
         plant=system,
         model=system if model is None else model,
         barriers=named,
         states=states,
-        inputs=tuple(Variable(u, *ends, unit.get(u, "")) for u, ends in zip(system.inputs, _boxes(system, box), strict=True)),
+        inputs=tuple(
+            Variable(u, *ends, unit.get(u, ""))
+            for u, ends in zip(system.inputs, _boxes(system, box), strict=True)
+        ),
         reward=formula("reward", reward),
-        nominal=tuple(formula("nominal", law) if rest.get("features") else law_of(law, system) for law in laws),
+        nominal=tuple(
+            formula("nominal", law) if rest.get("features") else law_of(law, system) for law in laws
+        ),
         starts={"start": _start(states, named, start)},
         dt=finite_number("dt", dt),
         horizon=finite_number("horizon", horizon),
@@ -101,9 +129,14 @@ def named_barriers(barriers: Any) -> tuple[Barrier, ...]:
     """
     given = list(barriers) if isinstance(barriers, list | tuple) else [barriers]
     if not given:
-        raise SystemDefinitionError("barriers is empty; give h, an expression of the states, or several")
+        raise SystemDefinitionError(
+            "barriers is empty; give h, an expression of the states, or several"
+        )
     several = len(given) > 1
-    return tuple(b if isinstance(b, Barrier) else Barrier(b, f"h_{i}" if several else "h") for i, b in enumerate(given, 1))
+    return tuple(
+        b if isinstance(b, Barrier) else Barrier(b, f"h_{i}" if several else "h")
+        for i, b in enumerate(given, 1)
+    )
 
 
 def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str, Any]:
@@ -115,8 +148,14 @@ def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str,
     elsewhere = system.drift.free_symbols | system.input_matrix.free_symbols
     degrees = [degree_of(system, b.expression) for b in barriers]
     return {
-        "noise": tuple(p.name for p in system.parameters if p in system.diffusion.free_symbols - elsewhere),
-        "gains": tuple((1.0,) * degree for degree in degrees) if len(set(degrees)) > 1 else (1.0,) * degrees[0],
+        "noise": tuple(
+            p.name for p in system.parameters if p in system.diffusion.free_symbols - elsewhere
+        ),
+        "gains": (
+            tuple((1.0,) * degree for degree in degrees)
+            if len(set(degrees)) > 1
+            else (1.0,) * degrees[0]
+        ),
         "filter": "szcbf" if system.noisy else "hocbf",
         "plane": tuple(s.name for s in system.states) if system.n == 2 else None,
     }
@@ -132,14 +171,25 @@ def _require_known(rest: Mapping[str, Any], system: ControlAffineSDE) -> None:
     allowed = [f.name for f in fields(SafetyProblem) if f.init and f.name not in _STATED]
     for name in rest:
         if name not in allowed:
-            raise ConfigurationError(f"a problem has no further {shown(name)}; {nearest(name, allowed)}")
+            raise ConfigurationError(
+                f"a problem has no further {shown(name)}; {nearest(name, allowed)}"
+            )
     parameters, states = [p.name for p in system.parameters], [s.name for s in system.states]
-    for name, known, what in (("noise", parameters, "parameters of the diffusion"), ("plane", states, "states, two of them")):
+    for name, known, what in (
+        ("noise", parameters, "parameters of the diffusion"),
+        ("plane", states, "states, two of them"),
+    ):
         given = rest.get(name)
         if given is not None and not (isinstance(given, list | tuple) and set(given) <= set(known)):
-            raise ConfigurationError(f"{name} = {given!r}; it names {what} ({', '.join(known) or 'there are none'}), like {name}=(...,)")
+            raise ConfigurationError(
+                f"{name} = {given!r}; it names {what} ({', '.join(known) or 'there are none'}),"
+                f" like {name}=(...,)"
+            )
     if "gains" in rest and not isinstance(rest["gains"], list | tuple):
-        raise ConfigurationError(f"gains = {rest['gains']!r}; give a tuple of rates, one for each order, or such a tuple for each barrier")
+        raise ConfigurationError(
+            f"gains = {rest['gains']!r}; give a tuple of rates, one for each order, or such a tuple"
+            " for each barrier"
+        )
 
 
 def _listed(laws: Any, count: int) -> list[Any]:
@@ -152,9 +202,13 @@ def _start(states: Sequence[Variable], barriers: Sequence[Barrier], start: Any) 
     names = ", ".join(s.symbol.name for s in states)
     given = start.tolist() if isinstance(start, np.ndarray) else start
     if not isinstance(given, list | tuple) or len(given) != len(states):
-        raise SystemDefinitionError(f"start = {start!r}; give a number or (low, high) for each of the {len(states)} states: {names}")
+        raise SystemDefinitionError(
+            f"start = {start!r}; give a number or (low, high) for each of the {len(states)} states:"
+            f" {names}"
+        )
     ends = [
-        _ends(f"start of {s.symbol}", v if isinstance(v, list | tuple | np.ndarray) else (v, v)) for s, v in zip(states, given, strict=True)
+        _ends(f"start of {s.symbol}", v if isinstance(v, list | tuple | np.ndarray) else (v, v))
+        for s, v in zip(states, given, strict=True)
     ]
     for s, (low, high) in zip(states, ends, strict=True):
         finite_number(f"start of {s.symbol}", low)
@@ -162,11 +216,16 @@ def _start(states: Sequence[Variable], barriers: Sequence[Barrier], start: Any) 
     if all(low == high for low, high in ends):
         return Start.at([low for low, _ in ends])
     uniforms = sp.symbols(f"uniform_1:{len(states) + 1}", real=True)
-    state = tuple(low + (high - low) * uniform for (low, high), uniform in zip(ends, uniforms, strict=True))
+    state = tuple(
+        low + (high - low) * uniform for (low, high), uniform in zip(ends, uniforms, strict=True)
+    )
     within = [
         distance
         for s, (low, high) in zip(states, ends, strict=True)
-        for distance, leaves in ((s.symbol - s.low, low < s.low), (s.high - s.symbol, high > s.high))
+        for distance, leaves in (
+            (s.symbol - s.low, low < s.low),
+            (s.high - s.symbol, high > s.high),
+        )
         if leaves
     ]
     return Start(state, uniforms, sp.Min(*[b.expression for b in barriers], *within))
@@ -174,9 +233,16 @@ def _start(states: Sequence[Variable], barriers: Sequence[Barrier], start: Any) 
 
 def _boxes(system: ControlAffineSDE, box: Any) -> list[Range]:
     given = box.tolist() if isinstance(box, np.ndarray) else box
-    pairs = list(given) if isinstance(given, list | tuple) and given and isinstance(given[0], list | tuple) else [given] * system.m
+    pairs = (
+        list(given)
+        if isinstance(given, list | tuple) and given and isinstance(given[0], list | tuple)
+        else [given] * system.m
+    )
     if len(pairs) != system.m:
-        raise ConfigurationError(f"box = {shown(box)}; give (low, high), or one such pair for each of the {system.m} inputs")
+        raise ConfigurationError(
+            f"box = {shown(box)}; give (low, high), or one such pair for each of the {system.m}"
+            " inputs"
+        )
     return [_ends(f"box of {u}", pair) for u, pair in zip(system.inputs, pairs, strict=True)]
 
 
@@ -195,4 +261,7 @@ def _require_symbols(what: str, given: Mapping[Any, Any], allowed: Sequence[sp.S
     for symbol in given:
         if symbol not in allowed:
             names = ", ".join(map(str, allowed))
-            raise SystemDefinitionError(f"{what} names {symbol!r}, which is none of the symbols {names}; give the symbol itself, no text")
+            raise SystemDefinitionError(
+                f"{what} names {symbol!r}, which is none of the symbols {names}; give the symbol"
+                " itself, no text"
+            )

@@ -31,7 +31,8 @@ class CLF:
         ConfigurationError: the rate is negative or not finite.
         SystemDefinitionError: V or a weight is no expression.
 
-    Source: the CLF part of the quadratic programs in thesis Sec. 4.3.1 and 5.4.2. Sec. 4.3.1 asks for AV <= d, without the
+    Source: the CLF part of the quadratic programs in thesis Sec. 4.3.1 and 5.4.2. Sec. 4.3.1 asks
+        for AV <= d, without the
     rate, with the trace of sigma' sigma V_xx and weights of 1/2 each, at which u stays near 0.
     """
 
@@ -54,7 +55,9 @@ class CLF:
         """
         system.require_known("V of the clf", self.V.free_symbols, system.states)
         for weight in (self.input_weight, self.slack_weight):
-            system.require_known("a weight of the clf", weight.free_symbols, tuple(system.parameters))
+            system.require_known(
+                "a weight of the clf", weight.free_symbols, tuple(system.parameters)
+            )
 
     def growth(self, system: ControlAffineSDE) -> tuple[sp.Expr, tuple[sp.Expr, ...]]:
         """Offset a and coefficients b, one for each input, of AV + rate V = a + b u."""
@@ -62,11 +65,14 @@ class CLF:
         return generator(system, self.V) + sp.sympify(self.rate) * self.V, tuple(b)
 
     def min_norm(self, system: ControlAffineSDE) -> tuple[sp.Expr, ...]:
-        """The input of the smallest cost, without a box: an expression of states and parameters for each input.
+        """The input of the smallest cost, without a box: an expression of states and parameters for
+        each input.
 
-        The only constraint is inactive where a <= 0. Elsewhere the multiplier follows from a + b u = d, so that
-        u = -b' max(a, 0) / (b b' + w_u / w_d): there is no division by zero.
+        The only constraint is inactive where a <= 0. Elsewhere the multiplier follows from a + b u
+        = d, so that u = -b' max(a, 0) / (b b' + w_u / w_d): there is no division by zero.
         """
         a, b = self.growth(system)
-        scale = sp.Max(a, 0) / (sum(entry**2 for entry in b) + sp.sympify(self.input_weight) / self.slack_weight)
+        scale = sp.Max(a, 0) / (
+            sum(entry**2 for entry in b) + sp.sympify(self.input_weight) / self.slack_weight
+        )
         return tuple(-scale * entry for entry in b)

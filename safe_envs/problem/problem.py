@@ -1,4 +1,5 @@
-"""A safety problem: plant, model, barriers, input box, start, timing and task, as one frozen statement."""
+"""A safety problem: plant, model, barriers, input box, start, timing and task, as one frozen
+statement."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ from safe_envs.problem.clf import CLF
 from safe_envs.problem.sampling_domain import SamplingDomain
 
 TIME = sp.Symbol("t", nonnegative=True)
-"""Time since the start of the episode, in s: references and rewards may depend on it. No state or input, which may have any sign,
-is the same symbol, even if its name is t."""
+"""Time since the start of the episode, in s: references and rewards may depend on it. No state or
+input, which may have any sign, is the same symbol, even if its name is t."""
 
 _WIDEST = 1e100
 """Largest bound of a box: its square, an effort, is still a number."""
@@ -29,8 +30,8 @@ _WIDEST = 1e100
 class Variable:
     """A state or an input with its range.
 
-    For a state the range is the workspace: an episode ends when the state leaves it (an infinite range never ends
-    one). For an input it is the box of admissible actions, finite.
+    For a state the range is the workspace: an episode ends when the state leaves it (an infinite
+    range never ends one). For an input it is the box of admissible actions, finite.
     """
 
     symbol: sp.Symbol
@@ -56,7 +57,8 @@ class Feature:
 
 @dataclass(frozen=True)
 class Start:
-    """Distribution of the initial state: a map of independent uniforms on [0, 1), kept where `condition` > 0."""
+    """Distribution of the initial state: a map of independent uniforms on [0, 1), kept where
+    `condition` > 0."""
 
     state: tuple[sp.Expr, ...]
     uniforms: tuple[sp.Symbol, ...] = ()
@@ -79,9 +81,10 @@ class SafetyProblem:
         barriers: what is safe.
         states: range and unit of each state of the plant, in order.
         inputs: box and unit of each input, in order.
-        reward: of a step, an expression of the state that it reaches, of the executed input and of `TIME`.
-        nominal: the nominal controller, an expression for each input of the features' symbols and the model's
-            parameters. The box clips it.
+        reward: of a step, an expression of the state that it reaches, of the executed input and of
+            `TIME`.
+        nominal: the nominal controller, an expression for each input of the features' symbols and
+            the model's parameters. The box clips it.
         starts: named initial distributions.
         start: the name of the one in use.
         dt: control period in s.
@@ -89,13 +92,16 @@ class SafetyProblem:
         features: entries of the observation; the states by default.
         goal: the episode ends where this expression is >= 0.
         noise: names of the diffusion parameters, in the order of the `noise` argument.
-        gains: rates p_1..p_r in 1/s that the conditions use unless told otherwise, for all barriers; or such a tuple for each.
+        gains: rates p_1..p_r in 1/s that the conditions use unless told otherwise, for all
+            barriers; or such a tuple for each.
         filter: name of the condition that suits the problem.
         substeps: integration steps in a control period.
         plane: the two states that draw a trajectory, if any.
-        scene: how the problem is drawn, a name of `safe_envs.rendering.scenes`; "" for the drawing that fits every problem.
+        scene: how the problem is drawn, a name of `safe_envs.rendering.scenes`; "" for the drawing
+            that fits every problem.
         clf: the task as a soft goal, if it is one.
-        explored: where and how the system is excited to learn from it, as far as the defaults do not suit; see `exploration`.
+        explored: where and how the system is excited to learn from it, as far as the defaults do
+            not suit; see `exploration`.
 
     Raises:
         SystemDefinitionError: the parts do not fit together.
@@ -134,17 +140,34 @@ class SafetyProblem:
         object.__setattr__(self, "box", tuple((i.low, i.high) for i in self.inputs))
         if (plant.states, plant.inputs) != (model.states, model.inputs):
             raise SystemDefinitionError("plant and model must have the same states and inputs")
-        if tuple(s.symbol for s in self.states) != plant.states or tuple(i.symbol for i in self.inputs) != plant.inputs:
-            raise SystemDefinitionError("the ranges of states and inputs must be given in the order of the plant's symbols")
+        if (
+            tuple(s.symbol for s in self.states) != plant.states
+            or tuple(i.symbol for i in self.inputs) != plant.inputs
+        ):
+            raise SystemDefinitionError(
+                "the ranges of states and inputs must be given in the order of the plant's symbols"
+            )
         if not self.barriers or len(self.nominal) != plant.m:
-            raise SystemDefinitionError(f"a problem needs a barrier and a nominal expression for each of the {plant.m} inputs")
+            raise SystemDefinitionError(
+                f"a problem needs a barrier and a nominal expression for each of the {plant.m}"
+                " inputs"
+            )
         for barrier in self.barriers:
-            plant.require_known(f"barrier {barrier.name}", barrier.expression.free_symbols, plant.states)
+            plant.require_known(
+                f"barrier {barrier.name}", barrier.expression.free_symbols, plant.states
+            )
         if isinstance(self.gains[0], tuple) and len(self.gains) != len(self.barriers):
-            raise SystemDefinitionError(f"gains has {len(self.gains)} tuples for {len(self.barriers)} barriers; give one for each")
-        plant.require_known("the reward", self.reward.free_symbols, (*plant.states, *plant.inputs, TIME))
+            raise SystemDefinitionError(
+                f"gains has {len(self.gains)} tuples for {len(self.barriers)} barriers; give one"
+                " for each"
+            )
+        plant.require_known(
+            "the reward", self.reward.free_symbols, (*plant.states, *plant.inputs, TIME)
+        )
         for feature in self.features:
-            plant.require_known(f"feature {feature.name}", feature.expression.free_symbols, (*plant.states, TIME))
+            plant.require_known(
+                f"feature {feature.name}", feature.expression.free_symbols, (*plant.states, TIME)
+            )
         self._check_feature_names()
         for law in self.nominal:
             known = (*(f.symbol for f in self.features), *model.parameters)
@@ -154,12 +177,14 @@ class SafetyProblem:
         for i in self.inputs:
             if not -_WIDEST <= i.low < i.high <= _WIDEST:
                 raise ConfigurationError(
-                    f"box of input {i.symbol} is [{i.low}, {i.high}]; it needs bounds within {_WIDEST:g}, the lower one below the upper. "
-                    "Unbounded control is a wide box"
+                    f"box of input {i.symbol} is [{i.low}, {i.high}]; it needs bounds within"
+                    f" {_WIDEST:g}, the lower one below the upper. Unbounded control is a wide box"
                 )
         self._check_timing()
         for coordinate in self.explored.coordinates:
-            plant.require_known("a coordinate of the exploration", coordinate.free_symbols, plant.states)
+            plant.require_known(
+                "a coordinate of the exploration", coordinate.free_symbols, plant.states
+            )
 
     @cached_property
     def exploration(self) -> SamplingDomain:
@@ -177,15 +202,23 @@ class SafetyProblem:
         symbols = [f.symbol for f in self.features]
         twice = {s.name for s in symbols if symbols.count(s) > 1 or s in self.model.parameters}
         if twice:
-            raise SystemDefinitionError(f"features named twice, or like a parameter: {', '.join(sorted(twice))}; give each another name")
+            raise SystemDefinitionError(
+                f"features named twice, or like a parameter: {', '.join(sorted(twice))}; give each"
+                " another name"
+            )
 
     def _check_timing(self) -> None:
         if not self.dt > 0 or not math.isfinite(self.dt):
             raise ConfigurationError(f"dt = {self.dt} s; a control period is positive and finite")
         if not math.isfinite(self.horizon / self.dt) or round(self.horizon / self.dt) < 1:
-            raise ConfigurationError(f"horizon = {self.horizon} s; it must hold at least one control period of {self.dt} s")
+            raise ConfigurationError(
+                f"horizon = {self.horizon} s; it must hold at least one control period of"
+                f" {self.dt} s"
+            )
         if not isinstance(self.substeps, int) or self.substeps < 1:
-            raise ConfigurationError(f"substeps = {shown(self.substeps)}; give a whole number from 1")
+            raise ConfigurationError(
+                f"substeps = {shown(self.substeps)}; give a whole number from 1"
+            )
 
     def gains_of(self, barrier: int) -> tuple[float, ...]:
         """Rates p_1..p_r for a barrier, by its index."""
@@ -199,7 +232,8 @@ class SafetyProblem:
 
     @property
     def duration(self) -> float:
-        """Length of an episode in s as it is simulated: the whole number of control periods that is nearest to the horizon."""
+        """Length of an episode in s as it is simulated: the whole number of control periods that is
+        nearest to the horizon."""
         return self.steps * self.dt
 
     @property
@@ -222,7 +256,8 @@ class SafetyProblem:
         """Return the problem with other numbers; None keeps the default.
 
         Args:
-            noise: diffusion of plant and model alike, one number for all channels or one for each; 0 turns it off.
+            noise: diffusion of plant and model alike, one number for all channels or one for each;
+                0 turns it off.
             plant: parameters of the plant, by name.
             model: parameters of the model, by name.
             dt: control period in s.
@@ -248,7 +283,10 @@ class SafetyProblem:
             changes["inputs"] = self._boxed(box)
         if isinstance(start, str):
             if start not in self.starts:
-                raise ConfigurationError(f"unknown start {shown(start)}; {nearest(start, self.starts)}, or {len(self.states)} numbers")
+                raise ConfigurationError(
+                    f"unknown start {shown(start)}; {nearest(start, self.starts)}, or"
+                    f" {len(self.states)} numbers"
+                )
             changes["start"] = start
         elif start is not None:
             changes["starts"] = {**self.starts, "given": self._fixed(start)}
@@ -259,12 +297,22 @@ class SafetyProblem:
         if noise is None:
             return {}
         if not self.noise:
-            advice = ": its diffusion holds numbers only; write it as a parameter, so that it can be changed" if self.plant.noisy else ""
+            advice = (
+                ": its diffusion holds numbers only; write it as a parameter, so that it can be"
+                " changed"
+                if self.plant.noisy
+                else ""
+            )
             raise ConfigurationError(f"{self.name} has no noise channels{advice}")
         given = _numbers(noise)
-        if given.shape not in ((1,), (len(self.noise),)) or not np.isfinite(given).all() or (given < 0).any():
+        if (
+            given.shape not in ((1,), (len(self.noise),))
+            or not np.isfinite(given).all()
+            or (given < 0).any()
+        ):
             raise ConfigurationError(
-                f"noise = {shown(noise)}; give one number >= 0, or {len(self.noise)} of them ({', '.join(self.noise)})"
+                f"noise = {shown(noise)}; give one number >= 0, or {len(self.noise)} of them"
+                f" ({', '.join(self.noise)})"
             )
         return dict(zip(self.noise, np.broadcast_to(given, len(self.noise)).tolist(), strict=True))
 
@@ -272,19 +320,32 @@ class SafetyProblem:
         pairs = _numbers(box)
         pairs = np.broadcast_to(pairs, (len(self.inputs), 2)) if pairs.shape == (2,) else pairs
         if pairs.shape != (len(self.inputs), 2):
-            raise ConfigurationError(f"box = {shown(box)}; give (low, high), or one such pair for each of the {len(self.inputs)} inputs")
+            raise ConfigurationError(
+                f"box = {shown(box)}; give (low, high), or one such pair for each of the"
+                f" {len(self.inputs)} inputs"
+            )
         bounds = [(float(low), float(high)) for low, high in pairs]
-        return tuple(replace(i, low=low, high=high) for i, (low, high) in zip(self.inputs, bounds, strict=True))
+        return tuple(
+            replace(i, low=low, high=high)
+            for i, (low, high) in zip(self.inputs, bounds, strict=True)
+        )
 
     def _fixed(self, start: Sequence[float]) -> Start:
         names = ", ".join(s.symbol.name for s in self.states)
         given = _numbers(start)
         if given.shape != (len(self.states),):
-            raise ConfigurationError(f"start has {given.size} numbers; the state has {len(self.states)}: {names}")
-        values = [finite_number(f"start of {s.symbol}", v) for s, v in zip(self.states, given.tolist(), strict=True)]
+            raise ConfigurationError(
+                f"start has {given.size} numbers; the state has {len(self.states)}: {names}"
+            )
+        values = [
+            finite_number(f"start of {s.symbol}", v)
+            for s, v in zip(self.states, given.tolist(), strict=True)
+        ]
         for s, v in zip(self.states, values, strict=True):
             if not s.low <= v <= s.high:
-                raise ConfigurationError(f"start of {s.symbol} = {v} is outside the workspace [{s.low}, {s.high}]")
+                raise ConfigurationError(
+                    f"start of {s.symbol} = {v} is outside the workspace [{s.low}, {s.high}]"
+                )
         return Start.at(values)
 
 
@@ -300,7 +361,8 @@ def _numbers(given: Any) -> np.ndarray:
 
 @lru_cache(maxsize=256)
 def _excess(ranges: tuple[tuple[sp.Symbol, float, float], ...]) -> sp.Expr:
-    """By how much the furthest state is outside its range; -1 without a bound. Remembered, for sympy compares all it takes the most of."""
+    """By how much the furthest state is outside its range; -1 without a bound. Remembered, for
+    sympy compares all it takes the most of."""
     symmetric: dict[float, list[sp.Expr]] = {}
     excess: list[sp.Expr] = []
     for symbol, low, high in ranges:

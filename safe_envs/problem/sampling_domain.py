@@ -13,13 +13,15 @@ from safe_envs.errors import SystemDefinitionError
 
 @dataclass(frozen=True)
 class SamplingDomain:
-    """What a problem says about learning it; what it leaves empty, `SafetyProblem.exploration` completes.
+    """What a problem says about learning it; what it leaves empty, `SafetyProblem.exploration`
+    completes.
 
     Attributes:
-        region: (low, high) of each state. States are drawn uniformly from it, and kept where every barrier is positive.
+        region: (low, high) of each state. States are drawn uniformly from it, and kept where every
+            barrier is positive.
         inputs: input vectors that are tried, in physical units; clipped to the box.
-        coordinates: expressions of the states that a learned function depends on: cosines and sines of angles, relative
-            positions.
+        coordinates: expressions of the states that a learned function depends on: cosines and sines
+            of angles, relative positions.
     """
 
     region: tuple[tuple[float, float], ...] = ()
@@ -27,9 +29,14 @@ class SamplingDomain:
     coordinates: tuple[sp.Expr, ...] = ()
 
     def completed(
-        self, states: Sequence[sp.Symbol], ranges: Sequence[tuple[float, float]], angles: Sequence[bool], box: Sequence[tuple[float, float]]
+        self,
+        states: Sequence[sp.Symbol],
+        ranges: Sequence[tuple[float, float]],
+        angles: Sequence[bool],
+        box: Sequence[tuple[float, float]],
     ) -> SamplingDomain:
-        """Fill what is empty: the ranges themselves, with a whole turn for an angle; each input halfway to its bounds.
+        """Fill what is empty: the ranges themselves, with a whole turn for an angle; each input
+        halfway to its bounds.
 
         Args:
             states: symbols.
@@ -41,27 +48,46 @@ class SamplingDomain:
             SystemDefinitionError: a part has the wrong length, or a range is infinite or empty.
         """
         turn = (-math.pi, math.pi)
-        region = self.region or tuple(turn if angle else bounds for bounds, angle in zip(ranges, angles, strict=True))
+        region = self.region or tuple(
+            turn if angle else bounds for bounds, angle in zip(ranges, angles, strict=True)
+        )
         if len(region) != len(states):
-            raise SystemDefinitionError(f"the region of an exploration has {len(region)} ranges for {len(states)} states")
+            raise SystemDefinitionError(
+                f"the region of an exploration has {len(region)} ranges for {len(states)} states"
+            )
         for state, (low, high) in zip(states, region, strict=True):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise SystemDefinitionError(
-                    f"cannot explore {state} in [{low}, {high}]; give SamplingDomain(region=...) finite ranges, or the problem a workspace"
+                    f"cannot explore {state} in [{low}, {high}]; give SamplingDomain(region=...)"
+                    " finite ranges, or the problem a workspace"
                 )
         if any(len(u) != len(box) or not all(map(math.isfinite, u)) for u in self.inputs):
-            raise SystemDefinitionError(f"an input of an exploration needs {len(box)} finite numbers; given {self.inputs}")
-        clipped = tuple(tuple(min(max(v, low), high) for v, (low, high) in zip(u, box, strict=True)) for u in self.inputs)
+            raise SystemDefinitionError(
+                f"an input of an exploration needs {len(box)} finite numbers; given {self.inputs}"
+            )
+        clipped = tuple(
+            tuple(min(max(v, low), high) for v, (low, high) in zip(u, box, strict=True))
+            for u in self.inputs
+        )
         # Inputs that a narrow box makes one and the same would tell nothing of the input's effect.
-        inputs = clipped if clipped and len(set(clipped)) == len(set(self.inputs)) else _halfway(box)
+        inputs = (
+            clipped if clipped and len(set(clipped)) == len(set(self.inputs)) else _halfway(box)
+        )
         coordinates = self.coordinates or tuple(
-            e for s, angle in zip(states, angles, strict=True) for e in ((sp.cos(s), sp.sin(s)) if angle else (s,))
+            e
+            for s, angle in zip(states, angles, strict=True)
+            for e in ((sp.cos(s), sp.sin(s)) if angle else (s,))
         )
         return SamplingDomain(region, inputs, coordinates)
 
 
 def _halfway(box: Sequence[tuple[float, float]]) -> tuple[tuple[float, ...], ...]:
-    """For each input both points halfway from the centre of the box to its bounds, with the others at the centre."""
+    """For each input both points halfway from the centre of the box to its bounds, with the others
+    at the centre."""
     center = [0.5 * (low + high) for low, high in box]
     reach = [0.25 * (high - low) for low, high in box]
-    return tuple(tuple(c + sign * reach[j] * (i == j) for i, c in enumerate(center)) for j in range(len(box)) for sign in (-1.0, 1.0))
+    return tuple(
+        tuple(c + sign * reach[j] * (i == j) for i, c in enumerate(center))
+        for j in range(len(box))
+        for sign in (-1.0, 1.0)
+    )

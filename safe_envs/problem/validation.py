@@ -1,4 +1,5 @@
-"""Mistakes in the statement of a problem that would only show as wrong results: they are found before the first step."""
+"""Mistakes in the statement of a problem that would only show as wrong results: they are found
+before the first step."""
 
 from __future__ import annotations
 
@@ -12,7 +13,13 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
-from safe_envs.dynamics.lie import generator, has_kinks, lie_derivative_f, lie_derivative_g, relative_degree
+from safe_envs.dynamics.lie import (
+    generator,
+    has_kinks,
+    lie_derivative_f,
+    lie_derivative_g,
+    relative_degree,
+)
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.simulation import proposed_starts
 from safe_envs.errors import SystemDefinitionError, SystemDefinitionWarning
@@ -29,13 +36,15 @@ _sound: weakref.WeakValueDictionary[int, SafetyProblem] = weakref.WeakValueDicti
 def require_sound(problem: SafetyProblem) -> None:
     """Look for mistakes in a problem, at its starts mostly; once for each problem.
 
-    Wrong are: an input that nothing depends on; a barrier that no input reaches, or that cannot be differentiated as often as
-    that takes; gains that are not one positive number for each order; functions without a finite value; and starts of which all
-    are outside the safe set (an h of the wrong sign) or the workspace.
+    Wrong are: an input that nothing depends on; a barrier that no input reaches, or that cannot be
+    differentiated as often as that takes; gains that are not one positive number for each order;
+    functions without a finite value; and starts of which all are outside the safe set (an h of the
+    wrong sign) or the workspace.
 
-    Doubtful is what other units than the model's would explain: few of the drawn starts are safe (degrees for radians); the
-    nominal controller asks for a hundred times what the box holds, or a barrier's condition for a hundred times what the box can
-    do, at every start; the box throws a state across its whole workspace within a control period.
+    Doubtful is what other units than the model's would explain: few of the drawn starts are safe
+    (degrees for radians); the nominal controller asks for a hundred times what the box holds, or a
+    barrier's condition for a hundred times what the box can do, at every start; the box throws a
+    state across its whole workspace within a control period.
 
     Raises:
         SystemDefinitionError: something is wrong.
@@ -53,8 +62,9 @@ def require_sound(problem: SafetyProblem) -> None:
             degree = degree_of(system, barrier.expression)
             if degree > 1 and has_kinks(barrier.expression):
                 raise SystemDefinitionError(
-                    f"barrier {barrier.name} = {barrier.expression} has kinks and relative degree {degree}: it cannot be differentiated "
-                    "that often. Give a smooth one, or a barrier for each of its pieces"
+                    f"barrier {barrier.name} = {barrier.expression} has kinks and relative degree"
+                    f" {degree}: it cannot be differentiated that often. Give a smooth one, or a"
+                    " barrier for each of its pieces"
                 )
             _require_gains(problem.gains_of(i), barrier.name, degree)
     x = _safe_starts(problem)
@@ -86,13 +96,19 @@ def _require_inputs_used(system: ControlAffineSDE) -> None:
     numbers = system.numeric(system.input_matrix)
     for j, u in enumerate(system.inputs):
         if all(entry == 0 for entry in numbers[:, j]):
-            raise SystemDefinitionError(f"input {u} never appears: its column of the input matrix is 0; leave it out, or say what it does")
+            raise SystemDefinitionError(
+                f"input {u} never appears: its column of the input matrix is 0; leave it out, or"
+                " say what it does"
+            )
 
 
 def _require_gains(gains: Sequence[float], name: str, degree: int) -> None:
     numbers = all(isinstance(gain, int | float) and 0.0 < gain < math.inf for gain in gains)
     if len(gains) != degree or not numbers:
-        raise SystemDefinitionError(f"gains of {name} = {gains}; its relative degree is {degree}: give as many positive numbers")
+        raise SystemDefinitionError(
+            f"gains of {name} = {gains}; its relative degree is {degree}: give as many positive"
+            " numbers"
+        )
 
 
 def _safe_starts(problem: SafetyProblem) -> Components:
@@ -107,43 +123,58 @@ def _safe_starts(problem: SafetyProblem) -> Components:
         inside = (values >= state.low) & (values <= state.high)
         if not inside.any():
             raise SystemDefinitionError(
-                f"every start is outside the workspace: {state.symbol} = {values[0]:.6g} is not in [{state.low:g}, {state.high:g}]"
+                f"every start is outside the workspace: {state.symbol} = {values[0]:.6g} is not in"
+                f" [{state.low:g}, {state.high:g}]"
             )
         within &= inside
     h = _values(states, [b.expression for b in problem.barriers], x)
     for barrier, values in zip(problem.barriers, h.T, strict=True):
         if not np.isfinite(values).any():
             raise SystemDefinitionError(
-                f"barrier {barrier.name} = {barrier.expression} has no finite value at the start {_at(problem, x, 0)}"
+                f"barrier {barrier.name} = {barrier.expression} has no finite value at the start"
+                f" {_at(problem, x, 0)}"
             )
         if not (values > 0.0).any():
             best = int(np.nanargmax(values))
             raise SystemDefinitionError(
-                f"every start is unsafe: {barrier.name} = {barrier.expression} is at most {values[best]:.6g}, at {_at(problem, x, best)}. "
-                "An episode has to start where h > 0: look for a wrong sign, or start elsewhere"
+                f"every start is unsafe: {barrier.name} = {barrier.expression} is at most"
+                f" {values[best]:.6g}, at {_at(problem, x, best)}. An episode has to start where h"
+                " > 0: look for a wrong sign, or start elsewhere"
             )
     kept = within & (h > 0.0).all(axis=1)
     if not kept.any():
-        raise SystemDefinitionError("no start is safe for all barriers at once and in the workspace: look at their signs")
+        raise SystemDefinitionError(
+            "no start is safe for all barriers at once and in the workspace: look at their signs"
+        )
     if kept.mean() < _FEW and problem.starts[problem.start].uniforms:
-        _doubt(f"only {100 * kept.mean():.2g} % of the starts that are drawn are safe: check their units (degrees for radians?)")
+        _doubt(
+            f"only {100 * kept.mean():.2g} % of the starts that are drawn are safe: check their"
+            " units (degrees for radians?)"
+        )
     return tuple(component[kept] for component in x)
 
 
 def _require_finite(problem: SafetyProblem, x: Components) -> None:
     for believed, system in (("plant", problem.plant), ("model", problem.model)):
         for name in ("drift", "input_matrix", "diffusion"):
-            _require_numbers(f"{name} of the {believed}", problem, list(system.numeric(getattr(system, name))), x)
+            _require_numbers(
+                f"{name} of the {believed}", problem, list(system.numeric(getattr(system, name))), x
+            )
     laws = _laws(problem)
     if laws is not None:
         _require_numbers("the nominal controller", problem, laws, x)
 
 
-def _require_numbers(what: str, problem: SafetyProblem, expressions: Sequence[Any], x: Components) -> None:
+def _require_numbers(
+    what: str, problem: SafetyProblem, expressions: Sequence[Any], x: Components
+) -> None:
     bad = ~np.isfinite(_values(problem.plant.states, expressions, x))
     if bad.any():
         i, j = np.argwhere(bad)[0].tolist()
-        raise SystemDefinitionError(f"{what} has no finite value at the start {_at(problem, x, i)}: look at {expressions[j]}")
+        raise SystemDefinitionError(
+            f"{what} has no finite value at the start {_at(problem, x, i)}: look at"
+            f" {expressions[j]}"
+        )
 
 
 def _laws(problem: SafetyProblem) -> list[Any] | None:
@@ -157,12 +188,15 @@ def _doubt_box_of_nominal(problem: SafetyProblem, x: Components) -> None:
     laws = _laws(problem)
     if laws is None:
         return
-    for variable, asked in zip(problem.inputs, abs(_values(problem.plant.states, laws, x)).T, strict=True):
+    for variable, asked in zip(
+        problem.inputs, abs(_values(problem.plant.states, laws, x)).T, strict=True
+    ):
         least, most = float(asked.min()), max(abs(variable.low), abs(variable.high))
         if least > _OTHER_UNITS * most:
             _doubt(
-                f"the nominal controller asks for |{variable.symbol}| >= {least:.4g} at every start, and the box "
-                f"[{variable.low:g}, {variable.high:g}] ends at {most:.4g}: check that both have the unit {variable.unit or 'of the model'}"
+                f"the nominal controller asks for |{variable.symbol}| >= {least:.4g} at every"
+                f" start, and the box [{variable.low:g}, {variable.high:g}] ends at {most:.4g}:"
+                f" check that both have the unit {variable.unit or 'of the model'}"
             )
 
 
@@ -173,28 +207,43 @@ def _doubt_box_of_barriers(problem: SafetyProblem, x: Components) -> None:
         chain, gains = model.numeric(barrier.expression), problem.gains_of(i)
         for gain in gains[:-1]:
             chain = generator(model, chain) + gain * chain
-        rate = generator(model, chain).replace(sp.DiracDelta, lambda *_: sp.Integer(0))  # At a kink, which no start is likely to hit.
+        rate = generator(model, chain).replace(
+            sp.DiracDelta, lambda *_: sp.Integer(0)
+        )  # At a kink, which no start is likely to hit.
         effect = model.numeric(lie_derivative_g(model, chain))
-        best = sum(sp.Max(e * variable.low, e * variable.high) for e, variable in zip(effect, problem.inputs, strict=True))
+        best = sum(
+            sp.Max(e * variable.low, e * variable.high)
+            for e, variable in zip(effect, problem.inputs, strict=True)
+        )
         without, reach = _values(model.states, [model.numeric(rate + gains[-1] * chain), best], x).T
         if (without < -_OTHER_UNITS * abs(reach)).all():
             nearest = int((abs(reach) / -without).argmax())
             _doubt(
-                f"the box is too small for {barrier.name} at every start: at {_at(problem, x, nearest)} the condition lacks "
-                f"{-without[nearest]:.4g}, of which the inputs make up {reach[nearest]:.4g}: check the units of the box and the gains"
+                f"the box is too small for {barrier.name} at every start: at"
+                f" {_at(problem, x, nearest)} the condition lacks {-without[nearest]:.4g}, of which"
+                f" the inputs make up {reach[nearest]:.4g}: check the units of the box and the"
+                " gains"
             )
 
 
 def _doubt_box_of_workspace(problem: SafetyProblem, x: Components) -> None:
     plant = problem.plant
-    moved = _values(plant.states, [abs(e) for e in plant.numeric(plant.input_matrix)], x).max(axis=0).reshape(plant.n, plant.m)
+    moved = (
+        _values(plant.states, [abs(e) for e in plant.numeric(plant.input_matrix)], x)
+        .max(axis=0)
+        .reshape(plant.n, plant.m)
+    )
     for state, row in zip(problem.states, moved, strict=True):
         for variable, rate in zip(problem.inputs, row, strict=True):
-            step, width = rate * 0.5 * (variable.high - variable.low) * problem.dt, state.high - state.low
+            step, width = (
+                rate * 0.5 * (variable.high - variable.low) * problem.dt,
+                state.high - state.low,
+            )
             if step > width:
                 _doubt(
-                    f"{variable.symbol} over half its box [{variable.low:g}, {variable.high:g}] moves {state.symbol} by {step:.4g} in a "
-                    f"control period, across its whole workspace [{state.low:g}, {state.high:g}]: check their units"
+                    f"{variable.symbol} over half its box [{variable.low:g}, {variable.high:g}]"
+                    f" moves {state.symbol} by {step:.4g} in a control period, across its whole"
+                    f" workspace [{state.low:g}, {state.high:g}]: check their units"
                 )
 
 
@@ -204,4 +253,11 @@ def _doubt(text: str) -> None:
 
 
 def _at(problem: SafetyProblem, x: Components, i: int) -> str:
-    return "(" + ", ".join(f"{s} = {component[i]:.6g}" for s, component in zip(problem.plant.states, x, strict=True)) + ")"
+    return (
+        "("
+        + ", ".join(
+            f"{s} = {component[i]:.6g}"
+            for s, component in zip(problem.plant.states, x, strict=True)
+        )
+        + ")"
+    )

@@ -28,10 +28,18 @@ def ticks(low: float, high: float, most: int = 6) -> list[float]:
 
 
 def grown(shown: Range, values: np.ndarray) -> Range:
-    """The range, or one that is 2, 4, 8, ... times as wide around the same middle, so that all finite values are in it."""
+    """The range, or one that is 2, 4, 8, ... times as wide around the same middle, so that all
+    finite values are in it."""
     middle, half = 0.5 * (shown[0] + shown[1]), 0.5 * (shown[1] - shown[0])
     far = np.abs(values[np.isfinite(values)] - middle).max(initial=0.0)
-    return shown if far <= half else (middle - half * (scale := 2.0 ** math.ceil(math.log2(far / half))), middle + half * scale)
+    return (
+        shown
+        if far <= half
+        else (
+            middle - half * (scale := 2.0 ** math.ceil(math.log2(far / half))),
+            middle + half * scale,
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -52,7 +60,10 @@ class Axes:
     def equal(cls, box: Box, x: Range, y: Range) -> Axes:
         """Axes with the same scale along both sides: the ranges are widened to fill the box."""
         scale = min(box[2] / (x[1] - x[0]), box[3] / (y[1] - y[0]))
-        ranges = [(0.5 * (low + high), 0.5 * side / scale) for (low, high), side in ((x, box[2]), (y, box[3]))]
+        ranges = [
+            (0.5 * (low + high), 0.5 * side / scale)
+            for (low, high), side in ((x, box[2]), (y, box[3]))
+        ]
         wide, tall = ((middle - half, middle + half) for middle, half in ranges)
         return cls(box, wide, tall)
 
@@ -64,7 +75,9 @@ class Axes:
     def place(self, x: float, y: float) -> tuple[float, float]:
         """The pixel of a point of the world."""
         right, up = self.scale
-        return self.box[0] + right * (x - self.x[0]), self.box[1] + self.box[3] - up * (y - self.y[0])
+        return self.box[0] + right * (x - self.x[0]), self.box[1] + self.box[3] - up * (
+            y - self.y[0]
+        )
 
     def places(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """The pixels of points of the world, shape (k, 2)."""
@@ -86,7 +99,9 @@ class Axes:
             canvas.text(_tick_text(tick), (left - 6, py), GREY, SMALL, align=(1.0, 0.5))
         canvas.frame((left - 1, top - 1, width + 2, height + 2), GREY)
         canvas.text(x_label, (left + width / 2, bottom + 21), INK, SMALL, align=(0.5, 0.0))
-        canvas.text(y_label, (left - 56, top + height / 2), INK, SMALL, align=(0.0, 0.5), turned=True)
+        canvas.text(
+            y_label, (left - 56, top + height / 2), INK, SMALL, align=(0.0, 0.5), turned=True
+        )
 
 
 def _tick_text(tick: float) -> str:

@@ -19,7 +19,8 @@ Point = Sequence[float]
 Box = tuple[int, int, int, int]
 
 _FAR = 20_000.0
-"""Points further away are drawn at this distance: the coordinates of a surface are 16-bit numbers."""
+"""Points further away are drawn at this distance: the coordinates of a surface are 16-bit numbers.
+"""
 
 _BRUSHES = {
     1: ((0.0, 0.0),),
@@ -30,12 +31,14 @@ _BRUSHES = {
 
 
 def _font(size: int, bold: bool) -> pygame.font.Font:
-    """DejaVu Sans, which has all the letters and comes with matplotlib: the same picture on every machine."""
+    """DejaVu Sans, which has all the letters and comes with matplotlib: the same picture on every
+    machine."""
     font = _loaded_font(size, bold)
     try:
         font.get_height()
     except pygame.error:
-        # Gymnasium's own envs quit pygame when they close, after which no font that was loaded before can be used.
+        # Gymnasium's own envs quit pygame when they close, after which no font that was loaded
+        # before can be used.
         _loaded_font.cache_clear()
         font = _loaded_font(size, bold)
     return font
@@ -57,7 +60,8 @@ def _text(text: str, size: int, bold: bool, color: Color, turned: bool) -> pygam
 
 
 def _apart(points: np.ndarray) -> np.ndarray:
-    """Indices of points that lie about a pixel and a half apart along a path, the first and the last among them."""
+    """Indices of points that lie about a pixel and a half apart along a path, the first and the
+    last among them."""
     steps = np.floor(np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))]) / 1.5)
     return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(steps)) + 1, [len(points) - 1]]))
 
@@ -87,7 +91,10 @@ class Canvas:
         shown = pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
         scale = min(width / shown.get_width(), height / shown.get_height())
         size = max(1, round(scale * shown.get_width())), max(1, round(scale * shown.get_height()))
-        self.surface.blit(pygame.transform.smoothscale(shown, size), (left + (width - size[0]) // 2, top + (height - size[1]) // 2))
+        self.surface.blit(
+            pygame.transform.smoothscale(shown, size),
+            (left + (width - size[0]) // 2, top + (height - size[1]) // 2),
+        )
 
     def within(self, box: Box | None) -> None:
         """Draw only inside a box from now on; None for everywhere."""
@@ -95,11 +102,15 @@ class Canvas:
 
     def fill(self, box: Sequence[float], color: Color, rounded: int = 0) -> None:
         """Fill a rectangle of left, top, width and height."""
-        pygame.draw.rect(self.surface, color, pygame.Rect([round(v) for v in box]), border_radius=rounded)
+        pygame.draw.rect(
+            self.surface, color, pygame.Rect([round(v) for v in box]), border_radius=rounded
+        )
 
     def frame(self, box: Sequence[float], color: Color, width: int = 1, rounded: int = 0) -> None:
         """Draw the outline of a rectangle."""
-        pygame.draw.rect(self.surface, color, pygame.Rect([round(v) for v in box]), width, border_radius=rounded)
+        pygame.draw.rect(
+            self.surface, color, pygame.Rect([round(v) for v in box]), width, border_radius=rounded
+        )
 
     def line(self, start: Point, end: Point, color: Color, width: int = 1) -> None:
         """Draw a straight line."""
@@ -114,10 +125,13 @@ class Canvas:
             self.fill((left - thick, top, width, length), color)
             return
         across = (start[1] - end[1]) / length, (end[0] - start[0]) / length
-        # Side by side, half a pixel apart: a polygon has no smooth edges, and lines a whole pixel apart have gaps.
+        # Side by side, half a pixel apart: a polygon has no smooth edges, and lines a whole pixel
+        # apart have gaps.
         for k in range(1 - width, width):
             x, y = (0.5 * k * step for step in across)
-            pygame.draw.aaline(self.surface, color, (start[0] + x, start[1] + y), (end[0] + x, end[1] + y))
+            pygame.draw.aaline(
+                self.surface, color, (start[0] + x, start[1] + y), (end[0] + x, end[1] + y)
+            )
 
     def path(self, points: np.ndarray, color: Color, width: int = 1) -> None:
         """Draw lines through points, shape (k, 2), up to 3 pixels wide."""
@@ -129,31 +143,45 @@ class Canvas:
         # Wide lines of the library have gaps at their corners: a brush of thin ones has none.
         for offset in _BRUSHES[min(width, 3)]:
             through = (points + offset).tolist()
-            # Of two points the library's `aalines` looks at a third, so that its picture is a matter of chance.
+            # Of two points the library's `aalines` looks at a third, so that its picture is a
+            # matter of chance.
             if len(through) == 2:
                 pygame.draw.aaline(self.surface, color, *through)
             else:
                 pygame.draw.aalines(self.surface, color, False, through)
 
-    def dashes(self, points: np.ndarray, color: Color, width: int = 1, period: float = 12.0) -> None:
+    def dashes(
+        self, points: np.ndarray, color: Color, width: int = 1, period: float = 12.0
+    ) -> None:
         """Draw a dashed line through points, shape (k, 2)."""
         if len(points) < 2:
             return
         points = np.clip(points, -_FAR, _FAR)
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
         stops = np.arange(0.0, along[-1], period / 2)
-        places = np.stack([np.interp(stops, along, points[:, i]) for i in range(2)], axis=1).tolist()
+        places = np.stack(
+            [np.interp(stops, along, points[:, i]) for i in range(2)], axis=1
+        ).tolist()
         for start, end in zip(places[::2], places[1::2], strict=False):
             self.line(start, end, color, width)
 
-    def shape(self, points: Any, fill: Color | None, outline: Color | None = None, width: int = 1) -> None:
+    def shape(
+        self, points: Any, fill: Color | None, outline: Color | None = None, width: int = 1
+    ) -> None:
         """Draw a polygon with smooth edges."""
         vertices = np.clip(np.asarray(points, dtype=float), -_FAR, _FAR)
         if fill is not None:
             pygame.draw.polygon(self.surface, fill, vertices.tolist())
         self.path(np.concatenate([vertices, vertices[:1]]), outline or fill or INK, width)
 
-    def disk(self, center: Point, radius: float, fill: Color | None, outline: Color | None = None, width: int = 2) -> None:
+    def disk(
+        self,
+        center: Point,
+        radius: float,
+        fill: Color | None,
+        outline: Color | None = None,
+        width: int = 2,
+    ) -> None:
         """Draw a circle, filled or not."""
         if not all(-_FAR < v < _FAR for v in (*center, radius)):
             return
@@ -162,10 +190,14 @@ class Canvas:
         if outline is not None:
             pygame.draw.aacircle(self.surface, outline, center, radius, width)
 
-    def diamond(self, center: Point, size: float, fill: Color | None, outline: Color, width: int = 2) -> None:
+    def diamond(
+        self, center: Point, size: float, fill: Color | None, outline: Color, width: int = 2
+    ) -> None:
         """Draw a square that stands on a corner."""
         x, y = center
-        self.shape([(x, y - size), (x + size, y), (x, y + size), (x - size, y)], fill, outline, width)
+        self.shape(
+            [(x, y - size), (x + size, y), (x, y + size), (x - size, y)], fill, outline, width
+        )
 
     def cross(self, center: Point, size: float, color: Color, width: int = 3) -> None:
         """Draw an X."""
@@ -173,7 +205,9 @@ class Canvas:
         for side in (-size, size):
             self.line((x - size, y - side), (x + size, y + side), color, width)
 
-    def arrow(self, start: Point, end: Point, color: Color, width: int = 2, head: float = 7.0) -> None:
+    def arrow(
+        self, start: Point, end: Point, color: Color, width: int = 2, head: float = 7.0
+    ) -> None:
         """Draw an arrow."""
         length = math.dist(start, end)
         if length < 1.0:
@@ -181,7 +215,9 @@ class Canvas:
         along = (end[0] - start[0]) / length, (end[1] - start[1]) / length
         base = end[0] - head * along[0], end[1] - head * along[1]
         self.line(start, base, color, width)
-        sides = [(base[0] + s * along[1], base[1] - s * along[0]) for s in (0.55 * head, -0.55 * head)]
+        sides = [
+            (base[0] + s * along[1], base[1] - s * along[0]) for s in (0.55 * head, -0.55 * head)
+        ]
         self.shape([end, *sides], color)
 
     def text(
@@ -217,7 +253,9 @@ class Canvas:
             text += "…"
         surface = _text(text, size, bold, color, turned)
         width, height = surface.get_size()
-        self.surface.blit(surface, (round(at[0] - align[0] * width), round(at[1] - align[1] * height)))
+        self.surface.blit(
+            surface, (round(at[0] - align[0] * width), round(at[1] - align[1] * height))
+        )
         return width
 
     def pixels(self) -> np.ndarray:

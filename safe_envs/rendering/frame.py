@@ -17,7 +17,8 @@ from safe_envs.rendering.style import SCENE, SIZE
 
 
 class Picture:
-    """Draws instants of a problem's episodes; it holds no episode, so that one object serves any number of envs.
+    """Draws instants of a problem's episodes; it holds no episode, so that one object serves any
+    number of envs.
 
     Args:
         problem: that is drawn. A scene of its name is only looked for when it is to be shown.
@@ -32,13 +33,16 @@ class Picture:
     def _scene(self) -> Scene:
         return make_scene(self._problem)
 
-    def draw(self, moment: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None) -> pygame.Surface:
+    def draw(
+        self, moment: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None
+    ) -> pygame.Surface:
         """Draw an instant; the surface is drawn over by the next call.
 
         Args:
             moment: what is drawn.
             caption: above it.
-            shot: somebody else's picture of it, uint8 of shape (height, width, 3), to show in place of the scene.
+            shot: somebody else's picture of it, uint8 of shape (height, width, 3), to show in place
+                of the scene.
         """
         self._panel.draw(self._canvas, moment, caption)
         if shot is None:
@@ -47,7 +51,9 @@ class Picture:
             self._canvas.photograph(shot, SCENE)
         return self._canvas.surface
 
-    def frame(self, moment: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None) -> np.ndarray:
+    def frame(
+        self, moment: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None
+    ) -> np.ndarray:
         """Draw an instant; uint8 of shape (height, width, 3). Arguments as for `draw`."""
         self.draw(moment, caption, shot)
         return self._canvas.pixels()

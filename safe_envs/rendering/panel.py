@@ -1,4 +1,5 @@
-"""The panel beside the scene: time, what the filter does, the inputs, and the smallest barrier over time."""
+"""The panel beside the scene: time, what the filter does, the inputs, and the smallest barrier over
+time."""
 
 from __future__ import annotations
 
@@ -56,11 +57,14 @@ class Panel:
 
     def __init__(self, problem: SafetyProblem) -> None:
         self._problem = problem
-        # Over somebody else's env without a limit of time, the problem's horizon is a single control period.
+        # Over somebody else's env without a limit of time, the problem's horizon is a single
+        # control period.
         self._endless = problem.steps == 1
         shown = problem.inputs[:_MOST_BARS]
         pitch = min(58.0, (_BARS[1] - _BARS[0] - 26) / len(shown))
-        self._rows = [(variable, _BARS[0] + 26 + round(j * pitch)) for j, variable in enumerate(shown)]
+        self._rows = [
+            (variable, _BARS[0] + 26 + round(j * pitch)) for j, variable in enumerate(shown)
+        ]
         self._ranged = pitch >= 50.0
         below = _BARS[0] + 26 + round(len(shown) * pitch) + 10
         self._heading = below
@@ -71,10 +75,22 @@ class Panel:
         canvas.line((SCENE[2], 0), (SCENE[2], SIZE[1]), LINE)
         canvas.text(problem.name, (_LEFT, 14), INK, LARGE, bold=True, widest=_WIDTH)
         more = len(problem.inputs) - len(shown)
-        canvas.text("Action" + (f" (and {more} more)" if more else ""), (_LEFT, _BARS[0]), INK, NORMAL, bold=True)
+        canvas.text(
+            "Action" + (f" (and {more} more)" if more else ""),
+            (_LEFT, _BARS[0]),
+            INK,
+            NORMAL,
+            bold=True,
+        )
         for variable, top in self._rows:
             self._track(variable, top)
-        canvas.text("Smallest h" if len(problem.barriers) > 1 else "h", (_LEFT, below), INK, NORMAL, bold=True)
+        canvas.text(
+            "Smallest h" if len(problem.barriers) > 1 else "h",
+            (_LEFT, below),
+            INK,
+            NORMAL,
+            bold=True,
+        )
         self._legend()
 
     def draw(self, canvas: Canvas, moment: EpisodeSnapshot, caption: str) -> None:
@@ -85,7 +101,9 @@ class Panel:
         time = float(moment.times[-1])
         canvas.text(f"t = {time:.2f} s", (_LEFT, 68), INK, NORMAL)
         if not self._endless:
-            canvas.text(f"of {self._problem.duration:g} s", (_RIGHT, 68), GREY, NORMAL, align=(1.0, 0.0))
+            canvas.text(
+                f"of {self._problem.duration:g} s", (_RIGHT, 68), GREY, NORMAL, align=(1.0, 0.0)
+            )
             canvas.fill((_LEFT, 91, _WIDTH, 3), LINE)
             canvas.fill((_LEFT, 91, _WIDTH * min(time / self._problem.duration, 1.0), 3), GREY)
         self._status(canvas, moment)
@@ -101,15 +119,35 @@ class Panel:
         elif moment.decision is not None:
             filtered = ("action unchanged", GREEN, False)
         else:
-            filtered = ("no filter", GREY, False) if moment.executed is not None else ("no step yet", GREY, False)
+            filtered = (
+                ("no filter", GREY, False)
+                if moment.executed is not None
+                else ("no step yet", GREY, False)
+            )
         h = float(moment.h[-1])
-        safe = ("violation", VIOLATION, True) if h < 0.0 else ("safe now, was not", GREEN, False) if moment.violated is not None else None
-        for (text, color, loud), left in ((filtered, _LEFT), (safe or ("safe", GREEN, False), _LEFT + half + 8)):
+        safe = (
+            ("violation", VIOLATION, True)
+            if h < 0.0
+            else ("safe now, was not", GREEN, False)
+            if moment.violated is not None
+            else None
+        )
+        for (text, color, loud), left in (
+            (filtered, _LEFT),
+            (safe or ("safe", GREEN, False), _LEFT + half + 8),
+        ):
             box = (left, 104, half, 28)
             canvas.fill(box, color if loud else mix(color, PANEL, 0.12), 6)
             canvas.frame(box, color, 1, 6)
             ink = INK if color == INTERVENING else PAPER
-            canvas.text(text, (left + half / 2, 118), ink if loud else mix(color, INK, 0.6), NORMAL, bold=loud, align=(0.5, 0.5))
+            canvas.text(
+                text,
+                (left + half / 2, 118),
+                ink if loud else mix(color, INK, 0.6),
+                NORMAL,
+                bold=loud,
+                align=(0.5, 0.5),
+            )
 
     def _track(self, variable: Variable, top: int) -> None:
         """The empty bar of an input, with its name and its range."""
@@ -117,7 +155,13 @@ class Panel:
         canvas.text(label(variable.symbol.name, variable.unit), (_LEFT, top), INK, SMALL)
         if self._ranged:
             for value, side in ((variable.low, 0.0), (variable.high, 1.0)):
-                canvas.text(bound(value), (_LEFT + side * _WIDTH, top + 36), GREY, SMALL - 2, align=(side, 0.0))
+                canvas.text(
+                    bound(value),
+                    (_LEFT + side * _WIDTH, top + 36),
+                    GREY,
+                    SMALL - 2,
+                    align=(side, 0.0),
+                )
         canvas.fill((_LEFT, top + 20, _WIDTH, 12), PAPER, 2)
         canvas.frame((_LEFT, top + 20, _WIDTH, 12), mix(GREY, PANEL, 0.6), 1, 2)
 
@@ -125,7 +169,9 @@ class Panel:
         executed, decision = moment.executed, moment.decision
         if executed is None:
             return
-        color: Color = INFEASIBLE if moment.infeasible else INTERVENING if moment.intervening else EXECUTED
+        color: Color = (
+            INFEASIBLE if moment.infeasible else INTERVENING if moment.intervening else EXECUTED
+        )
         for j, (variable, top) in enumerate(self._rows):
             rest = _on_track(variable, min(max(0.0, variable.low), variable.high))
             here = _on_track(variable, executed[j])
@@ -134,19 +180,42 @@ class Panel:
             canvas.fill((here - 1, top + 18, 3, 16), INK)
             right, scale = _RIGHT, max(-variable.low, variable.high)
             if decision is not None:
-                place = _on_track(variable, min(max(decision.nominal[j], variable.low), variable.high))
+                place = _on_track(
+                    variable, min(max(decision.nominal[j], variable.low), variable.high)
+                )
                 canvas.diamond((place, top + 26), 7, None, INK)
-                right -= canvas.text(number(decision.nominal[j], scale), (right, top), INK, SMALL, align=(1.0, 0.0)) + 10
+                right -= (
+                    canvas.text(
+                        number(decision.nominal[j], scale),
+                        (right, top),
+                        INK,
+                        SMALL,
+                        align=(1.0, 0.0),
+                    )
+                    + 10
+                )
                 canvas.diamond((right, top + 8), 4, None, INK, 1)
                 right -= 16
-            right -= canvas.text(number(executed[j], scale), (right, top), INK, SMALL, bold=True, align=(1.0, 0.0)) + 14
+            right -= (
+                canvas.text(
+                    number(executed[j], scale),
+                    (right, top),
+                    INK,
+                    SMALL,
+                    bold=True,
+                    align=(1.0, 0.0),
+                )
+                + 14
+            )
             canvas.fill((right, top + 3, 9, 9), color)
 
     def _chart(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         times, h = _thinned(moment.times, moment.h)
         low, high = min(float(h.min()), 0.0), max(float(h.max()), 0.0)
         span = max(high - low, 1e-9)
-        axes = Axes(self._box, self._period(float(times[-1])), (low - 0.12 * span, high + 0.12 * span))
+        axes = Axes(
+            self._box, self._period(float(times[-1])), (low - 0.12 * span, high + 0.12 * span)
+        )
         left, top, width, height = self._box
         edge = axes.place(0.0, 0.0)[1]
         canvas.fill((left, top, width, edge - top), mix(GREEN, PAPER, 0.10))
@@ -164,17 +233,44 @@ class Panel:
         far = high if high >= -low else low
         canvas.text(number(far), (left - 6, axes.place(0.0, far)[1]), GREY, SMALL, align=(1.0, 0.5))
         for time, side in zip(axes.x, (0.0, 1.0), strict=True):
-            canvas.text(f"{time:.3g} s", (left + side * width, top + height + 4), GREY, SMALL - 1, align=(side, 0.0))
+            canvas.text(
+                f"{time:.3g} s",
+                (left + side * width, top + height + 4),
+                GREY,
+                SMALL - 1,
+                align=(side, 0.0),
+            )
         now = number(float(moment.h[-1]))
-        right = canvas.text(f"least {number(moment.least)}", (_RIGHT, self._heading + 2), GREY, SMALL, align=(1.0, 0.0))
-        canvas.text(f"now {now}", (_RIGHT - right - 14, self._heading + 2), INK, SMALL, bold=True, align=(1.0, 0.0))
+        right = canvas.text(
+            f"least {number(moment.least)}",
+            (_RIGHT, self._heading + 2),
+            GREY,
+            SMALL,
+            align=(1.0, 0.0),
+        )
+        canvas.text(
+            f"now {now}",
+            (_RIGHT - right - 14, self._heading + 2),
+            INK,
+            SMALL,
+            bold=True,
+            align=(1.0, 0.0),
+        )
         if len(moment.barriers) > 1:
             name = self._problem.barriers[int(np.argmin(moment.barriers))].name
             middle, room = left + width / 2, width - 120
-            canvas.text(f"smallest: {pretty(name)}", (middle, top + height + 4), GREY, SMALL - 1, align=(0.5, 0.0), widest=room)
+            canvas.text(
+                f"smallest: {pretty(name)}",
+                (middle, top + height + 4),
+                GREY,
+                SMALL - 1,
+                align=(0.5, 0.0),
+                widest=room,
+            )
 
     def _period(self, now: float) -> Range:
-        """The times that the chart shows: the horizon, or the last one; without a horizon all, for 100, 200, 400, ... control periods."""
+        """The times that the chart shows: the horizon, or the last one; without a horizon all, for
+        100, 200, 400, ... control periods."""
         if self._endless:
             first = _FIRST_STEPS * self._problem.dt
             return 0.0, first * 2.0 ** max(0, math.ceil(math.log2(max(now, first) / first)))
@@ -201,7 +297,8 @@ def _on_track(variable: Variable, value: float) -> float:
 
 
 def _thinned(times: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """At most about two points a pixel, with the smallest h of each group, so that no violation is lost."""
+    """At most about two points a pixel, with the smallest h of each group, so that no violation is
+    lost."""
     stride = 1 + len(h) // 400
     if stride == 1:
         return times, h

@@ -1,4 +1,5 @@
-"""The safe set in a plane of two states: its edge h = 0, its inside tinted less towards the edge, its outside hatched."""
+"""The safe set in a plane of two states: its edge h = 0, its inside tinted less towards the edge,
+its outside hatched."""
 
 from __future__ import annotations
 
@@ -45,17 +46,21 @@ class Barriers:
 
     def __init__(self, problem: SafetyProblem, chosen: Sequence[int] | None = None) -> None:
         self.chosen = range(len(problem.barriers)) if chosen is None else chosen
-        self._read = compile_function(problem.plant.states, [problem.barriers[k].expression for k in self.chosen], "arrays")
+        self._read = compile_function(
+            problem.plant.states, [problem.barriers[k].expression for k in self.chosen], "arrays"
+        )
 
     def __call__(self, components: Sequence[np.ndarray | float]) -> np.ndarray:
-        """Each barrier at states that broadcast against each other, with the barriers in front; NaN counts as unsafe."""
+        """Each barrier at states that broadcast against each other, with the barriers in front; NaN
+        counts as unsafe."""
         shape = np.broadcast_shapes(*(np.shape(c) for c in components))
         with np.errstate(all="ignore"):
             values = self._read(*(np.array(c, dtype=float, ndmin=1) for c in components))
         return np.nan_to_num(np.stack([filled(v, shape) for v in values]), nan=-1.0)
 
     def along(self, state: np.ndarray, i: int, values: np.ndarray) -> np.ndarray:
-        """The smallest barrier where one state takes other values, shape (k,); of no barrier, infinite."""
+        """The smallest barrier where one state takes other values, shape (k,); of no barrier,
+        infinite."""
         if not len(self.chosen):
             return np.full(len(values), np.inf)
         return self([values if j == i else float(v) for j, v in enumerate(state)]).min(axis=0)
@@ -67,7 +72,10 @@ class Barriers:
         safe = np.concatenate([[False], h >= 0.0, [False]])
         starts = np.flatnonzero(safe[1:] & ~safe[:-1]).tolist()
         ends = (np.flatnonzero(safe[:-1] & ~safe[1:]) - 1).tolist()
-        return [(_crossing(values, h, s - 1, s), _crossing(values, h, e, e + 1)) for s, e in zip(starts, ends, strict=True)]
+        return [
+            (_crossing(values, h, s - 1, s), _crossing(values, h, e, e + 1))
+            for s, e in zip(starts, ends, strict=True)
+        ]
 
 
 def _crossing(values: np.ndarray, h: np.ndarray, i: int, j: int) -> float:
@@ -80,8 +88,8 @@ def _crossing(values: np.ndarray, h: np.ndarray, i: int, j: int) -> float:
 class SafeSet:
     """Draws the safe set onto a box of axes.
 
-    The tint grows in steps of h/|grad h|, the distance from the edge to first order: levels of h that can be compared
-    between barriers, whatever their units.
+    The tint grows in steps of h/|grad h|, the distance from the edge to first order: levels of h
+    that can be compared between barriers, whatever their units.
 
     Args:
         barriers: of the set.
@@ -97,15 +105,21 @@ class SafeSet:
         right, up = axes.scale
         self._x = (axes.x[0] + np.arange(columns) * _CELL / right)[None, :]
         self._y = (axes.y[1] - np.arange(rows) * _CELL / up)[:, None]
-        self._hatched = np.where(sum(np.ogrid[:height, :width]) % 10 < 2, _count(), 0).astype(np.int32)
+        self._hatched = np.where(sum(np.ogrid[:height, :width]) % 10 < 2, _count(), 0).astype(
+            np.int32
+        )
         self._surface = pygame.Surface((width, height), 0, 32)
-        self._colors = np.array([self._surface.map_rgb(c) for c in (*_colors(False), *_colors(True))], dtype=np.uint32)
+        self._colors = np.array(
+            [self._surface.map_rgb(c) for c in (*_colors(False), *_colors(True))], dtype=np.uint32
+        )
 
     def draw(self, canvas: Canvas, state: np.ndarray) -> None:
         """Draw the set with all states but the two of the plane as they are."""
         x, y = self._plane
         height, width = self._hatched.shape
-        h = self._barriers([self._x if i == x else self._y if i == y else float(v) for i, v in enumerate(state)])
+        h = self._barriers(
+            [self._x if i == x else self._y if i == y else float(v) for i, v in enumerate(state)]
+        )
         h = np.broadcast_to(h, (len(h), self._y.size, self._x.size))
         distance = np.clip(_to_edge(h), _NEAREST, _FURTHEST)
         knots = (distance - _NEAREST) * np.float32(_RESOLUTION)
@@ -118,7 +132,8 @@ class SafeSet:
 
 
 def _to_edge(h: np.ndarray) -> np.ndarray:
-    """Distance from the edge in pixels, to first order, the least of all barriers: h has shape (barriers, rows, columns)."""
+    """Distance from the edge in pixels, to first order, the least of all barriers: h has shape
+    (barriers, rows, columns)."""
     down, across = np.gradient(h, _CELL, axis=(1, 2))
     slope = np.sqrt(np.maximum(down * down + across * across, 1e-24))
     return (h / slope).min(axis=0).astype(np.float32)

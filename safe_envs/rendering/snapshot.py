@@ -75,7 +75,9 @@ class History:
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
-        self._barriers = compile_function(problem.plant.states, [b.expression for b in problem.barriers], "floats")
+        self._barriers = compile_function(
+            problem.plant.states, [b.expression for b in problem.barriers], "floats"
+        )
         # The columns are the time, the smallest barrier, and the states.
         self._rows = np.empty((2 * _KEPT, 2 + problem.plant.n))
         self._count = 0
@@ -88,7 +90,13 @@ class History:
         self._violated_at = 0.0
         self.append(state, time, None, None)
 
-    def append(self, state: Sequence[float], time: float, executed: Sequence[float] | None, decision: Decision | None) -> None:
+    def append(
+        self,
+        state: Sequence[float],
+        time: float,
+        executed: Sequence[float] | None,
+        decision: Decision | None,
+    ) -> None:
         """Add a state and what led to it."""
         if self._count == len(self._rows):
             self._rows[:_KEPT] = self._rows[-_KEPT:]
@@ -108,5 +116,13 @@ class History:
         rows = self._rows[: self._count]
         barriers, executed, decision = self._latest
         return EpisodeSnapshot(
-            rows[:, 2:], rows[:, 0], rows[:, 1], barriers, self._least, executed, decision, self._violated, self._violated_at
+            rows[:, 2:],
+            rows[:, 0],
+            rows[:, 1],
+            barriers,
+            self._least,
+            executed,
+            decision,
+            self._violated,
+            self._violated_at,
         )

@@ -50,12 +50,15 @@ _SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 def mix(color: Color, background: Color, share: float) -> Color:
     """A colour laid over another one with an opacity from 0 to 1."""
-    r, g, b = (round(share * c + (1 - share) * under) for c, under in zip(color, background, strict=True))
+    r, g, b = (
+        round(share * c + (1 - share) * under) for c, under in zip(color, background, strict=True)
+    )
     return r, g, b
 
 
 def pretty(name: str) -> str:
-    """A name with Greek letters and indices, and rates as such: theta, x_1 and zdot as θ, x₁ and dz/dt."""
+    """A name with Greek letters and indices, and rates as such: theta, x_1 and zdot as θ, x₁ and
+    dz/dt."""
     base = name.removesuffix("dot")
     text = sp.pretty(sp.Symbol(base or name), use_unicode=True)
     return f"d{text}/dt" if base and base != name else text
@@ -73,11 +76,13 @@ def label(name: str, unit: str = "") -> str:
 
 
 def number(value: float, scale: float = 0.0) -> str:
-    """Three digits that count, with a true minus sign; large numbers in whole ones, in groups of three.
+    """Three digits that count, with a true minus sign; large numbers in whole ones, in groups of
+    three.
 
     Args:
         value: to write.
-        scale: what is less than a thousandth of it is written as 0, and the digits count at this size.
+        scale: what is less than a thousandth of it is written as 0, and the digits count at this
+            size.
     """
     size = abs(value)
     if size <= 1e-3 * scale:
@@ -95,5 +100,10 @@ def number(value: float, scale: float = 0.0) -> str:
 
 
 def bound(value: float) -> str:
-    """A bound: three digits without zeros behind the point; very small and large ones as `number` writes them."""
-    return f"{value:.3g}".replace("-", "\u2212") if value == 0.0 or 1e-3 <= abs(value) < 999.5 else number(value)
+    """A bound: three digits without zeros behind the point; very small and large ones as `number`
+    writes them."""
+    return (
+        f"{value:.3g}".replace("-", "\u2212")
+        if value == 0.0 or 1e-3 <= abs(value) < 999.5
+        else number(value)
+    )

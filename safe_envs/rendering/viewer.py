@@ -1,4 +1,5 @@
-"""What an env keeps in order to be seen: the history of its episodes, and the picture or the window that shows them."""
+"""What an env keeps in order to be seen: the history of its episodes, and the picture or the window
+that shows them."""
 
 from __future__ import annotations
 
@@ -33,7 +34,9 @@ def frames_a_second(problem: SafetyProblem) -> int:
     return max(1, round(min(1 / problem.dt, _MOST_FRAMES)))
 
 
-def open_viewer(problem: SafetyProblem, mode: str | None, num_envs: int | None = None) -> Viewer | None:
+def open_viewer(
+    problem: SafetyProblem, mode: str | None, num_envs: int | None = None
+) -> Viewer | None:
     """Return the viewer of an env, None if it is not to be seen.
 
     Args:
@@ -48,28 +51,37 @@ def open_viewer(problem: SafetyProblem, mode: str | None, num_envs: int | None =
     if mode is None:
         return None
     if mode not in allowed:
-        reason = "a window shows one env, so make a scalar one for it; " if mode in RENDER_MODES else ""
-        raise ConfigurationError(f"render_mode = {mode!r}; {reason}allowed: None, {', '.join(map(repr, allowed))}")
+        reason = (
+            "a window shows one env, so make a scalar one for it; " if mode in RENDER_MODES else ""
+        )
+        raise ConfigurationError(
+            f"render_mode = {mode!r}; {reason}allowed: None, {', '.join(map(repr, allowed))}"
+        )
     return Viewer(problem, mode, num_envs or 1)
 
 
 def require_pygame() -> None:
-    """Raise gymnasium.error.DependencyNotInstalled, with what to install, if pygame-ce is missing or the other pygame is in its place."""
+    """Raise gymnasium.error.DependencyNotInstalled, with what to install, if pygame-ce is missing
+    or the other pygame is in its place."""
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
         import pygame
     except ImportError as error:
-        raise gym.error.DependencyNotInstalled('drawing needs pygame-ce: pip install "safe-envs[render]"') from error
+        raise gym.error.DependencyNotInstalled(
+            'drawing needs pygame-ce: pip install "safe-envs[render]"'
+        ) from error
     if not hasattr(pygame.draw, "aacircle"):
         # Two distributions share the name of the import, and each overwrites files of the other.
         raise gym.error.DependencyNotInstalled(
-            f"drawing needs pygame-ce 2.5 or newer, and what is imported is pygame {pygame.version.ver}: "
-            'pip uninstall pygame pygame-ce, and then pip install "safe-envs[render]"'
+            "drawing needs pygame-ce 2.5 or newer, and what is imported is pygame"
+            f" {pygame.version.ver}: pip uninstall pygame pygame-ce, and then pip install"
+            ' "safe-envs[render]"'
         )
 
 
 class Viewer:
-    """Records the episodes of a batch of envs and draws them; nothing is drawn before it is asked for.
+    """Records the episodes of a batch of envs and draws them; nothing is drawn before it is asked
+    for.
 
     Attributes:
         caption: what the pictures say above the scene, the name of a filter say.
@@ -90,12 +102,16 @@ class Viewer:
         self._window: Window | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy gets: neither the window nor the canvas, which it makes for itself when it draws."""
+        """What a copy gets: neither the window nor the canvas, which it makes for itself when it
+        draws."""
         return {**vars(self), "_picture": None, "_window": None}
 
     def announce(self, nominal: Rows, active: Rows, feasible: Rows) -> None:
         """Keep what a filter decided, a row for each env, for the step that comes next."""
-        self._decisions = [Decision(tuple(n), bool(a), bool(f)) for n, a, f in zip(nominal, active, feasible, strict=True)]
+        self._decisions = [
+            Decision(tuple(n), bool(a), bool(f))
+            for n, a, f in zip(nominal, active, feasible, strict=True)
+        ]
 
     def restart(self, states: Rows, times: Rows, envs: Iterable[int]) -> None:
         """Begin an episode in some envs.
@@ -133,7 +149,12 @@ class Viewer:
         """
         picture = self._drawn()
         each = shots or [None] * len(self._histories)
-        return tuple([picture.frame(history.moment, self.caption, shot) for history, shot in zip(self._histories, each, strict=True)])
+        return tuple(
+            [
+                picture.frame(history.moment, self.caption, shot)
+                for history, shot in zip(self._histories, each, strict=True)
+            ]
+        )
 
     def render(self) -> Any:
         """The picture of a single env; in human mode it goes to the window, and None is returned.
@@ -168,5 +189,7 @@ class Viewer:
         if self._window is None:
             from safe_envs.rendering.window import Window
 
-            self._window = Window(surface.get_size(), self._problem.name, frames_a_second(self._problem))
+            self._window = Window(
+                surface.get_size(), self._problem.name, frames_a_second(self._problem)
+            )
         self._window.show(surface)

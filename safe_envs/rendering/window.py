@@ -36,7 +36,8 @@ class Window:
             window.get_surface()
         except pygame.error as error:
             raise ConfigurationError(
-                f'no window can be opened ({error}); make the env with render_mode="rgb_array", which needs no display'
+                f'no window can be opened ({error}); make the env with render_mode="rgb_array",'
+                " which needs no display"
             ) from error
         return window
 
@@ -58,7 +59,8 @@ class Window:
         self._window.flip()
 
     def close(self) -> None:
-        """Close the window, and after the last one the display, unless somebody else shows something on it."""
+        """Close the window, and after the last one the display, unless somebody else shows
+        something on it."""
         self._window.destroy()
         _OPEN.discard(self)
         if not _OPEN and pygame.display.get_init() and pygame.display.get_surface() is None:
@@ -68,7 +70,8 @@ class Window:
 def _forget_all() -> None:
     """Let go of windows that ended with the display.
 
-    SDL gives a new window the address of one of them: an old one that is let go of only then would end the new one.
+    SDL gives a new window the address of one of them: an old one that is let go of only then would
+    end the new one.
     """
     for each in _OPEN:
         each._window.destroy()

@@ -26,7 +26,17 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for command in (evaluate, identify, train, leaderboard, verify, render, reproduce, sweep, sweep_report):
+for command in (
+    evaluate,
+    identify,
+    train,
+    leaderboard,
+    verify,
+    render,
+    reproduce,
+    sweep,
+    sweep_report,
+):
     app.command(command.__name__.replace("_", "-"))(with_quiet(command))
 
 
@@ -48,7 +58,8 @@ def list_command(json: Json = None) -> None:
 @app.command("doctor")
 @with_quiet
 def doctor_command(json: Json = None) -> None:
-    """Check the installation: packages and extras, the solvers against known answers, every env with its filter, and the speed."""
+    """Check the installation: packages and extras, the solvers against known answers, every env
+    with its filter, and the speed."""
     from safe_envs.scripts.doctor import doctor
 
     doctor(json)
@@ -57,11 +68,14 @@ def doctor_command(json: Json = None) -> None:
 @app.command("demo")
 @with_quiet
 def demo_command(
-    folder: Annotated[Path, typer.Option(metavar="FOLDER", help="Where the trained policy and the pictures go.")] = Path("demo-results"),
+    folder: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Where the trained policy and the pictures go.")
+    ] = Path("demo-results"),
     episodes: Annotated[int, typer.Option(min=1, help="Episodes for each filter.")] = 1000,
     json: Json = None,
 ) -> None:
-    """Train PPO briefly without a filter, then show the safety of it and of the nominal controller, bare and filtered."""
+    """Train PPO briefly without a filter, then show the safety of it and of the nominal controller,
+    bare and filtered."""
     from safe_envs.scripts.demo import demo
 
     demo(folder, episodes, json_file=json)
@@ -71,7 +85,10 @@ def demo_command(
 @with_quiet
 def benchmark_command(
     json: Json = None,
-    compare: Annotated[Path | None, typer.Option(metavar="FILE", help="Of an earlier run with --json: print the ratios to it.")] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Of an earlier run with --json: print the ratios to it."),
+    ] = None,
 ) -> None:
     """Measure the speed of filters and envs."""
     from safe_envs.scripts.benchmark import benchmark
@@ -85,12 +102,17 @@ def main(command: str | None = None) -> None:
     Args:
         command: the one to run, for a script that is one; that of the command line by default.
     """
-    run(lambda: _command()(None if command is None else [command, *sys.argv[1:]], prog_name="safe-envs"))
+    run(
+        lambda: _command()(
+            None if command is None else [command, *sys.argv[1:]], prog_name="safe-envs"
+        )
+    )
 
 
 @cache
 def _command() -> Any:
-    """Build the command with its options; Typer does so at every call, which takes longer than to run a quick one."""
+    """Build the command with its options; Typer does so at every call, which takes longer than to
+    run a quick one."""
     return typer.main.get_command(app)
 
 

@@ -19,11 +19,15 @@ FILTERS = ("none", "hocbf", "scbf")
 _STEPS = 100_000
 
 
-def demo(folder: Path, episodes: int = 1000, steps: int = _STEPS, json_file: Path | None = None) -> None:
-    """Train PPO without a filter, and print and draw the safety of the nominal controller and of PPO.
+def demo(
+    folder: Path, episodes: int = 1000, steps: int = _STEPS, json_file: Path | None = None
+) -> None:
+    """Train PPO without a filter, and print and draw the safety of the nominal controller and of
+    PPO.
 
     Args:
-        folder: where the policy and the pictures go; it is made if need be. A training that is in it is gone on with.
+        folder: where the policy and the pictures go; it is made if need be. A training that is in
+            it is gone on with.
         episodes: for each policy and filter.
         steps: control periods of the training.
         json_file: where both evaluations go, if they are to.
@@ -35,7 +39,9 @@ def demo(folder: Path, episodes: int = 1000, steps: int = _STEPS, json_file: Pat
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigurationError(f"--folder {folder} cannot be made: {error.strerror}; give another one") from error
+        raise ConfigurationError(
+            f"--folder {folder} cannot be made: {error.strerror}; give another one"
+        ) from error
     console = stdout()
     policy = folder / "ppo"
     _train(policy, steps)
@@ -54,10 +60,21 @@ def demo(folder: Path, episodes: int = 1000, steps: int = _STEPS, json_file: Pat
 def _train(policy: Path, steps: int) -> None:
     """Train the policy, or finish its training."""
     console = stdout()
-    console.print(f"Training PPO on {ENV_ID}, {steps} steps without any filter ...", highlight=False)
+    console.print(
+        f"Training PPO on {ENV_ID}, {steps} steps without any filter ...", highlight=False
+    )
     with progress_bar("Training PPO") as tell:
-        seconds = train(Training.of(ENV_ID, "ppo", n_timesteps=steps, eval_freq=steps), policy, resume=os.path.exists(policy), tell=tell)
-    console.print(f"Trained in {seconds:.0f} s of processor time and saved in {policy}\n", highlight=False, markup=False)
+        seconds = train(
+            Training.of(ENV_ID, "ppo", n_timesteps=steps, eval_freq=steps),
+            policy,
+            resume=os.path.exists(policy),
+            tell=tell,
+        )
+    console.print(
+        f"Trained in {seconds:.0f} s of processor time and saved in {policy}\n",
+        highlight=False,
+        markup=False,
+    )
 
 
 if __name__ == "__main__":

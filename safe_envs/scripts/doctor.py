@@ -1,4 +1,5 @@
-"""`safe-envs doctor`: whether the installation is complete, its solvers right and its envs in order, and how fast they are here."""
+"""`safe-envs doctor`: whether the installation is complete, its solvers right and its envs in
+order, and how fast they are here."""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ class Check:
 
 @dataclass(frozen=True)
 class Program:
-    """A quadratic program whose answer is known: the nearest input to the proposed one, in a box, with a u + b >= 0.
+    """A quadratic program whose answer is known: the nearest input to the proposed one, in a box,
+    with a u + b >= 0.
 
     Attributes:
         name: which solver it is for.
@@ -75,11 +77,41 @@ class Program:
 
 PROGRAMS = (
     Program("one row, in closed form", ((-1.0, -1.0),), (1.0,), (1.0, 1.0), 5.0, (0.5, 0.5)),
-    Program("one row that cannot be met", ((1.0, 0.0),), (-7.0,), (0.0, 1.0), 5.0, (5.0, 1.0), feasible=False),
+    Program(
+        "one row that cannot be met",
+        ((1.0, 0.0),),
+        (-7.0,),
+        (0.0, 1.0),
+        5.0,
+        (5.0, 1.0),
+        feasible=False,
+    ),
     Program("several rows, one input", ((-1.0,), (1.0,)), (1.0, 3.0), (2.0,), 5.0, (1.0,)),
-    Program("several rows, two inputs", ((-1.0, 0.0), (0.0, -1.0)), (1.0, 0.5), (2.0, 2.0), 5.0, (1.0, 0.5)),
-    Program("contradicting rows, two inputs", ((1.0, 0.0), (-1.0, 0.0)), (-2.0, 1.0), (0.0, 0.3), 5.0, (1.5, 0.3), feasible=False),
-    Program("ProxQP", ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)), (1.0, 0.5), (2.0, 2.0, 2.0), 5.0, (1.0, 0.5, 2.0)),
+    Program(
+        "several rows, two inputs",
+        ((-1.0, 0.0), (0.0, -1.0)),
+        (1.0, 0.5),
+        (2.0, 2.0),
+        5.0,
+        (1.0, 0.5),
+    ),
+    Program(
+        "contradicting rows, two inputs",
+        ((1.0, 0.0), (-1.0, 0.0)),
+        (-2.0, 1.0),
+        (0.0, 0.3),
+        5.0,
+        (1.5, 0.3),
+        feasible=False,
+    ),
+    Program(
+        "ProxQP",
+        ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)),
+        (1.0, 0.5),
+        (2.0, 2.0, 2.0),
+        5.0,
+        (1.0, 0.5, 2.0),
+    ),
     Program(
         "ProxQP, contradicting rows",
         ((1.0, 1.0, 1.0), (1.0, 0.0, 0.0)),
@@ -93,7 +125,8 @@ PROGRAMS = (
 
 
 def doctor(json_file: Path | None = None) -> None:
-    """Look at the installation, print what was found, and end with the status 1 if something is wrong.
+    """Look at the installation, print what was found, and end with the status 1 if something is
+    wrong.
 
     Args:
         json_file: where the same goes as JSON, if it is to.
@@ -125,7 +158,12 @@ def doctor(json_file: Path | None = None) -> None:
 
 def packages() -> Iterator[Check]:
     """Python, what is required, and the optional packages with their extras."""
-    yield Check("python", sys.version_info >= (3, 11), platform.python_version(), "Python 3.11 or newer is needed")
+    yield Check(
+        "python",
+        sys.version_info >= (3, 11),
+        platform.python_version(),
+        "Python 3.11 or newer is needed",
+    )
     for package, extra in required():
         if package == "pygame-ce" and (wrong := _other_pygame()):
             yield wrong
@@ -134,11 +172,14 @@ def packages() -> Iterator[Check]:
             yield Check(package, True, version(package))
         except PackageNotFoundError:
             target = package if extra == _NEEDED else f"safe-envs[{extra}]"
-            yield Check(package, False if extra == _NEEDED else None, "missing", f'pip install "{target}"')
+            yield Check(
+                package, False if extra == _NEEDED else None, "missing", f'pip install "{target}"'
+            )
 
 
 def _other_pygame() -> Check | None:
-    """What is wrong if pygame, or a pygame-ce that is too old, is imported in place of the pygame-ce that draws; else None."""
+    """What is wrong if pygame, or a pygame-ce that is too old, is imported in place of the
+    pygame-ce that draws; else None."""
     if find_spec("pygame") is None:
         return None
     try:
@@ -150,7 +191,8 @@ def _other_pygame() -> Check | None:
 
 
 def required() -> list[tuple[str, str]]:
-    """Packages of the metadata, each with the extra that it belongs to; those of `dev` are not for users."""
+    """Packages of the metadata, each with the extra that it belongs to; those of `dev` are not for
+    users."""
     found: dict[str, str] = {}
     for line in requires("safe-envs") or ():
         package = re.match(r"[\w.-]+", line)
@@ -164,7 +206,11 @@ def required() -> list[tuple[str, str]]:
 def solvers() -> Iterator[Check]:
     """The solvers on programs whose answers are known."""
     for program in PROGRAMS:
-        yield _looked(program.name, lambda program=program: _solve(program), "reinstall proxsuite, numpy and scipy")
+        yield _looked(
+            program.name,
+            lambda program=program: _solve(program),
+            "reinstall proxsuite, numpy and scipy",
+        )
 
 
 def _solve(program: Program) -> tuple[bool, str]:
@@ -172,16 +218,29 @@ def _solve(program: Program) -> tuple[bool, str]:
 
     m, k = len(program.proposed), len(program.b)
     low, high, ones = [-program.box] * m, [program.box] * m, [1.0] * m
-    action, _, _, feasible = project_floats(program.a, program.b, list(program.proposed), low, high, ones, [1.0] * k)
+    action, _, _, feasible = project_floats(
+        program.a, program.b, list(program.proposed), low, high, ones, [1.0] * k
+    )
     error = float(np.abs(np.subtract(action, program.answer)).max())
     right = error <= _TOLERANCE and feasible == program.feasible
-    return right, f"off by {error:.1g}" if feasible == program.feasible else f"said to be {'' if feasible else 'in'}feasible, and is not"
+    return (
+        right,
+        (
+            f"off by {error:.1g}"
+            if feasible == program.feasible
+            else f"said to be {'' if feasible else 'in'}feasible, and is not"
+        ),
+    )
 
 
 def envs() -> Iterator[Check]:
     """Every id, made and stepped with its natural filter."""
     for env_id in ENV_IDS:
-        yield _looked(env_id, lambda env_id=env_id: _step(env_id), "reinstall safe-envs; if that does not help, it is a fault of its own")
+        yield _looked(
+            env_id,
+            lambda env_id=env_id: _step(env_id),
+            "reinstall safe-envs; if that does not help, it is a fault of its own",
+        )
 
 
 def _step(env_id: str) -> tuple[bool, str]:
@@ -196,12 +255,18 @@ def _step(env_id: str) -> tuple[bool, str]:
         _, reward, terminated, truncated, info = env.step(np.zeros(env.action_space.shape or ()))
         low, high = np.transpose(bare.problem.box)
         action = np.asarray(info["safe_action"])
-        inside &= bool(np.isfinite(reward) and (action >= low - 1e-9).all() and (action <= high + 1e-9).all())
+        inside &= bool(
+            np.isfinite(reward) and (action >= low - 1e-9).all() and (action <= high + 1e-9).all()
+        )
         if terminated or truncated:
             env.reset()
     return (
         inside,
-        f"{_STEPS} steps with {bare.problem.filter}" if inside else "an action outside of the box, or a reward that is not finite",
+        (
+            f"{_STEPS} steps with {bare.problem.filter}"
+            if inside
+            else "an action outside of the box, or a reward that is not finite"
+        ),
     )
 
 
@@ -219,7 +284,9 @@ def speeds() -> dict[str, float]:
     from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
     def scalar() -> gym.Env[Any, Any]:
-        return gym.make(_SPEED_ID, disable_env_checker=True, horizon=1e9, start=[0.0, 0.0, 0.0], noise=0.01)
+        return gym.make(
+            _SPEED_ID, disable_env_checker=True, horizon=1e9, start=[0.0, 0.0, 0.0], noise=0.01
+        )
 
     def vector() -> Any:
         return gym.make_vec(_SPEED_ID, num_envs=_NUM_ENVS)
@@ -228,31 +295,49 @@ def speeds() -> dict[str, float]:
         "env": (scalar(), 1, 1000),
         f"env with {_SPEED_FILTER}": (SafetyFilterWrapper(scalar(), _SPEED_FILTER), 1, 500),
         f"vector env of {_NUM_ENVS}": (vector(), _NUM_ENVS, 50),
-        f"vector env of {_NUM_ENVS} with {_SPEED_FILTER}": (SafetyFilterVectorWrapper(vector(), _SPEED_FILTER), _NUM_ENVS, 50),
+        f"vector env of {_NUM_ENVS} with {_SPEED_FILTER}": (
+            SafetyFilterVectorWrapper(vector(), _SPEED_FILTER),
+            _NUM_ENVS,
+            50,
+        ),
     }
     found = {}
     for name, (env, size, steps) in cases.items():
         env.reset(seed=0)
         action = np.full(env.action_space.shape, 0.3, dtype=np.float32)
-        found[name] = size * steps / min(timeit.repeat(lambda env=env, action=action: env.step(action), number=steps, repeat=3))
+        found[name] = (
+            size
+            * steps
+            / min(
+                timeit.repeat(
+                    lambda env=env, action=action: env.step(action), number=steps, repeat=3
+                )
+            )
+        )
     return found
 
 
 def _report(found: dict[str, list[Check]], speed: dict[str, float], healthy: bool) -> None:
     console = stdout()
-    console.print(f"safe-envs {__version__} on {platform.platform()}\n", highlight=False, markup=False)
+    console.print(
+        f"safe-envs {__version__} on {platform.platform()}\n", highlight=False, markup=False
+    )
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for title in ("", "", "found", "what to do"):
         table.add_column(title)
     for checks in found.values():
         for check in checks:
             mark = {True: "ok", False: "WRONG", None: "-"}[check.ok]
-            table.add_row(mark, Text(check.name), Text(check.found), Text("" if check.ok else check.advice))
+            table.add_row(
+                mark, Text(check.name), Text(check.found), Text("" if check.ok else check.advice)
+            )
         table.add_section()
     for name, steps in speed.items():
         table.add_row("", f"speed: {name}", f"{steps:,.0f} steps/s", "")
     console.print(table)
-    console.print(f"\n{'All is well.' if healthy else 'Something is wrong: see above.'}", highlight=False)
+    console.print(
+        f"\n{'All is well.' if healthy else 'Something is wrong: see above.'}", highlight=False
+    )
 
 
 if __name__ == "__main__":

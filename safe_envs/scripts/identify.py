@@ -24,15 +24,24 @@ _OF_COLLECTING = ("starts", "steps", "points", "repetitions")
 
 SETTINGS = {
     "learned-hocbf": "states=3000, label_dt=0.001, hidden=100,30, epochs=500",
-    "ddscbf": "points=200, repetitions=50000, estimator=martingale (or centred, printed), way=network or direct (by default what suits)",
+    "ddscbf": (
+        "points=200, repetitions=50000, estimator=martingale (or centred, printed), way=network or"
+        " direct (by default what suits)"
+    ),
     "bayesian": (
-        "starts=1000, steps=1, repetitions=100, degree=1 to 3 or more (by default by the number of rows), prior=10.0, diffusion_degree=0, "
-        "alpha=1.0, beta=1.0"
+        "starts=1000, steps=1, repetitions=100, degree=1 to 3 or more (by default by the number of"
+        " rows), prior=10.0, diffusion_degree=0, alpha=1.0, beta=1.0"
     ),
 }
-"""What `--set` takes for each method, for the help: the functions themselves are too heavy to import for it."""
+"""What `--set` takes for each method, for the help: the functions themselves are too heavy to
+import for it."""
 
-_SETTINGS_HELP = "\n\n".join(("Setting of the method, repeatable; with the defaults:", *(f"{m}: {text}." for m, text in SETTINGS.items())))
+_SETTINGS_HELP = "\n\n".join(
+    (
+        "Setting of the method, repeatable; with the defaults:",
+        *(f"{m}: {text}." for m, text in SETTINGS.items()),
+    )
+)
 
 
 @functools.partial(with_env, without=("horizon", "start"))
@@ -42,14 +51,23 @@ def identify(
         typer.Option(
             metavar="NAME",
             autocompletion=completion.words(tuple(SETTINGS)),
-            help="learned-hocbf: residuals of derivatives of the barriers; ddscbf: unknown noise; bayesian: the whole system.",
+            help=(
+                "learned-hocbf: residuals of derivatives of the barriers; ddscbf: unknown noise;"
+                " bayesian: the whole system."
+            ),
         ),
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Where what was learned goes: an npz, without pickle.")],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="FILE", help="Where what was learned goes: an npz, without pickle."),
+    ],
     env: EnvOptions,
     data: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Learn from these, an npz of Transitions.save, instead of collecting data."),
+        typer.Option(
+            metavar="FILE",
+            help="Learn from these, an npz of Transitions.save, instead of collecting data.",
+        ),
     ] = None,
     settings: Annotated[
         list[str] | None,
@@ -58,18 +76,35 @@ def identify(
     seed: text_options.Seed = 0,
     json: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write configuration, versions, record and errors; - for stdout, and nothing else there."),
+        typer.Option(
+            metavar="FILE",
+            help=(
+                "Write configuration, versions, record and errors; - for stdout, and nothing else"
+                " there."
+            ),
+        ),
     ] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE", help=f"Draw the truth against the estimate: {text_options.FORMATS}")] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help=f"Draw the truth against the estimate: {text_options.FORMATS}"
+        ),
+    ] = None,
 ) -> None:
     """Learn of a system by a method, and print how far what was learned is from the truth.
 
-    The plant is only stepped, or not at all with --data: then --dt, --substeps, --box and settings of what is collected are
-    refused. The truth, with which the estimates are compared at states drawn anew from where the problem is explored, is that of
-    the plant, with its --noise.
+    The plant is only stepped, or not at all with --data: then --dt, --substeps, --box and settings
+    of what is collected are refused. The truth, with which the estimates are compared at states
+    drawn anew from where the problem is explored, is that of the plant, with its --noise.
     """
     from safe_envs.registry import load_problem, title_of
-    from safe_envs.scripts.reports.identify_report import Identification, Source, compare, document, print_report
+    from safe_envs.scripts.reports.identify_report import (
+        Identification,
+        Source,
+        compare,
+        document,
+        print_report,
+    )
     from safe_envs.wrappers.learning import learner_of
     from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning
 
@@ -121,14 +156,20 @@ def read_settings(method: str, learner: Callable[..., Any], texts: Sequence[str]
     for name, value in found.items():
         if name not in allowed:
             given = shortened(f"{name}={value}")
-            raise ConfigurationError(f"--set {given}: {method} has no setting {shown(name)}; {nearest(name, allowed)}")
+            raise ConfigurationError(
+                f"--set {given}: {method} has no setting {shown(name)}; {nearest(name, allowed)}"
+            )
         found[name] = _of_kind(name, value, hints[name])
     return found
 
 
 def settings_of(learner: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     """The settings of the function that learns by a method, by name."""
-    return {name: found for name, found in inspect.signature(learner).parameters.items() if name not in _NOT_SETTINGS}
+    return {
+        name: found
+        for name, found in inspect.signature(learner).parameters.items()
+        if name not in _NOT_SETTINGS
+    }
 
 
 def _refuse_collecting(settings: Mapping[str, Any], env: EnvOptions) -> None:
@@ -136,11 +177,15 @@ def _refuse_collecting(settings: Mapping[str, Any], env: EnvOptions) -> None:
     idle = [f"--set {name}" for name in _OF_COLLECTING if name in settings]
     idle += [f"--{name}" for name in ("dt", "substeps", "box") if name in env.changes]
     if idle:
-        raise ConfigurationError(f"{', '.join(idle)}: not allowed with --data, since nothing is collected then; leave it out")
+        raise ConfigurationError(
+            f"{', '.join(idle)}: not allowed with --data, since nothing is collected then; leave"
+            " it out"
+        )
 
 
 def _of_kind(name: str, value: float | str, hint: Any) -> Any:
-    """A value as an argument with a type hint takes it: a word, a list of whole numbers, or a number."""
+    """A value as an argument with a type hint takes it: a word, a list of whole numbers, or a
+    number."""
     parts = (hint, *typing.get_args(hint))
     origins = {typing.get_origin(part) for part in parts}
     if typing.Literal in origins:
@@ -150,9 +195,13 @@ def _of_kind(name: str, value: float | str, hint: Any) -> Any:
             return [_whole(real(entry)) for entry in str(value).split(",")]
         except ValueError as error:
             given = shortened(f"{name}={value}")
-            raise ConfigurationError(f"--set {given}: give whole numbers with commas between, such as {name}=100,30") from error
+            raise ConfigurationError(
+                f"--set {given}: give whole numbers with commas between, such as {name}=100,30"
+            ) from error
     if isinstance(value, str):
-        raise ConfigurationError(f"--set {shortened(name)}={shortened(value)}: {shown(value)} is not a number")
+        raise ConfigurationError(
+            f"--set {shortened(name)}={shortened(value)}: {shown(value)} is not a number"
+        )
     # A whole number may be written as 1e3; what is not whole, the method refuses.
     return int(value) if int in parts and float(value).is_integer() else value
 
@@ -173,8 +222,8 @@ def _load_data(method: str, learner: Callable[..., Any], path: Path) -> Any:
 
     if "data" not in inspect.signature(learner).parameters:
         raise ConfigurationError(
-            f"--data {path}: {method} needs paths of several steps under a held input, which single steps are not; leave --data out, and "
-            "they are collected from the plant"
+            f"--data {path}: {method} needs paths of several steps under a held input, which single"
+            " steps are not; leave --data out, and they are collected from the plant"
         )
     return Transitions.load(path)
 

@@ -16,7 +16,13 @@ from safe_envs.atomic_io import write_json
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.options import completion
-from safe_envs.scripts.options.console import Json, progress_bar, require_result, stdout, write_result
+from safe_envs.scripts.options.console import (
+    Json,
+    progress_bar,
+    require_result,
+    stdout,
+    write_result,
+)
 from safe_envs.scripts.reports.rates import percent_in
 
 _RESULTS = "results.json"
@@ -33,32 +39,61 @@ Row = dict[str, Any]
 
 def leaderboard(
     env_ids: Annotated[
-        list[str] | None, typer.Argument(metavar="[ENV_ID]...", help="Envs; by default all.", autocompletion=completion.env_ids)
+        list[str] | None,
+        typer.Argument(
+            metavar="[ENV_ID]...", help="Envs; by default all.", autocompletion=completion.env_ids
+        ),
     ] = None,
-    algo: Annotated[str, typer.Option(metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3.")] = "ppo",
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where agents and results go. What is in it already is not done again.")] = Path(
-        "leaderboard"
-    ),
-    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each evaluation; by default 1000, or 100 with --quick.")] = None,
+    algo: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3."
+        ),
+    ] = "ppo",
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Where agents and results go. What is in it already is not done again.",
+        ),
+    ] = Path("leaderboard"),
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Episodes of each evaluation; by default 1000, or 100 with --quick."
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all randomness.")] = 0,
-    quick: Annotated[bool, typer.Option("--quick", help="Train for moments only: to see that it works, not how good agents get.")] = False,
-    markdown: Annotated[bool, typer.Option("--markdown", help="Print the table as Markdown, with a row for each env.")] = False,
+    quick: Annotated[
+        bool,
+        typer.Option(
+            "--quick", help="Train for moments only: to see that it works, not how good agents get."
+        ),
+    ] = False,
+    markdown: Annotated[
+        bool,
+        typer.Option("--markdown", help="Print the table as Markdown, with a row for each env."),
+    ] = False,
     json_file: Json = None,
 ) -> None:
-    """Train an agent on each env, without a filter and with the env's own in the loop, and compare it with the nominal controller.
+    """Train an agent on each env, without a filter and with the env's own in the loop, and compare
+    it with the nominal controller.
 
-    Each policy is evaluated bare and behind the filter, which knows the plant; the agent that was trained behind it only there.
-    The table has the safety rates with their 95 % intervals, the returns, and the processor time of the training. The intervals are of the
-    episodes: there is one training of each kind, and another seed gives another agent.
+    Each policy is evaluated bare and behind the filter, which knows the plant; the agent that was
+    trained behind it only there. The table has the safety rates with their 95 % intervals, the
+    returns, and the processor time of the training. The intervals are of the episodes: there is one
+    training of each kind, and another seed gives another agent.
     """
     from safe_envs.registry import full_id
 
     require_result(json_file)
-    ids = list(dict.fromkeys(full_id(env_id) for env_id in (env_ids or ENV_IDS)))
+    ids = list(dict.fromkeys(full_id(env_id) for env_id in env_ids or ENV_IDS))
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigurationError(f"--out {out} cannot be made: {error.strerror}; give another folder") from error
+        raise ConfigurationError(
+            f"--out {out} cannot be made: {error.strerror}; give another folder"
+        ) from error
     settings: dict[str, Any] = _QUICK if quick else {}
     known = {
         "algo": algo,
@@ -72,7 +107,9 @@ def leaderboard(
         tell = bar or (lambda _: None)
         for k, env_id in enumerate(ids):
             if not any(row["env_id"] == env_id for row in rows):
-                rows += _of_env(env_id, known, settings, out, lambda part, k=k: tell((k + part) / len(ids)))
+                rows += _of_env(
+                    env_id, known, settings, out, lambda part, k=k: tell((k + part) / len(ids))
+                )
                 _write(out / _RESULTS, known, rows)
             tell((k + 1) / len(ids))
     found = [row for env_id in ids for row in rows if row["env_id"] == env_id]
@@ -83,8 +120,11 @@ def leaderboard(
     write_result(json_file, lambda: _document(known, found))
 
 
-def _of_env(env_id: str, known: dict[str, Any], settings: dict[str, Any], out: Path, tell: Any) -> list[Row]:
-    """The rows of one env: the nominal controller, an agent trained bare, and one trained behind the filter."""
+def _of_env(
+    env_id: str, known: dict[str, Any], settings: dict[str, Any], out: Path, tell: Any
+) -> list[Row]:
+    """The rows of one env: the nominal controller, an agent trained bare, and one trained behind
+    the filter."""
     from safe_envs.agents.training.config import Training
     from safe_envs.agents.training.trainer import train
     from safe_envs.registry import load_problem
@@ -92,19 +132,52 @@ def _of_env(env_id: str, known: dict[str, Any], settings: dict[str, Any], out: P
     natural = load_problem(env_id).filter
     rows = _evaluated(env_id, "nominal", "nominal", ["none", natural], known, None)
     for i, (name, in_loop, filters) in enumerate(
-        ((known["algo"], None, ["none", natural]), (f"{known['algo']}, filter in the loop", natural, [natural]))
+        (
+            (known["algo"], None, ["none", natural]),
+            (f"{known['algo']}, filter in the loop", natural, [natural]),
+        )
     ):
-        folder = out / f"{env_id.split('/')[-1]}-{known['algo']}-{'bare' if in_loop is None else 'filtered'}"
-        training = Training.of(env_id, known["algo"], filter=in_loop, knowledge=_KNOWLEDGE, seed=known["seed"], **settings)
-        seconds = train(training, folder, resume=(folder / "config.json").exists(), tell=lambda part, i=i: tell((i + part) / 2))
+        folder = (
+            out
+            / f"{env_id.split('/')[-1]}-{known['algo']}-{'bare' if in_loop is None else 'filtered'}"
+        )
+        training = Training.of(
+            env_id,
+            known["algo"],
+            filter=in_loop,
+            knowledge=_KNOWLEDGE,
+            seed=known["seed"],
+            **settings,
+        )
+        seconds = train(
+            training,
+            folder,
+            resume=(folder / "config.json").exists(),
+            tell=lambda part, i=i: tell((i + part) / 2),
+        )
         rows += _evaluated(env_id, name, str(folder), filters, known, seconds)
     return rows
 
 
-def _evaluated(env_id: str, name: str, policy: str, filters: Sequence[str], known: dict[str, Any], seconds: float | None) -> list[Row]:
+def _evaluated(
+    env_id: str,
+    name: str,
+    policy: str,
+    filters: Sequence[str],
+    known: dict[str, Any],
+    seconds: float | None,
+) -> list[Row]:
     from safe_envs.agents import evaluate
 
-    found = evaluate(env_id, policy, filters, episodes=known["episodes"], seed=known["seed"], knowledge=_KNOWLEDGE, bounds=False)
+    found = evaluate(
+        env_id,
+        policy,
+        filters,
+        episodes=known["episodes"],
+        seed=known["seed"],
+        knowledge=_KNOWLEDGE,
+        bounds=False,
+    )
     figures = [{name: row[name] for name in ("filter", *_FIGURES)} for row in found.rows]
     return [{"env_id": env_id, "policy": name, **row, "trained_in": seconds} for row in figures]
 
@@ -116,9 +189,14 @@ def _read(path: Path, known: dict[str, Any]) -> list[Row]:
     document = read_json(path, "give another --out")
     rows = document.get("rows") if isinstance(document, dict) else None
     if not isinstance(rows, list) or "settings" not in document or not all(map(_is_row, rows)):
-        raise ConfigurationError(f"{path} is not what `safe-envs leaderboard` writes; give another --out")
+        raise ConfigurationError(
+            f"{path} is not what `safe-envs leaderboard` writes; give another --out"
+        )
     if document["settings"] != known:
-        raise ConfigurationError(f"{path} has the settings {shown(document['settings'])}, not {known}; give another --out")
+        raise ConfigurationError(
+            f"{path} has the settings {shown(document['settings'])}, not {known}; give another"
+            " --out"
+        )
     return rows
 
 
@@ -127,7 +205,9 @@ def _is_row(row: Any) -> bool:
     if not isinstance(row, dict) or row.keys() != {*_NAMES, *_FIGURES, "trained_in"}:
         return False
     numbers = [row[name] for name in _FIGURES] + [row["trained_in"] or 0.0]
-    return all(isinstance(row[name], str) for name in _NAMES) and all(isinstance(number, int | float) for number in numbers)
+    return all(isinstance(row[name], str) for name in _NAMES) and all(
+        isinstance(number, int | float) for number in numbers
+    )
 
 
 def _write(path: Path, known: dict[str, Any], rows: Sequence[Row]) -> None:
@@ -152,10 +232,14 @@ def _table(rows: Sequence[Row]) -> Table:
     """A row for each policy and filter."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
     for title in ("env", "policy", "filter", "safe [95 % interval]", "return", "processor time"):
-        table.add_column(title, justify="left" if title in ("env", "policy", "filter") else "right", no_wrap=True)
+        table.add_column(
+            title, justify="left" if title in ("env", "policy", "filter") else "right", no_wrap=True
+        )
     for row in rows:
         name = row["env_id"].removeprefix("safe_envs/")
-        table.add_row(name, row["policy"], row["filter"], _rate(row), f"{row['return_mean']:.4g}", _time(row))
+        table.add_row(
+            name, row["policy"], row["filter"], _rate(row), f"{row['return_mean']:.4g}", _time(row)
+        )
     return table
 
 
@@ -163,7 +247,10 @@ def _markdown(rows: Sequence[Row]) -> list[str]:
     """A row for each env: how safe each policy was, and its return."""
     from safe_envs.agents.evaluation.evaluate import BARE
 
-    policies = [row["policy"] if row["filter"] == BARE or k == 4 else f"{row['policy']} + filter" for k, row in enumerate(rows[:5])]
+    policies = [
+        row["policy"] if row["filter"] == BARE or k == 4 else f"{row['policy']} + filter"
+        for k, row in enumerate(rows[:5])
+    ]
     table = [["env", "filter", *policies, "processor time"], ["---"] * 8]
     for k in range(0, len(rows), 5):
         of_env = rows[k : k + 5]

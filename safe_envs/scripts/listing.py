@@ -27,13 +27,22 @@ def list_envs(json_file: Path | None = None) -> None:
         ConfigurationError: the file cannot be written.
     """
     require_result(json_file)
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True)
+    table = Table(
+        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True
+    )
     table.add_column("id, and what is to be kept safe", max_width=50)
     for name in _COLUMNS:
         table.add_column(name, no_wrap=True)
-    rows = [{"env_id": env_id, "about": _about(env), **_defaults(env.problem)} for env_id in ENV_IDS for env in (make_env(env_id),)]
+    rows = [
+        {"env_id": env_id, "about": _about(env), **_defaults(env.problem)}
+        for env_id in ENV_IDS
+        for env in (make_env(env_id),)
+    ]
     for row in rows:
-        table.add_row(f"[bold]{row['env_id']}[/]\n{escape(row['about'])}\n", *[_cell(name, row[name]) for name in _COLUMNS])
+        table.add_row(
+            f"[bold]{row['env_id']}[/]\n{escape(row['about'])}\n",
+            *[_cell(name, row[name]) for name in _COLUMNS],
+        )
     stdout().print(table)
     write_result(json_file, lambda: {"envs": rows})
 

@@ -1,4 +1,5 @@
-"""`safe-envs render`: an episode as a video, an animation or a still, under one filter or several side by side."""
+"""`safe-envs render`: an episode as a video, an animation or a still, under one filter or several
+side by side."""
 
 from __future__ import annotations
 
@@ -27,27 +28,41 @@ def render(
     out: Annotated[
         Path,
         typer.Option(
-            "--out", metavar="FILE", help="A .mp4 or .gif of the whole episode in real time, or a .png of its end.", show_default=False
+            "--out",
+            metavar="FILE",
+            help="A .mp4 or .gif of the whole episode in real time, or a .png of its end.",
+            show_default=False,
         ),
     ],
     env: EnvOptions,
     filter_name: Annotated[
         str | None,
-        typer.Option("--filter", metavar="NAME", help="As for evaluate: none, scbf, hocbf:p=2,8, ... By default the env's own."),
+        typer.Option(
+            "--filter",
+            metavar="NAME",
+            help="As for evaluate: none, scbf, hocbf:p=2,8, ... By default the env's own.",
+        ),
     ] = None,
     compare: Annotated[
         str | None,
         typer.Option(
             metavar="NAMES",
-            help="In place of --filter: several, with commas between, side by side from the same start with the same noise: "
-            "none,hocbf:p=2,8,scbf. A comma that no filter's name follows belongs to the filter before it.",
+            help=(
+                "In place of --filter: several, with commas between, side by side from the same"
+                " start with the same noise: "
+                "none,hocbf:p=2,8,scbf. A comma that no filter's name follows belongs to the filter"
+                " before it."
+            ),
         ),
     ] = None,
     policy: Annotated[
         str,
         typer.Option(
             metavar="NAME|FOLDER|FILE",
-            help="nominal, clf, zero, random, a folder of `safe-envs train`, or with --trust a .zip of Stable-Baselines3.",
+            help=(
+                "nominal, clf, zero, random, a folder of `safe-envs train`, or with --trust a .zip"
+                " of Stable-Baselines3."
+            ),
         ),
     ] = "nominal",
     trust: text_options.Trust = False,
@@ -55,37 +70,75 @@ def render(
     knowledge: text_options.Knowledge = "model",
     learned: Annotated[
         list[Path] | None,
-        typer.Option("--learned", metavar="FILE", help="What `safe-envs identify` wrote, for the learned filters. Repeatable."),
+        typer.Option(
+            "--learned",
+            metavar="FILE",
+            help="What `safe-envs identify` wrote, for the learned filters. Repeatable.",
+        ),
     ] = None,
     json_file: Json = None,
 ) -> None:
-    """Draw an episode: the scene to scale, the safe set, the trail, and what the filter does to the policy's actions.
+    """Draw an episode: the scene to scale, the safe set, the trail, and what the filter does to the
+    policy's actions.
 
-    The episode is that of an env which is reset with the seed. Filters that rest on something learned learn it first, unless
-    --learned gives it.
+    The episode is that of an env which is reset with the seed. Filters that rest on something
+    learned learn it first, unless --learned gives it.
     """
     from safe_envs.registry import load_problem
 
     if filter_name is not None and compare is not None:
-        raise ConfigurationError(f"--filter {filter_name} and --compare {compare} are both there; give one of them")
+        raise ConfigurationError(
+            f"--filter {filter_name} and --compare {compare} are both there; give one of them"
+        )
     require_film(out)
-    names = None if filter_name is None and compare is None else [filter_name] if filter_name is not None else split_filters(compare or "")
-    text_options.require_outputs(json_file, None, out=out, inputs=text_options.inputs_of(env.system, policy, names or (), learned or ()))
+    names = (
+        None
+        if filter_name is None and compare is None
+        else [filter_name]
+        if filter_name is not None
+        else split_filters(compare or "")
+    )
+    text_options.require_outputs(
+        json_file,
+        None,
+        out=out,
+        inputs=text_options.inputs_of(env.system, policy, names or (), learned or ()),
+    )
     problem = load_problem(env.full_id, env.arguments)
     with progress_bar("Drawing") as tell:
-        runs = make_runs(problem, names or [problem.filter], policy, trust=trust, seed=seed, knowledge=knowledge, learned=learned or ())
-        every = problem.steps if out.suffix.lower() == ".png" else steps_a_frame(out, problem.dt, problem.steps)
+        runs = make_runs(
+            problem,
+            names or [problem.filter],
+            policy,
+            trust=trust,
+            seed=seed,
+            knowledge=knowledge,
+            learned=learned or (),
+        )
+        every = (
+            problem.steps
+            if out.suffix.lower() == ".png"
+            else steps_a_frame(out, problem.dt, problem.steps)
+        )
         count = write_film(out, frames_of(runs, every, problem.steps, tell), every * problem.dt)
     console = stdout()
     for each in runs:
         console.print(each.summary(), highlight=False)
-    size = "a still" if out.suffix.lower() == ".png" else f"{count} frames, {count * every * problem.dt:.2f} s"
+    size = (
+        "a still"
+        if out.suffix.lower() == ".png"
+        else f"{count} frames, {count * every * problem.dt:.2f} s"
+    )
     console.print(f"{out}: {size}", highlight=False)
-    write_result(json_file, lambda: {"film": str(out), "frames": count, "episodes": [each.document() for each in runs]})
+    write_result(
+        json_file,
+        lambda: {"film": str(out), "frames": count, "episodes": [each.document() for each in runs]},
+    )
 
 
 def split_filters(text: str) -> list[str]:
-    """The filters of --compare, each once: a comma divides two of them where the name of a filter follows it.
+    """The filters of --compare, each once: a comma divides two of them where the name of a filter
+    follows it.
 
     Raises:
         ConfigurationError: one has no text.
@@ -96,7 +149,10 @@ def split_filters(text: str) -> list[str]:
     names = "|".join(sorted((BARE, *CONDITIONS, *LEARNED), key=len, reverse=True))
     found = [part.strip() for part in re.split(rf",(?=\s*(?:{names})\s*(?:[:+,]|$))", text)]
     if not all(found):
-        raise ConfigurationError(f"--compare {shown(text)} names no filter at one place; give names with commas between: none,scbf")
+        raise ConfigurationError(
+            f"--compare {shown(text)} names no filter at one place; give names with commas between:"
+            " none,scbf"
+        )
     return list(dict.fromkeys(found))
 
 
@@ -113,14 +169,22 @@ class Run:
     """
 
     def __init__(
-        self, name: str, conditions: Sequence[Condition], problem: SafetyProblem, actor: Policy, seed: int, knowledge: str
+        self,
+        name: str,
+        conditions: Sequence[Condition],
+        problem: SafetyProblem,
+        actor: Policy,
+        seed: int,
+        knowledge: str,
     ) -> None:
         from safe_envs import SafeEnv
         from safe_envs.wrappers import SafetyFilterWrapper
 
         self.name, self._actor = name, actor
         self._world = SafeEnv(problem, render_mode="rgb_array")
-        self._env = SafetyFilterWrapper(self._world, conditions, knowledge) if conditions else self._world
+        self._env = (
+            SafetyFilterWrapper(self._world, conditions, knowledge) if conditions else self._world
+        )
         if self._world.viewer is not None:
             self._world.viewer.caption = f"filter {name}" if conditions else "no filter"
         actor.begin(range(1), seed)
@@ -135,7 +199,9 @@ class Run:
         if self.ended:
             return
         first = np.array([self._steps == 0])
-        actions, self._state = self._actor.predict(self._observation[None], self._state, first, deterministic=True)
+        actions, self._state = self._actor.predict(
+            self._observation[None], self._state, first, deterministic=True
+        )
         self._observation, _, terminated, truncated, self._info = self._env.step(actions[0])
         self._steps += 1
         self.ended = terminated or truncated
@@ -149,8 +215,15 @@ class Run:
     def summary(self) -> str:
         """How the episode went."""
         safe = "safe" if self._violated_at is None else f"violation at {self._violated_at:.2f} s"
-        share = f", {self._info['episode_interventions']} interventions" if "episode_interventions" in self._info else ""
-        return f"{self.name}: {safe}, least h {self._info['h_min']:.3g}{share}, {self._steps * self._dt:.2f} s"
+        share = (
+            f", {self._info['episode_interventions']} interventions"
+            if "episode_interventions" in self._info
+            else ""
+        )
+        return (
+            f"{self.name}: {safe}, least h {self._info['h_min']:.3g}{share},"
+            f" {self._steps * self._dt:.2f} s"
+        )
 
     def document(self) -> dict[str, Any]:
         """The same, JSON-able."""
@@ -164,7 +237,14 @@ class Run:
 
 
 def make_runs(
-    problem: SafetyProblem, names: Sequence[str], policy: str, *, trust: bool, seed: int, knowledge: str, learned: Sequence[Path]
+    problem: SafetyProblem,
+    names: Sequence[str],
+    policy: str,
+    *,
+    trust: bool,
+    seed: int,
+    knowledge: str,
+    learned: Sequence[Path],
 ) -> list[Run]:
     """An episode for each filter, all with the same seed, at its start.
 
@@ -180,13 +260,17 @@ def make_runs(
 
     require_whole("seed", seed, 0)
     if knowledge not in ("model", "plant"):
-        raise ConfigurationError(f"knowledge = {shown(knowledge)}; {nearest(knowledge, ('model', 'plant'))}")
+        raise ConfigurationError(
+            f"knowledge = {shown(knowledge)}; {nearest(knowledge, ('model', 'plant'))}"
+        )
     known = (BARE, *CONDITIONS, *LEARNED)
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.
         for word in re.split("[:+]", name)[0].split(","):
             if word.strip() not in known:
-                raise ConfigurationError(f"unknown filter {shown(word.strip())}; {nearest(word.strip(), known)}")
+                raise ConfigurationError(
+                    f"unknown filter {shown(word.strip())}; {nearest(word.strip(), known)}"
+                )
         if name != BARE:
             require_readable(name, problem)
     actors = [make_policy(policy, problem, trust) for _ in names]
@@ -194,13 +278,23 @@ def make_runs(
     for method, repeat in learning.missing():
         learning.learn(method, repeat, None)
     return [
-        Run(name, () if name == BARE else learning.conditions(name, 0), problem, actor, seed, knowledge)
+        Run(
+            name,
+            () if name == BARE else learning.conditions(name, 0),
+            problem,
+            actor,
+            seed,
+            knowledge,
+        )
         for name, actor in zip(names, actors, strict=True)
     ]
 
 
-def frames_of(runs: Sequence[Run], every: int, steps: int, tell: Callable[[float], None] | None) -> Iterator[np.ndarray]:
-    """Pictures of the episodes side by side: at the start, after every so many steps, and at the end.
+def frames_of(
+    runs: Sequence[Run], every: int, steps: int, tell: Callable[[float], None] | None
+) -> Iterator[np.ndarray]:
+    """Pictures of the episodes side by side: at the start, after every so many steps, and at the
+    end.
 
     An episode that ended before the others stays as it was.
 

@@ -1,4 +1,5 @@
-"""`safe-envs sweep`: many evaluations from one file, on this machine or on a cluster; a stopped one goes on."""
+"""`safe-envs sweep`: many evaluations from one file, on this machine or on a cluster; a stopped one
+goes on."""
 
 from __future__ import annotations
 
@@ -11,7 +12,13 @@ import typer
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import text_options
-from safe_envs.scripts.options.console import Json, progress_bar, require_result, stdout, write_result
+from safe_envs.scripts.options.console import (
+    Json,
+    progress_bar,
+    require_result,
+    stdout,
+    write_result,
+)
 
 if TYPE_CHECKING:
     from safe_envs.agents.jobs.executor import Backend
@@ -23,23 +30,49 @@ _SHOWN = 10
 
 
 def sweep(
-    spec: Annotated[Path, typer.Argument(metavar="SPEC.yaml", help="What to sweep: sections fixed, grid and cells.", show_default=False)],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where results go. Cells that are in it already are not computed again.")],
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes of this machine; by default 2.", show_default=False)] = None,
+    spec: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SPEC.yaml",
+            help="What to sweep: sections fixed, grid and cells.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR",
+            help="Where results go. Cells that are in it already are not computed again.",
+        ),
+    ],
+    jobs: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes of this machine; by default 2.", show_default=False),
+    ] = None,
     backend: Annotated[
-        str, typer.Option(metavar="local|dask|ray", help="Who computes: this machine, or the workers of a cluster.")
+        str,
+        typer.Option(
+            metavar="local|dask|ray",
+            help="Who computes: this machine, or the workers of a cluster.",
+        ),
     ] = "local",
     address: Annotated[
-        str | None, typer.Option(metavar="ADDR", help="Of the cluster: tcp://HOST:PORT of a Dask scheduler, HOST:PORT of Ray.")
+        str | None,
+        typer.Option(
+            metavar="ADDR",
+            help="Of the cluster: tcp://HOST:PORT of a Dask scheduler, HOST:PORT of Ray.",
+        ),
     ] = None,
     trust: text_options.Trust = False,
     json: Json = None,
 ) -> None:
     """Evaluate each cell of a sweep: one env, filter, policy, seed and set of parameters.
 
-    The file has settings under fixed, lists of values under grid, which multiply, and single cells under cells. All of it is checked
-    before the first cell. Each result is written as it ends, with its configuration and versions: a run that was stopped goes on, and
-    computes what is missing. A cell that fails is reported and stops no other. Results depend neither on the backend nor on the jobs.
+    The file has settings under fixed, lists of values under grid, which multiply, and single cells
+    under cells. All of it is checked before the first cell. Each result is written as it ends, with
+    its configuration and versions: a run that was stopped goes on, and computes what is missing. A
+    cell that fails is reported and stops no other. Results depend neither on the backend nor on the
+    jobs.
     """
     from safe_envs.agents.jobs.executor import Backend
     from safe_envs.agents.sweeps.spec import read_sweep
@@ -47,7 +80,10 @@ def sweep(
 
     require_result(json)
     if jobs is not None and backend != "local":
-        raise ConfigurationError(f"--jobs {jobs} is of this machine; with --backend {backend} all workers of the cluster compute")
+        raise ConfigurationError(
+            f"--jobs {jobs} is of this machine; with --backend {backend} all workers of the cluster"
+            " compute"
+        )
     place = Backend(backend, address, jobs or 2)
     found = read_sweep(spec, trust)
     store = Store(out, found)
@@ -55,10 +91,23 @@ def sweep(
     failures = _compute(store, place, out)
     done = len(found.cells) - len(store.missing)
     kept = f", of which {before} were there before" if before else ""
-    stdout().print(f"{done} of {len(found.cells)} cells are in {out}{kept}.", highlight=False, markup=False, soft_wrap=True)
+    stdout().print(
+        f"{done} of {len(found.cells)} cells are in {out}{kept}.",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )
     if store.hidden:
-        hidden = f"{store.hidden} cells of another grid or version are in {out} too, where no report reads them now"
-        stdout().print(f"Note: {hidden}; give each sweep a folder of its own.", highlight=False, markup=False, soft_wrap=True)
+        hidden = (
+            f"{store.hidden} cells of another grid or version are in {out} too, where no report"
+            " reads them now"
+        )
+        stdout().print(
+            f"Note: {hidden}; give each sweep a folder of its own.",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
     counts = {"cells": len(found.cells), "done": done, "before": before}
     write_result(json, lambda: _document(found, failures, counts))
     if failures:
@@ -69,12 +118,17 @@ def _document(found: Sweep, failures: Sequence[Outcome], counts: dict[str, int])
     from safe_envs.agents.sweeps.cell import versions
 
     errors = {outcome.key: outcome.error for outcome in failures}
-    failed = [{"key": cell.key, "settings": cell.settings, "error": errors[cell.key]} for cell in found.cells if cell.key in errors]
+    failed = [
+        {"key": cell.key, "settings": cell.settings, "error": errors[cell.key]}
+        for cell in found.cells
+        if cell.key in errors
+    ]
     return {**counts, "failed": failed, "swept": found.swept, "versions": versions()}
 
 
 def _compute(store: Store, place: Backend, out: Path) -> list[Outcome]:
-    """Compute what is missing; return the outcomes that failed, and that no other run has computed meanwhile."""
+    """Compute what is missing; return the outcomes that failed, and that no other run has computed
+    meanwhile."""
     from safe_envs.agents.jobs.executor import run
 
     missing, failures, done = store.missing, [], 0
@@ -102,9 +156,23 @@ def _told(found: Sweep, failures: Sequence[Outcome]) -> str:
     from safe_envs.agents.sweeps.spec import describe
 
     errors = {outcome.key: outcome.error for outcome in failures}
-    lines = [f"{describe(cell, found.swept) or 'the only cell'}: {errors[cell.key]}" for cell in found.cells if cell.key in errors]
-    more = [f"and {len(lines) - _SHOWN} more, which `safe-envs sweep-report` lists"] if len(lines) > _SHOWN else []
-    return "\n  ".join([f"{len(lines)} of {len(found.cells)} cells failed; the same command tries them again:", *lines[:_SHOWN], *more])
+    lines = [
+        f"{describe(cell, found.swept) or 'the only cell'}: {errors[cell.key]}"
+        for cell in found.cells
+        if cell.key in errors
+    ]
+    more = (
+        [f"and {len(lines) - _SHOWN} more, which `safe-envs sweep-report` lists"]
+        if len(lines) > _SHOWN
+        else []
+    )
+    return "\n  ".join(
+        [
+            f"{len(lines)} of {len(found.cells)} cells failed; the same command tries them again:",
+            *lines[:_SHOWN],
+            *more,
+        ]
+    )
 
 
 if __name__ == "__main__":

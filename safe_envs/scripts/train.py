@@ -22,8 +22,18 @@ from safe_envs.scripts.reports.rates import percent_in
 
 @with_env
 def train(
-    algo: Annotated[str, typer.Option(metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="New folder for the policy, its evaluations and the checkpoint.")],
+    algo: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME", autocompletion=completion.algorithms, help="ppo, a2c, sac or td3."
+        ),
+    ],
+    out: Annotated[
+        Path,
+        typer.Option(
+            metavar="DIR", help="New folder for the policy, its evaluations and the checkpoint."
+        ),
+    ],
     env: EnvOptions,
     filters: Annotated[
         list[str] | None,
@@ -31,50 +41,86 @@ def train(
             "--filter",
             metavar="NAME",
             autocompletion=completion.filters,
-            help="Filter in the loop; none by default. A learned one with its file: ddscbf:file=FILE.",
+            help=(
+                "Filter in the loop; none by default. A learned one with its file:"
+                " ddscbf:file=FILE."
+            ),
         ),
     ] = None,
     n_timesteps: Annotated[
         int | None,
-        typer.Option(help="Control periods over all copies, rounded up to whole rollouts; by default that of the hyperparameters."),
+        typer.Option(
+            help=(
+                "Control periods over all copies, rounded up to whole rollouts; by default that of"
+                " the hyperparameters."
+            )
+        ),
     ] = None,
-    num_envs: Annotated[int | None, typer.Option(help="Copies of the env; by default that of the hyperparameters.")] = None,
+    num_envs: Annotated[
+        int | None, typer.Option(help="Copies of the env; by default that of the hyperparameters.")
+    ] = None,
     seed: text_options.Seed = 0,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="Hyperparameter in place of the file's, such as learning_rate=3e-4. Repeatable."),
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Hyperparameter in place of the file's, such as learning_rate=3e-4. Repeatable.",
+        ),
     ] = None,
     action: Annotated[
-        str, typer.Option(metavar="executed|proposed|both", help="On which action an off-policy algorithm learns behind a filter.")
+        str,
+        typer.Option(
+            metavar="executed|proposed|both",
+            help="On which action an off-policy algorithm learns behind a filter.",
+        ),
     ] = "executed",
     intervention_penalty: Annotated[
-        float, typer.Option(metavar="X", help="Taken from the reward for each unit by which the filter moves the action.")
+        float,
+        typer.Option(
+            metavar="X",
+            help="Taken from the reward for each unit by which the filter moves the action.",
+        ),
     ] = 0.0,
     knowledge: text_options.Knowledge = "model",
     eval_freq: Annotated[
-        int | None, typer.Option(help="Steps between evaluations and checkpoints; by default a tenth of the training.")
+        int | None,
+        typer.Option(
+            help="Steps between evaluations and checkpoints; by default a tenth of the training."
+        ),
     ] = None,
     eval_episodes: Annotated[int, typer.Option(help="Episodes of each evaluation.")] = 200,
     threads: Annotated[int, typer.Option(help="Threads of torch and BLAS.")] = 1,
-    tensorboard: Annotated[Path | None, typer.Option(metavar="DIR", help="Write logs for tensorboard.")] = None,
+    tensorboard: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Write logs for tensorboard.")
+    ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the unfinished training in --out after its last checkpoint.")
+        bool,
+        typer.Option(
+            "--resume",
+            help="Go on with the unfinished training in --out after its last checkpoint.",
+        ),
     ] = False,
     json_file: Json = None,
 ) -> None:
     """Train an agent, evaluate it on the way, and keep the last and the best policy.
 
-    The hyperparameters are those of agents/hyperparams, in the RL Zoo's format. What is logged goes to progress.jsonl and, if
-    asked for, to tensorboard: the safety rate of the last episodes, their cost and smallest h, and violations, interventions and
-    infeasible steps in the training so far. The folder is what `safe-envs evaluate --policy DIR` reads.
+    The hyperparameters are those of agents/hyperparams, in the RL Zoo's format. What is logged goes
+    to progress.jsonl and, if asked for, to tensorboard: the safety rate of the last episodes, their
+    cost and smallest h, and violations, interventions and infeasible steps in the training so far.
+    The folder is what `safe-envs evaluate --policy DIR` reads.
     """
     from safe_envs.agents.policies.registry import DESCRIPTION
     from safe_envs.agents.training.config import Training
     from safe_envs.agents.training.trainer import train as train_agent
 
-    text_options.require_outputs(json_file, None, inputs=text_options.inputs_of(env.system, filters=filters or ()))
+    text_options.require_outputs(
+        json_file, None, inputs=text_options.inputs_of(env.system, filters=filters or ())
+    )
     if len(filters or []) > 1:
-        raise ConfigurationError(f"--filter was given {len(filters or [])} times; a training has one filter in the loop")
+        raise ConfigurationError(
+            f"--filter was given {len(filters or [])} times; a training has one filter in the loop"
+        )
     training = Training.of(
         env.full_id,
         algo,
@@ -97,18 +143,34 @@ def train(
         try:
             train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)
         except KeyboardInterrupt:
-            print(f"Stopped. The same command with --resume goes on after the last checkpoint in {out}.", file=sys.stderr)
+            print(
+                "Stopped. The same command with --resume goes on after the last checkpoint in"
+                f" {out}.",
+                file=sys.stderr,
+            )
             raise
     if finished:
         stdout().print(
-            f"The training in {out} was finished already: nothing was left to do.", highlight=False, markup=False, soft_wrap=True
+            f"The training in {out} was finished already: nothing was left to do.",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
         )
     rows = json.loads((out / "evaluations.json").read_text())
     _report(training.filter or "none", rows)
     known = [f"--knowledge={knowledge}"] if knowledge != "model" else []
-    command = env.evaluate_command("--policy", str(out), "--filter", training.filter or "none", *known)
+    command = env.evaluate_command(
+        "--policy", str(out), "--filter", training.filter or "none", *known
+    )
     stdout().print(f"\nTo evaluate the policy: {command}", highlight=False, markup=False)
-    write_result(json_file, lambda: {"folder": str(out), "config": json.loads((out / "config.json").read_text()), "evaluations": rows})
+    write_result(
+        json_file,
+        lambda: {
+            "folder": str(out),
+            "config": json.loads((out / "config.json").read_text()),
+            "evaluations": rows,
+        },
+    )
 
 
 def _settings(texts: list[str]) -> dict[str, Any]:
@@ -121,14 +183,21 @@ def _settings(texts: list[str]) -> dict[str, Any]:
     for text in texts:
         name, equals, value = text.partition("=")
         if not equals or not name:
-            raise ConfigurationError(f"--set {shortened(text)}: give NAME=VALUE, such as learning_rate=0.001")
+            raise ConfigurationError(
+                f"--set {shortened(text)}: give NAME=VALUE, such as learning_rate=0.001"
+            )
         if not value.isascii():
-            raise ConfigurationError(f"--set {shortened(text)} has characters beyond ASCII; write numbers with the digits 0 to 9")
+            raise ConfigurationError(
+                f"--set {shortened(text)} has characters beyond ASCII; write numbers with the"
+                " digits 0 to 9"
+            )
         try:
             found[name] = _number(value_of(value, "--set"))
         except yaml.YAMLError as error:
             problem = shortened(getattr(error, "problem", error))
-            raise ConfigurationError(f"--set {shortened(text)} is no YAML that a setting may have: {problem}") from error
+            raise ConfigurationError(
+                f"--set {shortened(text)} is no YAML that a setting may have: {problem}"
+            ) from error
     return found
 
 
@@ -148,7 +217,12 @@ def _report(filter_name: str, rows: list[dict[str, Any]]) -> None:
         table.add_column(title, justify="right")
     for row in rows:
         rate = percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
-        table.add_row(f"{row['timesteps']:,}", rate, f"{row['return_mean']:.4g}", f"{row['training']['violations']:.0f}")
+        table.add_row(
+            f"{row['timesteps']:,}",
+            rate,
+            f"{row['return_mean']:.4g}",
+            f"{row['training']['violations']:.0f}",
+        )
     console.print(f"Evaluations with the filter {filter_name}:", highlight=False, markup=False)
     console.print(table)
 

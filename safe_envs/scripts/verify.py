@@ -1,4 +1,5 @@
-"""`safe-envs verify`: where a filter's conditions can be met, what they promise, and whether that is true."""
+"""`safe-envs verify`: where a filter's conditions can be met, what they promise, and whether that
+is true."""
 
 from __future__ import annotations
 
@@ -28,25 +29,46 @@ def verify(
     knowledge: text_options.Knowledge = "model",
     policy: Annotated[
         str,
-        typer.Option(metavar="NAME|FOLDER|FILE", autocompletion=completion.policies, help="Who acts in the simulation, as for evaluate."),
+        typer.Option(
+            metavar="NAME|FOLDER|FILE",
+            autocompletion=completion.policies,
+            help="Who acts in the simulation, as for evaluate.",
+        ),
     ] = "nominal",
     trust: text_options.Trust = False,
-    episodes: Annotated[int, typer.Option(help="Episodes of the simulation, from each start.")] = 500,
+    episodes: Annotated[
+        int, typer.Option(help="Episodes of the simulation, from each start.")
+    ] = 500,
     seed: text_options.Seed = 0,
-    simulate: Annotated[bool, typer.Option("--simulate/--no-simulate", help="Measure the safety, and hold it against the bounds.")] = True,
+    simulate: Annotated[
+        bool,
+        typer.Option(
+            "--simulate/--no-simulate", help="Measure the safety, and hold it against the bounds."
+        ),
+    ] = True,
     json: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write all that was found; - for stdout, and nothing else there.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Write all that was found; - for stdout, and nothing else there."
+        ),
     ] = None,
     plot: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help=f"Draw where the conditions cannot be met, h and the boundaries: {text_options.FORMATS}"),
+        typer.Option(
+            metavar="FILE",
+            help=(
+                "Draw where the conditions cannot be met, h and the boundaries:"
+                f" {text_options.FORMATS}"
+            ),
+        ),
     ] = None,
 ) -> None:
-    """Print where the filter's conditions cannot be met, what bounds on its safety are estimated at, and what a simulation says to that.
+    """Print where the filter's conditions cannot be met, what bounds on its safety are estimated
+    at, and what a simulation says to that.
 
-    The safe set C is sampled, and searched for the worst: where the input has no say, where no action in the box meets the
-    conditions, and the suprema on which the bounds rest. Nothing of this depends on the policy; the simulation does, and a bound
-    that it contradicts is withheld.
+    The safe set C is sampled, and searched for the worst: where the input has no say, where no
+    action in the box meets the conditions, and the suprema on which the bounds rest. Nothing of
+    this depends on the policy; the simulation does, and a bound that it contradicts is withheld.
     """
     from safe_envs.agents.evaluation.bound_check import judged, measure, starts_of
     from safe_envs.agents.policies.registry import make_policy
@@ -57,12 +79,18 @@ def verify(
     from safe_envs.wrappers.verification.guarantee import promise
 
     require_whole("episodes", episodes, 1)
-    text_options.require_outputs(json, plot, inputs=text_options.inputs_of(env.system, policy, [filter_name or ""]))
+    text_options.require_outputs(
+        json, plot, inputs=text_options.inputs_of(env.system, policy, [filter_name or ""])
+    )
     known, arguments = env.full_id, env.arguments
     title = title_of(known, arguments)
     problem = load_problem(known, arguments)
-    actor = make_policy(policy, problem, trust)  # An unknown one is to show before the search, and without a simulation too.
-    found = find(problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed)
+    actor = make_policy(
+        policy, problem, trust
+    )  # An unknown one is to show before the search, and without a simulation too.
+    found = find(
+        problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed
+    )
     starts = starts_of(problem, seed)
     bounds = promise(found, starts, problem.duration)
     measurements = []

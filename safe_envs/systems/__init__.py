@@ -1,4 +1,5 @@
-"""The systems of the thesis and variations of them, one file each, and their registration with Gymnasium."""
+"""The systems of the thesis and variations of them, one file each, and their registration with
+Gymnasium."""
 
 from __future__ import annotations
 
@@ -30,7 +31,11 @@ CUSTOM_ID = "safe_envs/Custom-v0"
 
 def register_all() -> None:
     """Register every id with Gymnasium; the systems themselves are imported when an env is made."""
-    gym.register(CUSTOM_ID, entry_point="safe_envs.envs.custom:Custom", vector_entry_point="safe_envs.envs.custom:CustomVector")
+    gym.register(
+        CUSTOM_ID,
+        entry_point="safe_envs.envs.custom:Custom",
+        vector_entry_point="safe_envs.envs.custom:CustomVector",
+    )
     for name, module in _CLASSES.items():
         path = f"safe_envs.systems.{module}:{name}"
         gym.register(f"safe_envs/{name}-v0", entry_point=path, vector_entry_point=f"{path}Vector")

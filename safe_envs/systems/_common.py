@@ -1,4 +1,5 @@
-"""What the systems share: checks of the barriers' arguments, and building blocks of start distributions."""
+"""What the systems share: checks of the barriers' arguments, and building blocks of start
+distributions."""
 
 from __future__ import annotations
 

@@ -22,7 +22,8 @@ _TARGET = sp.Rational(2, 5)
 
 
 def inverted_pendulum() -> ControlAffineSDE:
-    """The pendulum: dtheta = thetadot dt + sigma theta dW, dthetadot = (g/l sin(theta) + u/(m l^2)) dt.
+    """The pendulum: dtheta = thetadot dt + sigma theta dW, dthetadot = (g/l sin(theta) + u/(m l^2))
+    dt.
 
     Source: thesis Sec. 5.4.1.
     """
@@ -47,7 +48,9 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
     c = positive("level", level)
     state = sp.Matrix([theta, thetadot])
     h = c - sp.expand((state.T * P * state)[0, 0])
-    reach = float(sp.sqrt(c * P.inv().row(0)[0]))  # largest angle, and largest speed, in the ellipse
+    reach = float(
+        sp.sqrt(c * P.inv().row(0)[0])
+    )  # largest angle, and largest speed, in the ellipse
     system = inverted_pendulum()
     first, second = uniforms(2)
     return SafetyProblem(
@@ -60,7 +63,9 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         reward=sp.exp(-((5 * (theta - _TARGET)) ** 2)),
         nominal=(sp.Integer(0),),
         starts={
-            "uniform": Start((around(0.0, reach, first), around(0.0, reach, second)), (first, second), h),
+            "uniform": Start(
+                (around(0.0, reach, first), around(0.0, reach, second)), (first, second), h
+            ),
             "near-origin": Start.at((0.1, 0.1)),
         },
         dt=0.01,
@@ -77,8 +82,8 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
 class Pendulum(SystemEnv):
     """An inverted pendulum, with noise that grows with its angle, is to stay near the top.
 
-    ## Description
-    The pendulum falls over when it is left alone. The task is to lean it a little beyond the edge of the safe ellipse.
+    ## Description The pendulum falls over when it is left alone. The task is to lean it a little
+    beyond the edge of the safe ellipse.
 
     ## Equations
     dtheta = thetadot dt + sigma theta dW, dthetadot = (g/l sin(theta) + u/(m l^2)) dt,
@@ -98,15 +103,15 @@ class Pendulum(SystemEnv):
     ## Observation
     The states.
 
-    ## Barrier
-    h = c - x' P x with c = .2 and P = [[sqrt(3), 1], [1, sqrt(3)]], of relative degree 1, with sup h = c. In the ellipse
-    abs(theta) and abs(thetadot) stay below .416. Gain 5. Natural filter: `scbf`.
+    ## Barrier h = c - x' P x with c = .2 and P = [[sqrt(3), 1], [1, sqrt(3)]], of relative degree
+    1, with sup h = c. In the ellipse abs(theta) and abs(thetadot) stay below .416. Gain 5. Natural
+    filter: `scbf`.
 
     ## Noise
     `sigma` = .1 1/sqrt(s).
 
-    ## Mismatch
-    None by default. The thesis takes the diffusion as unknown: `model={"sigma": 0.0}` is a designer who neglects it.
+    ## Mismatch None by default. The thesis takes the diffusion as unknown: `model={"sigma": 0.0}`
+    is a designer who neglects it.
 
     ## Reward
     exp(-(5 (theta - .4))^2) a step, in (0, 1]. Chosen by us: at rest there h = -.08.
@@ -123,8 +128,8 @@ class Pendulum(SystemEnv):
     ## Arguments
     `barrier={"level": 0.2}`, c; for all others see `SystemEnv`.
 
-    ## Source
-    Thesis Sec. 5.4.1, which does not give m. Eq. (5.19) is malformed as a trace; its value is right.
+    ## Source Thesis Sec. 5.4.1, which does not give m. Eq. (5.19) is malformed as a trace; its
+    value is right.
     """
 
     problem_factory = staticmethod(pendulum)

@@ -57,7 +57,9 @@ _STATES = (
     *(Variable(s, -15.0, 15.0, "rad/s") for s in (phidot, thetadot, psidot)),
 )
 
-MIXING = sp.ImmutableMatrix([[k_t] * 4, [0, -k_t, 0, k_t], [k_t, 0, -k_t, 0], [k_d, -k_d, k_d, -k_d]])
+MIXING = sp.ImmutableMatrix(
+    [[k_t] * 4, [0, -k_t, 0, k_t], [k_t, 0, -k_t, 0], [k_d, -k_d, k_d, -k_d]]
+)
 """(U_1, U_2, U_3, U_4) = MIXING (Omega_1^2, ..., Omega_4^2). Source: thesis Eq. (3.30)."""
 
 
@@ -94,10 +96,11 @@ def quadrotor(mass: float) -> ControlAffineSDE:
 
 
 def rotor_laws(x_wanted: sp.Expr, x_rate_wanted: sp.Expr) -> tuple[sp.Expr, ...]:
-    """Thrust by the altitude, torques that follow x and hold y and the heading at 0, through the inverse of the mixing.
+    """Thrust by the altitude, torques that follow x and hold y and the heading at 0, through the
+    inverse of the mixing.
 
-    The position loop asks for a horizontal acceleration, which for small tilts is g times an angle: that angle is
-    what the attitude loop, about three times as fast, follows.
+    The position loop asks for a horizontal acceleration, which for small tilts is g times an angle:
+    that angle is what the attitude loop, about three times as fast, follows.
     """
     push_x, push_y = x_wanted - x + 2 * (x_rate_wanted - xdot), -y - 2 * ydot
     wanted_phi = (push_x * sin_psi - push_y * cos_psi) / g
@@ -160,10 +163,19 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
         model=quadrotor(MODEL_MASS),
         barriers=(band(center, half_width),),
         nominal=rotor_laws(sp.Integer(0), sp.Integer(0)),
-        starts={"spread": start_at({z: around(5.0, 0.5, height), zdot: around(0.0, 0.5, climb)}, spread), "thesis": start_at({z: 5})},
+        starts={
+            "spread": start_at(
+                {z: around(5.0, 0.5, height), zdot: around(0.0, 0.5, climb)}, spread
+            ),
+            "thesis": start_at({z: 5}),
+        },
         explored=SamplingDomain(
             region=tuple(
-                {z: (center - half_width, center + half_width), zdot: CLIMB_RATES, psi: (-math.pi, math.pi)}.get(s.symbol, (s.low, s.high))
+                {
+                    z: (center - half_width, center + half_width),
+                    zdot: CLIMB_RATES,
+                    psi: (-math.pi, math.pi),
+                }.get(s.symbol, (s.low, s.high))
                 for s in _STATES
             ),
             coordinates=(z, zdot, phi, theta),
@@ -174,9 +186,8 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
 class Quadrotor(SystemEnv):
     """The altitude of a quadrotor with all its twelve states and four rotors is to stay in a band.
 
-    ## Description
-    The task of `QuadrotorAltitude`, through the full dynamics: the thrust that a filter adds is shared among four rotors, and
-    acts along a body axis that tilts.
+    ## Description The task of `QuadrotorAltitude`, through the full dynamics: the thrust that a
+    filter adds is shared among four rotors, and acts along a body axis that tilts.
 
     ## Equations
     Positions and angles integrate their rates. With noise sigma_i dW_i on the three accelerations,
@@ -191,8 +202,8 @@ class Quadrotor(SystemEnv):
         U_1 = k_t (O_1 + O_2 + O_3 + O_4),  U_2 = k_t (O_4 - O_2),  U_3 = k_t (O_1 - O_3)
         U_4 = k_d (O_1 - O_2 + O_3 - O_4),  O_i = Omega_i^2
 
-    Chosen by us, in the range of a small research quadrotor: l = .23 m, I_x = I_y = .0075, I_z = .013 kg m^2,
-    k_t = 3.13e-5 N s^2, k_d = 7.5e-7 N m s^2.
+    Chosen by us, in the range of a small research quadrotor: l = .23 m, I_x = I_y = .0075, I_z =
+    .013 kg m^2, k_t = 3.13e-5 N s^2, k_d = 7.5e-7 N m s^2.
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -204,17 +215,14 @@ class Quadrotor(SystemEnv):
     | `psi` | yaw | rad | unbounded |
     | `phidot`, `thetadot`, `psidot` | rates | rad/s | [-15, 15] |
 
-    ## Inputs
-    | symbol | meaning | unit | box |
-    |---|---|---|---|
-    | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the plant's hover, chosen by us |
+    ## Inputs | symbol | meaning | unit | box | |---|---|---|---| | `rotor_1` to `rotor_4` | squared
+    rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the plant's hover, chosen by us |
 
-    ## Observation
-    The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5 sin(t), and its rate.
+    ## Observation The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5
+    sin(t), and its rate.
 
-    ## Barrier
-    h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold on h at z = c, where it is
-    not needed. Gains 2 and 8. Natural filter: `hocbf`.
+    ## Barrier h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses
+    its hold on h at z = c, where it is not needed. Gains 2 and 8. Natural filter: `hocbf`.
 
     ## Noise
     `sigma_x`, `sigma_y`, `sigma_z` of the accelerations in m/s/sqrt(s), all 0.
@@ -225,12 +233,11 @@ class Quadrotor(SystemEnv):
     ## Reward
     exp(-(z - z_ref)^2) a step, in (0, 1].
 
-    ## Nominal controller
-    U_1 as in `QuadrotorAltitude`; PD laws that hold x, y and psi at 0 through the roll and pitch angles, for the torques; and
-    the rotor speeds by the inverse of the mixing.
+    ## Nominal controller U_1 as in `QuadrotorAltitude`; PD laws that hold x, y and psi at 0 through
+    the roll and pitch angles, for the torques; and the rotor speeds by the inverse of the mixing.
 
-    ## Start
-    `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0, all else 0. `thesis`: z = 5 m, all else 0.
+    ## Start `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0, all else 0. `thesis`:
+    z = 5 m, all else 0.
 
     ## Episode end
     Terminated outside the workspace, truncated after 30 s = 600 steps.

@@ -32,7 +32,10 @@ HEIGHT = (Variable(z, 0.0, 10.0, "m"), Variable(zdot, -10.0, 10.0, "m/s"))
 ALTITUDE_REWARD = sp.exp(-((z - _REFERENCE) ** 2))
 """Reward of a step for the altitude, in (0, 1]."""
 
-FOLLOWED = (Feature("z_ref", _REFERENCE, 2.5, 7.5), Feature("z_ref_rate", _REFERENCE.diff(TIME), -2.5, 2.5))
+FOLLOWED = (
+    Feature("z_ref", _REFERENCE, 2.5, 7.5),
+    Feature("z_ref_rate", _REFERENCE.diff(TIME), -2.5, 2.5),
+)
 """The reference altitude, and its rate."""
 
 
@@ -66,12 +69,18 @@ def band(center: float, half_width: float) -> Barrier:
 
     Source: thesis Eq. (3.32).
     """
-    return Barrier(1 - ((z - finite_number("center", center)) / positive("half_width", half_width)) ** 4)
+    return Barrier(
+        1 - ((z - finite_number("center", center)) / positive("half_width", half_width)) ** 4
+    )
 
 
-def altitude_problem(name: str, *, reward: sp.Expr = ALTITUDE_REWARD, gains: Any = (2.0, 8.0), **rest: Any) -> SafetyProblem:
+def altitude_problem(
+    name: str, *, reward: sp.Expr = ALTITUDE_REWARD, gains: Any = (2.0, 8.0), **rest: Any
+) -> SafetyProblem:
     """What all quadrotors have in common: the task, the timing and the gains."""
-    return SafetyProblem(name=name, reward=reward, dt=0.05, horizon=30.0, gains=gains, filter="hocbf", **rest)
+    return SafetyProblem(
+        name=name, reward=reward, dt=0.05, horizon=30.0, gains=gains, filter="hocbf", **rest
+    )
 
 
 CLIMB_RATES = (-5.0, 5.0)
@@ -97,7 +106,10 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         inputs=(Variable(U_1, 0.0, _MOST_THRUST, "N"),),
         features=(*(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in HEIGHT), *FOLLOWED),
         nominal=(thrust_law(),),
-        starts={"spread": Start((around(5.0, 0.5, height), around(0.0, 0.5, climb)), (height, climb)), "thesis": Start.at((5.0, 0.0))},
+        starts={
+            "spread": Start((around(5.0, 0.5, height), around(0.0, 0.5, climb)), (height, climb)),
+            "thesis": Start.at((5.0, 0.0)),
+        },
         noise=("sigma_z",),
         plane=("z", "zdot"),
         scene="altitude",
@@ -108,8 +120,8 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
 class QuadrotorAltitude(SystemEnv):
     """The altitude of a quadrotor, heavier than its designer believes, is to stay in a band.
 
-    ## Description
-    A quadrotor in level flight follows a sinusoidal altitude that leaves the safe band at both ends.
+    ## Description A quadrotor in level flight follows a sinusoidal altitude that leaves the safe
+    band at both ends.
 
     ## Equations
     dz = zdot dt, dzdot = (-g + U_1/m) dt + sigma_z dW
@@ -128,21 +140,20 @@ class QuadrotorAltitude(SystemEnv):
     ## Observation
     z, zdot, the reference z_ref = 5 + 2.5 sin(t) at the time t of the observation, and its rate.
 
-    ## Barrier
-    h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold on h at z = c, where it is
-    not needed. Gains 2 and 8. Natural filter: `hocbf`.
+    ## Barrier h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses
+    its hold on h at z = c, where it is not needed. Gains 2 and 8. Natural filter: `hocbf`.
 
     ## Noise
     `sigma_z` of the acceleration in m/s/sqrt(s), 0.
 
-    ## Mismatch
-    The plant has m = .6 kg, the model m = .4 kg: the designer expects half as much acceleration again as the thrust gives.
+    ## Mismatch The plant has m = .6 kg, the model m = .4 kg: the designer expects half as much
+    acceleration again as the thrust gives.
 
     ## Reward
     exp(-(z - z_ref)^2) a step, in (0, 1].
 
-    ## Nominal controller
-    U_1 = m (g + 6 e + 4 edot), e = z_ref - z, with the model's mass. The thesis names a PID controller without its gains.
+    ## Nominal controller U_1 = m (g + 6 e + 4 edot), e = z_ref - z, with the model's mass. The
+    thesis names a PID controller without its gains.
 
     ## Start
     `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0. `thesis`: (5, 0).
@@ -153,9 +164,8 @@ class QuadrotorAltitude(SystemEnv):
     ## Arguments
     `barrier={"center": 5.0, "half_width": 2.0}`, c and p in m; for all others see `SystemEnv`.
 
-    ## Source
-    Thesis Sec. 3.5.2, Eq. (3.31) with phi = theta = 0, (3.32). Eq. (3.33) has wrong signs in L_f^2 h and L_g L_f h, and zdot
-    in place of its square; nothing here depends on it.
+    ## Source Thesis Sec. 3.5.2, Eq. (3.31) with phi = theta = 0, (3.32). Eq. (3.33) has wrong signs
+    in L_f^2 h and L_g L_f h, and zdot in place of its square; nothing here depends on it.
     """
 
     problem_factory = staticmethod(quadrotor_altitude)

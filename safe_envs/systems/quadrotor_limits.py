@@ -1,4 +1,5 @@
-"""Quadrotor with all twelve states between a floor and a ceiling, whose tilt is limited: three barriers, four inputs."""
+"""Quadrotor with all twelve states between a floor and a ceiling, whose tilt is limited: three
+barriers, four inputs."""
 
 from __future__ import annotations
 
@@ -13,7 +14,17 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import TIME, Feature, SafetyProblem
 from safe_envs.systems._common import around, uniforms
-from safe_envs.systems.quadrotor import LARGEST_TILT, phi, psi, quadrotor, rotor_laws, rotor_problem, start_at, theta, x
+from safe_envs.systems.quadrotor import (
+    LARGEST_TILT,
+    phi,
+    psi,
+    quadrotor,
+    rotor_laws,
+    rotor_problem,
+    start_at,
+    theta,
+    x,
+)
 from safe_envs.systems.quadrotor_altitude import ALTITUDE_REWARD, HEIGHT, PLANT_MASS, z, zdot
 
 x_ref, x_ref_rate = sp.symbols("x_ref x_ref_rate", real=True)
@@ -23,7 +34,9 @@ _SWAY_RATE = 1.5
 _REFERENCE = _SWAY * sp.sin(_SWAY_RATE * TIME)
 
 
-def quadrotor_limits(*, floor: float = 3.0, ceiling: float = 7.0, tilt: float = 0.5) -> SafetyProblem:
+def quadrotor_limits(
+    *, floor: float = 3.0, ceiling: float = 7.0, tilt: float = 0.5
+) -> SafetyProblem:
     """A band of altitudes and a cone of tilts, for a quadrotor that its designer knows.
 
     Args:
@@ -31,12 +44,20 @@ def quadrotor_limits(*, floor: float = 3.0, ceiling: float = 7.0, tilt: float = 
         ceiling: highest safe altitude, in m.
         tilt: largest safe angle between the thrust and the vertical, in rad.
     """
-    low, high, angle = finite_number("floor", floor), finite_number("ceiling", ceiling), finite_number("tilt", tilt)
+    low, high, angle = (
+        finite_number("floor", floor),
+        finite_number("ceiling", ceiling),
+        finite_number("tilt", tilt),
+    )
     bottom, top = HEIGHT[0].low, HEIGHT[0].high
     if not bottom < low < high < top:
-        raise ConfigurationError(f"floor = {low} and ceiling = {high}; give {bottom} < floor < ceiling < {top}")
+        raise ConfigurationError(
+            f"floor = {low} and ceiling = {high}; give {bottom} < floor < ceiling < {top}"
+        )
     if not 0 < angle < LARGEST_TILT:
-        raise ConfigurationError(f"tilt = {angle}; give an angle between 0 and {LARGEST_TILT:.3f} rad")
+        raise ConfigurationError(
+            f"tilt = {angle}; give an angle between 0 and {LARGEST_TILT:.3f} rad"
+        )
     craft = quadrotor(PLANT_MASS)
     height, climb, heading = spread = uniforms(3)
     return rotor_problem(
@@ -69,11 +90,12 @@ def quadrotor_limits(*, floor: float = 3.0, ceiling: float = 7.0, tilt: float = 
 
 
 class QuadrotorLimits(SystemEnv):
-    """A quadrotor is to stay between a floor and a ceiling, and its tilt below a limit, while it is told to do neither.
+    """A quadrotor is to stay between a floor and a ceiling, and its tilt below a limit, while it is
+    told to do neither.
 
-    ## Description
-    The quadrotor follows an altitude that leaves the band at both ends, and sways from side to side faster than the tilt limit
-    allows. Thrust serves the floor and the ceiling, and torques the tilt; the same four rotors, within their speeds, give both.
+    ## Description The quadrotor follows an altitude that leaves the band at both ends, and sways
+    from side to side faster than the tilt limit allows. Thrust serves the floor and the ceiling,
+    and torques the tilt; the same four rotors, within their speeds, give both.
 
     ## Equations
     Those of `Quadrotor`.
@@ -93,8 +115,8 @@ class QuadrotorLimits(SystemEnv):
     |---|---|---|---|
     | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the hover |
 
-    ## Observation
-    The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5 sin(t) and its rate, x_ref = 2 sin(1.5 t) and its rate.
+    ## Observation The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5
+    sin(t) and its rate, x_ref = 2 sin(1.5 t) and its rate.
 
     ## Barrier
     | name | h | relative degree | gains |
@@ -103,9 +125,10 @@ class QuadrotorLimits(SystemEnv):
     | `ceiling` | z_max - z, z_max = 7 m | 2 | 2, 8 |
     | `tilt` | cos(phi) cos(theta) - cos(a), a = .5 rad | 2 | 3, 12 |
 
-    The angle from the thrust to the vertical is to stay below a. In level flight no torque reaches the second derivative of the
-    last one: the condition can be met there only if phidot^2 + thetadot^2 <= p_1 p_2 (1 - cos(a)), so that a limit below about
-    .3 rad needs larger gains. Natural filter: `hocbf`.
+    The angle from the thrust to the vertical is to stay below a. In level flight no torque reaches
+    the second derivative of the last one: the condition can be met there only if phidot^2 +
+    thetadot^2 <= p_1 p_2 (1 - cos(a)), so that a limit below about .3 rad needs larger gains.
+    Natural filter: `hocbf`.
 
     ## Noise
     `sigma_x`, `sigma_y`, `sigma_z` of the accelerations in m/s/sqrt(s), all 0.
@@ -119,14 +142,14 @@ class QuadrotorLimits(SystemEnv):
     ## Nominal controller
     That of `Quadrotor`, with x_ref in place of 0.
 
-    ## Start
-    `spread`: z uniform in the middle quarter of the band, zdot within .5 m/s of 0, psi within .5 rad of 0, all else 0.
+    ## Start `spread`: z uniform in the middle quarter of the band, zdot within .5 m/s of 0, psi
+    within .5 rad of 0, all else 0.
 
     ## Episode end
     Terminated outside the workspace, truncated after 30 s = 600 steps.
 
-    ## Arguments
-    `floor=3.0`, `ceiling=7.0` in m, within (0, 10); `tilt=0.5` in rad, within (0, pi/3). For all others see `SystemEnv`.
+    ## Arguments `floor=3.0`, `ceiling=7.0` in m, within (0, 10); `tilt=0.5` in rad, within (0,
+    pi/3). For all others see `SystemEnv`.
 
     ## Source
     The vehicle of thesis Sec. 3.5.2, Eq. (3.29), (3.30); barriers and task were chosen by us.

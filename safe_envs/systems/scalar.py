@@ -19,7 +19,14 @@ def scalar_system() -> ControlAffineSDE:
 
     Source: thesis Sec. 4.2.2.
     """
-    return ControlAffineSDE(states=(x,), inputs=(u,), drift=[x], input_matrix=[1], diffusion=[sigma], parameters={sigma: 0.2})
+    return ControlAffineSDE(
+        states=(x,),
+        inputs=(u,),
+        drift=[x],
+        input_matrix=[1],
+        diffusion=[sigma],
+        parameters={sigma: 0.2},
+    )
 
 
 def scalar(*, limit: float = 1.0) -> SafetyProblem:
@@ -42,7 +49,10 @@ def scalar(*, limit: float = 1.0) -> SafetyProblem:
         inputs=(Variable(u, -10.0, 10.0, "1/s"),),
         reward=sp.exp(-((2 * (x / edge - 1)) ** 2)),
         nominal=(-x + edge - x,),
-        starts={"spread": Start((around(0.0, 0.9 * edge, spread),), (spread,)), "origin": Start.at((0.0,))},
+        starts={
+            "spread": Start((around(0.0, 0.9 * edge, spread),), (spread,)),
+            "origin": Start.at((0.0,)),
+        },
         dt=0.01,
         horizon=5.0,
         noise=("sigma",),
@@ -55,8 +65,8 @@ def scalar(*, limit: float = 1.0) -> SafetyProblem:
 class Scalar(SystemEnv):
     """An unstable scalar system with noise is to stay below a limit.
 
-    ## Description
-    The smallest system on which the conditions differ: near the limit a reciprocal one asks for unbounded control.
+    ## Description The smallest system on which the conditions differ: near the limit a reciprocal
+    one asks for unbounded control.
 
     ## Equations
     dx = (x + u) dt + sigma dW

@@ -1,4 +1,5 @@
-"""The documentation: a page for each env and condition, commands that exist, examples and notebooks that run."""
+"""The documentation: a page for each env and condition, commands that exist, examples and notebooks
+that run."""
 
 from __future__ import annotations
 
@@ -58,7 +59,9 @@ def leaves(nav: Any) -> Iterator[str]:
 
 
 def test_every_env_and_condition_has_a_page(pages_in_navigation: list[str]):
-    assert {f"envs/{env_id.split('/')[1].removesuffix('-v0')}.md" for env_id in ENV_IDS} <= set(pages_in_navigation)
+    assert {f"envs/{env_id.split('/')[1].removesuffix('-v0')}.md" for env_id in ENV_IDS} <= set(
+        pages_in_navigation
+    )
     for name in (*CONDITIONS, *LEARNED):
         assert f"filters/{name}.md" in pages_in_navigation
         assert (DOCS / "filters" / f"{name}.md").is_file()
@@ -76,7 +79,9 @@ def test_every_page_is_in_the_navigation(pages_in_navigation: list[str]):
 def test_page_of_a_condition_has_equation_promise_and_an_example_of_it(name: str, hook: Any):
     text = (DOCS / "filters" / f"{name}.md").read_text()
     assert text.startswith(f"# {name}\n\n$$")
-    assert all(f"**{part}" in text for part in ("When.", "What it promises.", "Outside its assumptions."))
+    assert all(
+        f"**{part}" in text for part in ("When.", "What it promises.", "Outside its assumptions.")
+    )
     filters = [word.split(":")[0] for words in hook("runs").commands_in(text) for word in words]
     assert name in filters
 
@@ -109,18 +114,25 @@ def test_python_runs(page: Path, hook: Any, monkeypatch: pytest.MonkeyPatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", sorted((DOCS / "notebooks").glob("*.ipynb")), ids=name_of)
-def test_notebook_is_kept_without_outputs_and_its_cells_run(path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_notebook_is_kept_without_outputs_and_its_cells_run(
+    path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
     text = path.read_text()
     assert '"outputs": []' in text
     assert not re.search(r'"outputs": \[\s*\{', text)
-    # In this process: a kernel of its own imports everything once more. `make docs` executes notebooks in kernels.
+    # In this process: a kernel of its own imports everything once more. `make docs` executes
+    # notebooks in kernels.
     pictures: list[Any] = []
     monkeypatch.setattr(plt, "show", lambda: pictures.append(plt.get_fignums()))
     monkeypatch.setattr(tempfile, "mkdtemp", lambda: str(tmp_path))
     names: dict[str, Any] = {}
     for cell in json.loads(text)["cells"]:
         if cell["cell_type"] == "code":
-            pictures += [value for value in [run_cell("".join(cell["source"]), names)] if isinstance(value, Image)]
+            pictures += [
+                value
+                for value in [run_cell("".join(cell["source"]), names)]
+                if isinstance(value, Image)
+            ]
     plt.close("all")
     assert len(pictures) == 1
     assert pictures[0]
@@ -135,12 +147,16 @@ def run_cell(source: str, names: dict[str, Any]) -> Any:
 
 
 @pytest.mark.slow
-def test_notebooks_are_executed_in_a_kernel_and_shown_with_their_outputs(hook: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+def test_notebooks_are_executed_in_a_kernel_and_shown_with_their_outputs(
+    hook: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
     notebooks, pixel = hook("notebooks"), base64.b64encode(b"\x89PNG of a pixel").decode()
     cells = [
         nbformat.v4.new_markdown_cell("# A title"),
         nbformat.v4.new_code_cell("print(6)\nprint(7)\n6 * 7"),
-        nbformat.v4.new_code_cell(f"from IPython.display import display\ndisplay({{'image/png': '{pixel}'}}, raw=True)"),
+        nbformat.v4.new_code_cell(
+            f"from IPython.display import display\ndisplay({{'image/png': '{pixel}'}}, raw=True)"
+        ),
     ]
     nbformat.write(nbformat.v4.new_notebook(cells=cells), tmp_path / "small.ipynb")
     monkeypatch.setattr(notebooks, "FOLDER", tmp_path)
@@ -149,9 +165,17 @@ def test_notebooks_are_executed_in_a_kernel_and_shown_with_their_outputs(hook: A
     assert pages["notebooks/small-2-0.png"] == b"\x89PNG of a pixel"
 
 
-@pytest.mark.parametrize("package", [safe_envs, wrappers, agents], ids=lambda package: package.__name__)
+@pytest.mark.parametrize(
+    "package", [safe_envs, wrappers, agents], ids=lambda package: package.__name__
+)
 def test_everything_public_is_in_the_reference(package: Any):
-    shown = set(re.findall(r"^::: (\S+)$", "".join(page.read_text() for page in (DOCS / "reference").glob("*.md")), re.MULTILINE))
+    shown = set(
+        re.findall(
+            r"^::: (\S+)$",
+            "".join(page.read_text() for page in (DOCS / "reference").glob("*.md")),
+            re.MULTILINE,
+        )
+    )
     written = (DOCS / "reference" / "envs.md").read_text()
     for name in package.__all__:
         module = getattr(getattr(package, name), "__module__", "")
@@ -161,7 +185,10 @@ def test_everything_public_is_in_the_reference(package: Any):
 
 def test_what_an_example_prints_follows_it(hook: Any):
     runs = hook("runs")
-    page = "```python run\nprint(6 * 7)\n```\n\ntext\n\n```console run fails\n$ safe-envs evaluate safe_envs/Nothing-v0\n```\n"
+    page = (
+        "```python run\nprint(6 * 7)\n```\n\ntext\n\n```console run fails\n$ safe-envs evaluate"
+        " safe_envs/Nothing-v0\n```\n"
+    )
     shown = runs.with_output(page)
     assert shown.startswith("```python\nprint(6 * 7)\n```\n\n```text\n42\n```\n\ntext")
     assert "```console\n$ safe-envs evaluate safe_envs/Nothing-v0\n```\n\n```text\nError: " in shown

@@ -1,4 +1,5 @@
-"""Generated functions: any formula of symbols of any names is computed as sympy computes it, for floats and for arrays."""
+"""Generated functions: any formula of symbols of any names is computed as sympy computes it, for
+floats and for arrays."""
 
 from __future__ import annotations
 
@@ -14,8 +15,40 @@ from safe_envs import SystemDefinitionError
 from safe_envs.dynamics.codegen import compile_function, settled
 
 NAMES = (
-    *("x", "p0", "p1", "x0", "x1", "a000", "a001", "_c0", "_c1", "t", "h", "_w0", "nan", "pi", "e", "I"),
-    *("sin", "cos", "sqrt", "pow", "abs", "max", "select", "array", "math", "print", "lambda", "None", "def", "_lambdifygenerated"),
+    *(
+        "x",
+        "p0",
+        "p1",
+        "x0",
+        "x1",
+        "a000",
+        "a001",
+        "_c0",
+        "_c1",
+        "t",
+        "h",
+        "_w0",
+        "nan",
+        "pi",
+        "e",
+        "I",
+    ),
+    *(
+        "sin",
+        "cos",
+        "sqrt",
+        "pow",
+        "abs",
+        "max",
+        "select",
+        "array",
+        "math",
+        "print",
+        "lambda",
+        "None",
+        "def",
+        "_lambdifygenerated",
+    ),
     *("x_{1}", "a b", "θ", "1", "", "x.y", "a,b", "#", "'"),
 )
 LARGEST = 1e6
@@ -35,12 +68,15 @@ def grown(parts):
         pair.map(lambda p: p[0] - sp.Rational(3, 7) * p[1]),
         st.tuples(parts, st.integers(2, 3)).map(lambda p: p[0] ** p[1]),
         st.tuples(parts, st.integers(-3, -1)).map(lambda p: (2 + p[0] ** 2) ** p[1]),
-        st.tuples(parts, st.sampled_from([sp.Rational(1, 2), sp.Rational(-3, 2), sp.Rational(1, 3), sp.Float(0.7)])).map(
-            lambda p: (1 + p[0] ** 2) ** p[1]
-        ),
-        st.tuples(parts, st.sampled_from([sp.sin, sp.cos, sp.tanh, sp.atan, sp.erf, sp.Abs, sp.exp])).map(
-            lambda p: p[1](-abs(p[0]) if p[1] is sp.exp else p[0])
-        ),
+        st.tuples(
+            parts,
+            st.sampled_from(
+                [sp.Rational(1, 2), sp.Rational(-3, 2), sp.Rational(1, 3), sp.Float(0.7)]
+            ),
+        ).map(lambda p: (1 + p[0] ** 2) ** p[1]),
+        st.tuples(
+            parts, st.sampled_from([sp.sin, sp.cos, sp.tanh, sp.atan, sp.erf, sp.Abs, sp.exp])
+        ).map(lambda p: p[1](-abs(p[0]) if p[1] is sp.exp else p[0])),
         pair.map(lambda p: sp.Max(*p, evaluate=False)),
         st.tuples(parts, parts, parts).map(lambda p: sp.Min(*p)),
     )
@@ -60,16 +96,28 @@ def formulas(symbols):
     )
     leaf = st.sampled_from(symbols)
     power = st.tuples(leaf, st.integers(4, 10)).map(lambda p: p[0] ** p[1])
-    leaves = st.one_of(leaf, power, st.tuples(jump, leaf).map(lambda p: p[0](p[1])), st.integers(-3, 3).map(sp.Integer))
+    leaves = st.one_of(
+        leaf,
+        power,
+        st.tuples(jump, leaf).map(lambda p: p[0](p[1])),
+        st.integers(-3, 3).map(sp.Integer),
+    )
     return st.recursive(leaves, grown, max_leaves=6)
 
 
 @st.composite
 def cases(draw):
-    symbols = tuple(symbol(name) for name in draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=4, unique=True)))
+    symbols = tuple(
+        symbol(name)
+        for name in draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=4, unique=True))
+    )
     shared = draw(formulas(symbols))
     expressions = [shared, draw(formulas(symbols)), (shared + 1) * draw(formulas(symbols)) + shared]
-    return symbols, expressions, draw(st.lists(st.tuples(*[VALUES for _ in symbols]), min_size=2, max_size=2))
+    return (
+        symbols,
+        expressions,
+        draw(st.lists(st.tuples(*[VALUES for _ in symbols]), min_size=2, max_size=2)),
+    )
 
 
 class Exactly:
@@ -91,7 +139,9 @@ class Exactly:
 @settings(max_examples=18)
 def test_floats_and_arrays_are_what_sympy_computes_whatever_the_names(case):
     symbols, expressions, points = case
-    floats, arrays = (compile_function(symbols, expressions, flavour) for flavour in ("floats", "arrays"))
+    floats, arrays = (
+        compile_function(symbols, expressions, flavour) for flavour in ("floats", "arrays")
+    )
     with np.errstate(all="ignore"):
         columns = np.broadcast_arrays(*arrays(*np.array(points).T), np.zeros(len(points)))[:-1]
     for row, point in enumerate(points):
@@ -104,15 +154,30 @@ def test_floats_and_arrays_are_what_sympy_computes_whatever_the_names(case):
 
 
 @pytest.mark.parametrize("flavour", ["floats", "arrays"])
-@pytest.mark.parametrize("names", [("p0", "p1"), ("x0", "x1"), ("_c0", "_c1"), ("a001", "a000"), ("sin", "None"), ("lambda", "x_{1}")])
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("p0", "p1"),
+        ("x0", "x1"),
+        ("_c0", "_c1"),
+        ("a001", "a000"),
+        ("sin", "None"),
+        ("lambda", "x_{1}"),
+    ],
+)
 def test_names_change_nothing(names, flavour):
     def read(first, second):
         both = first + second
-        return compile_function((first, second), [both**2 + 3 * first * sp.sin(both) + 5 * sp.sin(both)], flavour)
+        return compile_function(
+            (first, second), [both**2 + 3 * first * sp.sin(both) + 5 * sp.sin(both)], flavour
+        )
 
     expected = 3.0**2 + 3.0 * math.sin(3.0) + 5.0 * math.sin(3.0)
     assert read(*map(symbol, names))(1.0, 2.0)[0] == pytest.approx(expected, rel=1e-15)
-    assert read(*map(symbol, sorted(names)))(1.0, 2.0)[0] == read(symbol("a"), symbol("b"))(1.0, 2.0)[0]
+    assert (
+        read(*map(symbol, sorted(names)))(1.0, 2.0)[0]
+        == read(symbol("a"), symbol("b"))(1.0, 2.0)[0]
+    )
 
 
 @pytest.mark.parametrize("flavour", ["floats", "arrays"])
@@ -126,14 +191,26 @@ def test_powers_of_either_sign(power, flavour):
         assert value == pytest.approx(expected, rel=1e-14)
 
 
-@pytest.mark.parametrize("power", [sp.Rational(1, 2), sp.Rational(-1, 2), -1, -3, sp.Rational(3, 2), 9, sp.Float(0.7), sp.pi])
-@pytest.mark.parametrize("base", [lambda x, y: sp.Max(x, y), lambda x, y: x + sp.Min(x, y, 2), lambda x, y: sp.Abs(x - 5) * sp.Max(x, y)])
+@pytest.mark.parametrize(
+    "power",
+    [sp.Rational(1, 2), sp.Rational(-1, 2), -1, -3, sp.Rational(3, 2), 9, sp.Float(0.7), sp.pi],
+)
+@pytest.mark.parametrize(
+    "base",
+    [
+        lambda x, y: sp.Max(x, y),
+        lambda x, y: x + sp.Min(x, y, 2),
+        lambda x, y: sp.Abs(x - 5) * sp.Max(x, y),
+    ],
+)
 def test_powers_of_kinks(base, power):
     x, y = symbol("x"), symbol("y")
     points = [(1.0, 3.0), (2.0, 1.0)]
     arrays = compile_function((x, y), [base(x, y) ** power], "arrays")(*np.array(points).T)[0]
     for value, point in zip(arrays, points, strict=True):
-        assert value == pytest.approx(float((base(x, y) ** power).subs(dict(zip((x, y), point, strict=True)))), rel=1e-14)
+        assert value == pytest.approx(
+            float((base(x, y) ** power).subs(dict(zip((x, y), point, strict=True)))), rel=1e-14
+        )
 
 
 @pytest.mark.parametrize("flavour", ["floats", "arrays"])
@@ -142,7 +219,9 @@ def test_constants_have_all_their_digits(flavour):
     numbers = [sp.pi, sp.Rational(1, 3), sp.sqrt(2), sp.Float(0.1, 17), sp.exp(1)]
     expected = [math.pi, 1 / 3, math.sqrt(2), 0.1, math.e]
     assert [float(v) for v in compile_function((), numbers, flavour)()] == expected
-    inside = [float(v) for v in compile_function((x,), [x * number for number in numbers], flavour)(1.0)]
+    inside = [
+        float(v) for v in compile_function((x,), [x * number for number in numbers], flavour)(1.0)
+    ]
     assert inside == pytest.approx(expected, rel=2.3e-16, abs=0.0)
 
 
@@ -150,7 +229,9 @@ def test_a_piece_without_a_value_elsewhere_counts_where_it_applies_only():
     x = symbol("x")
     shared = sp.log(x) * sp.sin(sp.log(x)) + 1 / x
     pieces = sp.Piecewise((shared, x > 0), (-1, True))
-    floats, arrays = (compile_function((x,), [pieces, pieces**2], flavour) for flavour in ("floats", "arrays"))
+    floats, arrays = (
+        compile_function((x,), [pieces, pieces**2], flavour) for flavour in ("floats", "arrays")
+    )
     assert floats(-1.0) == (-1.0, 1.0)
     assert floats(0.0) == (-1.0, 1.0)
     assert floats(1.0) == pytest.approx((1.0, 1.0))
@@ -161,7 +242,9 @@ def test_a_piece_without_a_value_elsewhere_counts_where_it_applies_only():
 def test_what_has_no_real_value_is_no_number_in_either_flavour():
     x = symbol("x")
     unfinished = sp.Piecewise((x, x > 0))
-    floats, arrays = (compile_function((x,), [unfinished], flavour) for flavour in ("floats", "arrays"))
+    floats, arrays = (
+        compile_function((x,), [unfinished], flavour) for flavour in ("floats", "arrays")
+    )
     assert math.isnan(floats(-1.0)[0])
     assert np.isnan(arrays(np.array([-1.0]))[0]).all()
     root = x ** sp.Rational(3, 2) + x ** sp.Float(0.4)
@@ -199,7 +282,10 @@ def test_a_symbol_is_one_argument():
         compile_function((symbol("x"), symbol("x")), [symbol("x")], "floats")
 
 
-@given(st.lists(st.tuples(st.integers(0, 2), st.floats(-3.0, 3.0)), min_size=1, max_size=12), st.booleans())
+@given(
+    st.lists(st.tuples(st.integers(0, 2), st.floats(-3.0, 3.0)), min_size=1, max_size=12),
+    st.booleans(),
+)
 @settings(max_examples=40)
 def test_arrays_that_change_in_place_are_read_anew(changes, views):
     x, y = symbol("x"), symbol("y")

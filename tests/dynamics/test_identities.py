@@ -1,4 +1,5 @@
-"""Formulas that are zero everywhere are told from those that are zero in places, wherever these lie."""
+"""Formulas that are zero everywhere are told from those that are zero in places, wherever these
+lie."""
 
 from __future__ import annotations
 
@@ -57,13 +58,26 @@ def test_what_is_zero_in_places_only_is_not_zero(name):
     assert not is_zero(NOT_ZERO[name])
 
 
-@given(st.lists(st.tuples(st.integers(-50, 50), st.integers(-9, 9)), min_size=1, max_size=4, unique_by=lambda p: p[0]), st.booleans())
+@given(
+    st.lists(
+        st.tuples(st.integers(-50, 50), st.integers(-9, 9)),
+        min_size=1,
+        max_size=4,
+        unique_by=lambda p: p[0],
+    ),
+    st.booleans(),
+)
 @settings(max_examples=20)
 def test_a_piecewise_linear_function_is_zero_where_its_values_are(kinks, differently):
-    """sum c max(x - k, 0), written a second time by sizes; the values at and between the kinks tell whether both are the same."""
+    """sum c max(x - k, 0), written a second time by sizes; the values at and between the kinks tell
+    whether both are the same."""
     written = sum(c * sp.Max(x - k, 0) for k, c in kinks)
     again = sum(sp.Rational(c, 2) * (x - k + sp.Abs(x - k)) for k, c in kinks)
-    left_out = sum(sp.Rational(c, 2) * (x - k + sp.Abs(x - k)) for k, c in kinks[1:]) if differently else again
+    left_out = (
+        sum(sp.Rational(c, 2) * (x - k + sp.Abs(x - k)) for k, c in kinks[1:])
+        if differently
+        else again
+    )
     at = [-1000, 1000, *[k + d for k, _ in kinks for d in (-1, 0, 1)]]
     same = all((written - left_out).subs(x, value) == 0 for value in at)
     assert is_zero(written - left_out) == same
@@ -75,18 +89,29 @@ def noisy(diffusion, gain=1):
 
 def test_noise_in_a_part_of_the_workspace_reaches_a_barrier():
     start = {"box": (-1, 1), "start": [0.0, 0.0], "dt": 0.1, "horizon": 1.0}
-    for diffusion in (sp.Max(x - 2, 0), sp.Piecewise((0, x < 50), (sigma, True)), sigma * sp.Heaviside(-x - 1)):
+    for diffusion in (
+        sp.Max(x - 2, 0),
+        sp.Piecewise((0, x < 50), (sigma, True)),
+        sigma * sp.Heaviside(-x - 1),
+    ):
         bridge = BrownianBridge(state_problem(noisy(diffusion), [5 - x, 5 - y], **start))
         assert bridge.reached == (True, False)
     bridge = BrownianBridge(state_problem(noisy(sp.Max(x - 2, 0)), 5 - x, **start))
     states, ends = (np.array([1.0, 3.0]), np.zeros(2)), np.array([[0.2], [0.2]])
-    # With h = 0.2 at both ends and E = 1 the smallest h is (0.4 - sqrt(2 s^2 dt))/2, s = max(x - 2, 0).
+    # With h = 0.2 at both ends and E = 1 the smallest h is (0.4 - sqrt(2 s^2 dt))/2, s = max(x - 2,
+    # 0).
     expected = [0.2, 0.5 * (0.4 - math.sqrt(2 * 0.1))]
-    np.testing.assert_allclose(bridge.lowest(states, ends, ends, np.ones((2, 1)))[:, 0], expected, rtol=1e-12)
+    np.testing.assert_allclose(
+        bridge.lowest(states, ends, ends, np.ones((2, 1)))[:, 0], expected, rtol=1e-12
+    )
 
 
 def test_an_input_that_counts_in_a_part_of_the_workspace_counts():
-    for gain in (sp.Max(x - 2, 0), sp.Piecewise((0, x < 50), (1, True)), sp.sqrt(2 - 2 * sp.cos(x)) - 2 * sp.sin(x / 2)):
+    for gain in (
+        sp.Max(x - 2, 0),
+        sp.Piecewise((0, x < 50), (1, True)),
+        sp.sqrt(2 - 2 * sp.cos(x)) - 2 * sp.sin(x / 2),
+    ):
         assert relative_degree(noisy(0, gain), 5 - x) == 1
     with pytest.raises(RelativeDegreeError):
         relative_degree(noisy(0, sp.Max(x, 0) + sp.Min(x, 0) - x), 5 - x)
@@ -99,7 +124,11 @@ def test_parameters_count_with_their_decimal_values():
 
 @pytest.mark.parametrize("edge", [2, 500])
 def test_a_rate_that_is_not_affine_beyond_some_input_is_refused(edge):
-    for bend in (sp.Max(u - edge, 0), sp.Piecewise((0, u < edge), (1, True)), sp.Abs(u + edge) - edge):
+    for bend in (
+        sp.Max(u - edge, 0),
+        sp.Piecewise((0, u < edge), (1, True)),
+        sp.Abs(u + edge) - edge,
+    ):
         with pytest.raises(SystemDefinitionError, match="not affine"):
             ControlAffineSDE.from_rate((x,), (u,), [u + bend])
     affine = ControlAffineSDE.from_rate((x,), (u,), [sp.Max(x, 0) * u + sp.Abs(x - edge) + 0.1 * u])

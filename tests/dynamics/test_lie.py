@@ -38,7 +38,13 @@ def in_fifty_digits(system, expression):
 def states_near_starts(problem, count=4):
     simulation = Simulation(problem, "floats")
     rng = np.random.default_rng(0)
-    return [[mpmath.mpf(c) for c in np.add(simulation.draw_start(rng), 0.3 * rng.normal(size=problem.plant.n))] for _ in range(count)]
+    return [
+        [
+            mpmath.mpf(c)
+            for c in np.add(simulation.draw_start(rng), 0.3 * rng.normal(size=problem.plant.n))
+        ]
+        for _ in range(count)
+    ]
 
 
 def moved(x, direction, step):
@@ -46,13 +52,18 @@ def moved(x, direction, step):
 
 
 def levels_of(problem, system):
-    """For each barrier, and each time that the generator is applied up to its degree: phi, its Lie derivatives and A phi."""
+    """For each barrier, and each time that the generator is applied up to its degree: phi, its Lie
+    derivatives and A phi."""
     for barrier in problem.barriers:
         phi = barrier.expression
         for _ in range(relative_degree(system, phi, generator)):
             generated = generator(system, phi)
             exact = [lie_derivative_f(system, phi), *lie_derivative_g(system, phi)]
-            yield in_fifty_digits(system, phi), [in_fifty_digits(system, e) for e in exact], in_fifty_digits(system, generated)
+            yield (
+                in_fifty_digits(system, phi),
+                [in_fifty_digits(system, e) for e in exact],
+                in_fifty_digits(system, generated),
+            )
             phi = generated
 
 
@@ -65,14 +76,24 @@ def test_derivatives_equal_finite_differences(env_id):
 
 def assert_derivatives(problem, system):
     step = mpmath.mpf("1e-12")
-    f, g, sigma = (in_fifty_digits(system, m) for m in (system.drift, system.input_matrix, system.diffusion))
+    f, g, sigma = (
+        in_fifty_digits(system, m) for m in (system.drift, system.input_matrix, system.diffusion)
+    )
     states = states_near_starts(problem)
-    directions = [[[values[:, j] for j in range(values.cols)] for values in (m(x) for m in (f, g, sigma))] for x in states]
+    directions = [
+        [[values[:, j] for j in range(values.cols)] for values in (m(x) for m in (f, g, sigma))]
+        for x in states
+    ]
     for (at, exact, generated), (x, (drift, effects, noises)) in itertools.product(
         levels_of(problem, system), zip(states, directions, strict=True)
     ):
-        slopes = [(at(moved(x, d, step)) - at(moved(x, d, -step))) / (2 * step) for d in (*drift, *effects)]
-        curvature = sum((at(moved(x, s, step)) - 2 * at(x) + at(moved(x, s, -step))) / step**2 for s in noises)
+        slopes = [
+            (at(moved(x, d, step)) - at(moved(x, d, -step))) / (2 * step)
+            for d in (*drift, *effects)
+        ]
+        curvature = sum(
+            (at(moved(x, s, step)) - 2 * at(x) + at(moved(x, s, -step))) / step**2 for s in noises
+        )
         for slope, derivative in zip(slopes, exact, strict=True):
             assert abs(slope - derivative(x)) < mpmath.mpf("1e-9") * (1 + abs(slope))
         a_phi = slopes[0] + curvature / 2
@@ -87,16 +108,26 @@ def correlated() -> ControlAffineSDE:
 
 
 def coin_tosses(system, phi, x, dt):
-    """Mean and mean square of the change of phi by x + f dt + sigma dW, where each dW is +sqrt(dt) or -sqrt(dt), over dt.
+    """Mean and mean square of the change of phi by x + f dt + sigma dW, where each dW is +sqrt(dt)
+    or -sqrt(dt), over dt.
 
     Tosses have the mean and the covariance of dW, which is all of it that counts as dt -> 0.
     """
-    f, sigma = in_fifty_digits(system, system.drift)(x), in_fifty_digits(system, system.diffusion)(x)
+    f, sigma = (
+        in_fifty_digits(system, system.drift)(x),
+        in_fifty_digits(system, system.diffusion)(x),
+    )
     changes = []
     for signs in itertools.product((-1, 1), repeat=system.diffusion.cols):
-        noise = [mpmath.sqrt(dt) * sum(s * sigma[i, j] for j, s in enumerate(signs)) for i in range(system.n)]
+        noise = [
+            mpmath.sqrt(dt) * sum(s * sigma[i, j] for j, s in enumerate(signs))
+            for i in range(system.n)
+        ]
         changes.append(phi([x[i] + f[i] * dt + noise[i] for i in range(system.n)]) - phi(x))
-    return sum(changes) / len(changes) / dt, sum(change**2 for change in changes) / len(changes) / dt
+    return (
+        sum(changes) / len(changes) / dt,
+        sum(change**2 for change in changes) / len(changes) / dt,
+    )
 
 
 def test_correlated_noise_enters_the_generator_and_the_spread():
@@ -106,7 +137,8 @@ def test_correlated_noise_enters_the_generator_and_the_spread():
     with mpmath.workdps(60):
         for _ in range(2):
             exact, generated, square = (
-                in_fifty_digits(system, e) for e in (phi, generator(system, phi), quadratic_variation_rate(system, phi))
+                in_fifty_digits(system, e)
+                for e in (phi, generator(system, phi), quadratic_variation_rate(system, phi))
             )
             for x in ([0.3, -1.2, 0.8], [1.7, 0.4, -0.6]):
                 x = [mpmath.mpf(entry) for entry in x]
@@ -119,7 +151,10 @@ def test_correlated_noise_enters_the_generator_and_the_spread():
 
 def test_a_quadratic_form_under_correlated_noise():
     # A x'Px = x'(F'P + PF)x + tr(P S S') for dx = Fx dt + S dW, and so on for the form of F'P + PF.
-    F, P = sp.Matrix([[1, 2, 0], [0, -1, 3], [1, 0, 2]]), sp.Matrix([[2, 1, -1], [1, 3, 2], [-1, 2, 1]])
+    F, P = (
+        sp.Matrix([[1, 2, 0], [0, -1, 3], [1, 0, 2]]),
+        sp.Matrix([[2, 1, -1], [1, 3, 2], [-1, 2, 1]]),
+    )
     S = sp.Matrix([[1, 2], [3, -1], [0, 4]])
     x = sp.Matrix(sp.symbols("x_1:4", real=True))
     system = ControlAffineSDE(tuple(x), (sp.Symbol("u", real=True),), list(F * x), [0, 0, 1], S)
@@ -129,7 +164,13 @@ def test_a_quadratic_form_under_correlated_noise():
         form = F.T * form + form * F
         phi = generator(system, phi)
         assert sp.expand(phi - (x.T * form * x)[0, 0] - constant) == 0
-    assert sp.expand(quadratic_variation_rate(system, (x.T * P * x)[0, 0]) - 4 * (x.T * P * S * S.T * P * x)[0, 0]) == 0
+    assert (
+        sp.expand(
+            quadratic_variation_rate(system, (x.T * P * x)[0, 0])
+            - 4 * (x.T * P * S * S.T * P * x)[0, 0]
+        )
+        == 0
+    )
 
 
 def test_relative_degrees_of_the_registered_systems(env_id):
@@ -159,12 +200,15 @@ def integrators(count, **changes):
 def test_degree_of_a_chain_of_integrators_is_its_length(count):
     system = integrators(count)
     assert relative_degree(system, system.states[0]) == count
-    assert relative_degree(system, system.states[0] ** 3 + sp.sin(system.states[0]), generator) == count
+    assert (
+        relative_degree(system, system.states[0] ** 3 + sp.sin(system.states[0]), generator)
+        == count
+    )
 
 
 def test_noise_can_lower_the_degree():
-    # dx_1 = x_3 dt + x_2 dW, dx_2 = u dt, dx_3 = x_1 dt: the input reaches x_1 through the size of its noise alone,
-    # A x_1^2 = 2 x_1 x_3 + x_2^2.
+    # dx_1 = x_3 dt + x_2 dW, dx_2 = u dt, dx_3 = x_1 dt: the input reaches x_1 through the size of
+    # its noise alone, A x_1^2 = 2 x_1 x_3 + x_2^2.
     x1, x2, x3, u = sp.symbols("x1 x2 x3 u", real=True)
     system = ControlAffineSDE((x1, x2, x3), (u,), [x3, 0, x1], [0, 1, 0], [x2, 0, 0])
     assert relative_degree(system, x1**2, generator) == 2
@@ -188,14 +232,18 @@ def test_input_that_never_appears_is_an_error():
 def test_cancelling_parameters_leave_no_false_degree():
     # In binary, .1 + .2 - .3 is not 0; the designer means that it is.
     x, y, u, a, b, c = sp.symbols("x y u a b c", real=True)
-    system = ControlAffineSDE((x, y), (u,), [y, 0], [a + b - c, 1], [0, 0], {a: 0.1, b: 0.2, c: 0.3})
+    system = ControlAffineSDE(
+        (x, y), (u,), [y, 0], [a + b - c, 1], [0, 0], {a: 0.1, b: 0.2, c: 0.3}
+    )
     assert relative_degree(system, x) == 2
     assert relative_degree(system.with_parameters(c=0.31), x) == 1
 
 
 def test_hidden_zero_is_seen_without_simplification():
     x, y, u = sp.symbols("x y u", real=True)
-    system = ControlAffineSDE((x, y), (u,), [y, 0], [sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, 1], [0, 0])
+    system = ControlAffineSDE(
+        (x, y), (u,), [y, 0], [sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, 1], [0, 0]
+    )
     assert relative_degree(system, x) == 2
 
 
@@ -224,7 +272,9 @@ def test_dubins_disk_as_printed():
     cos, sin = sp.cos(s["theta"]), sp.sin(s["theta"])
     assert same(system, lf, -2 * s["v"] * (s["x"] * cos + s["y"] * sin))
     assert same(system, lf2, -2 * s["v"] ** 2)
-    assert same(system, lie_derivative_g(system, lf)[0], -2 * s["v"] * (s["y"] * cos - s["x"] * sin))
+    assert same(
+        system, lie_derivative_g(system, lf)[0], -2 * s["v"] * (s["y"] * cos - s["x"] * sin)
+    )
 
 
 def test_moving_obstacle_keeps_the_velocity_that_the_print_forgets():
@@ -258,7 +308,9 @@ def test_pendulum_as_printed():
     system, h = problem.model, problem.barriers[0].expression
     th, om = system.states
     root = sp.sqrt(3)
-    lf = -(2 * root * th + 2 * om) * om - (2 * th + 2 * root * om) * sp.Rational(100, 7) * sp.sin(th)
+    lf = -(2 * root * th + 2 * om) * om - (2 * th + 2 * root * om) * sp.Rational(100, 7) * sp.sin(
+        th
+    )
     rows = [
         (lie_derivative_f(system, h), lf),
         (lie_derivative_g(system, h)[0], -(2 * th + 2 * root * om) / sp.Rational(49, 100)),
@@ -276,7 +328,11 @@ def test_cubic_generators():
     assert same(parabola.model, a_h, sp.Rational(6, 10) * x1 + x2 - 2 * x1**3 * x2 - (x2 / 10) ** 2)
     # The print has x1 x2 for 2 x1 x2, and sigma_2 twice.
     a_h = generator(disk.model, disk.barriers[0].expression)
-    assert same(disk.model, a_h, sp.Rational(12, 10) * x1**2 + 2 * x1 * x2 - 2 * x1**3 * x2 - sp.Rational(8, 100))
+    assert same(
+        disk.model,
+        a_h,
+        sp.Rational(12, 10) * x1**2 + 2 * x1 * x2 - 2 * x1**3 * x2 - sp.Rational(8, 100),
+    )
 
 
 def test_cruise_generators():
@@ -285,7 +341,9 @@ def test_cruise_generators():
     drag = s["f_0"] + s["f_1"] * s["x_1"] + s["f_2"] * s["x_1"] ** 2
     tau = sp.Rational(9, 5)
     h = problem.barriers[0].expression
-    assert same(system, sp.nsimplify(generator(system, h)), s["x_2"] - s["x_1"] + tau * drag / s["M"])
+    assert same(
+        system, sp.nsimplify(generator(system, h)), s["x_2"] - s["x_1"] + tau * drag / s["M"]
+    )
     assert same(system, sp.nsimplify(lie_derivative_g(system, h)[0]), -tau / s["M"])
     assert same(system, generator(system, h), lie_derivative_f(system, h))
 
@@ -298,7 +356,11 @@ def test_gap_generators_with_the_terms_of_the_print_corrected():
     s2 = s["sigma_2"]
     _, b1, b2 = derivatives(system, sp.nsimplify(problem.barriers[0].expression), 2, generator)
     assert same(system, b1, 5 * y**4 * d + 10 * s2**2 * y**3)
-    assert same(system, b2, 20 * y**3 * d**2 + 60 * s2**2 * y**2 * d + 5 * y**4 * drag / s["M"] + 30 * s2**4 * y)
+    assert same(
+        system,
+        b2,
+        20 * y**3 * d**2 + 60 * s2**2 * y**2 * d + 5 * y**4 * drag / s["M"] + 30 * s2**4 * y,
+    )
     assert same(system, lie_derivative_g(system, b1)[0], -5 * y**4 / s["M"])
 
 

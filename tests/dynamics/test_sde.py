@@ -40,7 +40,10 @@ def scalar(**changes):
         ({"drift": [y]}, "unknown symbol y"),
         ({"drift": [sp.Symbol("x")]}, "Symbol\\('x'\\)"),
         ({"parameters": {}}, "unknown symbol k"),
-        ({"states": (x, x), "drift": [k * x, 0], "input_matrix": [1, 0], "diffusion": [0, 0]}, "more than once"),
+        (
+            {"states": (x, x), "drift": [k * x, 0], "input_matrix": [1, 0], "diffusion": [0, 0]},
+            "more than once",
+        ),
         ({"inputs": (), "input_matrix": []}, "needs a state and an input"),
         ({"drift": "no matrix"}, "drift is no matrix"),
     ],
@@ -60,8 +63,20 @@ def test_parameters_are_finite_numbers(value):
 
 def test_a_diffusion_of_zeros_is_no_noise_however_they_are_written():
     x, u, sigma = sp.symbols("x u sigma", real=True)
-    for entry, parameters, noisy in ((0, {}, False), (0.0, {}, False), (sigma, {sigma: 0.0}, False), (sigma, {sigma: 0.1}, True)):
-        system = ControlAffineSDE(states=(x,), inputs=(u,), drift=[0], input_matrix=[1], diffusion=[[entry, 0.0]], parameters=parameters)
+    for entry, parameters, noisy in (
+        (0, {}, False),
+        (0.0, {}, False),
+        (sigma, {sigma: 0.0}, False),
+        (sigma, {sigma: 0.1}, True),
+    ):
+        system = ControlAffineSDE(
+            states=(x,),
+            inputs=(u,),
+            drift=[0],
+            input_matrix=[1],
+            diffusion=[[entry, 0.0]],
+            parameters=parameters,
+        )
         assert system.noisy == noisy
         assert Integrator(system, 0.1, 1, "floats").channels == noisy
 

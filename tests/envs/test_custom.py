@@ -44,7 +44,9 @@ def place(folder: Path, name: str = "problem", statement: str = STATEMENT) -> st
 def stated_here(*, edge: float = 1.0) -> SafetyProblem:
     x, u = sp.symbols("x u", real=True)
     system = safe_envs.ControlAffineSDE((x,), (u,), [x], [1], [0])
-    return state_problem(system, edge - x, box=(-5, 5), start=[0.2], dt=0.05, horizon=1.0, workspace={x: (-5, 5)})
+    return state_problem(
+        system, edge - x, box=(-5, 5), start=[0.2], dt=0.05, horizon=1.0, workspace={x: (-5, 5)}
+    )
 
 
 @pytest.fixture
@@ -65,7 +67,10 @@ def test_the_arguments_of_every_env_hold_for_it(tmp_path):
 
 def test_a_batch_follows_the_scalar_env(tmp_path):
     system = place(tmp_path, "ready")
-    env, envs = gym.make(CUSTOM_ID, system=system), gym.make_vec(CUSTOM_ID, num_envs=2, system=system)
+    env, envs = (
+        gym.make(CUSTOM_ID, system=system),
+        gym.make_vec(CUSTOM_ID, num_envs=2, system=system),
+    )
     env.reset(seed=3)
     envs.reset(seed=3)
     for _ in range(5):
@@ -86,14 +91,22 @@ def test_registered_by_its_place_or_its_function(tmp_path, my_id):
 def test_a_file_that_changed_is_read_anew(tmp_path):
     system = place(tmp_path)
     assert load_system(system)().horizon == 1.0
-    Path(system.rpartition(":")[0]).write_text(STATEMENT.replace("SIGN", "1").replace("horizon=1.0", "horizon=22.0"))
+    Path(system.rpartition(":")[0]).write_text(
+        STATEMENT.replace("SIGN", "1").replace("horizon=1.0", "horizon=22.0")
+    )
     assert load_system(system)().horizon == 22.0
 
 
 def test_modules_beside_the_file_can_be_imported(tmp_path):
     (tmp_path / "beside_it.py").write_text("EDGE = 1.5")
-    statement = "from beside_it import EDGE\n" + STATEMENT.replace("edge: float = 1.0", "edge: float = EDGE")
-    assert load_system(place(tmp_path, statement=statement))().barriers[0].expression.has(sp.Float(1.5))
+    statement = "from beside_it import EDGE\n" + STATEMENT.replace(
+        "edge: float = 1.0", "edge: float = EDGE"
+    )
+    assert (
+        load_system(place(tmp_path, statement=statement))()
+        .barriers[0]
+        .expression.has(sp.Float(1.5))
+    )
 
 
 @pytest.mark.parametrize(
@@ -119,7 +132,9 @@ def test_a_mistake_in_a_ready_problem_is_found(tmp_path):
         load_system(f"{path}:problem")()
 
 
-@pytest.mark.parametrize("given", [lambda: None, 3, "nowhere.py:problem", "no_such_module:problem", "no_colon"])
+@pytest.mark.parametrize(
+    "given", [lambda: None, 3, "nowhere.py:problem", "no_such_module:problem", "no_colon"]
+)
 def test_what_cannot_be_registered_is_refused(given, my_id):
     with pytest.raises(ConfigurationError):
         safe_envs.register(my_id, given)
@@ -136,7 +151,9 @@ def test_the_arguments_of_the_env_itself_reach_it(tmp_path):
     env = Custom(system, max_episode_steps=3)
     env.reset(seed=0)
     assert [env.step([0.0])[3] for _ in range(3)] == [False, False, True]
-    envs = gym.make_vec(CUSTOM_ID, num_envs=1, system=system, autoreset_mode="SameStep", horizon=0.1)
+    envs = gym.make_vec(
+        CUSTOM_ID, num_envs=1, system=system, autoreset_mode="SameStep", horizon=0.1
+    )
     envs.reset(seed=0)
     assert "final_info" not in envs.step([[0.0]])[4]
     assert "final_info" in envs.step([[0.0]])[4]
@@ -183,7 +200,9 @@ def test_neighbours_of_one_name_in_two_folders_are_told_apart(tmp_path):
 
 
 def test_an_error_of_ours_has_the_line_of_the_file(tmp_path):
-    (tmp_path / "own.py").write_text("import sympy as sp\nfrom safe_envs import Barrier\nBarrier('x')")
+    (tmp_path / "own.py").write_text(
+        "import sympy as sp\nfrom safe_envs import Barrier\nBarrier('x')"
+    )
     with pytest.raises(SystemDefinitionError, match=r"own.py in line 3: a barrier is a text"):
         load_system(f"{tmp_path / 'own.py'}:problem")
 
@@ -192,18 +211,34 @@ def test_ids_of_others_are_not_replaced(tmp_path, my_id):
     with pytest.raises(ConfigurationError, match="is taken"):
         safe_envs.register("Pendulum-v1", place(tmp_path))
     for edge in ("1.0", "2.0"):
-        safe_envs.register(my_id, place(tmp_path, statement=STATEMENT.replace("edge: float = 1.0", f"edge: float = {edge}")))
+        safe_envs.register(
+            my_id,
+            place(
+                tmp_path, statement=STATEMENT.replace("edge: float = 1.0", f"edge: float = {edge}")
+            ),
+        )
 
 
-@pytest.mark.parametrize("make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)])
-@pytest.mark.parametrize("arguments", [{}, {"system": ""}, {"system": None}, {"system": 3}, {"system": stated_here}])
+@pytest.mark.parametrize(
+    "make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)]
+)
+@pytest.mark.parametrize(
+    "arguments", [{}, {"system": ""}, {"system": None}, {"system": 3}, {"system": stated_here}]
+)
 def test_the_id_for_any_system_asks_for_one(make, arguments):
-    with pytest.raises(ConfigurationError, match=r"system = .*; give the place of its statement as a text, FILE.py:NAME"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"system = .*; give the place of its statement as a text, FILE.py:NAME",
+    ):
         make(CUSTOM_ID, **arguments)
 
 
-@pytest.mark.parametrize("make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)])
-@pytest.mark.parametrize("arguments", [{"barrier": 3}, {"plant": 3}, {"model": [("sigma", 1.0)]}, {"plant": {3: 4.0}}])
+@pytest.mark.parametrize(
+    "make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)]
+)
+@pytest.mark.parametrize(
+    "arguments", [{"barrier": 3}, {"plant": 3}, {"model": [("sigma", 1.0)]}, {"plant": {3: 4.0}}]
+)
 def test_dictionaries_are_asked_for(make, arguments):
     with pytest.raises(ConfigurationError, match="give a dictionary of names and values"):
         make("safe_envs/Scalar-v0", **arguments)

@@ -41,7 +41,11 @@ def test_specs_round_trip(env_id, wrapped):
         env = SafetyFilterWrapper(env, env.unwrapped.problem.filter, knowledge="plant")
     spec = env.spec
     assert spec is not None
-    for copy in (spec, gym.envs.registration.EnvSpec.from_json(spec.to_json()), pickle.loads(pickle.dumps(spec))):
+    for copy in (
+        spec,
+        gym.envs.registration.EnvSpec.from_json(spec.to_json()),
+        pickle.loads(pickle.dumps(spec)),
+    ):
         other = gym.make(copy)
         assert str(other) == str(env)
         assert other.unwrapped.problem == env.unwrapped.problem
@@ -82,7 +86,11 @@ def test_an_episode_lasts_for_the_horizon():
     assert ends == [False] * 24 + [True]
     shorter = gym.make("safe_envs/ACC-v0", max_episode_steps=3)
     shorter.reset(seed=0)
-    assert [shorter.step(np.zeros(1, dtype=np.float32))[3] for _ in range(3)] == [False, False, True]
+    assert [shorter.step(np.zeros(1, dtype=np.float32))[3] for _ in range(3)] == [
+        False,
+        False,
+        True,
+    ]
 
 
 def test_violation_costs_and_does_not_end_the_episode():
@@ -90,7 +98,12 @@ def test_violation_costs_and_does_not_end_the_episode():
     _, info = env.reset(seed=0)
     assert (info["cost"], info["violation"], info["episode_cost"]) == (0.0, False, 0.0)
     _, _, terminated, _, info = env.step(np.ones(1, dtype=np.float32))
-    assert (info["cost"], info["violation"], info["episode_cost"], terminated) == (1.0, True, 1.0, False)
+    assert (info["cost"], info["violation"], info["episode_cost"], terminated) == (
+        1.0,
+        True,
+        1.0,
+        False,
+    )
     assert info["barrier"].dtype == np.float64
     assert info["h_min"] == info["barrier"][0] < 0
     _, _, _, _, info = env.step(np.ones(1, dtype=np.float32))
@@ -138,7 +151,10 @@ def test_noise_zero_is_deterministic_and_noise_is_not():
 def test_plant_moves_and_model_does_not():
     for arguments, moves in (({"plant": {"v": 1.0}}, True), ({"model": {"v": 1.0}}, False)):
         states = []
-        for env in (gym.make("safe_envs/DubinsDisk-v0", start="thesis"), gym.make("safe_envs/DubinsDisk-v0", start="thesis", **arguments)):
+        for env in (
+            gym.make("safe_envs/DubinsDisk-v0", start="thesis"),
+            gym.make("safe_envs/DubinsDisk-v0", start="thesis", **arguments),
+        ):
             env.reset(seed=0)
             env.step(np.zeros(1, dtype=np.float32))
             states.append(env.unwrapped.state)
@@ -153,7 +169,9 @@ def test_actions_are_scaled_to_the_box_and_clipped():
     np.testing.assert_allclose(env.normalized_action(env.physical_action(np.array([0.3]))), [0.3])
 
 
-@pytest.mark.parametrize("action", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.zeros((1, 1)), 0.0])
+@pytest.mark.parametrize(
+    "action", [np.array([np.nan]), np.array([np.inf]), np.zeros(2), np.zeros((1, 1)), 0.0]
+)
 def test_actions_that_are_none_are_errors(action):
     env = gym.make("safe_envs/Scalar-v0")
     env.reset(seed=0)

@@ -33,7 +33,9 @@ def test_number_of_obstacles_is_respected(count):
 
 @pytest.mark.parametrize("count", [0, 21, -1, 2.0, True, "3", None])
 def test_number_of_obstacles_is_checked(count):
-    with pytest.raises(ConfigurationError, match=r"num_obstacles = .*; give a whole number from 1 to 20"):
+    with pytest.raises(
+        ConfigurationError, match=r"num_obstacles = .*; give a whole number from 1 to 20"
+    ):
         gym.make(FIELD, num_obstacles=count)
 
 
@@ -56,7 +58,9 @@ def test_derivative_of_each_barrier_contains_the_velocity_of_its_obstacle(speed)
         assert symbolic == pytest.approx(measured[i] + p * values[1][i], abs=1e-6)
 
 
-@pytest.mark.parametrize("arguments", [{"num_obstacles": 1}, {}, {"num_obstacles": 20}, {"radius": 1.5}])
+@pytest.mark.parametrize(
+    "arguments", [{"num_obstacles": 1}, {}, {"num_obstacles": 20}, {"radius": 1.5}]
+)
 def test_vehicle_starts_at_a_distance_from_every_obstacle(arguments):
     env = gym.make(FIELD, **arguments)
     r = arguments.get("radius", 0.4)
@@ -82,7 +86,9 @@ def test_tilt_barrier_is_the_cosine_from_the_thrust_to_the_vertical_less_its_lim
     problem = problem_of(LIMITS, tilt=0.3)
     h = problem.barriers[2].expression
     pushes = problem.plant.numeric(problem.plant.input_matrix[3:6, 0])
-    at, to_vertical = (sp.lambdify([problem.plant.states], e) for e in (h, pushes[2] / pushes.norm()))
+    at, to_vertical = (
+        sp.lambdify([problem.plant.states], e) for e in (h, pushes[2] / pushes.norm())
+    )
     rng = np.random.default_rng(0)
     for x in rng.uniform(-0.8, 0.8, (20, 12)):
         assert at(x) == pytest.approx(to_vertical(x) - math.cos(0.3))
@@ -116,13 +122,21 @@ def test_gains_may_be_given_for_each_barrier_or_for_all():
         replace(limits, gains=((1.0, 1.0), (1.0, 1.0)))
 
 
-@pytest.mark.parametrize("make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)])
+@pytest.mark.parametrize(
+    "make", [gym.make, lambda env_id, **arguments: gym.make_vec(env_id, num_envs=2, **arguments)]
+)
 @pytest.mark.parametrize(
     ("env_id", "arguments"),
-    [(FIELD, {"num_obstacles": 3, "radius": 0.3}), (LIMITS, {"ceiling": 6.5, "tilt": 0.4}), ("safe_envs/DubinsDisk-v0", {"radius": 2.0})],
+    [
+        (FIELD, {"num_obstacles": 3, "radius": 0.3}),
+        (LIMITS, {"ceiling": 6.5, "tilt": 0.4}),
+        ("safe_envs/DubinsDisk-v0", {"radius": 2.0}),
+    ],
 )
 def test_factory_arguments_may_stand_by_themselves_or_in_barrier(make, env_id, arguments):
-    by_itself, in_barrier = (make(env_id, **given).unwrapped.problem for given in (arguments, {"barrier": arguments}))
+    by_itself, in_barrier = (
+        make(env_id, **given).unwrapped.problem for given in (arguments, {"barrier": arguments})
+    )
     assert by_itself == in_barrier
     assert by_itself != make(env_id).unwrapped.problem
 
@@ -131,7 +145,10 @@ def test_factory_arguments_may_stand_by_themselves_or_in_barrier(make, env_id, a
     ("arguments", "message"),
     [
         ({"num_obstacle": 3}, "no argument 'num_obstacle'; did you mean 'num_obstacles'"),
-        ({"barrier": {"num_obstacle": 3}}, "no barrier argument 'num_obstacle'; did you mean 'num_obstacles'"),
+        (
+            {"barrier": {"num_obstacle": 3}},
+            "no barrier argument 'num_obstacle'; did you mean 'num_obstacles'",
+        ),
         ({"tilt": 0.2}, "no argument 'tilt'"),
     ],
 )

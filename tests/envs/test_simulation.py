@@ -26,7 +26,12 @@ def first(found: Any) -> Any:
 def act(env, action):
     """Step with the same action everywhere; the numbers of the first env."""
     _, reward, terminated, truncated, info = env.step(np.full(env.action_space.shape, action))
-    return first(reward), first(terminated), first(truncated), {key: first(info[key]) for key in ("violation", "cost", "episode_cost")}
+    return (
+        first(reward),
+        first(terminated),
+        first(truncated),
+        {key: first(info[key]) for key in ("violation", "cost", "episode_cost")},
+    )
 
 
 def walker(**changes):
@@ -67,7 +72,12 @@ def test_an_episode_lasts_to_the_horizon_at_most(make, most, steps):
 
 @both
 def test_actions_beyond_the_box_are_clipped_to_it(make):
-    for action, low, high in ((1e200, -1.0, 3.0), (-1e200, -1.0, 3.0), (7.0, -5.0, -4.0), (1.0 + 1e-9, 0.0, 1.0)):
+    for action, low, high in (
+        (1e200, -1.0, 3.0),
+        (-1e200, -1.0, 3.0),
+        (7.0, -5.0, -4.0),
+        (1.0 + 1e-9, 0.0, 1.0),
+    ):
         env = make(walker(box=(low, high), horizon=5.0))
         env.reset(seed=0)
         act(env, action)
@@ -78,8 +88,12 @@ def test_actions_beyond_the_box_are_clipped_to_it(make):
 
 def swinging(noise: float, substeps: int):
     """A stiff oscillator with noise that depends on its state and is shared by both states."""
-    system = ControlAffineSDE((x, v), (u,), [v, -30 * sp.sin(x)], [0, 1 + x**2], [[noise * v, noise], [noise, noise * x]])
-    return state_problem(system, 9 - x, box=(-2, 2), start=[0.4, -0.3], dt=0.2, horizon=2.0, substeps=substeps)
+    system = ControlAffineSDE(
+        (x, v), (u,), [v, -30 * sp.sin(x)], [0, 1 + x**2], [[noise * v, noise], [noise, noise * x]]
+    )
+    return state_problem(
+        system, 9 - x, box=(-2, 2), start=[0.4, -0.3], dt=0.2, horizon=2.0, substeps=substeps
+    )
 
 
 def rate(state, force):
@@ -121,7 +135,11 @@ def test_envs_take_the_substeps_of_their_problem_with_noise(make, substeps, monk
     env = make(swinging(0.3, substeps))
     env.reset(seed=0)
     row = drawn.ravel()
-    monkeypatch.setattr(env._noise, "next", lambda *_: row.tolist() if isinstance(env, SafeEnv) else np.array([row, row]).T)
+    monkeypatch.setattr(
+        env._noise,
+        "next",
+        lambda *_: row.tolist() if isinstance(env, SafeEnv) else np.array([row, row]).T,
+    )
     act(env, 0.5)
     expected = by_hand([0.4, -0.3], 1.0, 0.2, substeps, drawn, 0.3)
     np.testing.assert_allclose(np.reshape(env.state, (-1, 2))[0], expected, rtol=1e-12)
@@ -132,9 +150,15 @@ def test_a_control_period_of_shared_noise_is_that_of_euler_and_maruyama(flavour)
     problem, drawn = swinging(0.3, 4), np.random.default_rng(2).standard_normal((4, 2))
     integrator = Integrator(problem.plant, 0.2, 4, flavour)
     assert integrator.channels == 8
-    state, draws = ([0.4, -0.3], list(drawn.ravel())) if flavour == "floats" else (np.array([[0.4], [-0.3]]), drawn.reshape(8, 1))
+    state, draws = (
+        ([0.4, -0.3], list(drawn.ravel()))
+        if flavour == "floats"
+        else (np.array([[0.4], [-0.3]]), drawn.reshape(8, 1))
+    )
     found = integrator.step(tuple(state), [1.0] if flavour == "floats" else [np.ones(1)], draws)
-    np.testing.assert_allclose(np.ravel(found), by_hand([0.4, -0.3], 1.0, 0.2, 4, drawn, 0.3), rtol=1e-12)
+    np.testing.assert_allclose(
+        np.ravel(found), by_hand([0.4, -0.3], 1.0, 0.2, 4, drawn, 0.3), rtol=1e-12
+    )
 
 
 def forgetful():
@@ -149,13 +173,23 @@ def test_a_state_that_forgets_all_within_a_step_is_a_batch_like_others(make):
     env.reset(seed=0)
     for action in (0.5, -0.25):
         act(env, action)
-        np.testing.assert_allclose(np.reshape(env.state, (-1, 2)), [[0.0, 2 * action]] * (1 if isinstance(env, SafeEnv) else 2), atol=1e-20)
+        np.testing.assert_allclose(
+            np.reshape(env.state, (-1, 2)),
+            [[0.0, 2 * action]] * (1 if isinstance(env, SafeEnv) else 2),
+            atol=1e-20,
+        )
 
 
 def diverging(**changes):
     """x' = u beside v' = v^3, which is infinite after .5 s."""
     system = ControlAffineSDE((x, v), (u,), [0, v**3], [1, 0], [0, 0])
-    numbers: dict[str, Any] = {"box": (-1, 1), "start": [0.0, 1.0], "dt": 0.25, "horizon": 100.0, **changes}
+    numbers: dict[str, Any] = {
+        "box": (-1, 1),
+        "start": [0.0, 1.0],
+        "dt": 0.25,
+        "horizon": 100.0,
+        **changes,
+    }
     return state_problem(system, 1000 - x, **numbers)
 
 

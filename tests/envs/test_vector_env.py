@@ -1,4 +1,5 @@
-"""The native vector env does what Gymnasium's SyncVectorEnv over the scalar envs does, autoreset included."""
+"""The native vector env does what Gymnasium's SyncVectorEnv over the scalar envs does, autoreset
+included."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ def pair(env_id, mode, filtered, num_envs=NUM_ENVS, **arguments):
 
 
 def assert_same(ours, theirs, where):
-    """Compare arrays, or infos key by key; floats to rounding, since NumPy and `math` differ in the last bit of a sine."""
+    """Compare arrays, or infos key by key; floats to rounding, since NumPy and `math` differ in the
+    last bit of a sine."""
     if isinstance(theirs, dict):
         assert set(ours) == set(theirs), where
         for key in theirs:
@@ -74,14 +76,21 @@ def test_equals_sync_vector_env(env_id, mode, filtered):
         actions = rng.uniform(-1.0, 1.0, ours.action_space.shape).astype(np.float32)
         *mine, my_info = ours.step(actions)
         *other, other_info = theirs.step(actions)
-        for name, a, b in zip(("observation", "reward", "terminated", "truncated"), mine, other, strict=True):
+        for name, a, b in zip(
+            ("observation", "reward", "terminated", "truncated"), mine, other, strict=True
+        ):
             assert_same(a, b, f"step {step}: {name}")
-        assert_same(only_where_present(my_info), only_where_present(other_info), f"step {step}: info")
+        assert_same(
+            only_where_present(my_info), only_where_present(other_info), f"step {step}: info"
+        )
 
 
 def test_equals_sync_vector_env_when_episodes_end_at_different_steps():
-    # Random actions drive the scalar system out of its workspace at different times, so that noise streams drift apart.
-    ours, theirs = pair("safe_envs/Scalar-v0", AutoresetMode.NEXT_STEP, False, noise=0.5, horizon=1.7)
+    # Random actions drive the scalar system out of its workspace at different times, so that noise
+    # streams drift apart.
+    ours, theirs = pair(
+        "safe_envs/Scalar-v0", AutoresetMode.NEXT_STEP, False, noise=0.5, horizon=1.7
+    )
     assert_same(*[e.reset(seed=3)[0] for e in (ours, theirs)], "reset")
     ends = set()
     for step in range(600):
@@ -96,7 +105,9 @@ def test_equals_sync_vector_env_when_episodes_end_at_different_steps():
 
 @pytest.mark.parametrize("filtered", [False, True])
 def test_disabled_autoreset_waits_for_a_masked_reset(filtered):
-    ours, theirs = pair("safe_envs/StochasticDubins-v0", AutoresetMode.DISABLED, filtered, horizon=0.5)
+    ours, theirs = pair(
+        "safe_envs/StochasticDubins-v0", AutoresetMode.DISABLED, filtered, horizon=0.5
+    )
     for env in (ours, theirs):
         env.reset(seed=5)
     actions = np.full((NUM_ENVS, 1), 0.4, dtype=np.float32)
@@ -107,13 +118,21 @@ def test_disabled_autoreset_waits_for_a_masked_reset(filtered):
     with pytest.raises(gym.error.ResetNeeded):
         ours.step(actions)
     for mask in ([True, False, True, False, False], [False, True, False, True, True]):
-        results = [e.reset(seed=None, options={"reset_mask": np.array(mask)}) for e in (ours, theirs)]
+        results = [
+            e.reset(seed=None, options={"reset_mask": np.array(mask)}) for e in (ours, theirs)
+        ]
         assert_same(results[0][0], results[1][0], "masked reset")
-        assert_same(only_where_present(results[0][1]), only_where_present(results[1][1]), "masked reset info")
+        assert_same(
+            only_where_present(results[0][1]),
+            only_where_present(results[1][1]),
+            "masked reset info",
+        )
     for _ in range(9):
         mine, other = ours.step(actions), theirs.step(actions)
         assert_same(mine[0], other[0], "after the reset")
-        assert_same(only_where_present(mine[4]), only_where_present(other[4]), "info after the reset")
+        assert_same(
+            only_where_present(mine[4]), only_where_present(other[4]), "info after the reset"
+        )
 
 
 def test_trajectories_do_not_depend_on_the_size_of_the_batch(env_id):
@@ -131,19 +150,32 @@ def test_trajectories_do_not_depend_on_the_size_of_the_batch(env_id):
 
 
 def test_what_was_handed_out_does_not_change_afterwards():
-    env = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.2), "scbf")
-    handed_out = [env.reset(seed=0), *(env.step(np.full((3, 1), 0.9, dtype=np.float32)) for _ in range(12))]
-    again = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.2), "scbf")
+    env = SafetyFilterVectorWrapper(
+        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.2), "scbf"
+    )
+    handed_out = [
+        env.reset(seed=0),
+        *(env.step(np.full((3, 1), 0.9, dtype=np.float32)) for _ in range(12)),
+    ]
+    again = SafetyFilterVectorWrapper(
+        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.2), "scbf"
+    )
     for step in range(13):
-        fresh = again.reset(seed=0) if step == 0 else again.step(np.full((3, 1), 0.9, dtype=np.float32))
+        fresh = (
+            again.reset(seed=0) if step == 0 else again.step(np.full((3, 1), 0.9, dtype=np.float32))
+        )
         for old, new in zip(handed_out[step][:-1], fresh[:-1], strict=True):
             np.testing.assert_array_equal(old, new)
         assert_same(handed_out[step][-1], fresh[-1], f"info of step {step}")
 
 
 def test_what_a_user_writes_into_an_info_stays_there():
-    env = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3), "scbf")
-    again = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3), "scbf")
+    env = SafetyFilterVectorWrapper(
+        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3), "scbf"
+    )
+    again = SafetyFilterVectorWrapper(
+        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3), "scbf"
+    )
     env.reset(seed=0)
     again.reset(seed=0)
     for _ in range(3):
@@ -166,7 +198,10 @@ def test_seeds_may_be_a_list():
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [({"num_envs": 0}, "num_envs = 0"), ({"num_envs": 2, "autoreset_mode": "never"}, "autoreset_mode = 'never'")],
+    [
+        ({"num_envs": 0}, "num_envs = 0"),
+        ({"num_envs": 2, "autoreset_mode": "never"}, "autoreset_mode = 'never'"),
+    ],
 )
 def test_arguments_out_of_range_are_named(arguments, message):
     with pytest.raises(ConfigurationError, match=message):
@@ -184,7 +219,9 @@ def test_reset_masks_are_checked():
 
 
 def test_a_fixed_start_is_that_of_every_env_and_draws_nothing():
-    envs = SafeVectorEnv(problem_of("safe_envs/DubinsObstacle-v0", start=[2.0, 1.3, 0.3, 0.5, 1.0]), 3)
+    envs = SafeVectorEnv(
+        problem_of("safe_envs/DubinsObstacle-v0", start=[2.0, 1.3, 0.3, 0.5, 1.0]), 3
+    )
     envs.reset(seed=0)
     np.testing.assert_array_equal(envs.state, [[2.0, 1.3, 0.3, 0.5, 1.0]] * 3)
     before = [rng.bit_generator.state for rng in envs._rngs]

@@ -1,8 +1,10 @@
 #!/usr/bin/env python3
-"""Check that the tests notice wrong code: apply each mutant of `mutants.toml` to a copy of the project, and run tests that must fail.
+"""Check that the tests notice wrong code: apply each mutant of `mutants.toml` to a copy of the
+project, and run tests that must fail.
 
-A mutant names a file, a text that occurs in it once, the text that takes its place, and the tests that must notice. Exit status: 0
-where each mutant was killed, 1 where one survived or could not be applied, 2 where no mutant has a name that was given.
+A mutant names a file, a text that occurs in it once, the text that takes its place, and the tests
+that must notice. Exit status: 0 where each mutant was killed, 1 where one survived or could not be
+applied, 2 where no mutant has a name that was given.
 """
 
 from __future__ import annotations
@@ -47,7 +49,10 @@ class Mutant:
 def mutants() -> list[Mutant]:
     """Read the list, in order."""
     with (Path(__file__).parent / "mutants.toml").open("rb") as file:
-        return [Mutant(m["name"], m["file"], m["old"], m["new"], tuple(m["tests"])) for m in tomllib.load(file)["mutant"]]
+        return [
+            Mutant(m["name"], m["file"], m["old"], m["new"], tuple(m["tests"]))
+            for m in tomllib.load(file)["mutant"]
+        ]
 
 
 def verdict(mutant: Mutant, copy: Path) -> str:
@@ -64,7 +69,9 @@ def verdict(mutant: Mutant, copy: Path) -> str:
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-x", "-q", *mutant.tests]
     environment = {**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"}
     try:
-        status = subprocess.run(command, cwd=copy, env=environment, capture_output=True, timeout=_SECONDS, check=False).returncode
+        status = subprocess.run(
+            command, cwd=copy, env=environment, capture_output=True, timeout=_SECONDS, check=False
+        ).returncode
     except subprocess.TimeoutExpired:
         return f"no answer in {_SECONDS} s"
     finally:
@@ -74,7 +81,9 @@ def verdict(mutant: Mutant, copy: Path) -> str:
 
 def copies(folder: Path, count: int) -> SimpleQueue[Path]:
     """Make copies of the files that git knows, as they are in the working tree."""
-    known = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    known = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout
     ready: SimpleQueue[Path] = SimpleQueue()
     for i in range(count):
         for name in filter(None, known.split("\0")):
@@ -109,10 +118,16 @@ def run(chosen: Sequence[Mutant], jobs: int) -> bool:
 def main() -> int:
     """Read the command line, run, and return the exit status."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("words", nargs="*", help="run the mutants whose name holds one of these words; all by default")
+    parser.add_argument(
+        "words",
+        nargs="*",
+        help="run the mutants whose name holds one of these words; all by default",
+    )
     parser.add_argument("--jobs", type=int, default=2, help="processes at a time (default: 2)")
     given = parser.parse_args()
-    chosen = [m for m in mutants() if not given.words or any(word in m.name for word in given.words)]
+    chosen = [
+        m for m in mutants() if not given.words or any(word in m.name for word in given.words)
+    ]
     if not chosen:
         print(f"no mutant's name holds {', '.join(given.words)}", file=sys.stderr)
         return 2

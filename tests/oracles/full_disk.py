@@ -8,7 +8,8 @@ from contextlib import contextmanager
 
 @contextmanager
 def no_file_larger_than(size):
-    """Let the operating system take no more bytes than these of any file of this process, and of those that it starts."""
+    """Let the operating system take no more bytes than these of any file of this process, and of
+    those that it starts."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:

@@ -17,10 +17,13 @@ def one(a, b, v, low=LOW, high=HIGH, w=(1.0, 1.0), priority=None):
 
 
 def many(a, b, v, low, high, w, priority):
-    """Solve a (N, k, 2), b (N, k), and v, low, high, w (N, 2) in one batch, and check that the floats give the same bits."""
+    """Solve a (N, k, 2), b (N, k), and v, low, high, w (N, 2) in one batch, and check that the
+    floats give the same bits."""
     k = b.shape[1]
     rows = [[a[:, i, j] for j in (0, 1)] for i in range(k)]
-    *parts, feasible = project_arrays(rows, list(b.T), list(v.T), list(low.T), list(high.T), list(w.T), priority)
+    *parts, feasible = project_arrays(
+        rows, list(b.T), list(v.T), list(low.T), list(high.T), list(w.T), priority
+    )
     u, margin, active = [np.array(part).T for part in parts]
     for i in range(len(b)):
         found = project_floats(*[part[i].tolist() for part in (a, b, v, low, high, w)], priority)
@@ -44,17 +47,27 @@ def with_faces(a, b, low, high):
 
 
 def nearest_oracle(a, b, v, low, high, w):
-    """Of v, its foot on each line and all crossings, the nearest that meets the rows and the box; NaN if none does."""
+    """Of v, its foot on each line and all crossings, the nearest that meets the rows and the box;
+    NaN if none does."""
     a, b = with_faces(a, b, low, high)
     with np.errstate(all="ignore"):
         lines = a / w[:, None, :]
         feet = v[:, None, :] - ((dot(a, v) + b) / (a * lines).sum(axis=2))[:, :, None] * lines
         i, j = np.array(list(itertools.combinations(range(b.shape[1]), 2))).T
         cross = a[:, i, 0] * a[:, j, 1] - a[:, i, 1] * a[:, j, 0]
-        crossings = np.stack([b[:, j] * a[:, i, 1] - b[:, i] * a[:, j, 1], b[:, i] * a[:, j, 0] - b[:, j] * a[:, i, 0]], axis=2)
+        crossings = np.stack(
+            [
+                b[:, j] * a[:, i, 1] - b[:, i] * a[:, j, 1],
+                b[:, i] * a[:, j, 0] - b[:, j] * a[:, i, 0],
+            ],
+            axis=2,
+        )
         points = np.concatenate([v[:, None, :], feet, crossings / cross[:, :, None]], axis=1)
         value = np.einsum("nij,npj->npi", a, points) + b[:, None, :]
-        size = np.einsum("nij,npj->npi", np.abs(a), np.abs(points) + np.abs(v)[:, None, :]) + np.abs(b)[:, None, :]
+        size = (
+            np.einsum("nij,npj->npi", np.abs(a), np.abs(points) + np.abs(v)[:, None, :])
+            + np.abs(b)[:, None, :]
+        )
         met = np.all(value >= -1e-11 * size, axis=2)
         cost = np.where(met, (w[:, None, :] * (points - v[:, None, :]) ** 2).sum(axis=2), np.inf)
     best = np.nanargmin(cost, axis=1)
@@ -63,7 +76,8 @@ def nearest_oracle(a, b, v, low, high, w):
 
 
 def least_sum_oracle(a, b, low, high, priority):
-    """The least sum over the minimisers of every violated set on the inside, the edges and the corners of the box, shape (N,)."""
+    """The least sum over the minimisers of every violated set on the inside, the edges and the
+    corners of the box, shape (N,)."""
     best = np.full(len(b), np.inf)
     units = np.sqrt(priority)
     for chosen in itertools.product((0.0, 1.0), repeat=b.shape[1]):
@@ -74,13 +88,21 @@ def least_sum_oracle(a, b, low, high, priority):
             rest = offsets + dot(rows, u)
             free = rows * ~fixed
             u = u - np.einsum("nji,ni->nj", np.linalg.pinv(free), rest)
-            u = np.where(np.all((u >= low - 1e-12) & (u <= high + 1e-12), axis=1)[:, None], np.clip(u, low, high), np.nan)
+            u = np.where(
+                np.all((u >= low - 1e-12) & (u <= high + 1e-12), axis=1)[:, None],
+                np.clip(u, low, high),
+                np.nan,
+            )
             best = np.fmin(best, (priority * np.minimum(dot(a, u) + b, 0.0) ** 2).sum(axis=1))
     return best
 
 
 def random_batch(rng, size, k, kind):
-    a, b, v = rng.normal(size=(size, k, 2)), rng.normal(size=(size, k)) * 0.7, rng.normal(size=(size, 2)) * 2
+    a, b, v = (
+        rng.normal(size=(size, k, 2)),
+        rng.normal(size=(size, k)) * 0.7,
+        rng.normal(size=(size, 2)) * 2,
+    )
     low, high = np.tile(LOW, (size, 1)), np.tile(HIGH, (size, 1))
     w = 10.0 ** rng.uniform(-1, 1, (size, 2))
     if kind == "sizes":
@@ -90,13 +112,21 @@ def random_batch(rng, size, k, kind):
         a[rng.random((size, k, 2)) < 0.4] = 0.0
     if kind == "integers":  # crossings, duplicates, opposite rows and corners that coincide exactly
         a, b = rng.integers(-2, 3, (size, k, 2)) * 1.0, rng.integers(-2, 3, (size, k)) * 1.0
-        v, low, high, w = rng.integers(-3, 4, (size, 2)) * 1.0, -np.ones((size, 2)), np.ones((size, 2)), np.ones((size, 2))
+        v, low, high, w = (
+            rng.integers(-3, 4, (size, 2)) * 1.0,
+            -np.ones((size, 2)),
+            np.ones((size, 2)),
+            np.ones((size, 2)),
+        )
     if kind == "thousands":
         a[:, :, 0] /= 5000.0
         low[:, 0], high[:, 0], v[:, 0] = -5000.0, 5000.0, v[:, 0] * 5000.0
         w[:, 1] = 10.0 ** rng.uniform(-4, 8, size)
     if kind == "endless":
-        low, high = -(10.0 ** rng.choice([8, 100], (size, 2))), 10.0 ** rng.choice([8, 100], (size, 2))
+        low, high = (
+            -(10.0 ** rng.choice([8, 100], (size, 2))),
+            10.0 ** rng.choice([8, 100], (size, 2)),
+        )
         low[rng.random((size, 2)) < 0.3] = 0.0
     if kind == "far":
         v *= 10.0 ** rng.uniform(0, 6, (size, 1))

@@ -1,4 +1,5 @@
-"""The nearest least-violating action in rational arithmetic, proved by its optimality conditions, for any number of inputs."""
+"""The nearest least-violating action in rational arithmetic, proved by its optimality conditions,
+for any number of inputs."""
 
 from __future__ import annotations
 
@@ -8,7 +9,8 @@ import numpy as np
 
 
 def eliminated(matrix, right):
-    """A solution of a consistent linear system, with zeros for what it leaves open; None if there is none. Rational Gauss-Jordan."""
+    """A solution of a consistent linear system, with zeros for what it leaves open; None if there
+    is none. Rational Gauss-Jordan."""
     table = [[*row, value] for row, value in zip(matrix, right, strict=True)]
     count = len(matrix[0]) if matrix else 0
     pivots = []
@@ -38,16 +40,28 @@ def dot(a, u):
 
 
 def nearest_of_least_violating(a, b, v, low, high, w, priority, near):
-    """The exact answer (m Fractions) and whether the rows can be met; None where the search from `near` does not end.
+    """The exact answer (m Fractions) and whether the rows can be met; None where the search from
+    `near` does not end.
 
-    `near` is an approximate answer, from which the sets of missed and binding rows and of held inputs are guessed. The guess is
-    changed until every condition of optimality holds exactly, so that it has no part in what is returned.
+    `near` is an approximate answer, from which the sets of missed and binding rows and of held
+    inputs are guessed. The guess is changed until every condition of optimality holds exactly, so
+    that it has no part in what is returned.
     """
     a = [[Fraction(x) for x in row] for row in a]
-    b, v, low, high, w, priority = [[Fraction(float(x)) for x in part] for part in (b, v, low, high, w, priority)]
+    b, v, low, high, w, priority = [
+        [Fraction(float(x)) for x in part] for part in (b, v, low, high, w, priority)
+    ]
     m, k = len(v), len(b)
     margin = np.array([float(dot(a[i], map(Fraction, map(float, near))) + b[i]) for i in range(k)])
-    terms = np.array([float(sum(abs(x) * abs(Fraction(float(y))) for x, y in zip(a[i], near, strict=True)) + abs(b[i])) for i in range(k)])
+    terms = np.array(
+        [
+            float(
+                sum(abs(x) * abs(Fraction(float(y))) for x, y in zip(a[i], near, strict=True))
+                + abs(b[i])
+            )
+            for i in range(k)
+        ]
+    )
     for doubt in (1e-9, 1e-12, 1e-6, 1e-14):
         missed = {i for i in range(k) if margin[i] < -doubt * terms[i]}
         binding = {i for i in range(k) if abs(margin[i]) <= doubt * terms[i] and any(a[i])}
@@ -68,18 +82,25 @@ def nearest_of_least_violating(a, b, v, low, high, w, priority, near):
 def _proved(a, b, v, low, high, w, priority, missed, binding, held):
     m, k = len(v), len(b)
     seen = set()
-    while (state := (frozenset(missed), frozenset(binding), frozenset(held.items()))) not in seen and len(seen) < 60:
+    while (
+        state := (frozenset(missed), frozenset(binding), frozenset(held.items()))
+    ) not in seen and len(seen) < 60:
         seen.add(state)
         free = [j for j in range(m) if j not in held]
         rows, walls = sorted(missed), sorted(binding)
         fixed = {j: low[j] if side < 0 else high[j] for j, side in held.items()}
-        # Least squares over the missed rows, with the binding ones as equations: a point that has the right slacks.
+        # Least squares over the missed rows, with the binding ones as equations: a point that has
+        # the right slacks.
         offset = [b[i] + sum((a[i][j] * fixed[j] for j in held), Fraction(0)) for i in range(k)]
         normal = [
-            [sum((priority[i] * a[i][p] * a[i][q] for i in rows), Fraction(0)) for q in free] + [a[i][p] for i in walls] for p in free
+            [sum((priority[i] * a[i][p] * a[i][q] for i in rows), Fraction(0)) for q in free]
+            + [a[i][p] for i in walls]
+            for p in free
         ]
         normal += [[a[i][q] for q in free] + [Fraction(0)] * len(walls) for i in walls]
-        right = [-sum((priority[i] * a[i][p] * offset[i] for i in rows), Fraction(0)) for p in free] + [-offset[i] for i in walls]
+        right = [
+            -sum((priority[i] * a[i][p] * offset[i] for i in rows), Fraction(0)) for p in free
+        ] + [-offset[i] for i in walls]
         point = eliminated(normal, right) if normal else []
         if point is None:
             binding.discard(walls[0])
@@ -88,9 +109,14 @@ def _proved(a, b, v, low, high, w, priority, missed, binding, held):
         slack = {i: -(dot(a[i], [at[j] for j in range(m)]) + b[i]) for i in rows}
         # The nearest point with these slacks.
         equations = rows + walls
-        kkt = [[w[p] if p == q else Fraction(0) for q in free] + [-a[i][p] for i in equations] for p in free]
+        kkt = [
+            [w[p] if p == q else Fraction(0) for q in free] + [-a[i][p] for i in equations]
+            for p in free
+        ]
         kkt += [[a[i][q] for q in free] + [Fraction(0)] * len(equations) for i in equations]
-        right = [w[p] * v[p] for p in free] + [-offset[i] - slack.get(i, Fraction(0)) for i in equations]
+        right = [w[p] * v[p] for p in free] + [
+            -offset[i] - slack.get(i, Fraction(0)) for i in equations
+        ]
         solution = eliminated(kkt, right) if kkt else []
         if solution is None:
             return None
@@ -103,7 +129,11 @@ def _proved(a, b, v, low, high, w, priority, missed, binding, held):
             return u, not slack
         where, what = change
         if where == "held":
-            held.pop(what) if what in held else held.update({what: -1 if u[what] < low[what] else 1})
+            (
+                held.pop(what)
+                if what in held
+                else held.update({what: -1 if u[what] < low[what] else 1})
+            )
         else:
             {"missed": missed, "binding": binding}[where].symmetric_difference_update({what})
             if where == "missed":
@@ -112,7 +142,8 @@ def _proved(a, b, v, low, high, w, priority, missed, binding, held):
 
 
 def _wrong(a, v, low, high, w, priority, u, margin, slack, pull, missed, binding, held):
-    """The first condition of optimality that does not hold, as the set to change and its member; None if all do."""
+    """The first condition of optimality that does not hold, as the set to change and its member;
+    None if all do."""
     for j, uj in enumerate(u):
         if not low[j] <= uj <= high[j]:
             return "held", j

@@ -1,4 +1,5 @@
-"""Problems of one's own: what is left out gets what suits, and mistakes are found before the first step."""
+"""Problems of one's own: what is left out gets what suits, and mistakes are found before the first
+step."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ from safe_envs import (
 from safe_envs.problem.validation import require_sound
 
 x, v, u, w, k, sigma = sp.symbols("x v u w k sigma", real=True)
-SYSTEM = ControlAffineSDE.from_rate((x, v), (u,), [v, k * u - x], diffusion=[0, sigma], parameters={k: 2.0, sigma: 0.1})
+SYSTEM = ControlAffineSDE.from_rate(
+    (x, v), (u,), [v, k * u - x], diffusion=[0, sigma], parameters={k: 2.0, sigma: 0.1}
+)
 NUMBERS = {"box": (-5.0, 5.0), "start": [(-0.5, 0.5), 0.0], "dt": 0.05, "horizon": 2.0}
 
 
@@ -68,7 +71,9 @@ def test_scalar_and_vector_envs_agree():
 
 
 def test_from_rate_takes_a_rate_apart():
-    system = ControlAffineSDE.from_rate((x, v), (u, w), [v + w, sp.cos(x) * (u + 3) - (x + u) ** 2 + u**2 + 2 * x * u])
+    system = ControlAffineSDE.from_rate(
+        (x, v), (u, w), [v + w, sp.cos(x) * (u + 3) - (x + u) ** 2 + u**2 + 2 * x * u]
+    )
     assert system.drift.equals(sp.Matrix([v, 3 * sp.cos(x) - x**2]))
     assert system.input_matrix.equals(sp.Matrix([[0, 1], [sp.cos(x), 0]]))
     assert not any(system.diffusion)
@@ -84,13 +89,21 @@ def test_from_rate_takes_a_rate_apart():
         ({"barriers": 1 - w**2}, SystemDefinitionError, "unknown symbol w"),
         ({"barriers": 1 - sp.sqrt(x - 5)}, SystemDefinitionError, "no finite value at the start"),
         ({"workspace": {x: (2.0, 3.0)}}, SystemDefinitionError, "outside the workspace"),
-        ({"barriers": [x - 0.1, -0.2 - x]}, SystemDefinitionError, "no start is safe for all barriers at once"),
+        (
+            {"barriers": [x - 0.1, -0.2 - x]},
+            SystemDefinitionError,
+            "no start is safe for all barriers at once",
+        ),
         ({"barriers": []}, SystemDefinitionError, "barriers is empty"),
         ({"barriers": 1 - x**2 > 0}, SystemDefinitionError, "give the expression itself"),
         ({"barriers": "1 - x**2"}, SystemDefinitionError, "give a sympy expression"),
         ({"barriers": 1 - sp.Abs(x)}, SystemDefinitionError, "has kinks and relative degree 2"),
         ({"nominal": lambda state: -state}, SystemDefinitionError, "nominal is a function"),
-        ({"nominal": sp.log(x - 5)}, SystemDefinitionError, "the nominal controller has no finite value"),
+        (
+            {"nominal": sp.log(x - 5)},
+            SystemDefinitionError,
+            "the nominal controller has no finite value",
+        ),
         ({"gains": (1.0,)}, SystemDefinitionError, "its relative degree is 2"),
         ({"gains": (1.0, -1.0)}, SystemDefinitionError, "as many positive numbers"),
         ({"gains": 2.0}, ConfigurationError, "give a tuple of rates"),
@@ -163,14 +176,26 @@ def test_what_other_units_would_explain_is_doubtful(change, says):
 
 
 def test_what_is_sound_is_not_doubted():
-    stated(system=ControlAffineSDE.from_rate((x, v), (u,), [v, u - 1000]), box=(990.0, 1010.0), workspace={v: (-50.0, 50.0)})
+    stated(
+        system=ControlAffineSDE.from_rate((x, v), (u,), [v, u - 1000]),
+        box=(990.0, 1010.0),
+        workspace={v: (-50.0, 50.0)},
+    )
     by_the_noise_alone = ControlAffineSDE((x, v), (u,), [-x, 0], [0, 1], [v, 0])
     assert len(stated(by_the_noise_alone).gains) == 2
 
 
 def test_starts_are_in_the_workspace_and_where_the_system_has_a_value():
     system = ControlAffineSDE.from_rate((x,), (u,), [sp.sqrt(x) + u])
-    problem = state_problem(system, x - 0.1, box=(-5, 5), start=[(-0.5, 2.0)], dt=0.1, horizon=1.0, workspace={x: (0.5, 3.0)})
+    problem = state_problem(
+        system,
+        x - 0.1,
+        box=(-5, 5),
+        start=[(-0.5, 2.0)],
+        dt=0.1,
+        horizon=1.0,
+        workspace={x: (0.5, 3.0)},
+    )
     envs = SafeVectorEnv(problem, 100)
     envs.reset(seed=0)
     assert envs.components[0].min() >= 0.5
@@ -179,7 +204,9 @@ def test_starts_are_in_the_workspace_and_where_the_system_has_a_value():
 
 def test_arrays_are_taken_for_start_and_box():
     assert stated(start=np.array([0.1, 0.0]), box=np.array([-5.0, 5.0])).box == ((-5.0, 5.0),)
-    assert stated(start=np.array([[-0.1, 0.1], [0.0, 0.0]]), box=np.array([[-5.0, 5.0]])).box == ((-5.0, 5.0),)
+    assert stated(start=np.array([[-0.1, 0.1], [0.0, 0.0]]), box=np.array([[-5.0, 5.0]])).box == (
+        (-5.0, 5.0),
+    )
 
 
 def test_a_missing_parameter_and_a_symbol_of_other_assumptions_are_told_apart():
@@ -191,8 +218,12 @@ def test_a_missing_parameter_and_a_symbol_of_other_assumptions_are_told_apart():
 
 def test_what_is_given_is_what_the_problem_has():
     model = SYSTEM.with_parameters(k=1.5)
-    noise_in_drift = ControlAffineSDE((x, v), (u,), [v, sigma], [0, 1], [0, k * sigma], {k: 2.0, sigma: 0.1})
-    problem = stated(model=model, units={x: "m", u: "N"}, reward=3 - v, filter="scbf", gains=(3.0, 4.0))
+    noise_in_drift = ControlAffineSDE(
+        (x, v), (u,), [v, sigma], [0, 1], [0, k * sigma], {k: 2.0, sigma: 0.1}
+    )
+    problem = stated(
+        model=model, units={x: "m", u: "N"}, reward=3 - v, filter="scbf", gains=(3.0, 4.0)
+    )
     assert problem.model == model
     assert [s.unit for s in (*problem.states, *problem.inputs)] == ["m", "", "N"]
     assert (problem.reward, problem.filter, problem.gains) == (3 - v, "scbf", (3.0, 4.0))
@@ -211,7 +242,16 @@ def test_gains_of_each_barrier_are_its_own():
 
 
 def test_boxes_without_zero_and_several_inputs_are_weighed_rightly():
-    # Only u near 9 or above keeps the state: |u| alone would say that the box holds twice what is needed.
+    # Only u near 9 or above keeps the state: |u| alone would say that the box holds twice what is
+    # needed.
     drift = ControlAffineSDE.from_rate((x,), (u, w), [u + w - 4000])
     with pytest.warns(SystemDefinitionWarning, match="the inputs make up 10"):
-        state_problem(drift, x + 1, box=[(-30.0, 4.0), (-30.0, 6.0)], start=[0.0], dt=0.01, horizon=1.0, nominal=[0, 0])
+        state_problem(
+            drift,
+            x + 1,
+            box=[(-30.0, 4.0), (-30.0, 6.0)],
+            start=[0.0],
+            dt=0.01,
+            horizon=1.0,
+            nominal=[0, 0],
+        )

@@ -36,18 +36,24 @@ def test_what_is_given_is_kept():
 
 
 def test_an_angle_is_explored_over_a_whole_turn():
-    found = SamplingDomain().completed((x, theta), ((-1.0, 3.0), (-math.inf, math.inf)), (False, True), ((-1.0, 1.0),))
+    found = SamplingDomain().completed(
+        (x, theta), ((-1.0, 3.0), (-math.inf, math.inf)), (False, True), ((-1.0, 1.0),)
+    )
     assert found.region == ((-1.0, 3.0), (-math.pi, math.pi))
     assert found.coordinates == (x, sp.cos(theta), sp.sin(theta))
 
 
 def test_only_unbounded_radians_are_angles():
     x_1, x_2 = DISK.plant.states
-    turning = bare(states=(Variable(x_1, -1.0, 1.0, "rad"), Variable(x_2, -math.inf, math.inf, "rad")))
+    turning = bare(
+        states=(Variable(x_1, -1.0, 1.0, "rad"), Variable(x_2, -math.inf, math.inf, "rad"))
+    )
     assert turning.exploration.region == ((-1.0, 1.0), (-math.pi, math.pi))
     assert turning.exploration.coordinates == (x_1, sp.cos(x_2), sp.sin(x_2))
     with pytest.raises(SystemDefinitionError, match=r"cannot explore x_2 in \[-inf, inf\]"):
-        _ = bare(states=(Variable(x_1, -1.0, 1.0), Variable(x_2, -math.inf, math.inf, "m"))).exploration
+        _ = bare(
+            states=(Variable(x_1, -1.0, 1.0), Variable(x_2, -math.inf, math.inf, "m"))
+        ).exploration
     with pytest.raises(SystemDefinitionError, match=r"cannot explore x_2 in \[0\.0, inf\]"):
         _ = bare(states=(Variable(x_1, -1.0, 1.0), Variable(x_2, 0.0, math.inf, "rad"))).exploration
 
@@ -62,7 +68,10 @@ def test_each_input_goes_halfway_with_the_others_at_the_centre():
     [
         (SamplingDomain(region=((0.0, 1.0),)), "has 1 ranges for 2 states"),
         (SamplingDomain(region=((0.0, 1.0),) * 3), "has 3 ranges for 2 states"),
-        (SamplingDomain(region=((0.0, math.inf), (0.0, 1.0))), r"cannot explore x_1 in \[0\.0, inf\]; give SamplingDomain\(region"),
+        (
+            SamplingDomain(region=((0.0, math.inf), (0.0, 1.0))),
+            r"cannot explore x_1 in \[0\.0, inf\]; give SamplingDomain\(region",
+        ),
         (SamplingDomain(region=((0.0, 1.0), (math.nan, 1.0))), "cannot explore x_2"),
         (SamplingDomain(region=((0.0, 1.0), (1.0, 1.0))), r"cannot explore x_2 in \[1\.0, 1\.0\]"),
         (SamplingDomain(inputs=((1.0, 2.0),)), "an input of an exploration needs 1 finite numbers"),
@@ -81,4 +90,6 @@ def test_every_problem_can_be_explored(env_id):
     assert len(exploration.region) == len(problem.states)
     low, high = np.array(problem.box).T
     assert all(((low <= u) & (u <= high)).all() for u in np.array(exploration.inputs))
-    assert set().union(*(c.free_symbols for c in exploration.coordinates)) <= set(problem.plant.states)
+    assert set().union(*(c.free_symbols for c in exploration.coordinates)) <= set(
+        problem.plant.states
+    )

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import ConfigurationError, ControlAffineSDE, SafeEnv, SafeVectorEnv, SystemDefinitionError, state_problem
+from safe_envs import (
+    ConfigurationError,
+    ControlAffineSDE,
+    SafeEnv,
+    SafeVectorEnv,
+    SystemDefinitionError,
+    state_problem,
+)
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import TIME, Feature
 from safe_envs.wrappers import SafetyFilter
@@ -14,18 +21,26 @@ from safe_envs.wrappers import SafetyFilter
 x, v, u, k, sigma = sp.symbols("x v u k sigma", real=True)
 
 
-@pytest.mark.parametrize("assumptions", [{}, {"positive": True}, {"integer": True}, {"commutative": False}])
+@pytest.mark.parametrize(
+    "assumptions", [{}, {"positive": True}, {"integer": True}, {"commutative": False}]
+)
 def test_states_and_inputs_are_symbols_declared_real_and_nothing_more(assumptions):
     y = sp.Symbol("y", **assumptions)
     for state, force in ((y, u), (x, y)):
-        with pytest.raises(SystemDefinitionError, match=r"y is declared .*sympy.symbols\('y', real=True\)"):
+        with pytest.raises(
+            SystemDefinitionError, match=r"y is declared .*sympy.symbols\('y', real=True\)"
+        ):
             ControlAffineSDE((state,), (force,), [0], [1], [0])
         with pytest.raises(SystemDefinitionError, match="y is declared"):
             ControlAffineSDE.from_rate([state], [force], [force])
 
 
 def test_parameters_are_what_their_symbols_are_declared():
-    plain, positive, whole = sp.Symbol("a"), sp.Symbol("b", positive=True), sp.Symbol("c", integer=True)
+    plain, positive, whole = (
+        sp.Symbol("a"),
+        sp.Symbol("b", positive=True),
+        sp.Symbol("c", integer=True),
+    )
     with pytest.raises(SystemDefinitionError, match="a is declared nothing"):
         ControlAffineSDE((x,), (u,), [plain * x], [1], [0], {plain: 1.0})
     for symbol, good, bad in ((positive, 0.5, -0.5), (positive, 2, 0.0), (whole, 3.0, 2.5)):
@@ -38,14 +53,18 @@ def test_parameters_are_what_their_symbols_are_declared():
 
 def test_a_root_of_a_square_is_the_size_of_a_real_state():
     system = ControlAffineSDE.from_rate((x,), (u,), [u])
-    problem = state_problem(system, 1 - sp.sqrt(x**2), box=(-1, 1), start=[-0.5], dt=0.1, horizon=1.0)
+    problem = state_problem(
+        system, 1 - sp.sqrt(x**2), box=(-1, 1), start=[-0.5], dt=0.1, horizon=1.0
+    )
     assert problem.barriers[0].expression == 1 - sp.Abs(x)
 
 
 @pytest.mark.parametrize("name", ["t", "sin", "x_{1}", "_c0"])
 def test_names_of_states_are_free(name):
     def episode(state, force, rate):
-        system = ControlAffineSDE((state, v), (force,), [sp.sin(v) * rate, 0], [0, 1], [0, sigma], {rate: 2.0, sigma: 0.3})
+        system = ControlAffineSDE(
+            (state, v), (force,), [sp.sin(v) * rate, 0], [0, 1], [0, sigma], {rate: 2.0, sigma: 0.3}
+        )
         problem = state_problem(
             system, 1 - state**2 - sp.sin(state) ** 2, box=(-1, 1), start=[0.1, 0.2], dt=0.1, horizon=1.0, nominal=-state,
             reward=state * force * sp.cos(TIME),
@@ -59,7 +78,11 @@ def test_names_of_states_are_free(name):
         return [*one[0], one[1], *many[0][0], many[1][0], *filtered.action, *filtered.barrier]
 
     plain = episode(x, u, k)
-    for symbols in ((sp.Symbol(name, real=True), u, k), (x, sp.Symbol(name, real=True), k), (x, u, sp.Symbol(name, real=True))):
+    for symbols in (
+        (sp.Symbol(name, real=True), u, k),
+        (x, sp.Symbol(name, real=True), k),
+        (x, u, sp.Symbol(name, real=True)),
+    ):
         assert episode(*symbols) == pytest.approx(plain, rel=1e-12)
 
 
@@ -77,8 +100,12 @@ def test_a_barrier_with_kinks_under_noise_is_stated_and_refused_where_ito_is_nee
 
 def test_a_symbol_of_the_nominal_controller_means_one_thing():
     for names in (("x", "x"), ("x", "k")):
-        features = tuple(Feature(name, state, -5.0, 5.0) for name, state in zip(names, (x, v), strict=True))
-        with pytest.raises(SystemDefinitionError, match=f"named twice, or like a parameter: {names[1]}"):
+        features = tuple(
+            Feature(name, state, -5.0, 5.0) for name, state in zip(names, (x, v), strict=True)
+        )
+        with pytest.raises(
+            SystemDefinitionError, match=f"named twice, or like a parameter: {names[1]}"
+        ):
             state_problem(
                 ControlAffineSDE((x, v), (u,), [v, -k * x], [0, 1], [0, 0], {k: 2.0}), 1 - x**2,
                 box=(-5, 5), start=[0.0, 0.0], dt=0.05, horizon=1.0, features=features, nominal=0,

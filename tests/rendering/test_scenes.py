@@ -15,7 +15,10 @@ def test_the_disk_is_to_scale():
     from safe_envs.rendering.frame import Picture
 
     for radius in (1.0, 2.5):
-        env = SafeEnv(problem_of("safe_envs/DubinsDisk-v0", radius=radius, start=[0.0, 0.0, 1.0]), render_mode="rgb_array")
+        env = SafeEnv(
+            problem_of("safe_envs/DubinsDisk-v0", radius=radius, start=[0.0, 0.0, 1.0]),
+            render_mode="rgb_array",
+        )
         env.reset(seed=0)
         frame = env.render()
         picture = Picture(env.problem)
@@ -24,7 +27,9 @@ def test_the_disk_is_to_scale():
         for angle in (0.3, 2.0, 4.0):
             x, y = axes.place(radius * np.cos(angle), radius * np.sin(angle))
             around = frame[int(y) - 1 : int(y) + 2, int(x) - 1 : int(x) + 2]
-            assert (np.abs(around.astype(int) - style.EDGE).sum(axis=-1) < 60).any(), "the edge is not where h = 0"
+            assert (np.abs(around.astype(int) - style.EDGE).sum(axis=-1) < 60).any(), (
+                "the edge is not where h = 0"
+            )
             for share, safe in ((0.97, True), (1.03, False)):
                 x, y = axes.place(share * radius * np.cos(angle), share * radius * np.sin(angle))
                 pixel = frame[int(y), int(x)].astype(int)
@@ -44,7 +49,9 @@ def test_obstacles_and_goal_are_to_scale():
     column = frame[int(y) - 3 : int(y) + 4, int(x)].astype(int)
     assert (np.abs(column - style.VIOLATION).sum(axis=-1) < 60).any()
     x, y = axes.place(3.0, 1.5 - 0.3)
-    assert (np.abs(frame[int(y) - 3 : int(y) + 4, int(x)].astype(int) - style.GOAL).sum(axis=-1) < 60).any()
+    assert (
+        np.abs(frame[int(y) - 3 : int(y) + 4, int(x)].astype(int) - style.GOAL).sum(axis=-1) < 60
+    ).any()
 
 
 def test_required_gap_is_where_the_barrier_vanishes():
@@ -90,7 +97,10 @@ def test_any_problem_is_drawn(plane):
 def test_states_without_bounds_are_drawn(plane):
     p, v, c = own_problem().plant.states
     states = tuple(Variable(s, -np.inf, np.inf) for s in (p, v, c))
-    env = SafeEnv(own_problem(plane=plane, states=states, features=(Feature("p", p, -1.0, 1.0),)), render_mode="rgb_array")
+    env = SafeEnv(
+        own_problem(plane=plane, states=states, features=(Feature("p", p, -1.0, 1.0),)),
+        render_mode="rgb_array",
+    )
     env.reset(seed=0)
     before = env.render()
     assert (stepped(env, 30, 1.0).render()[:, SCENE] != before[:, SCENE]).any()
@@ -116,7 +126,9 @@ def test_the_view_grows_with_the_trail():
 def four_states(**changes) -> SafetyProblem:
     """A cart with a pole, without a workspace, whose barriers vanish at other scales than 1."""
     x, v, theta, rate, force = sp.symbols("x v theta rate force", real=True)
-    system = ControlAffineSDE((x, v, theta, rate), (force,), [v, 0, rate, 9 * theta], [0, 1, 0, -1], [0, 0, 0, 0])
+    system = ControlAffineSDE(
+        (x, v, theta, rate), (force,), [v, 0, rate, 9 * theta], [0, 1, 0, -1], [0, 0, 0, 0]
+    )
     given = {
         "plant": system,
         "model": system,
@@ -188,7 +200,9 @@ def test_the_name_of_the_smallest_barrier_is_apart_from_its_value(monkeypatch):
     (name,) = (box for text, box in boxes.items() if text == "smallest: capacity")
     for text, (left, top, width) in boxes.items():
         if text.startswith(("now", "least")) or text in ("0 s", "2 s"):
-            assert abs(top - name[1]) > 15 or left + width < name[0] or left > name[0] + name[2], text
+            assert abs(top - name[1]) > 15 or left + width < name[0] or left > name[0] + name[2], (
+                text
+            )
 
 
 def test_an_obstacle_is_outlined_where_the_first_violation_was():
@@ -206,7 +220,9 @@ def test_an_obstacle_is_outlined_where_the_first_violation_was():
         axes = next(iter(env.viewer._picture._scene._plane._views))
         x, y = axes.place(state[3] - 0.7, state[4])
         around = frame[int(y) - 1 : int(y) + 2, int(x) - 3 : int(x) + 4].astype(int)
-        return (np.abs(around - style.mix(style.VIOLATION, style.PAPER, 0.6)).sum(axis=-1) < 90).any()
+        return (
+            np.abs(around - style.mix(style.VIOLATION, style.PAPER, 0.6)).sum(axis=-1) < 90
+        ).any()
 
     hit = np.array(state)
     hit[:2] = state[3:5] + 0.1

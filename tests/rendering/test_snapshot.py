@@ -24,7 +24,8 @@ def test_a_restored_snapshot_is_what_is_drawn():
 
 
 def histories(monkeypatch, kept: int, count: int):
-    """A history that keeps few states of an episode whose smallest barrier is that of its second state."""
+    """A history that keeps few states of an episode whose smallest barrier is that of its second
+    state."""
     from safe_envs.rendering import snapshot
 
     monkeypatch.setattr(snapshot, "_KEPT", kept)
@@ -61,7 +62,9 @@ def test_the_panel_says_the_least_of_the_whole_episode(monkeypatch):
     from safe_envs.rendering import snapshot
 
     monkeypatch.setattr(snapshot, "_KEPT", 4)
-    env = SafeEnv(problem_of("safe_envs/Scalar-v0", noise=1.0, start=[0.9]), render_mode="rgb_array")
+    env = SafeEnv(
+        problem_of("safe_envs/Scalar-v0", noise=1.0, start=[0.9]), render_mode="rgb_array"
+    )
     env.reset(seed=0)
     for _ in range(40):
         *_, info = env.step([-1.0])
@@ -108,7 +111,9 @@ def test_numbers_have_three_digits_that_count(value, scale, text):
 
 
 def test_trails_of_endless_episodes_are_bounded():
-    env = SafeEnv(problem_of("safe_envs/Scalar-v0", noise=0.0, start=[0.0]), render_mode="rgb_array")
+    env = SafeEnv(
+        problem_of("safe_envs/Scalar-v0", noise=0.0, start=[0.0]), render_mode="rgb_array"
+    )
     env.reset(seed=0)
     for _ in range(12_000):
         env.step([0.0])
@@ -123,7 +128,13 @@ def test_an_env_without_a_limit_of_time_has_no_horizon(monkeypatch, limited):
     bare = gym.make("Pendulum-v1", render_mode="rgb_array")
     theta, rate, torque = sp.symbols("theta rate torque", real=True)
     model = ControlAffineSDE((theta, rate), (torque,), [rate, 15 * sp.sin(theta)], [0, 3], [0, 0])
-    env = SafetyFilterWrapper(bare if limited else bare.unwrapped, "cbf", model=model, barriers=4 - rate, state_fn=lambda seen: seen[:2])
+    env = SafetyFilterWrapper(
+        bare if limited else bare.unwrapped,
+        "cbf",
+        model=model,
+        barriers=4 - rate,
+        state_fn=lambda seen: seen[:2],
+    )
     env.reset(seed=0)
     env.step([0.0])
     texts = written(monkeypatch)

@@ -23,9 +23,15 @@ def frames_in(path) -> list[np.ndarray]:
     return [np.frombuffer(frame, dtype=np.uint8).reshape(height, width, 3) for frame in reader]
 
 
-@pytest.mark.filterwarnings("ignore::SyntaxWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning")
+@pytest.mark.filterwarnings(
+    "ignore::SyntaxWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning"
+)
 def test_gymnasium_records_a_video(tmp_path):
-    env = RecordVideo(SafetyFilterWrapper(gym.make(DUBINS, render_mode="rgb_array"), "scbf"), str(tmp_path / "videos"), video_length=4)
+    env = RecordVideo(
+        SafetyFilterWrapper(gym.make(DUBINS, render_mode="rgb_array"), "scbf"),
+        str(tmp_path / "videos"),
+        video_length=4,
+    )
     stepped(env, 4)
     env.close()
     (video,) = (tmp_path / "videos").glob("*.mp4")
@@ -34,7 +40,9 @@ def test_gymnasium_records_a_video(tmp_path):
     assert frames[0].shape == (540, 960, 3)
 
 
-@pytest.mark.filterwarnings("ignore::SyntaxWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning")
+@pytest.mark.filterwarnings(
+    "ignore::SyntaxWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning"
+)
 def test_stable_baselines3_records_a_video(tmp_path):
     envs = make_sb3_env(DUBINS, 2, "scbf", render_mode="rgb_array", seed=0)
     recorder = VecVideoRecorder(envs, str(tmp_path), lambda _: True, video_length=3)

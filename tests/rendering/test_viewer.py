@@ -25,9 +25,15 @@ def test_every_env_is_drawn(env_id):
     assert first.flags.writeable
     env = stepped(env)
     second = env.render()
-    assert (first[:, SCENE] != second[:, SCENE]).any(), "the scene does not show that the state has moved"
-    assert (first[:, PANEL] != second[:, PANEL]).any(), "the panel does not show that time has passed"
-    np.testing.assert_array_equal(stepped(SafeEnv(problem_of(env_id), render_mode="rgb_array")).render(), second)
+    assert (first[:, SCENE] != second[:, SCENE]).any(), (
+        "the scene does not show that the state has moved"
+    )
+    assert (first[:, PANEL] != second[:, PANEL]).any(), (
+        "the panel does not show that time has passed"
+    )
+    np.testing.assert_array_equal(
+        stepped(SafeEnv(problem_of(env_id), render_mode="rgb_array")).render(), second
+    )
     # An episode that begins has neither a trail nor a past of h.
     env.reset(seed=1)
     np.testing.assert_array_equal(env.render(), first)
@@ -51,7 +57,9 @@ def test_a_vector_env_draws_what_the_scalar_one_draws(env_id):
 
 def test_a_reset_in_the_step_leaves_no_trace():
     problem = problem_of(DUBINS, horizon=0.1)
-    envs = SafetyFilterVectorWrapper(SafeVectorEnv(problem, 1, "SameStep", render_mode="rgb_array"), "scbf")
+    envs = SafetyFilterVectorWrapper(
+        SafeVectorEnv(problem, 1, "SameStep", render_mode="rgb_array"), "scbf"
+    )
     envs.reset(seed=0)
     for _ in range(2):
         envs.step(np.ones((1, 1), dtype=np.float32))
@@ -65,7 +73,9 @@ def test_a_reset_in_the_step_leaves_no_trace():
 
 
 def test_warning_colors_say_what_the_filter_does():
-    env = SafetyFilterWrapper(gym.make(DUBINS, render_mode="rgb_array", start=[2.5, 0.0, 0.0]), "scbf")
+    env = SafetyFilterWrapper(
+        gym.make(DUBINS, render_mode="rgb_array", start=[2.5, 0.0, 0.0]), "scbf"
+    )
     env.reset(seed=0)
     assert shown(env.render(), style.INTERVENING) == 0
     seen = set()
@@ -73,11 +83,19 @@ def test_warning_colors_say_what_the_filter_does():
         _, _, _, _, info = env.step(np.zeros(1, dtype=np.float32))
         frame = env.render()
         status = frame[FILTER_STATUS]
-        expected = style.INFEASIBLE if not info["feasible"] else style.INTERVENING if info["intervention"] else None
+        expected = (
+            style.INFEASIBLE
+            if not info["feasible"]
+            else style.INTERVENING
+            if info["intervention"]
+            else None
+        )
         for color in (style.INFEASIBLE, style.INTERVENING):
             assert (shown(status, color) > 1000) == (color == expected)
         if expected is not None:
-            assert shown(frame[:148, PANEL], expected) < shown(frame[:, PANEL], expected), "the bar of the action has another colour"
+            assert shown(frame[:148, PANEL], expected) < shown(frame[:, PANEL], expected), (
+                "the bar of the action has another colour"
+            )
         assert (shown(frame[SAFETY_STATUS], style.VIOLATION) > 1000) == info["violation"]
         seen.add(expected)
     assert style.INTERVENING in seen
@@ -112,7 +130,10 @@ def test_no_mode_draws_nothing(env_id):
 
 
 def test_there_is_nothing_to_draw_before_a_reset():
-    for env in (SafeEnv(problem_of(DUBINS), render_mode="rgb_array"), SafeVectorEnv(problem_of(DUBINS), 2, render_mode="rgb_array")):
+    for env in (
+        SafeEnv(problem_of(DUBINS), render_mode="rgb_array"),
+        SafeVectorEnv(problem_of(DUBINS), 2, render_mode="rgb_array"),
+    ):
         with pytest.raises(gym.error.ResetNeeded):
             env.render()
 
@@ -120,18 +141,30 @@ def test_there_is_nothing_to_draw_before_a_reset():
 def test_a_filter_over_another_env_is_shown_beside_its_picture():
     theta, rate, torque = sp.symbols("theta rate torque", real=True)
     view = {
-        "model": ControlAffineSDE((theta, rate), (torque,), [rate, 15 * sp.sin(theta)], [0, 3], [0, 0]),
+        "model": ControlAffineSDE(
+            (theta, rate), (torque,), [rate, 15 * sp.sin(theta)], [0, 3], [0, 0]
+        ),
         "barriers": 4 - rate**2 + 30 * (1 - sp.cos(theta)),
-        "state_fn": lambda seen: np.stack([np.arctan2(seen[..., 1], seen[..., 0]), seen[..., 2]], axis=-1),
+        "state_fn": lambda seen: np.stack(
+            [np.arctan2(seen[..., 1], seen[..., 0]), seen[..., 2]], axis=-1
+        ),
     }
-    env = SafetyFilterWrapper(gym.make("Pendulum-v1", render_mode="rgb_array"), "cbf:alpha=2:sampling_margin=15", **view)
+    env = SafetyFilterWrapper(
+        gym.make("Pendulum-v1", render_mode="rgb_array"), "cbf:alpha=2:sampling_margin=15", **view
+    )
     env.reset(seed=1)
     frames, colors = [], set()
     for _ in range(60):
         *_, info = env.step([2.0])
         frames.append(env.render())
         assert frames[-1].shape == (540, 960, 3)
-        color = style.INFEASIBLE if not info["feasible"] else style.INTERVENING if info["intervention"] else None
+        color = (
+            style.INFEASIBLE
+            if not info["feasible"]
+            else style.INTERVENING
+            if info["intervention"]
+            else None
+        )
         colors.add(color)
         assert color is None or shown(frames[-1][FILTER_STATUS], color)
     assert colors >= {None, style.INTERVENING}

@@ -26,7 +26,10 @@ def no_display(monkeypatch):
 @pytest.mark.usefixtures("no_display")
 def test_the_checker_accepts_both_modes(env_id):
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message=".*(Box action space|observation space (min|max)imum|not having a spec).*")
+        warnings.filterwarnings(
+            "ignore",
+            message=".*(Box action space|observation space (min|max)imum|not having a spec).*",
+        )
         check_env(gym.make(env_id, dt=0.01, horizon=0.1).unwrapped, skip_close_check=True)
 
 
@@ -57,7 +60,10 @@ def test_the_window_follows_the_steps():
 def test_each_env_has_a_window_of_its_own():
     import pygame
 
-    first, second = (stepped(gym.make(DUBINS, render_mode="human", dt=0.001, start=start), 1) for start in ([0.0] * 3, [3.0] * 3))
+    first, second = (
+        stepped(gym.make(DUBINS, render_mode="human", dt=0.001, start=start), 1)
+        for start in ([0.0] * 3, [3.0] * 3)
+    )
     assert (on_screen(first) != on_screen(second)).any()
     first.close()
     stepped(second, 1)
@@ -144,7 +150,9 @@ def test_a_window_for_a_batch_is_refused():
 def test_missing_pygame_says_what_to_install(monkeypatch):
     env = stepped(SafeEnv(problem_of(DUBINS), render_mode="rgb_array"), 1)
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(gym.error.DependencyNotInstalled, match=r'pip install "safe-envs\[render\]"'):
+    with pytest.raises(
+        gym.error.DependencyNotInstalled, match=r'pip install "safe-envs\[render\]"'
+    ):
         env.render()
 
 
@@ -153,5 +161,8 @@ def test_the_other_pygame_is_refused(monkeypatch):
 
     monkeypatch.delattr(pygame.draw, "aacircle")
     env = stepped(SafeEnv(problem_of(DUBINS), render_mode="rgb_array"), 1)
-    with pytest.raises(gym.error.DependencyNotInstalled, match=r'pip uninstall pygame.*pip install "safe-envs\[render\]"'):
+    with pytest.raises(
+        gym.error.DependencyNotInstalled,
+        match=r'pip uninstall pygame.*pip install "safe-envs\[render\]"',
+    ):
         env.render()

@@ -12,7 +12,8 @@ from tests.wrappers.verification.verified import hurry
 
 @pytest.fixture
 def safe_envs_command(monkeypatch, capsys, tmp_path):
-    """Runs the command in this process, in an empty folder; returns its exit status and what it printed."""
+    """Runs the command in this process, in an empty folder; returns its exit status and what it
+    printed."""
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments):

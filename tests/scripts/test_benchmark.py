@@ -25,7 +25,11 @@ def quick(monkeypatch):
     monkeypatch.setattr(benchmark, "_ROUNDS", 1)
     monkeypatch.setattr(benchmark, "_SECONDS_PER_ROUND", 1e-4)
     monkeypatch.setattr(sb3_speed, "speeds", partial(sb3_speed.speeds, steps=5, rounds=1))
-    few = {"learned-hocbf": {"states": 200, "epochs": 2}, "ddscbf": {"points": 30, "repetitions": 20}, "bayesian": {"starts": 50}}
+    few = {
+        "learned-hocbf": {"states": 200, "epochs": 2},
+        "ddscbf": {"points": 30, "repetitions": 20},
+        "bayesian": {"starts": 50},
+    }
     learned = {
         name: (env_id, method, {**few[method], **{k: v for k, v in settings.items() if k == "way"}})
         for name, (env_id, method, settings) in benchmark._LEARNED.items()
@@ -42,9 +46,13 @@ def test_figures_are_finite_and_positive_and_ratios_fit(quick):
     for batch in (1, 32, 1024, 10_000):
         assert sum(name.startswith(f"filter call, {batch} state") for name in figures) == 1
     step, vector = "env.step, {}", "vector env, {}"
-    assert figures["filtered / bare env.step"] == pytest.approx(figures[step.format("filtered")] / figures[step.format("bare")])
+    assert figures["filtered / bare env.step"] == pytest.approx(
+        figures[step.format("filtered")] / figures[step.format("bare")]
+    )
     for name in ("bare", "filtered"):
-        assert figures[f"vector env, {name}, million steps a second"] == pytest.approx(1 / figures[vector.format(name)])
+        assert figures[f"vector env, {name}, million steps a second"] == pytest.approx(
+            1 / figures[vector.format(name)]
+        )
     assert figures["speed of the filtered vector env / fused loop"] == pytest.approx(
         figures["hand-fused loop"] / figures[vector.format("filtered")]
     )
@@ -64,7 +72,11 @@ def test_earlier_figures_stand_beside_with_their_ratio(monkeypatch, tmp_path, ca
     earlier.write_text('{"filter call, 1 state": 4.0, "hand-fused loop": 0.1}')
     monkeypatch.setattr(benchmark, "measure", lambda: {"filter call, 1 state": 5.0, "new": 0.5})
     benchmark.benchmark(compare=earlier)
-    lines = {line.rsplit("  ")[0].strip(): line.split()[-3:] for line in capsys.readouterr().out.splitlines() if line.strip()}
+    lines = {
+        line.rsplit("  ")[0].strip(): line.split()[-3:]
+        for line in capsys.readouterr().out.splitlines()
+        if line.strip()
+    }
     rows = [cells for name, cells in lines.items() if name.startswith(("filter call", "new"))]
     assert rows == [["5", "4", "1.25"], ["0.5", "-", "-"]]
 
@@ -84,7 +96,9 @@ def test_the_fused_loop_does_the_work_of_the_filter():
     step()
     env = gym.make("safe_envs/StochasticDubins-v0").unwrapped
     turned = (cells["theta"].cell_contents - before[:, 2]) / env.problem.dt
-    result = SafetyFilterWrapper(env, "scbf").safety_filter.filter(before, np.full((len(before), 1), 3.0))
+    result = SafetyFilterWrapper(env, "scbf").safety_filter.filter(
+        before, np.full((len(before), 1), 3.0)
+    )
     np.testing.assert_allclose(turned, result.action[:, 0], rtol=1e-9, atol=1e-9)
     assert result.active.any()
     assert not result.active.all()
@@ -98,7 +112,9 @@ def test_page_faults_are_those_of_fresh_memory():
         pytest.skip("this system does not count page faults")
     kept = np.zeros(1 << 20)
     (reused,) = benchmark._page_faults(benchmark.Case(lambda: kept.fill(1.0), calls=50)).values()
-    (fresh,) = benchmark._page_faults(benchmark.Case(lambda: mmap.mmap(-1, 1 << 24).write(bytes(1 << 24)), calls=5)).values()
+    (fresh,) = benchmark._page_faults(
+        benchmark.Case(lambda: mmap.mmap(-1, 1 << 24).write(bytes(1 << 24)), calls=5)
+    ).values()
     assert reused < 1
     # 16 MiB at a time, in pages of at most 2 MiB.
     assert fresh >= 8

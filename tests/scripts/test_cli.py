@@ -26,7 +26,9 @@ QUICK = ("--episodes", "8", "--horizon", "0.3")
 
 def without_speed(text):
     """A printed table without its last column."""
-    return [line.rpartition("  ")[0].rstrip() for line in text.splitlines() if line and "─" not in line]
+    return [
+        line.rpartition("  ")[0].rstrip() for line in text.splitlines() if line and "─" not in line
+    ]
 
 
 def test_list_shows_every_id(safe_envs_command):
@@ -46,7 +48,13 @@ def test_help_names_the_commands(safe_envs_command):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["evalute"], ["evaluate"], ["evaluate", DUBINS, "--episodes", "many"], ["evaluate", DUBINS, "--nois", "1"]]
+    "arguments",
+    [
+        ["evalute"],
+        ["evaluate"],
+        ["evaluate", DUBINS, "--episodes", "many"],
+        ["evaluate", DUBINS, "--nois", "1"],
+    ],
 )
 def test_usage_errors_end_with_status_2_too(safe_envs_command, arguments):
     status, out, err = safe_envs_command(*arguments)
@@ -67,10 +75,13 @@ def test_other_commands_check_their_paths_before_they_begin(safe_envs_command, c
 
 
 def run_at_a_terminal(*command):
-    """Run a process whose standard error is a terminal; return its status, its output and what the terminal shows."""
+    """Run a process whose standard error is a terminal; return its status, its output and what the
+    terminal shows."""
     master, slave = pty.openpty()
     environment = {**os.environ, "TERM": "xterm"}
-    process = subprocess.Popen([*map(str, command)], stdout=subprocess.PIPE, stderr=slave, text=True, env=environment)
+    process = subprocess.Popen(
+        [*map(str, command)], stdout=subprocess.PIPE, stderr=slave, text=True, env=environment
+    )
     os.close(slave)
     shown = b""
     with suppress(OSError):  # the terminal ends with the process
@@ -82,9 +93,13 @@ def run_at_a_terminal(*command):
 
 
 @pytest.mark.slow
-def test_the_script_gives_the_same_as_the_command_and_a_terminal_gets_a_progress_bar(safe_envs_command, tmp_path):
+def test_the_script_gives_the_same_as_the_command_and_a_terminal_gets_a_progress_bar(
+    safe_envs_command, tmp_path
+):
     arguments = ["Scalar-v0", "--filter", "none", "--filter", "cbf", *QUICK, "--json"]
-    status, out, shown = run_at_a_terminal(sys.executable, ROOT / "scripts" / "evaluate.py", *arguments, tmp_path / "script.json")
+    status, out, shown = run_at_a_terminal(
+        sys.executable, ROOT / "scripts" / "evaluate.py", *arguments, tmp_path / "script.json"
+    )
     assert status == 0, shown
     assert "Evaluating" in shown
     assert "%" in shown

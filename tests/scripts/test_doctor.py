@@ -29,15 +29,31 @@ def test_a_sound_installation_is_sound(safe_envs_command, quick):
     assert document["healthy"]
     assert document["safe-envs"] == safe_envs.__version__
     checks = document["checks"]
-    assert {"gymnasium", "torch", "proxsuite", "python"} <= {check["name"] for check in checks["packages"]}
-    assert [check["name"] for check in checks["solvers"]] == [program.name for program in doctor.PROGRAMS]
-    assert [check["name"] for check in checks["envs"]] == ["safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0"]
+    assert {"gymnasium", "torch", "proxsuite", "python"} <= {
+        check["name"] for check in checks["packages"]
+    }
+    assert [check["name"] for check in checks["solvers"]] == [
+        program.name for program in doctor.PROGRAMS
+    ]
+    assert [check["name"] for check in checks["envs"]] == [
+        "safe_envs/Scalar-v0",
+        "safe_envs/DubinsDisk-v0",
+    ]
     assert document["steps_per_second"] == {"env": 1000.0}
 
 
 def test_each_solver_is_looked_at():
-    kinds = {(len(program.proposed), len(program.b) > 1, program.feasible) for program in doctor.PROGRAMS}
-    assert kinds == {(1, True, True), *((m, several, met) for m, several in ((2, False), (2, True), (3, True)) for met in (True, False))}
+    kinds = {
+        (len(program.proposed), len(program.b) > 1, program.feasible) for program in doctor.PROGRAMS
+    }
+    assert kinds == {
+        (1, True, True),
+        *(
+            (m, several, met)
+            for m, several in ((2, False), (2, True), (3, True))
+            for met in (True, False)
+        ),
+    }
     assert all(check.ok for check in doctor.solvers())
 
 
@@ -79,7 +95,10 @@ def test_one_bad_step_of_an_env_is_found(quick, monkeypatch, bad, what):
     monkeypatch.setattr(SafetyFilterWrapper, "step", stepped)
     (check,) = doctor.envs()
     assert len(steps) == doctor._STEPS
-    assert (check.ok, check.found) == (False, "an action outside of the box, or a reward that is not finite")
+    assert (check.ok, check.found) == (
+        False,
+        "an action outside of the box, or a reward that is not finite",
+    )
 
 
 def test_what_is_missing_says_how_to_install_it(monkeypatch):
@@ -90,12 +109,22 @@ def test_what_is_missing_says_how_to_install_it(monkeypatch):
 
     monkeypatch.setattr(doctor, "version", version)
     monkeypatch.setattr(
-        doctor, "requires", lambda _: ["torch>=2.3", "numpy>=2", "tensorboard>=2; extra == 'tensorboard'", "ruff; extra == 'dev'"]
+        doctor,
+        "requires",
+        lambda _: [
+            "torch>=2.3",
+            "numpy>=2",
+            "tensorboard>=2; extra == 'tensorboard'",
+            "ruff; extra == 'dev'",
+        ],
     )
     found = {check.name: check for check in doctor.packages()}
     assert list(found) == ["python", "torch", "numpy", "tensorboard"]
     assert (found["torch"].ok, found["torch"].advice) == (False, 'pip install "torch"')
-    assert (found["tensorboard"].ok, found["tensorboard"].advice) == (None, 'pip install "safe-envs[tensorboard]"')
+    assert (found["tensorboard"].ok, found["tensorboard"].advice) == (
+        None,
+        'pip install "safe-envs[tensorboard]"',
+    )
     assert found["numpy"].ok
     assert found["numpy"].found == "1.0"
 

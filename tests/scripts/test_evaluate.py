@@ -46,7 +46,17 @@ ROW_KEYS = [
 
 
 def test_json_has_the_documented_keys(safe_envs_command):
-    status, _, err = safe_envs_command("evaluate", DUBINS, "--filter", "none", "--filter", "hocbf:p=1,2", *QUICK, "--json", "out.json")
+    status, _, err = safe_envs_command(
+        "evaluate",
+        DUBINS,
+        "--filter",
+        "none",
+        "--filter",
+        "hocbf:p=1,2",
+        *QUICK,
+        "--json",
+        "out.json",
+    )
     assert (status, err) == (0, "")
     document = strictly("out.json")
     assert list(document) == ["config", "versions", "rows", "comparisons", "timing"]
@@ -71,7 +81,9 @@ def test_json_has_the_documented_keys(safe_envs_command):
 
 
 def test_json_is_strict_where_no_step_counts(safe_envs_command):
-    status, out, _ = safe_envs_command("evaluate", "Scalar-v0", "--start", "1.0", "--noise", "0", *QUICK, "--json", "out.json")
+    status, out, _ = safe_envs_command(
+        "evaluate", "Scalar-v0", "--start", "1.0", "--noise", "0", *QUICK, "--json", "out.json"
+    )
     assert status == 0
     assert "Note: nothing is random here" in out
     for row in strictly("out.json")["rows"]:
@@ -84,7 +96,17 @@ def test_all_but_timing_is_the_same_for_every_num_envs(safe_envs_command):
     documents = []
     for num_envs in (1000, 1, 7):
         status, _, _ = safe_envs_command(
-            "evaluate", DUBINS, "--policy", "random", *QUICK, "--seed", 4, "--num-envs", num_envs, "--json", f"{num_envs}.json"
+            "evaluate",
+            DUBINS,
+            "--policy",
+            "random",
+            *QUICK,
+            "--seed",
+            4,
+            "--num-envs",
+            num_envs,
+            "--json",
+            f"{num_envs}.json",
         )
         assert status == 0
         documents.append(strictly(f"{num_envs}.json"))
@@ -94,9 +116,44 @@ def test_all_but_timing_is_the_same_for_every_num_envs(safe_envs_command):
 
 def test_every_option_reaches_the_evaluation(safe_envs_command):
     status, out, _ = safe_envs_command(
-        *("evaluate", "StochasticDubins-v0", "--filter", "hocbf", "--policy", "zero", "--episodes", "6", "--seed", "5"),
-        *("--noise", ".1,.3", "--plant", "v=1.5", "--model", "v=1.7", "--barrier", "radius=2.5", "--knowledge", "plant"),
-        *("--dt", ".02", "--substeps", "2", "--horizon", ".4", "--box", "-3,4", "--start", "-0.5,0,1", "--num-envs", "4"),
+        *(
+            "evaluate",
+            "StochasticDubins-v0",
+            "--filter",
+            "hocbf",
+            "--policy",
+            "zero",
+            "--episodes",
+            "6",
+            "--seed",
+            "5",
+        ),
+        *(
+            "--noise",
+            ".1,.3",
+            "--plant",
+            "v=1.5",
+            "--model",
+            "v=1.7",
+            "--barrier",
+            "radius=2.5",
+            "--knowledge",
+            "plant",
+        ),
+        *(
+            "--dt",
+            ".02",
+            "--substeps",
+            "2",
+            "--horizon",
+            ".4",
+            "--box",
+            "-3,4",
+            "--start",
+            "-0.5,0,1",
+            "--num-envs",
+            "4",
+        ),
         *("--confidence", ".9"),
         *("--json", "out.json"),
     )
@@ -112,11 +169,28 @@ def test_every_option_reaches_the_evaluation(safe_envs_command):
         "box": [-3.0, 4.0],
         "start": [-0.5, 0.0, 1.0],
     }
-    wanted = evaluate(DUBINS, "zero", ["hocbf"], options=options, episodes=6, seed=5, knowledge="plant", confidence=0.9)
+    wanted = evaluate(
+        DUBINS,
+        "zero",
+        ["hocbf"],
+        options=options,
+        episodes=6,
+        seed=5,
+        knowledge="plant",
+        confidence=0.9,
+    )
     document = strictly("out.json")
     assert document["rows"] == wanted.rows
     assert document["config"] == json.loads(json.dumps(wanted.config))
-    for text in (DUBINS, "policy zero", "6 episodes", "seed 5", "v = 1.5 (model 1.7)", "sigma_1 = 0.1, sigma_2 = 0.3", "dt = 0.02 s"):
+    for text in (
+        DUBINS,
+        "policy zero",
+        "6 episodes",
+        "seed 5",
+        "v = 1.5 (model 1.7)",
+        "sigma_1 = 0.1, sigma_2 = 0.3",
+        "dt = 0.02 s",
+    ):
         assert text in out
     assert "filters know the plant" in out
     assert "safe [90 % interval]" in out
@@ -125,7 +199,17 @@ def test_every_option_reaches_the_evaluation(safe_envs_command):
 def test_boxes_for_each_input_and_named_starts(safe_envs_command):
     boxes = [argument for high in (4e4, 5e4, 6e4, 7e4) for argument in ("--box", f"0,{high}")]
     status, *_ = safe_envs_command(
-        "evaluate", "Quadrotor-v0", *boxes, "--start", "thesis", "--horizon", ".2", "--episodes", 2, "--json", "out.json"
+        "evaluate",
+        "Quadrotor-v0",
+        *boxes,
+        "--start",
+        "thesis",
+        "--horizon",
+        ".2",
+        "--episodes",
+        2,
+        "--json",
+        "out.json",
     )
     assert status == 0
     problem = strictly("out.json")["config"]["problem"]
@@ -134,14 +218,23 @@ def test_boxes_for_each_input_and_named_starts(safe_envs_command):
 
 
 def test_table_shows_the_rows(safe_envs_command):
-    _, out, _ = safe_envs_command("evaluate", DUBINS, "--episodes", 40, "--horizon", 2, "--filter", "none", "--filter", "scbf")
+    _, out, _ = safe_envs_command(
+        "evaluate", DUBINS, "--episodes", 40, "--horizon", 2, "--filter", "none", "--filter", "scbf"
+    )
     answer = evaluate(DUBINS, filters=["none", "scbf"], options={"horizon": 2.0}, episodes=40)
-    lines = {line.split()[0]: line for line in out.splitlines() if line and line.split()[0] in ("none", "scbf")}
+    lines = {
+        line.split()[0]: line
+        for line in out.splitlines()
+        if line and line.split()[0] in ("none", "scbf")
+    }
     assert list(lines) == ["none", "scbf"]
     for row in answer.rows:
         line = lines[row["filter"]]
         for shown in (
-            f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f}, {100 * row['ci_high']:.1f}]",
+            (
+                f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f},"
+                f" {100 * row['ci_high']:.1f}]"
+            ),
             f"{row['min_h_median']:.3g}",
             f" {row['violations']} ",
             f"{row['effort_mean']:.3g}",
@@ -154,44 +247,96 @@ def test_table_shows_the_rows(safe_envs_command):
 
 @pytest.mark.slow
 def test_filters_are_compared_under_the_table(safe_envs_command):
-    filters = [argument for name in ("none", "hocbf", "scbf", "hocbf:p=1,1") for argument in ("--filter", name)]
-    _, out, _ = safe_envs_command("evaluate", DUBINS, *filters, "--episodes", 200, "--noise", 0.4, "--json", "out.json")
-    shown = out.partition("Difference of the safety rates on the same episodes [95 % interval]:\n")[2].partition("\n\n")[0].splitlines()
-    comparisons = [c for c in strictly("out.json")["comparisons"] if "none" not in (c["first"], c["second"])]
+    filters = [
+        argument
+        for name in ("none", "hocbf", "scbf", "hocbf:p=1,1")
+        for argument in ("--filter", name)
+    ]
+    _, out, _ = safe_envs_command(
+        "evaluate", DUBINS, *filters, "--episodes", 200, "--noise", 0.4, "--json", "out.json"
+    )
+    shown = (
+        out.partition("Difference of the safety rates on the same episodes [95 % interval]:\n")[2]
+        .partition("\n\n")[0]
+        .splitlines()
+    )
+    comparisons = [
+        c for c in strictly("out.json")["comparisons"] if "none" not in (c["first"], c["second"])
+    ]
     assert len(shown) == len(comparisons) == 3
     for line, c in zip(shown, comparisons, strict=True):
         assert f"{c['first']} - {c['second']}: {100 * c['difference']:+.1f} points " in line
         assert f"[{100 * c['ci_low']:.1f}, {100 * c['ci_high']:.1f}], McNemar p " in line
-        assert line.endswith(f"(safe with one only: {c['first']} {c['only_first']}, {c['second']} {c['only_second']})")
+        assert line.endswith(
+            f"(safe with one only: {c['first']} {c['only_first']}, {c['second']}"
+            f" {c['only_second']})"
+        )
     assert shown[0].lstrip().startswith("scbf - hocbf: +")
     assert "McNemar p < 1e-10" in shown[0]
     assert "Difference" not in safe_envs_command("evaluate", DUBINS, *QUICK)[1]
 
 
 def test_all_safe_shows_the_exact_interval(safe_envs_command):
-    _, out, _ = safe_envs_command("evaluate", "ACC-v0", "--filter", "scbf", "--episodes", "100", "--horizon", "0.2")
+    _, out, _ = safe_envs_command(
+        "evaluate", "ACC-v0", "--filter", "scbf", "--episodes", "100", "--horizon", "0.2"
+    )
     # Clopper and Pearson's, .025^(1/100) = 96.38 %; Wilson's would begin at 96.3 %.
     assert "100.0 % [96.4, 100.0]" in out
 
 
 @pytest.mark.slow
 def test_refinement_says_which_rates_have_converged(safe_envs_command):
-    arguments = ("evaluate", "ACC-v0", "--filter", "none", "--filter", "scbf", "--episodes", "200", "--horizon", "0.2")
-    status, out, err = safe_envs_command(*arguments, "--refine", "--confidence", ".9", "--json", "out.json", "--plot", "out.svg")
+    arguments = (
+        "evaluate",
+        "ACC-v0",
+        "--filter",
+        "none",
+        "--filter",
+        "scbf",
+        "--episodes",
+        "200",
+        "--horizon",
+        "0.2",
+    )
+    status, out, err = safe_envs_command(
+        *arguments, "--refine", "--confidence", ".9", "--json", "out.json", "--plot", "out.svg"
+    )
     assert (status, err) == (0, "")
     plain, _, refined = out.partition("Refinement: safe [90 % interval]")
     assert "safe [90 % interval]" in plain
-    for text in ("dt = 0.05 s", "dt = 0.025 s", "dt = 0.0125 s", "noise that is not coupled", "no further than 3 points"):
+    for text in (
+        "dt = 0.05 s",
+        "dt = 0.025 s",
+        "dt = 0.0125 s",
+        "noise that is not coupled",
+        "no further than 3 points",
+    ):
         assert text in refined
     row = strictly("out.json")["refinement"]["rows"][1]
     rates = [f"100.0 % [{100 * low:.1f}, 100.0]" for low in row["ci_low"]]
     (line,) = [line for line in refined.splitlines() if line.startswith("scbf")]
     assert line.split() == ["scbf", *" ".join(rates).split()]
-    assert f"scbf: converged, +0.0 points [{100 * row['change_low']:.1f}, {100 * row['change_high']:.1f}]" in refined
+    assert (
+        f"scbf: converged, +0.0 points [{100 * row['change_low']:.1f},"
+        f" {100 * row['change_high']:.1f}]" in refined
+    )
     few = safe_envs_command(*arguments, "--episodes", "10", "--refine")[1]
     assert "  scbf: not resolved, +0.0 points [-27.8, 27.8]: more episodes are needed" in few
-    coarse = ("--dt", ".4", "--horizon", "1.6", "--start", ".5", "--noise", ".8", "--episodes", "500")
-    changing = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", *coarse, "--refine")[1]
+    coarse = (
+        "--dt",
+        ".4",
+        "--horizon",
+        "1.6",
+        "--start",
+        ".5",
+        "--noise",
+        ".8",
+        "--episodes",
+        "500",
+    )
+    changing = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", *coarse, "--refine")[
+        1
+    ]
     assert "  none: still changing by -" in changing
     picture = Path("out.svg").read_text()
     assert "dt = 0.05 s" in picture
@@ -199,7 +344,9 @@ def test_refinement_says_which_rates_have_converged(safe_envs_command):
 
 
 def test_bounds_are_shown_where_there_are_any():
-    answer = evaluate(DUBINS, filters=["none", "hocbf", "scbf"], options={"horizon": 0.2}, episodes=5)
+    answer = evaluate(
+        DUBINS, filters=["none", "hocbf", "scbf"], options={"horizon": 0.2}, episodes=5
+    )
 
     def printed(*changes):
         console = Console(width=200, file=io.StringIO())
@@ -207,8 +354,16 @@ def test_bounds_are_shown_where_there_are_any():
         print_evaluation(console, replace(answer, rows=rows))
         return console.file.getvalue()
 
-    bounded = printed({}, {"estimated_bound": None, "bound_note": "it ignores the noise"}, {"estimated_bound": 0.492, "bound_note": ""})
-    lines = {line.split()[0]: line for line in bounded.splitlines() if line.startswith(("none", "hocbf", "scbf"))}
+    bounded = printed(
+        {},
+        {"estimated_bound": None, "bound_note": "it ignores the noise"},
+        {"estimated_bound": 0.492, "bound_note": ""},
+    )
+    lines = {
+        line.split()[0]: line
+        for line in bounded.splitlines()
+        if line.startswith(("none", "hocbf", "scbf"))
+    }
     assert " 49.2 % " in lines["scbf"]
     assert not re.search("≥|>=|proved|guaranteed", bounded.replace("{b_j >= 0}", ""))
     assert "] none " in " ".join(lines["hocbf"].split())
@@ -218,14 +373,30 @@ def test_bounds_are_shown_where_there_are_any():
     assert bounded.count("Note: a bound is estimated: ") == 1
     nothing = {"estimated_bound": None, "bound_note": "it ignores the noise"}
     below = printed({}, nothing, judged({**answer.rows[2], "estimated_bound": 0.999}, 0.98))
-    assert "Note: no bound for scbf: withheld: the interval of the measured rate ends at 98.0 %, below 99.9 %" in below
-    assert "] withheld " in " ".join(next(line for line in below.splitlines() if line.startswith("scbf")).split())
+    assert (
+        "Note: no bound for scbf: withheld: the interval of the measured rate ends at 98.0 %, below"
+        " 99.9 %" in below
+    )
+    assert "] withheld " in " ".join(
+        next(line for line in below.splitlines() if line.startswith("scbf")).split()
+    )
     assert "a bound is estimated" not in below
 
 
 def test_the_plants_mass_saves_the_quadrotor(safe_envs_command):
     for knowledge in ("model", "plant"):
-        arguments = ("--filter", "none", "--filter", "hocbf", "--episodes", "12", "--knowledge", knowledge, "--json", f"{knowledge}.json")
+        arguments = (
+            "--filter",
+            "none",
+            "--filter",
+            "hocbf",
+            "--episodes",
+            "12",
+            "--knowledge",
+            knowledge,
+            "--json",
+            f"{knowledge}.json",
+        )
         assert safe_envs_command("evaluate", "safe_envs/QuadrotorAltitude-v0", *arguments)[0] == 0
     bare, model = strictly("model.json")["rows"]
     again, plant = strictly("plant.json")["rows"]
@@ -239,7 +410,11 @@ def test_the_plants_mass_saves_the_quadrotor(safe_envs_command):
 @pytest.mark.parametrize(
     ("env_id", "name", "options"),
     [
-        (DUBINS, "a.SVG", ("--policy", "random", "--filter", "none", "--filter", "hocbf", "--filter", "scbf")),
+        (
+            DUBINS,
+            "a.SVG",
+            ("--policy", "random", "--filter", "none", "--filter", "hocbf", "--filter", "scbf"),
+        ),
         ("DubinsObstacle-v0", "a.png", ()),
         ("Quadrotor-v0", "a.pdf", ()),
         ("ACC-v0", "a.png", ()),
@@ -255,6 +430,14 @@ def test_plot_writes_a_picture(safe_envs_command, env_id, name, options):
     assert content.startswith(starts[Path(name).suffix.lower()])
     assert len(content) > 5000
     if name == "a.SVG":
-        for text in (b"barrier h", b"safe so far", b"pointwise 95 % band", b"none: ", b"hocbf: ", b"scbf: ", b"unsafe"):
+        for text in (
+            b"barrier h",
+            b"safe so far",
+            b"pointwise 95 % band",
+            b"none: ",
+            b"hocbf: ",
+            b"scbf: ",
+            b"unsafe",
+        ):
             assert text in content
     assert [p.name for p in Path().iterdir()] == [name]

@@ -14,8 +14,21 @@ pytestmark = pytest.mark.usefixtures("coarse_bounds")
 DUBINS = "safe_envs/StochasticDubins-v0"
 QUICK = ("--episodes", "8", "--horizon", "0.3")
 USER_ERRORS = (
-    (["safe_envs/StochasticDubin-v0"], ["unknown env 'safe_envs/StochasticDubin-v0'", "did you mean 'safe_envs/StochasticDubins-v0'"]),
-    (["CartPole-v1"], ["not one of this project's envs", "safe_envs/DubinsDisk-v0", "`safe-envs evaluate CartPole-v1 --filter-spec"]),
+    (
+        ["safe_envs/StochasticDubin-v0"],
+        [
+            "unknown env 'safe_envs/StochasticDubin-v0'",
+            "did you mean 'safe_envs/StochasticDubins-v0'",
+        ],
+    ),
+    (
+        ["CartPole-v1"],
+        [
+            "not one of this project's envs",
+            "safe_envs/DubinsDisk-v0",
+            "`safe-envs evaluate CartPole-v1 --filter-spec",
+        ],
+    ),
     (["CartPole-v1", "--noise", "1"], ["CartPole-v1"]),
     ([":x"], [":x"]),
     ([DUBINS, "--filter", "hocb"], ["unknown filter 'hocb'", "did you mean 'hocbf'"]),
@@ -30,7 +43,10 @@ USER_ERRORS = (
     ([DUBINS, "--policy", "missing.zip"], ["'missing.zip'", "there is no such file"]),
     ([DUBINS, "--policy", __file__], ["not a policy that Stable-Baselines3 saved"]),
     ([DUBINS, "--policy", __file__, "--trust"], ["not a policy that Stable-Baselines3 saved"]),
-    ([DUBINS, "--policy", "."], ["policy.safetensors cannot be read: No such file", "`safe-envs train`"]),
+    (
+        [DUBINS, "--policy", "."],
+        ["policy.safetensors cannot be read: No such file", "`safe-envs train`"],
+    ),
     ([DUBINS, "--plant", "vv=1"], ["unknown parameter 'vv'", "did you mean 'v'"]),
     ([DUBINS, "--plant", "v=fast"], ["--plant 'v=fast'", "not a number"]),
     ([DUBINS, "--plant", "v"], ["NAME=VALUE"]),
@@ -58,17 +74,35 @@ USER_ERRORS = (
     ([DUBINS, "--filter", "hocbf+none"], ["'hocbf+none'", "'none' is the bare env"]),
     ([DUBINS, "--filter", "none+hocbf:p=1,2"], ["'none' is the bare env"]),
     ([DUBINS, "--refine", "--episodes", "0"], ["episodes = 0"]),
-    (["Scalar-v0", "--refine", "--dt", "5e-324", "--horizon", "5e-324"], ["dt = 0.0 s", "positive and finite"]),
+    (
+        ["Scalar-v0", "--refine", "--dt", "5e-324", "--horizon", "5e-324"],
+        ["dt = 0.0 s", "positive and finite"],
+    ),
     ([DUBINS, "--dt", "0"], ["dt = 0"]),
     ([DUBINS, "--horizon", "nan"], ["horizon = nan"]),
     ([DUBINS, "--substeps", "0"], ["substeps = 0"]),
     ([DUBINS, "--json", "nowhere/out.json"], ["cannot write nowhere/out.json", "does not exist"]),
     ([DUBINS, "--json", "."], ["it is a folder"]),
-    ([DUBINS, "--json", "out.svg", "--plot", "./out.svg"], ["--plot out.svg would overwrite the file of --json out.svg"]),
-    ([DUBINS, "--json", "x.npz", "--learned", "x.npz"], ["would overwrite the file of --learned x.npz"]),
-    ([DUBINS, "--json", "x.npz", "--filter", "ddscbf:file=x.npz"], ["would overwrite the file of --filter x.npz"]),
-    ([DUBINS, "--json", "ppo.zip", "--policy", "ppo.zip"], ["would overwrite the file of --policy ppo.zip"]),
-    ([DUBINS, "--json", "policy.json", "--policy", "."], ["would overwrite the file of --policy policy.json"]),
+    (
+        [DUBINS, "--json", "out.svg", "--plot", "./out.svg"],
+        ["--plot out.svg would overwrite the file of --json out.svg"],
+    ),
+    (
+        [DUBINS, "--json", "x.npz", "--learned", "x.npz"],
+        ["would overwrite the file of --learned x.npz"],
+    ),
+    (
+        [DUBINS, "--json", "x.npz", "--filter", "ddscbf:file=x.npz"],
+        ["would overwrite the file of --filter x.npz"],
+    ),
+    (
+        [DUBINS, "--json", "ppo.zip", "--policy", "ppo.zip"],
+        ["would overwrite the file of --policy ppo.zip"],
+    ),
+    (
+        [DUBINS, "--json", "policy.json", "--policy", "."],
+        ["would overwrite the file of --policy policy.json"],
+    ),
     ([DUBINS, "--plot", "nowhere/out.png"], ["cannot write nowhere/out.png"]),
     ([DUBINS, "--plot", "out.pong"], ["unknown format 'pong'", "did you mean 'png'"]),
     ([DUBINS, "--plot", "out"], ["unknown format ''"]),
@@ -77,7 +111,9 @@ USER_ERRORS = (
 
 
 @pytest.mark.parametrize(
-    ("arguments", "messages"), USER_ERRORS, ids=[" ".join(map(os.path.basename, arguments)) for arguments, _ in USER_ERRORS]
+    ("arguments", "messages"),
+    USER_ERRORS,
+    ids=[" ".join(map(os.path.basename, arguments)) for arguments, _ in USER_ERRORS],
 )
 def test_errors_of_the_user_end_with_status_2_and_say_why(safe_envs_command, arguments, messages):
     files = [] if "--json" in arguments or "--plot" in arguments else ["--json", "out.json"]
@@ -104,20 +140,35 @@ def ppo(tmp_path):
 
 
 def test_a_trained_policy_needs_trust_only_as_a_zip(safe_envs_command, ppo):
-    evaluation, verification = ("evaluate", DUBINS, *QUICK, "--filter", "none"), ("verify", "Scalar-v0", "--no-simulate")
+    evaluation, verification = (
+        ("evaluate", DUBINS, *QUICK, "--filter", "none"),
+        ("verify", "Scalar-v0", "--no-simulate"),
+    )
     assert safe_envs_command(*evaluation, "--policy", "ppo")[0] == 0
     assert safe_envs_command(*evaluation, "--policy", "ppo/model.zip", "--trust")[0] == 0
     for command in (evaluation, verification):
         status, out, err = safe_envs_command(*command, "--policy", "ppo/model.zip")
         assert (status, out) == (2, "")
-        assert "loading ppo/model.zip runs code that it contains; if you trust its source, pass --trust" in " ".join(err.split())
+        assert (
+            "loading ppo/model.zip runs code that it contains; if you trust its source, pass"
+            " --trust" in " ".join(err.split())
+        )
     status, _, err = safe_envs_command(*verification, "--policy", "ppo/model.zip", "--trust")
     assert (status, "another observation space" in " ".join(err.split())) == (2, True)
 
 
 def test_forces_beyond_floating_point_are_an_error_not_a_crash(safe_envs_command):
     # The square of such an input is not finite, and infinity is no JSON.
-    arguments = ("--box", "-1e200,1e200", "--policy", "random", "--filter", "none", "--json", "out.json")
+    arguments = (
+        "--box",
+        "-1e200,1e200",
+        "--policy",
+        "random",
+        "--filter",
+        "none",
+        "--json",
+        "out.json",
+    )
     status, _, err = safe_envs_command("evaluate", "Scalar-v0", *QUICK, *arguments)
     assert status in (0, 2)
     assert "Traceback" not in err
@@ -127,7 +178,9 @@ def test_forces_beyond_floating_point_are_an_error_not_a_crash(safe_envs_command
 
 @pytest.mark.parametrize("suffix", ["pgf", "eps", "ps", "tif", "raw", "svgz", "webp", "gif"])
 def test_every_format_is_refused_before_the_run_or_written(safe_envs_command, suffix):
-    status, _, _ = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", *QUICK, "--plot", f"out.{suffix}")
+    status, _, _ = safe_envs_command(
+        "evaluate", "Scalar-v0", "--filter", "none", *QUICK, "--plot", f"out.{suffix}"
+    )
     written = Path(f"out.{suffix}")
     assert (status == 0 and written.stat().st_size > 0) or (status == 2 and not written.exists())
 

@@ -23,12 +23,19 @@ def evaluate(safe_envs_command):
 @pytest.fixture
 def learned(safe_envs_command, tmp_path):
     """A file of `safe-envs identify`."""
-    assert safe_envs_command("identify", DISK[0], "--method", "bayesian", *SMALL, "--seed", 7, "--out", "disk.npz")[0] == 0
+    assert (
+        safe_envs_command(
+            "identify", DISK[0], "--method", "bayesian", *SMALL, "--seed", 7, "--out", "disk.npz"
+        )[0]
+        == 0
+    )
     return tmp_path / "disk.npz"
 
 
 def test_without_a_file_it_learns_first_and_says_for_how_long(evaluate):
-    status, out, err = evaluate("--filter", "scbf", "--filter", "bayesian-scbf", "--json", "out.json")
+    status, out, err = evaluate(
+        "--filter", "scbf", "--filter", "bayesian-scbf", "--json", "out.json"
+    )
     assert (status, err) == (0, "")
     document = strictly("out.json")
     plain, row = document["rows"]
@@ -50,19 +57,35 @@ def test_a_file_is_used_in_its_place(evaluate, learned):
     assert "bayesian-scbf was learned before, from 2,000 transitions: " in " ".join(out.split())
     assert (
         evaluate(
-            "--filter", f"bayesian-scbf:file={learned}", "--filter", f"bayesian-scbf:file={learned}:confidence=0.9", "--json", "named.json"
+            "--filter",
+            f"bayesian-scbf:file={learned}",
+            "--filter",
+            f"bayesian-scbf:file={learned}:confidence=0.9",
+            "--json",
+            "named.json",
         )[0]
         == 0
     )
     given, named = strictly("out.json")["rows"], strictly("named.json")["rows"]
     for row, other in zip(given, named, strict=True):
         assert {**row, "filter": None} == {**other, "filter": None}
-        assert (row["learning"]["seeds"], row["learning"]["files"], row["learning"]["transitions"]) == ([7], [str(learned)], 2000)
+        assert (
+            row["learning"]["seeds"],
+            row["learning"]["files"],
+            row["learning"]["transitions"],
+        ) == ([7], [str(learned)], 2000)
 
 
 @pytest.mark.slow
 def test_repeats_give_the_worst_identification_and_intervals_over_them(evaluate):
-    filters = ("--filter", "scbf", "--filter", "bayesian-scbf", "--filter", "bayesian-scbf:simultaneous=0.9")
+    filters = (
+        "--filter",
+        "scbf",
+        "--filter",
+        "bayesian-scbf",
+        "--filter",
+        "bayesian-scbf:simultaneous=0.9",
+    )
     status, out, err = evaluate(*filters, "--repeats", 2, "--json", "out.json")
     assert (status, err) == (0, "")
     document = strictly("out.json")
@@ -72,7 +95,11 @@ def test_repeats_give_the_worst_identification_and_intervals_over_them(evaluate)
     assert row["episodes"] == 40
     assert f" {100 * robust['posterior_bound']['probability']:.1f} % " in out
     assert not re.search("≥|>=|certificate|proved", out)
-    for text in ("20 episodes x 2 identifications", "over identifications and episodes", "200,000 transitions each"):
+    for text in (
+        "20 episodes x 2 identifications",
+        "over identifications and episodes",
+        "200,000 transitions each",
+    ):
         assert text in out
 
 
@@ -99,7 +126,9 @@ def test_what_it_cannot_take_ends_with_status_2(evaluate, arguments, messages):
 
 
 def test_files_for_something_else_end_with_status_2(evaluate, learned, safe_envs_command):
-    status, _, err = safe_envs_command("evaluate", "Pendulum-v0", "--filter", "bayesian-scbf", "--learned", learned, *QUICK)
+    status, _, err = safe_envs_command(
+        "evaluate", "Pendulum-v0", "--filter", "bayesian-scbf", "--learned", learned, *QUICK
+    )
     assert status == 2
     assert "CubicSDEDisk" in err
     status, _, err = evaluate("--filter", f"ddscbf:file={learned}")

@@ -11,7 +11,19 @@ from tests.oracles.full_disk import no_file_larger_than
 pytestmark = pytest.mark.slow
 
 SCALAR = ("Scalar-v0", "--horizon", 0.2, "--episodes", 5)
-TRAINED = ("Scalar-v0", "--algo", "ppo", "--n-timesteps", 64, "--num-envs", 2, "--eval-episodes", 2, "--set", "n_steps=16")
+TRAINED = (
+    "Scalar-v0",
+    "--algo",
+    "ppo",
+    "--n-timesteps",
+    64,
+    "--num-envs",
+    2,
+    "--eval-episodes",
+    2,
+    "--set",
+    "n_steps=16",
+)
 
 
 @pytest.mark.parametrize(
@@ -29,7 +41,11 @@ TRAINED = ("Scalar-v0", "--algo", "ppo", "--n-timesteps", 64, "--num-envs", 2, "
     ],
 )
 def test_commands_on_a_full_disk(arguments, written, size, safe_envs_command, tmp_path):
-    (tmp_path / "s.yaml").write_text(yaml.safe_dump({"fixed": {"env": "Scalar-v0", "filter": "none", "episodes": 5, "horizon": 0.2}}))
+    (tmp_path / "s.yaml").write_text(
+        yaml.safe_dump(
+            {"fixed": {"env": "Scalar-v0", "filter": "none", "episodes": 5, "horizon": 0.2}}
+        )
+    )
     (tmp_path / "a.json").write_text("before")
     for suffix in ("png", "npz", "mp4", "gif"):
         (tmp_path / f"a.{suffix}").write_text("before")
@@ -40,7 +56,14 @@ def test_commands_on_a_full_disk(arguments, written, size, safe_envs_command, tm
     assert f"Error: cannot write {written}" in " ".join(err.split())
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir() if path.is_file()} == before
     rests = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} - set(before)
-    assert rests <= {"swept", "swept/cells", "swept/sweep.json", "run", "run/config.json", "run/progress.jsonl"}
+    assert rests <= {
+        "swept",
+        "swept/cells",
+        "swept/sweep.json",
+        "run",
+        "run/config.json",
+        "run/progress.jsonl",
+    }
 
 
 @pytest.mark.parametrize("length", [10, 100_000])

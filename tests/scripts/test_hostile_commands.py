@@ -1,4 +1,5 @@
-"""Command lines of whoever wants to do harm: status 2 and a short message, at once and without a traceback."""
+"""Command lines of whoever wants to do harm: status 2 and a short message, at once and without a
+traceback."""
 
 from __future__ import annotations
 
@@ -30,7 +31,19 @@ LONG = "x" * 100_000
         ((*SCALAR, "--barrier", "limit=1_0"), "limit = '1_0' is not a number"),
         ((*SCALAR, "--start", "1_0"), "unknown start '1_0'"),
         ((*SCALAR, "--filter", "cbf:alpha=1_0"), "'1_0' is no decimal number"),
-        (("identify", "Scalar-v0", "--method", "ddscbf", "--out", "l.npz", "--set", "points=1_0"), "'1_0' is not a number"),
+        (
+            (
+                "identify",
+                "Scalar-v0",
+                "--method",
+                "ddscbf",
+                "--out",
+                "l.npz",
+                "--set",
+                "points=1_0",
+            ),
+            "'1_0' is not a number",
+        ),
         ((*TRAIN, "n_steps=6_4"), "6_4 is no plain number"),
         ((*TRAIN, f"n_steps={'[' * 3000}"), "nested more than"),
         ((*TRAIN, "n_steps=[&a [1], *a]"), "an alias is not allowed"),
@@ -57,12 +70,16 @@ LONG = "x" * 100_000
     ],
     ids=lambda given: " ".join(map(str, given))[:40] if isinstance(given, tuple) else "",
 )
-def test_what_no_command_can_take_ends_with_status_2_and_a_short_message(safe_envs_command, tmp_path, arguments, message):
+def test_what_no_command_can_take_ends_with_status_2_and_a_short_message(
+    safe_envs_command, tmp_path, arguments, message
+):
     for name in ("pipe", "pipe.py", "sweep.json"):
         os.mkfifo(tmp_path / name)
     (tmp_path / "loop").symlink_to("loop")
     (tmp_path / "deep.json").write_text("[" * 100_000)
-    (tmp_path / "results.json").write_text(json.dumps({"settings": {}, "rows": [{"env_id": "safe_envs/Scalar-v0"}]}))
+    (tmp_path / "results.json").write_text(
+        json.dumps({"settings": {}, "rows": [{"env_id": "safe_envs/Scalar-v0"}]})
+    )
     status, out, err = safe_envs_command(*arguments)
     assert (status, out) == (2, "")
     assert message in " ".join(err.replace("│", " ").split())

@@ -25,8 +25,26 @@ pytestmark = pytest.mark.slow
 SMALL = ("--set", "starts=10", "--set", "steps=20", "--set", "repetitions=10")
 BAYESIAN = ("CubicSDEDisk-v0", "--method", "bayesian", *SMALL, "--set", "degree=2")
 NETWORK = ("Pendulum-v0", "--method", "ddscbf", "--set", "points=20", "--set", "repetitions=50")
-DIRECT = ("StochasticDubins-v0", "--method", "ddscbf", "--set", "points=20", "--set", "repetitions=50")
-RESIDUAL = ("DubinsDisk-v0", "--method", "learned-hocbf", "--set", "states=60", "--set", "epochs=3", "--set", "hidden=8,4")
+DIRECT = (
+    "StochasticDubins-v0",
+    "--method",
+    "ddscbf",
+    "--set",
+    "points=20",
+    "--set",
+    "repetitions=50",
+)
+RESIDUAL = (
+    "DubinsDisk-v0",
+    "--method",
+    "learned-hocbf",
+    "--set",
+    "states=60",
+    "--set",
+    "epochs=3",
+    "--set",
+    "hidden=8,4",
+)
 PLAIN = BAYESIAN[:3]
 QUICK = {"bayesian": BAYESIAN, "ddscbf": NETWORK, "learned-hocbf": RESIDUAL}
 
@@ -66,21 +84,54 @@ def bad_files(tmp_path_factory):
         ),
         (
             NETWORK,
-            ("way = network", "against the labels, median; and", "M_1(h), standard error of labels", "--filter ddscbf --learned out.npz"),
+            (
+                "way = network",
+                "against the labels, median; and",
+                "M_1(h), standard error of labels",
+                "--filter ddscbf --learned out.npz",
+            ),
             ("M_1(h): error", "estimate at a state"),
         ),
         (
             DIRECT,
-            ("way = direct", "errors: of the covariances, root mean square\n", "C(x, x)", "m^2/s", "C(theta, theta)"),
+            (
+                "way = direct",
+                "errors: of the covariances, root mean square\n",
+                "C(x, x)",
+                "m^2/s",
+                "C(theta, theta)",
+            ),
             ("C(y, y): error", "truth 0.04<", "estimate 0.0"),
         ),
-        (RESIDUAL, ("hidden = 8,4", "rms", "q95", "h Delta_1", "h Sigma_omega", "--filter learned-hocbf --learned out.npz"), ()),
+        (
+            RESIDUAL,
+            (
+                "hidden = 8,4",
+                "rms",
+                "q95",
+                "h Delta_1",
+                "h Sigma_omega",
+                "--filter learned-hocbf --learned out.npz",
+            ),
+            (),
+        ),
     ],
 )
-def test_the_report_names_what_was_learned_and_the_picture_shows_it(identify, arguments, texts, drawn, tmp_path):
-    status, out, err = identify(*arguments, "--out", "out.npz", *(("--plot", "out.svg") if drawn else ()))
+def test_the_report_names_what_was_learned_and_the_picture_shows_it(
+    identify, arguments, texts, drawn, tmp_path
+):
+    status, out, err = identify(
+        *arguments, "--out", "out.npz", *(("--plot", "out.svg") if drawn else ())
+    )
     assert (status, err) == (0, "")
-    for text in (*texts, "Learned in", "Held-out errors", "Truth against estimate", "1000 fresh states", "Written to out.npz"):
+    for text in (
+        *texts,
+        "Learned in",
+        "Held-out errors",
+        "Truth against estimate",
+        "1000 fresh states",
+        "Written to out.npz",
+    ):
         assert text in out
     assert all(text in (tmp_path / "out.svg").read_text() for text in drawn)
 
@@ -97,7 +148,9 @@ def test_the_file_loads_again(identify, method, tmp_path):
 
 
 def test_json_holds_all_of_it(identify):
-    assert identify(*BAYESIAN, "--noise", "0.1,0.3", "--json", "out.json", "--out", "out.npz")[0] == 0
+    assert (
+        identify(*BAYESIAN, "--noise", "0.1,0.3", "--json", "out.json", "--out", "out.npz")[0] == 0
+    )
     document = strictly("out.json")
     assert document["config"] == {
         "env_id": "safe_envs/CubicSDEDisk-v0",
@@ -110,7 +163,9 @@ def test_json_holds_all_of_it(identify):
     assert document["record"]["settings"]["repetitions"] == 10
     functions = {entry["name"]: entry for entry in document["functions"]}
     assert functions["covariance[x_2, x_2]"]["size"] == pytest.approx(0.09)
-    assert functions["f[x_1]"]["relative"] == pytest.approx(functions["f[x_1]"]["error"] / functions["f[x_1]"]["size"])
+    assert functions["f[x_1]"]["relative"] == pytest.approx(
+        functions["f[x_1]"]["error"] / functions["f[x_1]"]["size"]
+    )
     assert functions["g[x_1, u]"]["relative"] is None
 
 
@@ -118,7 +173,9 @@ def test_the_same_seed_gives_the_same_file(identify, tmp_path):
     hashes = []
     for seed in (1, 1, 2):
         assert identify(*DIRECT, "--seed", seed, "--json", "out.json", "--out", "out.npz")[0] == 0
-        hashes.append([function["error"] for function in strictly(tmp_path / "out.json")["functions"]])
+        hashes.append(
+            [function["error"] for function in strictly(tmp_path / "out.json")["functions"]]
+        )
     assert hashes[0] == hashes[1] != hashes[2]
 
 
@@ -126,11 +183,28 @@ def test_the_same_seed_gives_the_same_file(identify, tmp_path):
 def test_learning_from_a_file_of_data(identify, tmp_path):
     path = "some data.npz"
     collect(load_problem("CubicSDEDisk-v0"), 40, 5, seed=7, dt=0.02).save(tmp_path / path)
-    status, out, err = identify(*PLAIN, "--data", path, "--noise", "0.3", "--json", "out.json", "--plot", "out.svg", "--out", "out.npz")
+    status, out, err = identify(
+        *PLAIN,
+        "--data",
+        path,
+        "--noise",
+        "0.3",
+        "--json",
+        "out.json",
+        "--plot",
+        "out.svg",
+        "--out",
+        "out.npz",
+    )
     assert (status, err) == (0, "")
     assert "| method bayesian | data some data.npz\n" in out
-    assert "transitions of some data.npz that last 8 s together, in steps of 0.02 s, of the seed 7\n" in out
-    compared = "compared with noise sigma_1 = 0.3, sigma_2 = 0.3, model = plant, at states of the seed 0"
+    assert (
+        "transitions of some data.npz that last 8 s together, in steps of 0.02 s, of the seed 7\n"
+        in out
+    )
+    compared = (
+        "compared with noise sigma_1 = 0.3, sigma_2 = 0.3, model = plant, at states of the seed 0"
+    )
     assert compared in out
     assert compared in (tmp_path / "out.svg").read_text()
     assert "dt = 0.01" not in out
@@ -140,28 +214,62 @@ def test_learning_from_a_file_of_data(identify, tmp_path):
 
 def test_what_is_said_of_data_from_elsewhere():
     data = collect(load_problem("CubicSDEDisk-v0"), 4)
-    logged = Transitions.from_log(data.signature, data.x, data.u, data.successors[:, 0], 0.01 * np.arange(1, data.points + 1))
-    assert str(Source.of(Path("log.npz"), logged)) == f"in steps of 0.01 to {0.01 * data.points:g} s, from elsewhere"
+    logged = Transitions.from_log(
+        data.signature, data.x, data.u, data.successors[:, 0], 0.01 * np.arange(1, data.points + 1)
+    )
+    assert (
+        str(Source.of(Path("log.npz"), logged))
+        == f"in steps of 0.01 to {0.01 * data.points:g} s, from elsewhere"
+    )
 
 
 def test_what_is_proposed_keeps_the_options_of_the_env(identify):
     given = ["--noise=0.1", "--plant=sigma_1=0.3", "--dt=0.02"]
     status, out, _ = identify(*BAYESIAN, *given, "--out", "my file.npz")
     assert status == 0
-    expected = ["safe-envs", "evaluate", "safe_envs/CubicSDEDisk-v0", "--filter", "bayesian-scbf", "--learned", "my file.npz", *given]
+    expected = [
+        "safe-envs",
+        "evaluate",
+        "safe_envs/CubicSDEDisk-v0",
+        "--filter",
+        "bayesian-scbf",
+        "--learned",
+        "my file.npz",
+        *given,
+    ]
     assert shlex.split(out.splitlines()[-1]) == expected
 
 
 def test_warnings_are_printed_as_notes(identify):
-    status, out, err = identify(*BAYESIAN[:-2], "--noise", "0.01", "--set", "degree=1", "--out", "out.npz")
+    status, out, err = identify(
+        *BAYESIAN[:-2], "--noise", "0.01", "--set", "degree=1", "--out", "out.npz"
+    )
     assert (status, err) == (0, "")
     assert "Note: x_2: features of degree 1 miss" in out
 
 
 def test_what_cannot_be_compared_is_said(identify):
     """Of the second derivative's noise part there is no truth where f and g are not known."""
-    learned = ("--set", "way=network", "--set", "points=20", "--set", "repetitions=20", "--model", "v=1.2")
-    status, out, _ = identify("StochasticDubins-v0", "--method", "ddscbf", *learned, "--plot", "out.svg", "--out", "out.npz")
+    learned = (
+        "--set",
+        "way=network",
+        "--set",
+        "points=20",
+        "--set",
+        "repetitions=20",
+        "--model",
+        "v=1.2",
+    )
+    status, out, _ = identify(
+        "StochasticDubins-v0",
+        "--method",
+        "ddscbf",
+        *learned,
+        "--plot",
+        "out.svg",
+        "--out",
+        "out.npz",
+    )
     assert status == 0
     assert "Truth against estimate" not in out
     assert "differ in f or g" in out
@@ -171,7 +279,10 @@ def test_what_cannot_be_compared_is_said(identify):
     ("arguments", "texts"),
     [
         ((*BAYESIAN, "--set", "diffusion_degree=1"), ("covariance[x_2, x_2]: error",)),
-        (("QuadrotorAltitude-v0", *RESIDUAL[1:]), ("h Delta_2: truth 0", "estimates at all states", "truth 0<", " to ")),
+        (
+            ("QuadrotorAltitude-v0", *RESIDUAL[1:]),
+            ("h Delta_2: truth 0", "estimates at all states", "truth 0<", " to "),
+        ),
     ],
 )
 def test_the_picture_is_drawn(identify, arguments, texts, tmp_path):
@@ -202,11 +313,26 @@ def test_the_picture_is_drawn(identify, arguments, texts, tmp_path):
         ((*PLAIN, "--data", "missing.npz"), "does not exist"),
         ((*PLAIN, "--data", "damaged.npz"), "truncated"),
         ((*PLAIN, "--data", "other.npz"), "of another problem"),
-        ((*BAYESIAN, "--data", "other.npz"), "--set starts, --set steps, --set repetitions: not allowed with --data"),
-        ((*PLAIN, "--data", "other.npz", "--dt", "0.1", "--substeps", "2", "--box", "0,1"), "--dt, --substeps, --box: not allowed"),
-        ((*PLAIN, "--data", "other.npz", "--out", "other.npz"), "--out other.npz would overwrite the file of --data other.npz"),
-        ((*BAYESIAN, "--json", "./out.npz"), "--json out.npz would overwrite the file of --out out.npz"),
-        ((*BAYESIAN, "--json", "found.svg", "--plot", "found.svg"), "--plot found.svg would overwrite the file of --json found.svg"),
+        (
+            (*BAYESIAN, "--data", "other.npz"),
+            "--set starts, --set steps, --set repetitions: not allowed with --data",
+        ),
+        (
+            (*PLAIN, "--data", "other.npz", "--dt", "0.1", "--substeps", "2", "--box", "0,1"),
+            "--dt, --substeps, --box: not allowed",
+        ),
+        (
+            (*PLAIN, "--data", "other.npz", "--out", "other.npz"),
+            "--out other.npz would overwrite the file of --data other.npz",
+        ),
+        (
+            (*BAYESIAN, "--json", "./out.npz"),
+            "--json out.npz would overwrite the file of --out out.npz",
+        ),
+        (
+            (*BAYESIAN, "--json", "found.svg", "--plot", "found.svg"),
+            "--plot found.svg would overwrite the file of --json found.svg",
+        ),
         (("Pendulum-v0", "--method", "ddscbf", "--data", "model.npz"), "holds"),
         ((*RESIDUAL, "--data", "other.npz"), "leave --data out"),
         ((*BAYESIAN, "--json", "missing/found.json"), "does not exist"),
@@ -235,25 +361,38 @@ def test_what_is_required(identify, left_out):
 
 
 def test_settings_are_read_by_the_kind_of_the_argument():
-    residual = read_settings("learned-hocbf", learner_of("learned-hocbf"), ["hidden=7", "label_dt=1e-2", "states=50"])
+    residual = read_settings(
+        "learned-hocbf", learner_of("learned-hocbf"), ["hidden=7", "label_dt=1e-2", "states=50"]
+    )
     assert residual == {"hidden": [7], "label_dt": 0.01, "states": 50}
-    assert read_settings("ddscbf", learner_of("ddscbf"), ["way=direct", "points=20"]) == {"way": "direct", "points": 20}
+    assert read_settings("ddscbf", learner_of("ddscbf"), ["way=direct", "points=20"]) == {
+        "way": "direct",
+        "points": 20,
+    }
     assert read_settings("bayesian", learner_of("bayesian"), ["degree=2"]) == {"degree": 2}
 
 
 def test_whole_numbers_may_be_written_as_floats():
-    found = read_settings("bayesian", learner_of("bayesian"), ["starts=1e3", "degree=2.0", "steps=1.5", "prior=2.0"])
+    found = read_settings(
+        "bayesian", learner_of("bayesian"), ["starts=1e3", "degree=2.0", "steps=1.5", "prior=2.0"]
+    )
     assert found == {"starts": 1000, "degree": 2, "steps": 1.5, "prior": 2.0}
     assert [type(value) for value in found.values()] == [int, int, float, float]
-    assert read_settings("learned-hocbf", learner_of("learned-hocbf"), ["hidden=1e2,30.0"]) == {"hidden": [100, 30]}
-    assert read_settings("learned-hocbf", learner_of("learned-hocbf"), ["hidden=1e2"]) == {"hidden": [100]}
+    assert read_settings("learned-hocbf", learner_of("learned-hocbf"), ["hidden=1e2,30.0"]) == {
+        "hidden": [100, 30]
+    }
+    assert read_settings("learned-hocbf", learner_of("learned-hocbf"), ["hidden=1e2"]) == {
+        "hidden": [100]
+    }
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_help_names_every_setting_and_its_default(method):
     parameters = settings_of(learner_of(method))
     text = SETTINGS[method]
-    assert [entry.split("=")[0] for entry in re.findall(r"(?:^|, )(\w+=)", text)] == list(parameters)
+    assert [entry.split("=")[0] for entry in re.findall(r"(?:^|, )(\w+=)", text)] == list(
+        parameters
+    )
     for name, parameter in parameters.items():
         default = parameter.default
         shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
@@ -282,7 +421,10 @@ def test_the_help_shows_the_settings(identify):
     ],
 )
 def test_units(name, unit):
-    assert unit_of(name, {"v": "m/s", "z": "m", "p": "", "u": "N", "w": "1/s", "r": "rad^2/s^2"}) == unit
+    assert (
+        unit_of(name, {"v": "m/s", "z": "m", "p": "", "u": "N", "w": "1/s", "r": "rad^2/s^2"})
+        == unit
+    )
 
 
 def test_errors_of_a_function():
@@ -295,11 +437,18 @@ def test_errors_of_a_function():
     assert Function("f", "", zero, zero).vanishes
     assert Function("f", "", zero, np.ones(2)).relative is None
     assert Function("f", "", 1e-17 * np.ones(2), np.ones(2)).relative is None
-    assert [percent(share) for share in (0.0, 1e-3, 0.2, 12.0)] == ["< 1e-06 %", "0.1 %", "20 %", "1200 %"]
+    assert [percent(share) for share in (0.0, 1e-3, 0.2, 12.0)] == [
+        "< 1e-06 %",
+        "0.1 %",
+        "20 %",
+        "1200 %",
+    ]
 
 
 def test_an_unbounded_state_asks_for_a_range_or_a_workspace(safe_envs_command):
     Path("own.py").write_text(SYSTEM)
-    status, _, err = safe_envs_command("identify", "--system", "own.py:problem", "--method", "bayesian", "--out", "learned.npz")
+    status, _, err = safe_envs_command(
+        "identify", "--system", "own.py:problem", "--method", "bayesian", "--out", "learned.npz"
+    )
     assert status == 2
     assert "finite ranges, or the problem a workspace" in err

@@ -10,7 +10,17 @@ from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.slow
 
-ACC = ("evaluate", "safe_envs/ACC-v0", "--filter", "scbf", "--start=10,10,40", "--horizon", "6", "--dt", "0.1")
+ACC = (
+    "evaluate",
+    "safe_envs/ACC-v0",
+    "--filter",
+    "scbf",
+    "--start=10,10,40",
+    "--horizon",
+    "6",
+    "--dt",
+    "0.1",
+)
 FEW = ("--particles", "50", "--repetitions", "10")
 
 
@@ -21,63 +31,131 @@ def test_acceptance_in_small(safe_envs_command):
     assert "rare violations, 10 repetitions of 50 particles" in out
     assert "P(violation) [95 % interval]" in out
     (row,) = strictly("rare.json")["rows"]
-    # h_0 = 22 m is 5 deviations of the Gaussian law away: 2 Phi(-h_0/(tau sigma sqrt(T))), and a little less at control instants.
+    # h_0 = 22 m is 5 deviations of the Gaussian law away: 2 Phi(-h_0/(tau sigma sqrt(T))), and a
+    # little less at control instants.
     law = math.erfc((22 + 0.5826 * 1.8 * math.sqrt(0.1)) / (1.8 * math.sqrt(6)) / math.sqrt(2))
     assert law < 1e-6
     assert row["ci_low"] < law < row["ci_high"]
     assert f"{row['probability']:.3g} [" in out
     check = row["check"]
-    assert f"the check on scbf, by {check['method']}, is {check['probability']:.3g} [{check['ci_low']:.3g}" in out
+    assert (
+        f"the check on scbf, by {check['method']}, is {check['probability']:.3g}"
+        f" [{check['ci_low']:.3g}" in out
+    )
     assert max(map(len, out.splitlines()[3:7])) < 140
 
 
 def test_reason_in_place_of_a_number(safe_envs_command):
     status, out, _ = safe_envs_command(
-        "evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--knowledge", "plant", "--rare", *FEW, "--json", "-"
+        "evaluate",
+        "DubinsDisk-v0",
+        "--filter",
+        "hocbf",
+        "--knowledge",
+        "plant",
+        "--rare",
+        *FEW,
+        "--json",
+        "-",
     )
     assert status == 0
     assert '"probability": null' in out
     assert '"knowledge": "plant"' in out
     for quiet in ((), ("--quiet",)):
-        status, out, _ = safe_envs_command("evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--rare", *FEW, *quiet)
+        status, out, _ = safe_envs_command(
+            "evaluate", "DubinsDisk-v0", "--filter", "hocbf", "--rare", *FEW, *quiet
+        )
         assert status == 0
         assert "none, see below" in out
         assert "Splitting cannot work here for hocbf: nothing is random after the start" in out
 
 
 def test_filters_with_the_same_reason_share_a_line(safe_envs_command):
-    arguments = ("evaluate", "Scalar-v0", "--noise", "0", "--filter", "none", "--filter", "scbf", "--rare", *FEW)
+    arguments = (
+        "evaluate",
+        "Scalar-v0",
+        "--noise",
+        "0",
+        "--filter",
+        "none",
+        "--filter",
+        "scbf",
+        "--rare",
+        *FEW,
+    )
     out = safe_envs_command(*arguments)[1]
     assert out.count("Splitting cannot work here for") == 1
     assert "for none, scbf: nothing is random" in out
 
 
 def test_starts_outside_the_safe_set_are_told(safe_envs_command):
-    arguments = ("evaluate", "Scalar-v0", "--filter", "scbf", "--start", "2", "--horizon", "0.2", "--json", "out.json")
+    arguments = (
+        "evaluate",
+        "Scalar-v0",
+        "--filter",
+        "scbf",
+        "--start",
+        "2",
+        "--horizon",
+        "0.2",
+        "--json",
+        "out.json",
+    )
     told = "all episodes start where h <= 0: they count as violated whatever a filter does"
     assert told in safe_envs_command(*arguments, "--episodes", "20")[1]
     assert told in safe_envs_command(*arguments, "--rare", *FEW)[1]
     (row,) = strictly("out.json")["rows"]
-    assert (row["method"], row["plain"]["outside"], row["plain"]["kept_length"]) == ("plain episodes", 500, None)
-    assert "h <= 0" not in safe_envs_command(*arguments[:4], "--horizon", "0.2", "--episodes", "20")[1]
+    assert (row["method"], row["plain"]["outside"], row["plain"]["kept_length"]) == (
+        "plain episodes",
+        500,
+        None,
+    )
+    assert (
+        "h <= 0" not in safe_envs_command(*arguments[:4], "--horizon", "0.2", "--episodes", "20")[1]
+    )
 
 
 @pytest.mark.slow
 def test_rare_violations_of_episodes_that_end_early_are_told(safe_envs_command):
-    arguments = ("evaluate", "Scalar-v0", "--policy", "random", "--filter", "scbf", "--rare", *FEW, "--json", "out.json")
+    arguments = (
+        "evaluate",
+        "Scalar-v0",
+        "--policy",
+        "random",
+        "--filter",
+        "scbf",
+        "--rare",
+        *FEW,
+        "--json",
+        "out.json",
+    )
     out = safe_envs_command(*arguments)[1]
     (row,) = strictly("out.json")["rows"]
     assert 0 < row["plain"]["kept_length"] < 450
-    assert f"the mean episode without a violation ends after {row['plain']['kept_length']:.1f} of 500 steps" in out
+    assert (
+        f"the mean episode without a violation ends after {row['plain']['kept_length']:.1f} of 500"
+        " steps" in out
+    )
 
 
 def test_continuous_monitoring_is_told_in_the_heading(safe_envs_command):
-    arguments = ("evaluate", "Scalar-v0", "--filter", "none", "--episodes", "20", "--horizon", "0.2")
+    arguments = (
+        "evaluate",
+        "Scalar-v0",
+        "--filter",
+        "none",
+        "--episodes",
+        "20",
+        "--horizon",
+        "0.2",
+    )
     assert "monitored" not in safe_envs_command(*arguments)[1]
     status, out, _ = safe_envs_command(*arguments, "--monitoring", "continuous")
     assert status == 0
     assert "horizon 0.2 s, monitored continuously" in out
-    status, out, _ = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", "--rare", "--monitoring", "continuous", *FEW)
+    status, out, _ = safe_envs_command(
+        "evaluate", "Scalar-v0", "--filter", "none", "--rare", "--monitoring", "continuous", *FEW
+    )
     assert "monitored continuously" in out
 
 
@@ -85,8 +163,14 @@ def test_continuous_monitoring_is_told_in_the_heading(safe_envs_command):
     ("arguments", "message"),
     [
         (("--rare", "--refine"), "--rare does not go with --refine"),
-        (("--rare", "--plot", "a.png", "--repeats", "2"), "--rare does not go with --plot, --repeats"),
-        (("--rare", "--episodes", "1000", "--num-envs", "64"), "--rare does not go with --episodes, --num-envs"),
+        (
+            ("--rare", "--plot", "a.png", "--repeats", "2"),
+            "--rare does not go with --plot, --repeats",
+        ),
+        (
+            ("--rare", "--episodes", "1000", "--num-envs", "64"),
+            "--rare does not go with --episodes, --num-envs",
+        ),
         (("--particles", "100"), "are of --rare"),
         (("--rare", "--particles", "3"), "particles = 3"),
         (("--monitoring", "often"), "monitoring = 'often'"),

@@ -38,7 +38,15 @@ def drawn(path) -> list[np.ndarray]:
 
 def test_a_still_of_two_filters(tmp_path):
     out = tmp_path / "end.png"
-    arguments = ("safe_envs/DubinsDisk-v0", "--horizon", "2", "--start", "0,0.1,0", "--out", str(out))
+    arguments = (
+        "safe_envs/DubinsDisk-v0",
+        "--horizon",
+        "2",
+        "--start",
+        "0,0.1,0",
+        "--out",
+        str(out),
+    )
     result = render(*arguments, "--compare", "none,hocbf:p=2,8")
     assert result.exit_code == 0, result.output
     assert "none: violation at" in result.output
@@ -46,7 +54,9 @@ def test_a_still_of_two_filters(tmp_path):
     (both,) = drawn(out)
     assert both.shape == (540, 1920, 3)
     bare = both[:, :960]
-    assert (bare[110:130, 790:930] == style.VIOLATION).all(axis=-1).sum() > 500, "the still does not say that the end is unsafe"
+    assert (bare[110:130, 790:930] == style.VIOLATION).all(axis=-1).sum() > 500, (
+        "the still does not say that the end is unsafe"
+    )
     assert (np.abs(bare[:, :600].astype(int) - style.VIOLATION).sum(axis=-1) < 60).sum() > 50, (
         "neither the trail nor a mark shows the violation"
     )
@@ -55,7 +65,9 @@ def test_a_still_of_two_filters(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::SyntaxWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning")
+@pytest.mark.filterwarnings(
+    "ignore::SyntaxWarning", "ignore::DeprecationWarning", "ignore::ResourceWarning"
+)
 def test_an_episode_as_video_and_animation(tmp_path):
     arguments = ("safe_envs/Scalar-v0", "--horizon", "0.1", "--policy", "random", "--noise", "0.5")
     video, animation = tmp_path / "run.mp4", tmp_path / "run.gif"
@@ -76,7 +88,9 @@ def test_an_episode_as_video_and_animation(tmp_path):
     played = [np.frombuffer(frame, dtype=np.uint8).reshape(540, 960, 3) for frame in reader]
     assert len(played) == 6
     for ours, theirs in zip(played, frames, strict=True):
-        assert np.abs(ours.astype(int) - theirs).mean() < 8.0, "video and animation show different things"
+        assert np.abs(ours.astype(int) - theirs).mean() < 8.0, (
+            "video and animation show different things"
+        )
 
 
 def test_filters_are_divided_at_their_names():
@@ -115,16 +129,25 @@ def test_animations_run_in_real_time(tmp_path, seconds):
     assert np.abs(ends - 1000 * seconds * np.arange(1, 8)).max() <= 5.0 + 1e-6
 
 
-def straightforward(env_id: str, seed: int, filter_name: str | None = None, knowledge: str = "model", **options):
-    """What an env of the seed does under the random policy: the least h, and where and when it ended and was unsafe first."""
+def straightforward(
+    env_id: str, seed: int, filter_name: str | None = None, knowledge: str = "model", **options
+):
+    """What an env of the seed does under the random policy: the least h, and where and when it
+    ended and was unsafe first."""
     problem = problem_of(env_id, **options)
-    env = SafeEnv(problem) if filter_name is None else SafetyFilterWrapper(SafeEnv(problem), filter_name, knowledge)
+    env = (
+        SafeEnv(problem)
+        if filter_name is None
+        else SafetyFilterWrapper(SafeEnv(problem), filter_name, knowledge)
+    )
     actor = make_policy("random", problem, False)
     actor.begin(range(1), seed)
     observation, info = env.reset(seed=seed)
     violated, steps, state, ended = 0.0 if info["cost"] else None, 0, None, False
     while not ended:
-        actions, state = actor.predict(observation[None], state, np.array([steps == 0]), deterministic=True)
+        actions, state = actor.predict(
+            observation[None], state, np.array([steps == 0]), deterministic=True
+        )
         observation, _, terminated, truncated, info = env.step(actions[0])
         steps += 1
         ended = terminated or truncated or steps >= problem.steps
@@ -135,7 +158,9 @@ def straightforward(env_id: str, seed: int, filter_name: str | None = None, know
 def episodes(tmp_path, *arguments: str) -> list[dict]:
     """The random policy's episodes, from the JSON of a still."""
     found = tmp_path / "found.json"
-    result = render(*arguments, "--policy", "random", "--out", str(tmp_path / "end.png"), "--json", str(found))
+    result = render(
+        *arguments, "--policy", "random", "--out", str(tmp_path / "end.png"), "--json", str(found)
+    )
     assert result.exit_code == 0, result.output
     return json.loads(found.read_text())["episodes"]
 
@@ -143,7 +168,18 @@ def episodes(tmp_path, *arguments: str) -> list[dict]:
 @pytest.mark.parametrize("seed", [0, 3])
 def test_episodes_are_those_of_the_seed(tmp_path, seed):
     (found,) = episodes(
-        tmp_path, "safe_envs/Scalar-v0", "--filter", "none", "--noise", "1", "--horizon", "0.5", "--start", "0", "--seed", str(seed)
+        tmp_path,
+        "safe_envs/Scalar-v0",
+        "--filter",
+        "none",
+        "--noise",
+        "1",
+        "--horizon",
+        "0.5",
+        "--start",
+        "0",
+        "--seed",
+        str(seed),
     )
     expected = straightforward("safe_envs/Scalar-v0", seed, noise=1.0, horizon=0.5, start=[0.0])
     assert {key: found[key] for key in expected} == pytest.approx(expected)
@@ -151,19 +187,49 @@ def test_episodes_are_those_of_the_seed(tmp_path, seed):
 
 
 def test_the_first_violation_is_at_its_step(tmp_path):
-    (found,) = episodes(tmp_path, "safe_envs/Scalar-v0", "--filter", "none", "--start", "0.9", "--noise", "2", "--horizon", "0.5")
+    (found,) = episodes(
+        tmp_path,
+        "safe_envs/Scalar-v0",
+        "--filter",
+        "none",
+        "--start",
+        "0.9",
+        "--noise",
+        "2",
+        "--horizon",
+        "0.5",
+    )
     expected = straightforward("safe_envs/Scalar-v0", 0, start=[0.9], noise=2.0, horizon=0.5)
     assert expected["violated_at"] > 0.01
     assert found["violated_at"] == pytest.approx(expected["violated_at"])
-    (found,) = episodes(tmp_path, "safe_envs/Scalar-v0", "--filter", "none", "--start", "1.5", "--horizon", "0.05")
+    (found,) = episodes(
+        tmp_path, "safe_envs/Scalar-v0", "--filter", "none", "--start", "1.5", "--horizon", "0.05"
+    )
     assert found["violated_at"] == 0.0
 
 
 def test_filters_know_what_they_are_told(tmp_path):
-    arguments = ("safe_envs/DubinsDisk-v0", "--filter", "hocbf:p=2,8", "--horizon", "1.5", "--start", "0,0.1,0")
-    found = {k: episodes(tmp_path, *arguments, "--knowledge", k)[0]["h_min"] for k in ("model", "plant")}
+    arguments = (
+        "safe_envs/DubinsDisk-v0",
+        "--filter",
+        "hocbf:p=2,8",
+        "--horizon",
+        "1.5",
+        "--start",
+        "0,0.1,0",
+    )
+    found = {
+        k: episodes(tmp_path, *arguments, "--knowledge", k)[0]["h_min"] for k in ("model", "plant")
+    }
     for knowledge, h_min in found.items():
-        expected = straightforward("safe_envs/DubinsDisk-v0", 0, "hocbf:p=2,8", knowledge, horizon=1.5, start=[0.0, 0.1, 0.0])
+        expected = straightforward(
+            "safe_envs/DubinsDisk-v0",
+            0,
+            "hocbf:p=2,8",
+            knowledge,
+            horizon=1.5,
+            start=[0.0, 0.1, 0.0],
+        )
         assert h_min == pytest.approx(expected["h_min"])
     assert found["model"] != found["plant"]
 
@@ -171,7 +237,9 @@ def test_filters_know_what_they_are_told(tmp_path):
 def test_each_episode_has_a_policy_of_its_own(tmp_path):
     arguments = ("safe_envs/Scalar-v0", "--noise", "1", "--horizon", "0.3", "--seed", "2")
     both = episodes(tmp_path, *arguments, "--compare", "none,scbf")
-    assert both == [episodes(tmp_path, *arguments, "--filter", name)[0] for name in ("none", "scbf")]
+    assert both == [
+        episodes(tmp_path, *arguments, "--filter", name)[0] for name in ("none", "scbf")
+    ]
 
 
 class Counted:
@@ -191,7 +259,9 @@ class Counted:
         return np.full((1, 1, 3), self.k)
 
 
-@pytest.mark.parametrize(("every", "expected"), [(1, [0, 1, 2, 3, 4, 5]), (2, [0, 2, 4, 5]), (5, [0, 5]), (9, [0, 5])])
+@pytest.mark.parametrize(
+    ("every", "expected"), [(1, [0, 1, 2, 3, 4, 5]), (2, [0, 2, 4, 5]), (5, [0, 5]), (9, [0, 5])]
+)
 def test_a_film_has_the_start_and_the_end(every, expected):
     told = []
     frames = list(frames_of([Counted(5), Counted(3)], every, 5, told.append))
@@ -203,9 +273,15 @@ def test_a_film_has_the_start_and_the_end(every, expected):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--out", "run.gif", "--json", "run.gif"), "--json run.gif would overwrite the file of --out run.gif"),
+        (
+            ("--out", "run.gif", "--json", "run.gif"),
+            "--json run.gif would overwrite the file of --out run.gif",
+        ),
         (("--out", "run.png", "--compare", "none,foo"), "unknown filter 'foo'"),
-        (("--out", "run.png", "--compare", "none, scfb:alpha=1,szcbf"), "unknown filter 'scfb'; did you mean 'scbf'"),
+        (
+            ("--out", "run.png", "--compare", "none, scfb:alpha=1,szcbf"),
+            "unknown filter 'scfb'; did you mean 'scbf'",
+        ),
         (("--out", "run.avi"), "ends in '.avi'"),
         (("--out", "missing/run.png"), "does not exist"),
         (("--out", "run.png", "--filter", "scfb"), "did you mean 'scbf'"),
@@ -229,13 +305,17 @@ def test_missing_moviepy_says_what_to_install(tmp_path, monkeypatch):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "moviepy", None)
     # Before any work: what else is wrong comes up later.
-    result = render("safe_envs/Scalar-v0", "--policy", "nominall", "--out", str(tmp_path / "run.mp4"))
+    result = render(
+        "safe_envs/Scalar-v0", "--policy", "nominall", "--out", str(tmp_path / "run.mp4")
+    )
     assert 'pip install "safe-envs[render]"' in str(result.exception)
 
 
 def test_missing_pygame_is_said_before_any_work(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    result = render("safe_envs/Scalar-v0", "--policy", "nominall", "--out", str(tmp_path / "run.png"))
+    result = render(
+        "safe_envs/Scalar-v0", "--policy", "nominall", "--out", str(tmp_path / "run.png")
+    )
     assert 'drawing needs pygame-ce: pip install "safe-envs[render]"' in str(result.exception)
     # The doctor reads the metadata, which have pygame-ce.
     assert next(check for check in packages() if check.name == "pygame-ce").ok

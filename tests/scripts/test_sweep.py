@@ -48,14 +48,21 @@ def test_a_sweep_its_second_run_and_its_report(safe_envs_command, spec: Path, tm
     status, out, _ = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)
     assert (status, out) == (0, "12 of 12 cells are in done, of which 8 were there before.\n")
 
-    status, out, _ = safe_envs_command("sweep-report", "done", "--worst", 2, "--json", "report.json")
+    status, out, _ = safe_envs_command(
+        "sweep-report", "done", "--worst", 2, "--json", "report.json"
+    )
     assert status == 0
     assert "12 of 12 cells are done, 0 failed, 0 are missing." in out
     assert (tmp_path / "done" / "report.png").stat().st_size > 10_000
     spec.write_text(SPEC.replace("[0, 1]", "[0]"))
     status, out, _ = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)
-    assert (status, out.splitlines()[0]) == (0, "4 of 4 cells are in done, of which 4 were there before.")
-    assert out.splitlines()[1].startswith("Note: 8 cells of another grid or version are in done too")
+    assert (status, out.splitlines()[0]) == (
+        0,
+        "4 of 4 cells are in done, of which 4 were there before.",
+    )
+    assert out.splitlines()[1].startswith(
+        "Note: 8 cells of another grid or version are in done too"
+    )
     spec.write_text(SPEC.replace("[0, 1]", "[0, 1, 2]"))
     assert safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)[0] == 0
     report = strictly(tmp_path / "report.json")
@@ -72,10 +79,13 @@ fixed: {system: "mine.py:problem", filter: scbf, episodes: 20}
 grid: {barrier.first: [0, 1], barrier.second: [0, 1], seed: [0, 1]}
 """)
     told = (
-        r"2 of 8 cells failed; the same command tries them again:\n  seed = 0, barrier\.first = 1, barrier\.second = 1: .*division by zero"
+        r"2 of 8 cells failed; the same command tries them again:\n  seed = 0, barrier\.first = 1,"
+        r" barrier\.second = 1: .*division by zero"
     )
     for there in ("", ", of which 6 were there before"):
-        status, out, err = safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1, "--json", "done.json")
+        status, out, err = safe_envs_command(
+            "sweep", spec, "--out", "done", "--jobs", 1, "--json", "done.json"
+        )
         assert (status, out) == (2, f"6 of 8 cells are in done{there}.\n")
         assert re.search(told, err)
         document = strictly(tmp_path / "done.json")
@@ -84,11 +94,17 @@ grid: {barrier.first: [0, 1], barrier.second: [0, 1], seed: [0, 1]}
     (tmp_path / "done" / "cells" / f"{read(tmp_path / 'done')['key'][0]}.parquet").unlink()
     # No cell that is there has this one.
     index = json.loads((tmp_path / "done" / "sweep.json").read_text())
-    (tmp_path / "done" / "sweep.json").write_text(json.dumps({**index, "swept": [*index["swept"], "dt"]}))
+    (tmp_path / "done" / "sweep.json").write_text(
+        json.dumps({**index, "swept": [*index["swept"], "dt"]})
+    )
     status, out, _ = safe_envs_command("sweep-report", "done", "--plot", "rates.svg")
     assert status == 0
     assert "5 of 8 cells are done, 2 failed, 1 are missing." in out
-    assert re.search(r"\nFailed:\n  seed = 0, barrier\.first = 1, barrier\.second = 1, dt = -: .*division by zero\n", out)
+    assert re.search(
+        r"\nFailed:\n  seed = 0, barrier\.first = 1, barrier\.second = 1, dt = -: .*division by"
+        r" zero\n",
+        out,
+    )
     assert "barrier.first" in (tmp_path / "rates.svg").read_text()
 
 
@@ -96,8 +112,22 @@ def test_mistakes_end_before_anything_is_made(safe_envs_command, spec: Path, tmp
     spec.write_text(SPEC.replace("scbf", "scfb"))
     status, _, err = safe_envs_command("sweep", spec, "--out", "done")
     assert status == 2
-    assert "sweep.yaml, cell filter = scfb, noise = 0.1, seed = 0: unknown filter 'scfb'; did you mean 'scbf'" in err
-    status, _, err = safe_envs_command("sweep", spec, "--out", "done", "--backend", "dask", "--address", "tcp://127.0.0.1:1", "--jobs", 2)
+    assert (
+        "sweep.yaml, cell filter = scfb, noise = 0.1, seed = 0: unknown filter 'scfb'; did you mean"
+        " 'scbf'" in err
+    )
+    status, _, err = safe_envs_command(
+        "sweep",
+        spec,
+        "--out",
+        "done",
+        "--backend",
+        "dask",
+        "--address",
+        "tcp://127.0.0.1:1",
+        "--jobs",
+        2,
+    )
     assert status == 2
     assert "--jobs 2 is of this machine" in err
     assert not (tmp_path / "done").exists()
@@ -105,7 +135,9 @@ def test_mistakes_end_before_anything_is_made(safe_envs_command, spec: Path, tmp
 
 def test_mistakes_in_a_report(safe_envs_command, spec: Path, tmp_path: Path):
     assert safe_envs_command("sweep-report", tmp_path)[0] == 2
-    spec.write_text("fixed: {env: Scalar-v0, episodes: 20, horizon: 0.2}\ngrid: {filter: [none, scbf]}")
+    spec.write_text(
+        "fixed: {env: Scalar-v0, episodes: 20, horizon: 0.2}\ngrid: {filter: [none, scbf]}"
+    )
     assert safe_envs_command("sweep", spec, "--out", "done", "--jobs", 1)[0] == 0
     for option in ("--x", "--lines"):
         status, _, err = safe_envs_command("sweep-report", "done", option, "noise")
@@ -118,15 +150,30 @@ def test_mistakes_in_a_report(safe_envs_command, spec: Path, tmp_path: Path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("jobs", "number"), [("2", signal.SIGINT), ("1", signal.SIGTERM)])
-def test_a_stop_keeps_what_is_done_and_leaves_no_process(spec: Path, tmp_path: Path, jobs: str, number: signal.Signals):
+def test_a_stop_keeps_what_is_done_and_leaves_no_process(
+    spec: Path, tmp_path: Path, jobs: str, number: signal.Signals
+):
     spec.write_text(SPEC.replace("seed: [0, 1]", f"seed: {list(range(100))}"))
-    words = [sys.executable, "-m", "safe_envs.scripts.sweep", str(spec), "--out", str(tmp_path / "out"), "--jobs", jobs]
+    words = [
+        sys.executable,
+        "-m",
+        "safe_envs.scripts.sweep",
+        str(spec),
+        "--out",
+        str(tmp_path / "out"),
+        "--jobs",
+        jobs,
+    ]
     # A shell that runs the tests in the background has its processes ignore the signal.
     heed = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heed)
+    process = subprocess.Popen(
+        words, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heed
+    )
     try:
         cells = tmp_path / "out" / "cells"
-        while process.poll() is None and not (cells.exists() and len(list(cells.glob("[!.]*.parquet"))) >= 3):
+        while process.poll() is None and not (
+            cells.exists() and len(list(cells.glob("[!.]*.parquet"))) >= 3
+        ):
             time.sleep(0.05)
         # As a terminal and a job manager send it: to all of them.
         os.killpg(process.pid, number)

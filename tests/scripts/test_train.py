@@ -13,7 +13,18 @@ from tests.scripts.own_system import SYSTEM
 pytestmark = pytest.mark.slow
 
 DUBINS = "safe_envs/StochasticDubins-v0"
-QUICK = ("--n-timesteps", 512, "--num-envs", 4, "--eval-freq", 256, "--eval-episodes", 8, "--horizon", 0.5)
+QUICK = (
+    "--n-timesteps",
+    512,
+    "--num-envs",
+    4,
+    "--eval-freq",
+    256,
+    "--eval-episodes",
+    8,
+    "--horizon",
+    0.5,
+)
 
 
 @pytest.mark.slow
@@ -41,7 +52,18 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
     config = json.loads((tmp_path / "run" / "config.json").read_text())["training"]
     assert config["hyperparameters"]["learning_rate"] == "lin_1e-3"
     assert config["hyperparameters"]["ent_coef"] == 1e-3
-    status, out, err = safe_envs_command("evaluate", DUBINS, "--policy", "run", "--filter", "none", "--filter", "scbf", "--episodes", 20)
+    status, out, err = safe_envs_command(
+        "evaluate",
+        DUBINS,
+        "--policy",
+        "run",
+        "--filter",
+        "none",
+        "--filter",
+        "scbf",
+        "--episodes",
+        20,
+    )
     assert (status, err) == (0, "")
     assert "policy run" in out
     status, _, err = safe_envs_command(*arguments)
@@ -62,7 +84,10 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
         (("--algo", "ppo", "--set", f"gamma={'[' * 1000}"), "no YAML"),
         (("--algo", "ppo", "--set", f"gamma={'[' * 3000}"), "nested more than 10 deep"),
         (("--algo", "ppo", "--set", "x" * 3000), "xxx: give NAME=VALUE"),
-        (("--algo", "ppo", "--set", "policy_kwargs={a: &a [1, 1], b: &b [*a, *a], c: [*b, *b]}"), "an alias is not allowed"),
+        (
+            ("--algo", "ppo", "--set", "policy_kwargs={a: &a [1, 1], b: &b [*a, *a], c: [*b, *b]}"),
+            "an alias is not allowed",
+        ),
         (("--algo", "ppo", "--set", "gamma=2020-13-45"), "gamma = '2020-13-45'; give a number"),
         (("--algo", "ppo", "--set", "n_steps=1_000"), "1_000 is no plain number"),
         (("--algo", "ppo", "--set", "gamma=\u0661"), "the digits 0 to 9"),
@@ -72,8 +97,12 @@ def test_an_agent_is_trained_evaluated_and_gone_on_with(safe_envs_command, tmp_p
         (("--algo", "ppo", "--resume"), "holds no training"),
     ],
 )
-def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(safe_envs_command, tmp_path, arguments, message):
-    status, _, err = safe_envs_command("train", DUBINS, "--horizon", 0.5, "--num-envs", 2, *arguments, "--out", "run")
+def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(
+    safe_envs_command, tmp_path, arguments, message
+):
+    status, _, err = safe_envs_command(
+        "train", DUBINS, "--horizon", 0.5, "--num-envs", 2, *arguments, "--out", "run"
+    )
     assert status == 2
     assert "Traceback" not in err
     assert message in " ".join(err.split())
@@ -82,8 +111,20 @@ def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(safe_envs_com
 
 @pytest.mark.slow
 def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command, monkeypatch):
-    monkeypatch.setattr("safe_envs.scripts.leaderboard._QUICK", {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4})
-    arguments = ("leaderboard", "Scalar-v0", "safe_envs/Scalar-v0", "--quick", "--episodes", 8, "--out", "board")
+    monkeypatch.setattr(
+        "safe_envs.scripts.leaderboard._QUICK",
+        {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4},
+    )
+    arguments = (
+        "leaderboard",
+        "Scalar-v0",
+        "safe_envs/Scalar-v0",
+        "--quick",
+        "--episodes",
+        8,
+        "--out",
+        "board",
+    )
     status, out, err = safe_envs_command(*arguments)
     assert (status, err) == (0, "")
     rows = strictly("board/results.json")["rows"]
@@ -98,7 +139,11 @@ def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command
     again = safe_envs_command(*arguments, "--markdown")
     assert again[0] == 0
     first, _, row = again[1].splitlines()
-    assert first == "| env | filter | nominal | nominal + filter | ppo | ppo + filter | ppo, filter in the loop | processor time |"
+    assert (
+        first
+        == "| env | filter | nominal | nominal + filter | ppo | ppo + filter | ppo, filter in the"
+        " loop | processor time |"
+    )
     assert row.startswith("| Scalar | scbf | ")
     assert strictly("board/results.json")["rows"] == rows
     status, _, err = safe_envs_command(*arguments, "--seed", 1)
@@ -108,12 +153,29 @@ def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command
 
 def test_a_system_without_a_workspace_is_trained_and_gone_on_with(safe_envs_command):
     Path("own.py").write_text(SYSTEM)
-    given = ("--algo", "ppo", "--n-timesteps", 128, "--num-envs", 4, "--eval-episodes", 8, "--set", "n_steps=32", "--out", "run")
+    given = (
+        "--algo",
+        "ppo",
+        "--n-timesteps",
+        128,
+        "--num-envs",
+        4,
+        "--eval-episodes",
+        8,
+        "--set",
+        "n_steps=32",
+        "--out",
+        "run",
+    )
     arguments = ("train", "--system", "own.py:problem", *given)
     status, out, err = safe_envs_command(*arguments, "--eval-freq", 128)
     assert (status, err) == (0, "")
     assert "finished already" not in out
-    assert strictly("run/policy.json")["problem"]["observation"] == {"shape": [2], "low": ["-inf", "-inf"], "high": ["inf", "inf"]}
+    assert strictly("run/policy.json")["problem"]["observation"] == {
+        "shape": [2],
+        "low": ["-inf", "-inf"],
+        "high": ["inf", "inf"],
+    }
     evaluated = ("--policy", "run", "--filter", "none", "--episodes", 8)
     assert safe_envs_command("evaluate", "--system", "own.py:problem", *evaluated)[::2] == (0, "")
     # A policy of other observations is refused as ever.
@@ -124,6 +186,8 @@ def test_a_system_without_a_workspace_is_trained_and_gone_on_with(safe_envs_comm
     assert status == 0
     assert out.startswith("The training in run was finished already")
     # The system is named before all that changes with it.
-    status, _, err = safe_envs_command("train", "--system", "own.py:bounded", *given, "--eval-freq", 64, "--resume")
+    status, _, err = safe_envs_command(
+        "train", "--system", "own.py:bounded", *given, "--eval-freq", 64, "--resume"
+    )
     assert status == 2
     assert "has system = 'own.py:problem', not 'own.py:bounded'" in err

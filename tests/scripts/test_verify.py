@@ -46,13 +46,35 @@ def test_the_report_names_what_was_found(verify):
 @pytest.mark.parametrize(
     ("arguments", "texts"),
     [
-        (("safe_envs/ACC-v0",), ("sup h over C = c = 1000", "suprema are of the part inside", "estimated")),
-        (("StochasticDubins-v0",), ("c_0 = 8.9996, c_1 = 11.92", "product of b_j/c_j", "conditions on the future")),
+        (
+            ("safe_envs/ACC-v0",),
+            ("sup h over C = c = 1000", "suprema are of the part inside", "estimated"),
+        ),
+        (
+            ("StochasticDubins-v0",),
+            ("c_0 = 8.9996, c_1 = 11.92", "product of b_j/c_j", "conditions on the future"),
+        ),
         (("StochasticDubins-v0", "--filter", "hocbf"), ("hocbf ignores the noise",)),
-        (("DubinsDisk-v0",), ("theta over a period of 2 pi", "the model differs from the plant in v", "the input has no say")),
-        (("DubinsDisk-v0", "--filter", "hocbf:p=1,1", "--knowledge", "plant"), ("the best action misses it by 0.28",)),
-        (("DubinsDisk-v0", "--start", "thesis", "--knowledge", "plant"), ("the start is outside C_1: b_1 = -1.26",)),
-        (("Pendulum-v0", "--start", ".1,.1"), ("nowhere; the least to spare", "estimated", "72.7 %")),
+        (
+            ("DubinsDisk-v0",),
+            (
+                "theta over a period of 2 pi",
+                "the model differs from the plant in v",
+                "the input has no say",
+            ),
+        ),
+        (
+            ("DubinsDisk-v0", "--filter", "hocbf:p=1,1", "--knowledge", "plant"),
+            ("the best action misses it by 0.28",),
+        ),
+        (
+            ("DubinsDisk-v0", "--start", "thesis", "--knowledge", "plant"),
+            ("the start is outside C_1: b_1 = -1.26",),
+        ),
+        (
+            ("Pendulum-v0", "--start", ".1,.1"),
+            ("nowhere; the least to spare", "estimated", "72.7 %"),
+        ),
     ],
 )
 def test_reports_without_a_simulation(verify, arguments, texts):
@@ -75,7 +97,10 @@ def test_of_a_set_that_is_cut_only_the_part_inside_is_told(verify):
     assert "% of the part of C that is searched" in out
     assert "  the part of C that is searched: " in out
     assert "where the episodes are" not in out
-    assert "of the starts are in C and outside this intersection: nothing is promised from there" in out
+    assert (
+        "of the starts are in C and outside this intersection: nothing is promised from there"
+        in out
+    )
 
 
 def test_json_holds_all_of_it(verify, tmp_path):
@@ -92,7 +117,11 @@ def test_json_holds_all_of_it(verify, tmp_path):
         "horizon": 1.0,
     }
     (barrier,) = document["barriers"]
-    assert (barrier["supremum"], barrier["unbounded"], barrier["suprema"]) == (1000.0, False, [1000.0])
+    assert (barrier["supremum"], barrier["unbounded"], barrier["suprema"]) == (
+        1000.0,
+        False,
+        [1000.0],
+    )
     assert [bound["status"] for bound in document["bounds"]] == ["hypothesis fails", "estimated"]
     assert len(document["safe"]["worst"]) == 3
     measured, _ = document["measurements"]

@@ -41,15 +41,24 @@ def rotors():
 @pytest.fixture(scope="session")
 def residual(disk):
     rng, coordinates = np.random.default_rng(0), disk.exploration.coordinates
-    network, heldout = some_network(rng, len(coordinates), 3, "relu"), abs(rng.normal(size=(40, 3))) * 0.05
-    return ResidualModel(Signature.of(disk), NO_RECORD, (LearnedResidual(disk.plant.states, coordinates, 2, network, heldout),))
+    network, heldout = (
+        some_network(rng, len(coordinates), 3, "relu"),
+        abs(rng.normal(size=(40, 3))) * 0.05,
+    )
+    return ResidualModel(
+        Signature.of(disk),
+        NO_RECORD,
+        (LearnedResidual(disk.plant.states, coordinates, 2, network, heldout),),
+    )
 
 
 @pytest.fixture(scope="session")
 def network(top):
     coordinates = top.exploration.coordinates
     network = some_network(np.random.default_rng(1), len(coordinates), 1, "tanh")
-    return GeneratorModel(Signature.of(top), NO_RECORD, (LearnedGenerator(top.plant.states, coordinates, (network,)),))
+    return GeneratorModel(
+        Signature.of(top), NO_RECORD, (LearnedGenerator(top.plant.states, coordinates, (network,)),)
+    )
 
 
 @pytest.fixture(scope="session")

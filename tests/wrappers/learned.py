@@ -23,8 +23,19 @@ NO_RECORD = Record(0, 0.0, 0.0)
 
 def some_network(rng, inputs, outputs, activation):
     """As training might have left it; none of these tests asks what it is good for."""
-    weights, biases = (rng.normal(size=(12, inputs)), rng.normal(size=(outputs, 12)) / 12), (rng.normal(size=12), rng.normal(size=outputs))
-    return Network(weights, biases, activation, np.zeros(inputs), np.ones(inputs), np.zeros(outputs), np.full(outputs, 0.3))
+    weights, biases = (
+        (rng.normal(size=(12, inputs)), rng.normal(size=(outputs, 12)) / 12),
+        (rng.normal(size=12), rng.normal(size=outputs)),
+    )
+    return Network(
+        weights,
+        biases,
+        activation,
+        np.zeros(inputs),
+        np.ones(inputs),
+        np.zeros(outputs),
+        np.full(outputs, 0.3),
+    )
 
 
 class Terms:
@@ -55,10 +66,16 @@ class Undefined(Terms):
         self._which, self._limit = which, limit
 
     def floats(self, x):
-        return [math.nan if i == self._which and x[0] > self._limit else v for i, v in enumerate(super().floats(x))]
+        return [
+            math.nan if i == self._which and x[0] > self._limit else v
+            for i, v in enumerate(super().floats(x))
+        ]
 
     def arrays(self, x):
-        return tuple(np.where((i == self._which) & (x[0] > self._limit), np.nan, v) for i, v in enumerate(super().arrays(x)))
+        return tuple(
+            np.where((i == self._which) & (x[0] > self._limit), np.nan, v)
+            for i, v in enumerate(super().arrays(x))
+        )
 
 
 def lie(system, barrier, degree):
@@ -73,7 +90,9 @@ def residual_of(problem, errors=()) -> Any:
     for i, barrier in enumerate(problem.barriers):
         r = len(problem.gains_of(i))
         truth, believed = (lie(system, barrier, r) for system in (problem.plant, problem.model))
-        parts.append(Terms(problem.plant, r, [p - m for p, m in zip(truth, believed, strict=True)], errors))
+        parts.append(
+            Terms(problem.plant, r, [p - m for p, m in zip(truth, believed, strict=True)], errors)
+        )
     return ResidualModel(Signature.of(problem), NO_RECORD, tuple(parts))
 
 
@@ -83,7 +102,9 @@ def generator_of(problem, degree) -> Any:
     noisy, plain = (derivatives(plant, h, degree, d) for d in (generator, lie_derivative_f))
     parts = [a - b for a, b in zip(noisy, plain, strict=True)]
     slopes = [sp.diff(parts[-2], s) for s in plant.states] if degree > 1 else []
-    return GeneratorModel(Signature.of(problem), NO_RECORD, (Terms(plant, degree, [parts[-1], *slopes]),))  # pyright: ignore[reportArgumentType]
+    return GeneratorModel(
+        Signature.of(problem), NO_RECORD, (Terms(plant, degree, [parts[-1], *slopes]),)
+    )  # pyright: ignore[reportArgumentType]
 
 
 def values(system, expressions, x):
@@ -95,7 +116,9 @@ def situations(problem, count, seed=0):
     """States where the problem is explored, and inputs from a box twice as wide as its own."""
     rng = np.random.default_rng(seed)
     low, high = np.array(problem.box).T
-    return draw_states(problem, count, rng), rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, (count, len(low)))
+    return draw_states(problem, count, rng), rng.uniform(
+        1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, (count, len(low))
+    )
 
 
 def assert_same_decisions(problem, one, other, count=200, tolerance=1e-9):
@@ -123,12 +146,17 @@ def assert_floats_are_arrays(safety_filter, x, u, tolerance=1e-9):
 
 
 def worst_row(problem, x, u, errors):
-    """The least of h^(r) + ... + k_0 h under an input over the corners of the errors of exact residuals."""
+    """The least of h^(r) + ... + k_0 h under an input over the corners of the errors of exact
+    residuals."""
     r, (p_1, p_2) = 2, problem.gains_of(0)
     h = values(problem.plant, [problem.barriers[0].expression], x)[:, 0]
     first, second, *gains = values(problem.plant, lie(problem.plant, problem.barriers[0], r), x).T
     rows = []
     for e_1, e_2, *e_u in itertools.product(*[(-e, e) for e in errors]):
-        highest = second + e_2 + sum((g + e) * u[:, j] for j, (g, e) in enumerate(zip(gains, e_u, strict=True)))
+        highest = (
+            second
+            + e_2
+            + sum((g + e) * u[:, j] for j, (g, e) in enumerate(zip(gains, e_u, strict=True)))
+        )
         rows.append(highest + (p_1 + p_2) * (first + e_1) + p_1 * p_2 * h)
     return np.min(rows, axis=0)

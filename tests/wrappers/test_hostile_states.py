@@ -1,4 +1,5 @@
-"""Filters at any state: an answer inside the bounds with the right flags, or a NumericalError, the same for one state and a batch."""
+"""Filters at any state: an answer inside the bounds with the right flags, or a NumericalError, the
+same for one state and a batch."""
 
 from __future__ import annotations
 
@@ -28,26 +29,43 @@ FILTERS = {
 }
 ALL = [
     f"{condition}{margin} {objective}"
-    for condition in ("cbf", "hocbf", "ecbf", "rcbf", "rcbf:form=log", "srcbf", "srcbf:form=log", "scbf", "szcbf")
+    for condition in (
+        "cbf",
+        "hocbf",
+        "ecbf",
+        "rcbf",
+        "rcbf:form=log",
+        "srcbf",
+        "srcbf:form=log",
+        "scbf",
+        "szcbf",
+    )
     for margin in ("", ":sampling_margin=first-order")
     for objective in ("nearest", "clf")
 ]
 
-# Log-uniform over all magnitudes and signs, zeros, denormals, and the round numbers at which h and gains vanish.
-NUMBER = st.builds(lambda sign, exponent: sign * 10.0**exponent, st.sampled_from([-1, 1]), st.floats(-320, 300))
+# Log-uniform over all magnitudes and signs, zeros, denormals, and the round numbers at which h and
+# gains vanish.
+NUMBER = st.builds(
+    lambda sign, exponent: sign * 10.0**exponent, st.sampled_from([-1, 1]), st.floats(-320, 300)
+)
 ENTRY = st.one_of(st.sampled_from([0.0, 1.0, -1.0, 2.0, 5e-324, 1e-160]), st.floats(-3, 3), NUMBER)
 
 
 @cache
 def filter_of(name: str, text: str) -> SafetyFilter:
     condition, objective = text.rsplit(" ", 1)
-    return SafetyFilter.for_problem(problem_of(f"safe_envs/{name}-v0"), condition, objective=objective)
+    return SafetyFilter.for_problem(
+        problem_of(f"safe_envs/{name}-v0"), condition, objective=objective
+    )
 
 
 @cache
 def gains_of(safety_filter: SafetyFilter):
     model = safety_filter.model
-    entries = [model.numeric(e) for constraint in safety_filter.constraints for e in constraint.coefficient]
+    entries = [
+        model.numeric(e) for constraint in safety_filter.constraints for e in constraint.coefficient
+    ]
     return compile_function(model.states, entries, "arrays")
 
 
@@ -81,14 +99,22 @@ def assert_sound(safety_filter, x, u):
         else:
             assert active.any()
     assert one[4] == batch[4]
-    np.testing.assert_allclose(one[0], batch[0], rtol=1e-9, atol=1e-9 * max(map(abs, [*low, *high])))
+    np.testing.assert_allclose(
+        one[0], batch[0], rtol=1e-9, atol=1e-9 * max(map(abs, [*low, *high]))
+    )
 
 
 @st.composite
 def situations(draw, names):
     safety_filter = filter_of(*draw(st.sampled_from(names)))
-    n, ends = safety_filter.model.n, zip(safety_filter.program.low, safety_filter.program.high, strict=True)
-    x, near = draw(st.lists(ENTRY, min_size=n, max_size=n)), st.tuples(*[st.floats(2 * lo - hi, 2 * hi - lo) for lo, hi in ends])
+    n, ends = (
+        safety_filter.model.n,
+        zip(safety_filter.program.low, safety_filter.program.high, strict=True),
+    )
+    x, near = (
+        draw(st.lists(ENTRY, min_size=n, max_size=n)),
+        st.tuples(*[st.floats(2 * lo - hi, 2 * hi - lo) for lo, hi in ends]),
+    )
     return safety_filter, x, draw(st.one_of(near, st.tuples(*[NUMBER] * safety_filter.model.m)))
 
 
@@ -110,12 +136,21 @@ def test_answers_of_every_filter_are_sound_or_errors():
                 safety_filter = filter_of(name, text)
             except ValueError:
                 continue  # of another relative degree, or without a goal
-            n, (low, high) = safety_filter.model.n, map(np.array, (safety_filter.program.low, safety_filter.program.high))
+            n, (low, high) = (
+                safety_filter.model.n,
+                map(np.array, (safety_filter.program.low, safety_filter.program.high)),
+            )
             for top in rng.choice([3, 8, 60, 90, 170, 300], 200):
                 x = rng.choice([-1, 1], n) * 10.0 ** rng.uniform(rng.choice([-5, -320]), top, n)
                 x = np.where(rng.random(n) < 0.2, rng.choice([0.0, 1.0, 2.0, 5e-324], n), x)
                 far = rng.choice([-1, 1], len(low)) * 10.0 ** rng.uniform(-300, 300, len(low))
-                assert_sound(safety_filter, x, np.where(rng.random() < 0.7, low + (high - low) * rng.uniform(-1, 2, len(low)), far))
+                assert_sound(
+                    safety_filter,
+                    x,
+                    np.where(
+                        rng.random() < 0.7, low + (high - low) * rng.uniform(-1, 2, len(low)), far
+                    ),
+                )
                 tried += 1
     assert tried > 20_000
 
@@ -139,11 +174,14 @@ def test_states_that_gave_no_number_have_an_answer(name, text, state):
 
 
 def test_a_tiny_gain_decides_where_h_rises():
-    # h = -1 at x = 2 falls along x_1 whatever is done; x_2 u is all that the input has, and 1e-160 is more than nothing.
+    # h = -1 at x = 2 falls along x_1 whatever is done; x_2 u is all that the input has, and 1e-160
+    # is more than nothing.
     safety_filter = filter_of("CubicSDE", "rcbf nearest")
     gain = gains_of(safety_filter)(2.0, 1e-160)[0]
     found = safety_filter.filter([2.0, 1e-160], [0.0])
-    assert found.action.tolist() == [safety_filter.program.high[0] if gain > 0 else safety_filter.program.low[0]]
+    assert found.action.tolist() == [
+        safety_filter.program.high[0] if gain > 0 else safety_filter.program.low[0]
+    ]
     assert found.cause == 0
     assert not found.feasible
 
@@ -161,7 +199,9 @@ def test_a_barrier_that_overflows_where_its_row_does_not_is_an_error():
     system = ControlAffineSDE((x,), (u,), [0], [1 / x], [0])
     safety_filter = SafetyFilter(system, [(Barrier(x**2), SCBF())], [(-1.0, 1.0)])
     for state in ([1e160], [[1.0], [1e160]]):
-        with pytest.raises(NumericalError, match=r"the barrier on .* has no finite value at x = 1e\+160"):
+        with pytest.raises(
+            NumericalError, match=r"the barrier on .* has no finite value at x = 1e\+160"
+        ):
             safety_filter.filter(state, np.zeros_like(state))
 
 
@@ -179,7 +219,9 @@ def test_what_overflows_on_the_way_to_a_number_is_that_number_for_one_state_too(
 def test_a_root_of_a_negative_number_is_an_error_and_not_complex():
     x, u = sp.symbols("x u", real=True)
     system = ControlAffineSDE((x,), (u,), [0], [1], [0])
-    safety_filter = SafetyFilter(system, [(Barrier((x + 1) ** sp.Rational(4, 3)), CBF(1.0))], [(-1.0, 1.0)])
+    safety_filter = SafetyFilter(
+        system, [(Barrier((x + 1) ** sp.Rational(4, 3)), CBF(1.0))], [(-1.0, 1.0)]
+    )
     for state in ([-2.0], [[-2.0]]):
         with pytest.raises(NumericalError, match="x = -2"):
             safety_filter.filter(state, np.zeros_like(state))

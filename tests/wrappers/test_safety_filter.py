@@ -11,7 +11,14 @@ import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, InvalidInputError, NumericalError, SystemDefinitionError
+from safe_envs import (
+    Barrier,
+    ConfigurationError,
+    ControlAffineSDE,
+    InvalidInputError,
+    NumericalError,
+    SystemDefinitionError,
+)
 from safe_envs.wrappers import CBF, HOCBF, SCBF, SafetyFilter
 from tests.conftest import problem_of
 
@@ -19,7 +26,14 @@ x, y, u, w = sp.symbols("x y u w", real=True)
 
 
 def integrator(**changes):
-    arguments = {"states": (x,), "inputs": (u,), "drift": [0], "input_matrix": [1], "diffusion": [0], **changes}
+    arguments = {
+        "states": (x,),
+        "inputs": (u,),
+        "drift": [0],
+        "input_matrix": [1],
+        "diffusion": [0],
+        **changes,
+    }
     return ControlAffineSDE(**arguments)
 
 
@@ -31,7 +45,12 @@ def plane():
 def test_nearest_action_of_a_scalar_system_in_closed_form():
     # h = 1 - x, x' = u: u <= alpha (1 - x).
     safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(2.0))], [(-3.0, 3.0)])
-    for state, nominal, action, active in ((0.0, 1.0, 1.0, False), (0.0, 2.5, 2.0, True), (0.9, 1.0, 0.2, True), (0.9, -4.0, -3.0, False)):
+    for state, nominal, action, active in (
+        (0.0, 1.0, 1.0, False),
+        (0.0, 2.5, 2.0, True),
+        (0.9, 1.0, 0.2, True),
+        (0.9, -4.0, -3.0, False),
+    ):
         result = safety_filter.filter(np.array([state]), np.array([nominal]))
         np.testing.assert_allclose(result.action, [action], atol=1e-12)
         assert result.active.tolist() == [active]
@@ -44,7 +63,11 @@ def test_nearest_action_of_a_scalar_system_in_closed_form():
 def test_infeasible_states_give_the_least_violating_action_with_its_slack():
     safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(1.0))], [(-3.0, 3.0)])
     result = safety_filter.filter(np.array([6.0]), np.array([1.0]))
-    assert (result.action.tolist(), result.feasible, result.slack.tolist()) == ([-3.0], False, [2.0])
+    assert (result.action.tolist(), result.feasible, result.slack.tolist()) == (
+        [-3.0],
+        False,
+        [2.0],
+    )
     batch = safety_filter.filter(np.array([[6.0], [0.0]]), np.array([[1.0], [0.5]]))
     assert batch.action.tolist() == [[-3.0], [0.5]]
     assert batch.feasible.tolist() == [False, True]
@@ -66,7 +89,9 @@ def test_quadrotor_filter_equals_a_search_over_its_four_inputs():
     a, b = row_of(safety_filter, state)
     assert result.margin[0] == pytest.approx(b + a @ result.action, rel=1e-9)
     for scale in (1.0, 1e-1, 1e-2, 1e-3):
-        tried = np.clip(result.action + scale * (high - low) * rng.normal(size=(20_000, 4)), low, high)
+        tried = np.clip(
+            result.action + scale * (high - low) * rng.normal(size=(20_000, 4)), low, high
+        )
         allowed = tried[b + tried @ a >= 0]
         assert len(allowed)
         assert np.sum((allowed - nominal) ** 2, axis=1).min() >= best * (1 - 1e-9)
@@ -102,14 +127,18 @@ def test_weights_decide_which_input_gives_way():
     rows = [(Barrier(1 - x - y), CBF(1.0))]
     even = SafetyFilter(plane(), rows, [(-5.0, 5.0)] * 2).filter(np.zeros(2), np.array([1.0, 1.0]))
     np.testing.assert_allclose(even.action, [0.5, 0.5])
-    uneven = SafetyFilter(plane(), rows, [(-5.0, 5.0)] * 2, weights=[1.0, 9.0]).filter(np.zeros(2), np.array([1.0, 1.0]))
+    uneven = SafetyFilter(plane(), rows, [(-5.0, 5.0)] * 2, weights=[1.0, 9.0]).filter(
+        np.zeros(2), np.array([1.0, 1.0])
+    )
     np.testing.assert_allclose(uneven.action, [0.1, 0.9])
 
 
 def test_several_barriers_with_conditions_of_their_own():
     chain = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1], [0, 0])
     position, speed = Barrier(1 - x, "position"), Barrier(2 - y, "speed")
-    safety_filter = SafetyFilter(chain, [(position, HOCBF((1.0, 1.0))), (speed, CBF(1.0))], [(-4.0, 4.0)])
+    safety_filter = SafetyFilter(
+        chain, [(position, HOCBF((1.0, 1.0))), (speed, CBF(1.0))], [(-4.0, 4.0)]
+    )
     # b_2 = -u - 2 y + (1 - x) >= 0 and -u + 2 - y >= 0.
     result = safety_filter.filter(np.array([0.0, 0.2]), np.array([3.0]))
     np.testing.assert_allclose(result.action, [0.6], atol=1e-7)
@@ -129,7 +158,15 @@ def test_several_barriers_with_conditions_of_their_own():
 
 @pytest.mark.parametrize(
     ("state", "nominal"),
-    [([np.nan], [0.0]), ([0.0], [np.nan]), ([0.0], [np.inf]), ([-np.inf], [0.0]), ([0.0, 0.0], [0.0]), ([0.0], [0.0, 0.0]), (0.0, [0.0])],
+    [
+        ([np.nan], [0.0]),
+        ([0.0], [np.nan]),
+        ([0.0], [np.inf]),
+        ([-np.inf], [0.0]),
+        ([0.0, 0.0], [0.0]),
+        ([0.0], [0.0, 0.0]),
+        (0.0, [0.0]),
+    ],
 )
 def test_inputs_that_are_none_are_errors(state, nominal):
     safety_filter = SafetyFilter(integrator(), [(Barrier(1 - x), CBF(1.0))], [(-1.0, 1.0)])
@@ -137,7 +174,9 @@ def test_inputs_that_are_none_are_errors(state, nominal):
         safety_filter.filter(np.array(state), np.array(nominal))
     if np.ndim(state):
         with pytest.raises(InvalidInputError):
-            safety_filter.filter(np.stack([np.zeros_like(state), state]), np.stack([np.zeros_like(nominal), nominal]))
+            safety_filter.filter(
+                np.stack([np.zeros_like(state), state]), np.stack([np.zeros_like(nominal), nominal])
+            )
 
 
 @pytest.mark.parametrize("h", [sp.log(x), 1 / x, sp.sqrt(x) + 1])
@@ -171,12 +210,21 @@ def test_single_state_of_batch_one_keeps_its_leading_axis():
     assert safety_filter.filter(np.zeros((0, 1)), np.zeros((0, 1))).action.shape == (0, 1)
 
 
-@given(st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3), st.floats(-1.0, 1.0)), min_size=1, max_size=8), st.sampled_from(["C", "F"]))
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 2), st.integers(0, 3), st.floats(-1.0, 1.0)),
+        min_size=1,
+        max_size=8,
+    ),
+    st.sampled_from(["C", "F"]),
+)
 @settings(max_examples=15)
 def test_batches_may_change_in_place_between_decisions(changes, order):
     problem = problem_of("safe_envs/DubinsDisk-v0")
     safety_filter = SafetyFilter.for_problem(problem, "hocbf")
-    states = np.array([[-1.5, 0.2, 0.1], [0.9, -1.3, 2.0], [1.1, 1.1, -2.0], [-1.2, 0.0, 0.0]], order=order)
+    states = np.array(
+        [[-1.5, 0.2, 0.1], [0.9, -1.3, 2.0], [1.1, 1.1, -2.0], [-1.2, 0.0, 0.0]], order=order
+    )
     inputs = np.zeros((4, 1))
     columns, proposed = tuple(states.T), tuple(inputs.T)
     # The envs' own states are remembered; these are not to be taken for them.
@@ -187,7 +235,9 @@ def test_batches_may_change_in_place_between_decisions(changes, order):
         inputs[row] = moved
         fresh = safety_filter.filter(states.copy(), inputs.copy())
         for batch in (columns, tuple(c.view() for c in columns)):
-            np.testing.assert_array_equal(safety_filter.decide_arrays(batch, proposed).action[0], fresh.action[:, 0])
+            np.testing.assert_array_equal(
+                safety_filter.decide_arrays(batch, proposed).action[0], fresh.action[:, 0]
+            )
         np.testing.assert_array_equal(safety_filter.filter(states, inputs).action, fresh.action)
 
 

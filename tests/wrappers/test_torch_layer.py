@@ -1,4 +1,5 @@
-"""Filters as layers of a torch network: values of `SafetyFilter`, and gradients as its finite differences are."""
+"""Filters as layers of a torch network: values of `SafetyFilter`, and gradients as its finite
+differences are."""
 
 from __future__ import annotations
 
@@ -54,11 +55,16 @@ def registered(request):
     rng = np.random.default_rng(1)
     low, high = np.array(problem.box).T
     x = visited(f"safe_envs/{name}-v0", 200) + 0.05 * rng.normal(size=(200, problem.model.n))
-    return module, x, rng.uniform(1.2 * low - 0.2 * high, 1.2 * high - 0.2 * low, (200, problem.model.m))
+    return (
+        module,
+        x,
+        rng.uniform(1.2 * low - 0.2 * high, 1.2 * high - 0.2 * low, (200, problem.model.m)),
+    )
 
 
 def planar(m, k, *, contradicting=False, seed=0):
-    """k curved rows on m inputs with all that a filter can weigh; pairs of contradicting ones have opposite coefficients."""
+    """k curved rows on m inputs with all that a filter can weigh; pairs of contradicting ones have
+    opposite coefficients."""
     rng = np.random.default_rng(seed)
     x, u = sp.symbols("x:2", real=True), sp.symbols(f"u:{m}", real=True)
 
@@ -72,14 +78,22 @@ def planar(m, k, *, contradicting=False, seed=0):
         barriers[1] = -barriers[0] - 2
     model = ControlAffineSDE(x, u, drift, inputs, [[0]] * 2)
     rows = [(Barrier(h, f"h{i}"), CBF(alpha=1.0)) for i, h in enumerate(barriers)]
-    return SafetyFilter(model, rows, [(-1.0, 1.5)] * m, weights=rng.uniform(0.3, 3.0, m), priorities=rng.uniform(0.3, 3.0, k))
+    return SafetyFilter(
+        model,
+        rows,
+        [(-1.0, 1.5)] * m,
+        weights=rng.uniform(0.3, 3.0, m),
+        priorities=rng.uniform(0.3, 3.0, k),
+    )
 
 
 def differences(safety_filter, x, u, step):
     """Central differences of the action by state and input, shape (m, n + m)."""
     z = np.concatenate([x, u])
     points = np.concatenate([z + step * np.eye(len(z)), z - step * np.eye(len(z))])
-    ahead, behind = np.split(safety_filter.filter(points[:, : len(x)], points[:, len(x) :]).action, 2)
+    ahead, behind = np.split(
+        safety_filter.filter(points[:, : len(x)], points[:, len(x) :]).action, 2
+    )
     return (ahead - behind).T / (2.0 * step)
 
 
@@ -89,7 +103,8 @@ def jacobian(module, x, u):
 
 
 def assert_slopes(module, x, u, step=1e-5, tolerance=1e-3):
-    """Compare the gradients of states where differences do not see a kink, and return how many these are."""
+    """Compare the gradients of states where differences do not see a kink, and return how many
+    these are."""
     count = 0
     for xi, ui in zip(x, u, strict=True):
         wanted, check = [differences(module.safety_filter, xi, ui, s) for s in (step, step / 2.0)]
@@ -117,13 +132,17 @@ def test_gradients_pass_gradcheck(registered):
     module, x, u = registered
     decided = module.safety_filter.filter(x, u)
     acting = decided.active.any(axis=-1)
-    chosen = np.concatenate([np.flatnonzero(mask)[:3] for mask in (~acting, acting & decided.feasible)])
+    chosen = np.concatenate(
+        [np.flatnonzero(mask)[:3] for mask in (~acting, acting & decided.feasible)]
+    )
     assert acting[chosen].any()
     # In units of the box, so that an error is judged by what the inputs can do.
     unit = np.abs(u).max()
     for i in chosen:
         given = [torch.tensor(part, requires_grad=True) for part in (x[i], u[i] / unit)]
-        assert torch.autograd.gradcheck(lambda x, u: module(x, unit * u) / unit, given, eps=1e-4, atol=1e-3, rtol=1e-3)
+        assert torch.autograd.gradcheck(
+            lambda x, u: module(x, unit * u) / unit, given, eps=1e-4, atol=1e-3, rtol=1e-3
+        )
 
 
 @pytest.mark.parametrize("most", [12, pytest.param(60, marks=pytest.mark.oracle)])
@@ -229,7 +248,10 @@ def test_a_state_where_no_row_acts_has_a_gradient_of_zero():
 
 def test_a_proposal_at_its_bound_can_leave_it():
     module = TorchFilter(planar(2, 1))
-    x, u = torch.zeros(2, dtype=torch.float64), torch.tensor([1.5, -1.0], dtype=torch.float64, requires_grad=True)
+    x, u = (
+        torch.zeros(2, dtype=torch.float64),
+        torch.tensor([1.5, -1.0], dtype=torch.float64, requires_grad=True),
+    )
     module(x, u).sum().backward()
     assert u.grad is not None
     assert u.grad.tolist() == [1.0, 1.0]
@@ -238,9 +260,15 @@ def test_a_proposal_at_its_bound_can_leave_it():
 def test_rows_of_functions_with_kinks():
     x, y, u = sp.symbols("x y u", real=True)
     model = ControlAffineSDE(
-        (x, y), (u,), [sp.Max(y, 0.5) + sp.Piecewise((0.1, x < 0), (0.3 * y, True)), -sp.Abs(y)], [[1], [0]], [[0], [0]]
+        (x, y),
+        (u,),
+        [sp.Max(y, 0.5) + sp.Piecewise((0.1, x < 0), (0.3 * y, True)), -sp.Abs(y)],
+        [[1], [0]],
+        [[0], [0]],
     )
-    module = TorchFilter(SafetyFilter(model, [(Barrier(1 - x - sp.sqrt(2) * y**2), CBF(alpha=1.0))], [(-9.0, 9.0)]))
+    module = TorchFilter(
+        SafetyFilter(model, [(Barrier(1 - x - sp.sqrt(2) * y**2), CBF(alpha=1.0))], [(-9.0, 9.0)])
+    )
     rng = np.random.default_rng(0)
     assert assert_slopes(module, rng.normal(size=(30, 2)), 4.0 + rng.normal(size=(30, 1))) > 25
 
@@ -250,15 +278,27 @@ def test_names_of_symbols_change_nothing():
     for names in (("y", "z"), ("x0", "x1"), ("x1", "sin"), ("torch", "None")):
         a, b = (sp.Symbol(name, real=True) for name in names)
         both, u = a + b, sp.Symbol("u", real=True)
-        model = ControlAffineSDE((a, b), (u,), [(both**2 + 3 * sp.sin(both)) * sp.sin(both), both**2], [[1], [0]], [[0], [0]])
-        module = TorchFilter(SafetyFilter(model, [(Barrier(1 - a - b**2), CBF(alpha=1.0))], [(-9.0, 9.0)]))
+        model = ControlAffineSDE(
+            (a, b),
+            (u,),
+            [(both**2 + 3 * sp.sin(both)) * sp.sin(both), both**2],
+            [[1], [0]],
+            [[0], [0]],
+        )
+        module = TorchFilter(
+            SafetyFilter(model, [(Barrier(1 - a - b**2), CBF(alpha=1.0))], [(-9.0, 9.0)])
+        )
         states = torch.tensor([0.9, 0.4], dtype=torch.float64, requires_grad=True)
         module(states, torch.tensor([8.0], dtype=torch.float64)).sum().backward()
         assert states.grad is not None
         found.append(states.grad.tolist())
     # u = 1 - a - b^2 - (s^2 + 3 sin s) sin s - 2 b s^2 with s = a + b.
     s, b = 1.3, 0.4
-    by_both = -(2 * s + 3 * math.cos(s)) * math.sin(s) - (s**2 + 3 * math.sin(s)) * math.cos(s) - 4 * b * s
+    by_both = (
+        -(2 * s + 3 * math.cos(s)) * math.sin(s)
+        - (s**2 + 3 * math.sin(s)) * math.cos(s)
+        - 4 * b * s
+    )
     assert found == [pytest.approx([by_both - 1, by_both - 2 * b - 2 * s**2], rel=1e-12)] * 4
 
 
@@ -283,11 +323,16 @@ def test_learning_through_the_filter():
 
 def test_what_is_no_plain_row_is_refused():
     problem = load_problem("safe_envs/CubicSDE-v0")
-    for condition, reason in (("srcbf", "reciprocal"), ("scbf:sampling_margin=first-order", "first order")):
+    for condition, reason in (
+        ("srcbf", "reciprocal"),
+        ("scbf:sampling_margin=first-order", "first order"),
+    ):
         with pytest.raises(ConfigurationError, match=reason):
             TorchFilter.for_problem(problem, parse_conditions(condition, problem))
     with pytest.raises(ConfigurationError, match="clf"):
-        TorchFilter(SafetyFilter.for_problem(problem, parse_conditions("scbf", problem), objective="clf"))
+        TorchFilter(
+            SafetyFilter.for_problem(problem, parse_conditions("scbf", problem), objective="clf")
+        )
 
 
 def test_functions_that_torch_lacks_are_refused():

@@ -1,4 +1,5 @@
-"""What a simulation says to the bounds of conditions: the measured safety over several horizons, and what it contradicts."""
+"""What a simulation says to the bounds of conditions: the measured safety over several horizons,
+and what it contradicts."""
 
 from __future__ import annotations
 
@@ -79,14 +80,17 @@ class Measurement:
 def judged(
     bounds: Sequence[Bound], measurements: Sequence[Measurement], verification: Verification
 ) -> tuple[list[Bound], list[Measurement]]:
-    """Bounds and measurements without the values of what was estimated and is contradicted; see `safe_envs.agents.evaluation.contradiction`.
+    """Bounds and measurements without the values of what was estimated and is contradicted; see
+    `safe_envs.agents.evaluation.contradiction`.
 
     Args:
         bounds: at the start.
         measurements: of the same conditions.
         verification: on which the bounds rest.
     """
-    of_all = by_states(from_survey(verification.survey), [seen for m in measurements for seen in m.seen])
+    of_all = by_states(
+        from_survey(verification.survey), [seen for m in measurements for seen in m.seen]
+    )
     of_each: dict[str, str] = {}
     for m in measurements:
         for h in m.horizons:
@@ -101,18 +105,27 @@ def judged(
     def cleared(h: Horizon) -> Horizon:
         return replace(h, bounds=tuple(map(without, h.bounds)))
 
-    return [without(bound) for bound in bounds], [replace(m, horizons=tuple(map(cleared, m.horizons))) for m in measurements]
+    return [without(bound) for bound in bounds], [
+        replace(m, horizons=tuple(map(cleared, m.horizons))) for m in measurements
+    ]
 
 
 def measure(
-    verification: Verification, policy: Any = "nominal", *, episodes: int = 500, seed: int = 0, progress: Progress | None = None
+    verification: Verification,
+    policy: Any = "nominal",
+    *,
+    episodes: int = 500,
+    seed: int = 0,
+    progress: Progress | None = None,
 ) -> list[Measurement]:
-    """Simulate a policy under the conditions, from the problem's start and from where the printed bound is largest.
+    """Simulate a policy under the conditions, from the problem's start and from where the printed
+    bound is largest.
 
-    The horizons are the problem's times 1, 2, 5, ..., up to 20 or, if there is noise and a bound that is for ever, 500, as far
-    as the simulation stays short. A bound is contradicted where the upper end of a one-sided exact interval lies below it by
-    more than its own error, an interval so wide that in 20 such reports at most one contradicts a bound that holds: the 5 %
-    are shared by all comparisons.
+    The horizons are the problem's times 1, 2, 5, ..., up to 20 or, if there is noise and a bound
+    that is for ever, 500, as far as the simulation stays short. A bound is contradicted where the
+    upper end of a one-sided exact interval lies below it by more than its own error, an interval so
+    wide that in 20 such reports at most one contradicts a bound that holds: the 5 % are shared by
+    all comparisons.
 
     Args:
         verification: of the conditions.
@@ -128,7 +141,12 @@ def measure(
     best = best_start(verification, seed)
     worlds = [(f"the start {problem.start!r}", problem)]
     if best is not None:
-        worlds.append(("the start where the printed bound is largest", problem.configured(start=best.tolist())))
+        worlds.append(
+            (
+                "the start where the printed bound is largest",
+                problem.configured(start=best.tolist()),
+            )
+        )
     found = []
     for i, (name, world) in enumerate(worlds):
         told = None if progress is None else _part_of(progress, i / len(worlds), 1.0 / len(worlds))
@@ -147,10 +165,18 @@ def _part_of(progress: Progress, before: float, size: float) -> Progress:
 
 
 def _measure(
-    verification: Verification, name: str, world: SafetyProblem, policy: Any, episodes: int, seed: int, progress: Progress | None
+    verification: Verification,
+    name: str,
+    world: SafetyProblem,
+    policy: Any,
+    episodes: int,
+    seed: int,
+    progress: Progress | None,
 ) -> Measurement:
     formulas, starts = verification.formulas, starts_of(world, seed)
-    lasting = formulas.noisy and any(b.forever and b.value for b in promise(verification, starts, world.duration))
+    lasting = formulas.noisy and any(
+        b.forever and b.value for b in promise(verification, starts, world.duration)
+    )
     runs = _runs(world, lasting, episodes)
     horizons: list[Horizon] = []
     seen: list[Seen] = []
@@ -165,18 +191,29 @@ def _measure(
             seed=seed,
             knowledge=formulas.knowledge,
             bounds=False,
-            progress=None if progress is None else _part_of(progress, done / whole, run[-1] / whole),
+            progress=(
+                None if progress is None else _part_of(progress, done / whole, run[-1] / whole)
+            ),
         )
         horizons += [_horizon(verification, answer, k * world.duration, starts) for k in run]
         seen += answer.seen[answer.rows[0]["filter"]]
         repeats, done = answer.repeats, done + run[-1]
-    return Measurement(name, starts[0] if len(starts) == 1 else None, episodes, repeats, tuple(horizons), tuple(seen))
+    return Measurement(
+        name,
+        starts[0] if len(starts) == 1 else None,
+        episodes,
+        repeats,
+        tuple(horizons),
+        tuple(seen),
+    )
 
 
 def _runs(world: SafetyProblem, lasting: bool, episodes: int) -> list[list[int]]:
-    """Of which horizons to measure, in units of the problem's: a lasting bound under noise may take long to fail.
+    """Of which horizons to measure, in units of the problem's: a lasting bound under noise may take
+    long to fail.
 
-    The long ones get a run of their own, since the instants at which a run is read are spread over the whole of it.
+    The long ones get a run of their own, since the instants at which a run is read are spread over
+    the whole of it.
     """
     # Several conditions on more than two inputs go to an iterative solver.
     allowed = _MOST_SOLVED if len(world.barriers) > 1 and len(world.inputs) > 2 else _MOST_STEPS
@@ -186,35 +223,57 @@ def _runs(world: SafetyProblem, lasting: bool, episodes: int) -> list[list[int]]
     return [run for run in runs if run]
 
 
-def _horizon(verification: Verification, answer: Evaluation, horizon: float, starts: np.ndarray) -> Horizon:
+def _horizon(
+    verification: Verification, answer: Evaluation, horizon: float, starts: np.ndarray
+) -> Horizon:
     """Read the curve of an evaluation at its last instant up to a horizon."""
     curve = answer.rows[0]["curve"]
     i = int(np.searchsorted(curve["time"], horizon * (1.0 + 1e-9), side="right")) - 1
     time = curve["time"][i]
     bounds = tuple(b for b in promise(verification, starts, time) if b.value is not None)
-    return Horizon(time, curve["safe"][i], curve["rate"][i], curve["ci_low"][i], curve["ci_high"][i], bounds)
+    return Horizon(
+        time, curve["safe"][i], curve["rate"][i], curve["ci_low"][i], curve["ci_high"][i], bounds
+    )
 
 
 def _all_compared(found: list[Measurement]) -> list[Measurement]:
-    comparisons = max(1, sum(bool(bound.value) for m in found for h in m.horizons for bound in h.bounds))
-    return [replace(m, horizons=tuple(_compared(m, h, comparisons) for h in m.horizons)) for m in found]
+    comparisons = max(
+        1, sum(bool(bound.value) for m in found for h in m.horizons for bound in h.bounds)
+    )
+    return [
+        replace(m, horizons=tuple(_compared(m, h, comparisons) for h in m.horizons)) for m in found
+    ]
 
 
 def _compared(measurement: Measurement, horizon: Horizon, comparisons: int) -> Horizon:
-    """Name the bounds above the interval; above the rate itself, where that is exact because nothing is random.
+    """Name the bounds above the interval; above the rate itself, where that is exact because
+    nothing is random.
 
     A mean over starts may lie above the mean over all starts by a few of its standard errors.
     """
-    most = horizon.rate if measurement.repeats else _upper_end(horizon.safe, measurement.episodes, _ERROR / comparisons)
-    above = [b.name for b in horizon.bounds if b.value is not None and b.value - _DEVIATIONS * b.error > most]
+    most = (
+        horizon.rate
+        if measurement.repeats
+        else _upper_end(horizon.safe, measurement.episodes, _ERROR / comparisons)
+    )
+    above = [
+        b.name
+        for b in horizon.bounds
+        if b.value is not None and b.value - _DEVIATIONS * b.error > most
+    ]
     return replace(horizon, contradicted=tuple(above))
 
 
 def _upper_end(successes: int, trials: int, error: float) -> float:
-    """Clopper and Pearson's one-sided upper end, which is below the probability of success in at most that part of all cases.
+    """Clopper and Pearson's one-sided upper end, which is below the probability of success in at
+    most that part of all cases.
 
     Wilson's is below more often where the probability is near 1, as that of safety is.
     """
     from scipy.special import betaincinv
 
-    return 1.0 if successes == trials else float(betaincinv(successes + 1, trials - successes, 1.0 - error))
+    return (
+        1.0
+        if successes == trials
+        else float(betaincinv(successes + 1, trials - successes, 1.0 - error))
+    )

@@ -24,37 +24,50 @@ def require_monitoring(monitoring: str) -> None:
         ConfigurationError: it is none of `MONITORING`.
     """
     if monitoring not in MONITORING:
-        raise ConfigurationError(f"monitoring = {shown(monitoring)}; {nearest(str(monitoring), MONITORING)}")
+        raise ConfigurationError(
+            f"monitoring = {shown(monitoring)}; {nearest(str(monitoring), MONITORING)}"
+        )
 
 
 class BrownianBridge:
     """Draws the smallest h of a control period, given h at both of its ends.
 
-    Between the ends h is taken for a Brownian bridge with the variance rate s^2 = |sigma' grad h|^2 of the period's beginning.
-    That is exact for a Brownian motion with any constant drift, and right to first order in the period where s varies. The minimum
-    m of such a bridge from h_0 to h_1 over dt has P(m <= y) = exp(-2 (h_0 - y)(h_1 - y)/(s^2 dt)) for y below both, so that with
-    a standard exponential E
+    Between the ends h is taken for a Brownian bridge with the variance rate s^2 = |sigma' grad h|^2
+    of the period's beginning. That is exact for a Brownian motion with any constant drift, and
+    right to first order in the period where s varies. The minimum m of such a bridge from h_0 to
+    h_1 over dt has P(m <= y) = exp(-2 (h_0 - y)(h_1 - y)/(s^2 dt)) for y below both, so that with a
+    standard exponential E
 
         m = (h_0 + h_1 - sqrt((h_1 - h_0)^2 + 2 s^2 dt E))/2.
 
-    Several barriers get bridges of their own, drawn independently of each other. Where s = 0, because there is no noise or
-    because it reaches h through a derivative only, the smaller end is all there is.
+    Several barriers get bridges of their own, drawn independently of each other. Where s = 0,
+    because there is no noise or because it reaches h through a derivative only, the smaller end is
+    all there is.
 
     Args:
         problem: whose plant, barriers and control period are taken.
 
     Attributes:
-        reached: for each barrier, whether the noise reaches it directly, so that there is anything to draw.
+        reached: for each barrier, whether the noise reaches it directly, so that there is anything
+            to draw.
 
     Source: P. Glasserman, Monte Carlo Methods in Financial Engineering, Springer 2003, Sec. 6.4.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
         plant = problem.plant
-        rates = [quadratic_variation_rate(plant, barrier.expression) for barrier in problem.barriers]
+        rates = [
+            quadratic_variation_rate(plant, barrier.expression) for barrier in problem.barriers
+        ]
         self.reached = tuple(not vanishes(plant, rate) for rate in rates)
-        self._rates = compile_function(plant.states, [2.0 * problem.dt * plant.numeric(rate) for rate in rates], "arrays")
-        self._h = compile_function(plant.states, [plant.numeric(barrier.expression) for barrier in problem.barriers], "arrays")
+        self._rates = compile_function(
+            plant.states, [2.0 * problem.dt * plant.numeric(rate) for rate in rates], "arrays"
+        )
+        self._h = compile_function(
+            plant.states,
+            [plant.numeric(barrier.expression) for barrier in problem.barriers],
+            "arrays",
+        )
 
     @property
     def draws(self) -> int:
@@ -65,7 +78,9 @@ class BrownianBridge:
         """The barriers at states, given component by component, shape (B, k)."""
         return stacked(self._h(*x), len(x[0]))
 
-    def lowest(self, x: Components, before: np.ndarray, after: np.ndarray, draws: np.ndarray) -> np.ndarray:
+    def lowest(
+        self, x: Components, before: np.ndarray, after: np.ndarray, draws: np.ndarray
+    ) -> np.ndarray:
         """Draw the smallest value of each barrier during a control period, its ends included.
 
         Args:
@@ -93,20 +108,27 @@ def smallest(barriers: np.ndarray) -> np.ndarray:
 def bridge_notes(problem: SafetyProblem) -> list[str]:
     """What has to be known to read numbers of continuous monitoring."""
     reached = BrownianBridge(problem).reached
-    missed = [barrier.name for barrier, reaches in zip(problem.barriers, reached, strict=True) if not reaches]
+    missed = [
+        barrier.name
+        for barrier, reaches in zip(problem.barriers, reached, strict=True)
+        if not reaches
+    ]
     notes = []
     if missed:
         notes.append(
-            f"continuous monitoring changes nothing for {', '.join(missed)}, which no noise reaches directly: there only a smaller dt does "
-            "anything."
+            f"continuous monitoring changes nothing for {', '.join(missed)}, which no noise reaches"
+            " directly: there only a smaller dt does anything."
         )
     if sum(reached) > 1:
-        notes.append("between control instants each barrier is taken by itself, independently of the others.")
+        notes.append(
+            "between control instants each barrier is taken by itself, independently of the others."
+        )
     return notes
 
 
 class Exponentials:
-    """Standard exponentials of episodes side by side, a stream for each: what an episode gets does not depend on its neighbours.
+    """Standard exponentials of episodes side by side, a stream for each: what an episode gets does
+    not depend on its neighbours.
 
     Args:
         seed: of the evaluation.
@@ -115,8 +137,11 @@ class Exponentials:
     """
 
     def __init__(self, seed: int, episodes: Sequence[int], width: int) -> None:
-        # The env of episode i is seeded by the child (i,) of the seed, and a random policy by (i, 0).
-        self._generators = [np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i, 1))) for i in episodes]
+        # The env of episode i is seeded by the child (i,) of the seed, and a random policy by (i,
+        # 0).
+        self._generators = [
+            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i, 1))) for i in episodes
+        ]
         self._drawn = np.empty((len(self._generators), _CHUNK, width))
         self._position = _CHUNK
 

@@ -8,7 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.statistics import mcnemar_p, paired_difference_interval, repeated_interval
+from safe_envs.agents.evaluation.statistics import (
+    mcnemar_p,
+    paired_difference_interval,
+    repeated_interval,
+)
 
 Comparison = dict[str, Any]
 Table = tuple[int, int, int, int]
@@ -34,12 +38,16 @@ class SafetyBits:
         """
         mine, others = np.frombuffer(self._bits, np.uint8), np.frombuffer(other._bits, np.uint8)
         # A portion is filled up with zeros to whole bytes: they are no flag of either.
-        both, first, second = (int(np.bitwise_count(bits).sum()) for bits in (mine & others, mine & ~others, others & ~mine))
+        both, first, second = (
+            int(np.bitwise_count(bits).sum())
+            for bits in (mine & others, mine & ~others, others & ~mine)
+        )
         return both, first, second, self._count - both - first - second
 
 
 def compare_all(flags: Mapping[str, Sequence[SafetyBits]], confidence: float) -> list[Comparison]:
-    """Compare every two filters by which of the same episodes were safe: each one with those before it.
+    """Compare every two filters by which of the same episodes were safe: each one with those before
+    it.
 
     A p value is of its pair alone: it is not adjusted for the number of pairs.
 
@@ -47,7 +55,10 @@ def compare_all(flags: Mapping[str, Sequence[SafetyBits]], confidence: float) ->
         flags: which episodes were safe, by filter: once, or with each of several identifications.
         confidence: of the interval of the difference of their rates.
     """
-    return [_compare(second, first, _tables(flags[second], flags[first]), confidence) for first, second in combinations(flags, 2)]
+    return [
+        _compare(second, first, _tables(flags[second], flags[first]), confidence)
+        for first, second in combinations(flags, 2)
+    ]
 
 
 def _tables(first: Sequence[SafetyBits], second: Sequence[SafetyBits]) -> list[Table]:
@@ -59,7 +70,9 @@ def _tables(first: Sequence[SafetyBits], second: Sequence[SafetyBits]) -> list[T
 def _compare(first: str, second: str, tables: Sequence[Table], confidence: float) -> Comparison:
     both, only_first, only_second, neither = (sum(counts) for counts in zip(*tables, strict=True))
     repeats = len(tables)
-    low, high = paired_difference_interval(both / repeats, only_first / repeats, only_second / repeats, neither / repeats, confidence)
+    low, high = paired_difference_interval(
+        both / repeats, only_first / repeats, only_second / repeats, neither / repeats, confidence
+    )
     if repeats > 1:
         differences = [(table[1] - table[2]) / sum(table) for table in tables]
         low, high = repeated_interval(differences, (low, high), confidence, (-1.0, 1.0))

@@ -1,9 +1,11 @@
-"""What the episodes of a command say against a bound that it estimates: the one place that decides what is withheld.
+"""What the episodes of a command say against a bound that it estimates: the one place that decides
+what is withheld.
 
-A bound is withheld, and the reason said, where the episodes themselves show that it, or a number it rests on, is wrong: a start
-or a visited state has a b_j above the supremum c_j that was found, the filter missed a condition by more than the shortfall m
-that was found, or the interval of the measured rate lies below the bound. See `safe_envs.wrappers.verification.estimated_bound.EstimatedBound.contradiction`
-for the first two.
+A bound is withheld, and the reason said, where the episodes themselves show that it, or a number it
+rests on, is wrong: a start or a visited state has a b_j above the supremum c_j that was found, the
+filter missed a condition by more than the shortfall m that was found, or the interval of the
+measured rate lies below the bound. See
+`safe_envs.wrappers.verification.estimated_bound.EstimatedBound.contradiction` for the first two.
 """
 
 from __future__ import annotations
@@ -25,12 +27,15 @@ def by_states(bound: EstimatedBound | PosteriorBound, seen: Sequence[Seen]) -> s
         bound: that was estimated.
         seen: in the episodes.
     """
-    found = (bound.contradiction(each.deepest, each.missed, each.actions, each.slack) for each in seen)
+    found = (
+        bound.contradiction(each.deepest, each.missed, each.actions, each.slack) for each in seen
+    )
     return next(filter(None, found), "")
 
 
 def by_rate(bound: float | None, ci_high: float) -> str:
-    """What the interval of a measured rate says against a bound: that it ends below it; "" if it does not.
+    """What the interval of a measured rate says against a bound: that it ends below it; "" if it
+    does not.
 
     Args:
         bound: on the probability of being safe, None for none.
@@ -38,25 +43,43 @@ def by_rate(bound: float | None, ci_high: float) -> str:
     """
     if bound is None or ci_high >= bound:
         return ""
-    return f"the interval of the measured rate ends at {100 * ci_high:.1f} %, below {100 * bound:.1f} %; {ADVICE}"
+    return (
+        f"the interval of the measured rate ends at {100 * ci_high:.1f} %, below {100 * bound:.1f}"
+        f" %; {ADVICE}"
+    )
 
 
 def judged(row: dict[str, Any], ci_high: float) -> dict[str, Any]:
-    """A row of an evaluation without the bounds that a rate contradicts; the reason is in `withheld`.
+    """A row of an evaluation without the bounds that a rate contradicts; the reason is in
+    `withheld`.
 
     Args:
-        row: with `estimated_bound`, `posterior_bound` and `withheld`, as `safe_envs.agents.evaluation.guarantees.GuaranteeAverager.row` makes it.
+        row: with `estimated_bound`, `posterior_bound` and `withheld`, as
+            `safe_envs.agents.evaluation.guarantees.GuaranteeAverager.row` makes it.
         ci_high: upper end of the interval of the rate.
     """
     posterior = row["posterior_bound"]
-    reason = by_rate(row["estimated_bound"], ci_high) or by_rate(posterior and posterior["probability"], ci_high)
+    reason = by_rate(row["estimated_bound"], ci_high) or by_rate(
+        posterior and posterior["probability"], ci_high
+    )
     return withheld(row, reason) if reason else row
 
 
 def withheld(row: dict[str, Any], reason: str) -> dict[str, Any]:
     """A row without its bounds, and why."""
-    changed = {**row, "withheld": reason, "estimated_bound": None, "bound_note": f"withheld: {reason}"}
+    changed = {
+        **row,
+        "withheld": reason,
+        "estimated_bound": None,
+        "bound_note": f"withheld: {reason}",
+    }
     if row["posterior_bound"] is not None:
-        changed |= {"posterior_bound": {**row["posterior_bound"], "probability": None, "note": f"withheld: {reason}"}}
+        changed |= {
+            "posterior_bound": {
+                **row["posterior_bound"],
+                "probability": None,
+                "note": f"withheld: {reason}",
+            }
+        }
         changed["bound_note"] = row["bound_note"]
     return changed

@@ -17,7 +17,14 @@ from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.guarantees import GuaranteeAverager, together
 from safe_envs.agents.evaluation.identification import describe, seconds_of
 from safe_envs.agents.evaluation.repeats import pooled
-from safe_envs.agents.evaluation.rollout import EpisodeStatistics, Progress, Recorder, Row, play, totals_of
+from safe_envs.agents.evaluation.rollout import (
+    EpisodeStatistics,
+    Progress,
+    Recorder,
+    Row,
+    play,
+    totals_of,
+)
 from safe_envs.agents.evaluation.spec import BARE, EvaluationSpec, Work
 from safe_envs.agents.evaluation.statistics import require_confidence
 from safe_envs.agents.evaluation.visited_states import Seen
@@ -29,7 +36,16 @@ from safe_envs.wrappers.learning import LearnedModel
 
 __all__ = ["BARE", "Evaluation", "evaluate", "package_versions"]
 
-_PACKAGES = ("safe-envs", "gymnasium", "numpy", "scipy", "sympy", "proxsuite", "stable-baselines3", "torch")
+_PACKAGES = (
+    "safe-envs",
+    "gymnasium",
+    "numpy",
+    "scipy",
+    "sympy",
+    "proxsuite",
+    "stable-baselines3",
+    "torch",
+)
 
 
 @dataclass(frozen=True)
@@ -43,8 +59,10 @@ class Evaluation:
         comparisons: of every two rows, by which of the same episodes were safe.
         timing: the only part that depends on the machine and on `num_envs`.
         recorders: trajectories for each filter, if asked for.
-        flags: which episodes were safe, for each filter, with each identification of what it rests on.
-        seen: states of the episodes that say something against a bound, for each filter and identification.
+        flags: which episodes were safe, for each filter, with each identification of what it rests
+            on.
+        seen: states of the episodes that say something against a bound, for each filter and
+            identification.
         learned: what the first identifications of the filters rest on.
         repeats: whether nothing is random, so that all episodes are one and the same.
     """
@@ -100,39 +118,49 @@ def evaluate(
 ) -> Evaluation:
     """Estimate the safety of a policy under each filter.
 
-    An episode is safe if every barrier is positive at every control instant, its start included; with continuous monitoring
-    between them too, see `safe_envs.agents.evaluation.brownian_bridge.BrownianBridge`, which changes neither control nor noise. After its first violation an
-    episode's interventions, infeasible steps and effort are no longer counted: the conditions mean nothing outside the safe
-    set. Its simulation goes on, and its return and smallest h are of the whole episode.
+    An episode is safe if every barrier is positive at every control instant, its start included;
+    with continuous monitoring between them too, see
+    `safe_envs.agents.evaluation.brownian_bridge.BrownianBridge`, which changes neither control nor
+    noise. After its first violation an episode's interventions, infeasible steps and effort are no
+    longer counted: the conditions mean nothing outside the safe set. Its simulation goes on, and
+    its return and smallest h are of the whole episode.
 
-    Beside the rate stands the largest bound that is estimated for the filter, on average over the starts: see
-    `safe_envs.wrappers.verification.bounds`. It is of continuous time and rests on suprema from a search. What the episodes contradict is withheld: see
+    Beside the rate stands the largest bound that is estimated for the filter, on average over the
+    starts: see `safe_envs.wrappers.verification.bounds`. It is of continuous time and rests on
+    suprema from a search. What the episodes contradict is withheld: see
     `safe_envs.agents.evaluation.contradiction`.
 
-    Episode i is seeded by its own child of `seed`, the same for all filters; all but `timing` is the same, to the
-    last bit, for every `num_envs`.
+    Episode i is seeded by its own child of `seed`, the same for all filters; all but `timing` is
+    the same, to the last bit, for every `num_envs`.
 
-    What a filter rests on that is learned, is learned first, with the defaults of its method. With `repeats` that is done anew
-    for each repeat, and the intervals are over identifications too: see `safe_envs.agents.evaluation.statistics.repeated_interval`.
+    What a filter rests on that is learned, is learned first, with the defaults of its method. With
+    `repeats` that is done anew for each repeat, and the intervals are over identifications too: see
+    `safe_envs.agents.evaluation.statistics.repeated_interval`.
 
     Args:
-        problem: what to simulate, or the id of a registered env; with a spec, the id of any env that Gymnasium knows.
+        problem: what to simulate, or the id of a registered env; with a spec, the id of any env
+            that Gymnasium knows.
         policy: a name or a path for `make_policy`, or anything with Stable-Baselines3's `predict`.
-        filters: texts for `parse_conditions`, or one, and "none" for the bare env; by default that and the problem's own.
+        filters: texts for `parse_conditions`, or one, and "none" for the bare env; by default that
+            and the problem's own.
         trust: load a policy's .zip, which runs code that it contains.
         options: arguments of `gym.make` for an id.
         episodes: number for each filter.
         seed: whole number from 0.
         num_envs: how many episodes to simulate side by side.
-        knowledge: what the filters know, "model" or "plant"; those that correct the model start from it in any case.
-        objective: of the filters, "nearest" to the policy's action or "clf": see `SafetyFilter.for_problem`.
+        knowledge: what the filters know, "model" or "plant"; those that correct the model start
+            from it in any case.
+        objective: of the filters, "nearest" to the policy's action or "clf": see
+            `SafetyFilter.for_problem`.
         confidence: of all intervals, between 0 and 1.
         bounds: look for bounds, which takes a search of the safe set for each filter.
-        spec: how filters see an env of somebody else, or FILE.py:NAME of that. There `problem` is the model that filters believe, and
-            episodes are simulated one by one.
+        spec: how filters see an env of somebody else, or FILE.py:NAME of that. There `problem` is
+            the model that filters believe, and episodes are simulated one by one.
         learned: models, or files of `safe-envs identify`, to use in place of learning.
-        repeats: number of identifications of what is learned, from the seed and from children of it; 1 where nothing is.
-        monitoring: when h is looked at: "discrete" for control instants, "continuous" for between them too.
+        repeats: number of identifications of what is learned, from the seed and from children of
+            it; 1 where nothing is.
+        monitoring: when h is looked at: "discrete" for control instants, "continuous" for between
+            them too.
         jobs: in how many processes to simulate; the answer is the same.
         progress: told the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
@@ -142,10 +170,17 @@ def evaluate(
         RelativeDegreeError: a condition does not suit a barrier.
         NumericalError: a simulation or a condition left the finite numbers.
     """
-    for name, value, least in (("episodes", episodes, 1), ("num_envs", num_envs, 1), ("jobs", jobs, 1)):
+    for name, value, least in (
+        ("episodes", episodes, 1),
+        ("num_envs", num_envs, 1),
+        ("jobs", jobs, 1),
+    ):
         require_whole(name, value, least)
     if jobs > 1 and record:
-        raise ConfigurationError(f"jobs = {jobs}: trajectories for pictures are kept in one process; leave jobs out, or the picture")
+        raise ConfigurationError(
+            f"jobs = {jobs}: trajectories for pictures are kept in one process; leave jobs out, or"
+            " the picture"
+        )
     require_confidence(confidence)
     require_monitoring(monitoring)
     setting = EvaluationSpec(
@@ -161,16 +196,25 @@ def evaluate(
         learned=learned,
         repeats=repeats,
     )
-    simulated, world, names, learning = setting.simulated, setting.problem, setting.names, setting.learning
+    simulated, world, names, learning = (
+        setting.simulated,
+        setting.problem,
+        setting.names,
+        setting.learning,
+    )
     if monitoring == "continuous" and simulated.spec is not None:
         raise ConfigurationError(
-            "monitoring = 'continuous': how an env of somebody else moves between its steps is not known; use 'discrete'"
+            "monitoring = 'continuous': how an env of somebody else moves between its steps is not"
+            " known; use 'discrete'"
         )
     work = Work(progress, len(learning.missing()) + sum(learning.repeats(name) for name in names))
     setting.learn(work.part)
     filters_of = setting.filters
     # Made before the first episode: what is wrong with any of them shows at once.
-    envs = {name: [setting.env(conditions, min(num_envs, episodes)) for conditions in each] for name, each in filters_of.items()}
+    envs = {
+        name: [setting.env(conditions, min(num_envs, episodes)) for conditions in each]
+        for name, each in filters_of.items()
+    }
     config = {
         **setting.config(),
         "episodes": episodes,
@@ -182,38 +226,89 @@ def evaluate(
     bridge = BrownianBridge(world) if monitoring == "continuous" else None
     why_not = simulated.why_no_bound or (None if bounds else "it was not asked for")
     rows, speeds, flags, seen = [], [], {}, {}
-    recorders = {name: Recorder(world.steps, world.plant.n, episodes) for name in names} if record else {}
+    recorders = (
+        {name: Recorder(world.steps, world.plant.n, episodes) for name in names} if record else {}
+    )
     for name in names:
-        promised = [GuaranteeAverager(conditions, world, knowledge, why_not) for conditions in filters_of[name]]
+        promised = [
+            GuaranteeAverager(conditions, world, knowledge, why_not)
+            for conditions in filters_of[name]
+        ]
         begun = time.perf_counter()
         totals = [
             totals_of(
                 world,
-                play_in_processes(setting, filters_of[name][r], episodes, seed, num_envs, jobs, bridge is not None, work.part(episodes))
-                if jobs > 1
-                else play(env, setting.actor, range(episodes), seed, work.part(episodes), recorders.get(name) if r == 0 else None, bridge),
+                (
+                    play_in_processes(
+                        setting,
+                        filters_of[name][r],
+                        episodes,
+                        seed,
+                        num_envs,
+                        jobs,
+                        bridge is not None,
+                        work.part(episodes),
+                    )
+                    if jobs > 1
+                    else play(
+                        env,
+                        setting.actor,
+                        range(episodes),
+                        seed,
+                        work.part(episodes),
+                        recorders.get(name) if r == 0 else None,
+                        bridge,
+                    )
+                ),
                 promised[r].add,
             )
             for r, env in enumerate(envs[name])
         ]
         for env in envs[name]:
             env.close()
-        speeds.append({**_speed(name, totals, time.perf_counter() - begun), "learning_seconds": seconds_of(filters_of[name])})
+        speeds.append(
+            {
+                **_speed(name, totals, time.perf_counter() - begun),
+                "learning_seconds": seconds_of(filters_of[name]),
+            }
+        )
         found = pooled([each.row(confidence) for each in totals], confidence)
         rows.append(
             {
                 "filter": name,
                 "policy": config["policy"]["name"],
                 **found,
-                **judged(together([promise.row(each.seen) for promise, each in zip(promised, totals, strict=True)]), found["ci_high"]),
-                "learning": describe(filters_of[name], [each.safe / each.episodes for each in totals], world, knowledge),
+                **judged(
+                    together(
+                        [
+                            promise.row(each.seen)
+                            for promise, each in zip(promised, totals, strict=True)
+                        ]
+                    ),
+                    found["ci_high"],
+                ),
+                "learning": describe(
+                    filters_of[name],
+                    [each.safe / each.episodes for each in totals],
+                    world,
+                    knowledge,
+                ),
             }
         )
         flags[name], seen[name] = [each.flags for each in totals], [each.seen for each in totals]
     timing = {"num_envs": num_envs, "rows": speeds}
     comparisons = compare_all(flags, confidence)
     return Evaluation(
-        world, config, rows, comparisons, timing, recorders, flags, seen, learning.models(), simulated.is_deterministic(setting.actor)
+        world,
+        config,
+        rows,
+        comparisons,
+        timing,
+        recorders,
+        flags,
+        seen,
+        learning.models(),
+        simulated.is_deterministic(setting.actor),
     )
 
 
@@ -230,4 +325,7 @@ def package_versions() -> dict[str, str]:
 @cache
 def _versions() -> dict[str, str]:
     """Read once: each is in a file of its own."""
-    return {"python": platform.python_version(), **{package: version(package) for package in _PACKAGES}}
+    return {
+        "python": platform.python_version(),
+        **{package: version(package) for package in _PACKAGES},
+    }

@@ -1,4 +1,5 @@
-"""What filters rest on that is learned: from files, or learned first, once or for each of several repeats."""
+"""What filters rest on that is learned: from files, or learned first, once or for each of several
+repeats."""
 
 from __future__ import annotations
 
@@ -28,12 +29,18 @@ class Learning:
         seed: of the first time; the others have children of it.
 
     Raises:
-        ConfigurationError: a file does not fit or no filter rests on it, two models are of one method, or the number of repeats is
-            not allowed, or more than 1 without anything to learn.
+        ConfigurationError: a file does not fit or no filter rests on it, two models are of one
+            method, or the number of repeats is not allowed, or more than 1 without anything to
+            learn.
     """
 
     def __init__(
-        self, problem: SafetyProblem, names: Sequence[str], given: Iterable[LearnedModel | Path | str], repeats: int, seed: int
+        self,
+        problem: SafetyProblem,
+        names: Sequence[str],
+        given: Iterable[LearnedModel | Path | str],
+        repeats: int,
+        seed: int,
     ) -> None:
         require_whole("repeats", repeats, 1)
         self._problem, self._repeats, self._seed = problem, repeats, seed
@@ -42,16 +49,22 @@ class Learning:
         for entry in given:
             model = entry if isinstance(entry, LearnedModel) else load_learned(entry, problem)
             if model.method in self._given:
-                raise ConfigurationError(f"two learned models of the method {model.method} were given; give one of each")
+                raise ConfigurationError(
+                    f"two learned models of the method {model.method} were given; give one of each"
+                )
             if model.method not in self._methods:
                 raise ConfigurationError(
-                    f"{entry} holds {model.method}, on which no filter rests; add {_filter_of(model.method)} or leave it out"
+                    f"{entry} holds {model.method}, on which no filter rests; add"
+                    f" {_filter_of(model.method)} or leave it out"
                 )
             type(model).check(model.signature, problem)
             self._given[model.method] = model
         self._learned: dict[tuple[str, int], LearnedModel] = {}
         if repeats > 1 and not self.missing():
-            raise ConfigurationError(f"repeats = {repeats}, but nothing is learned anew: no filter rests on it, or its file was given")
+            raise ConfigurationError(
+                f"repeats = {repeats}, but nothing is learned anew: no filter rests on it, or its"
+                " file was given"
+            )
 
     def repeats(self, name: str) -> int:
         """How many identifications a filter is evaluated with."""
@@ -59,14 +72,21 @@ class Learning:
 
     def missing(self) -> list[tuple[str, int]]:
         """What has yet to be learned: methods, and the number of the repeat."""
-        needed = [(method, r) for method in self._methods if method not in self._given for r in range(self._repeats)]
+        needed = [
+            (method, r)
+            for method in self._methods
+            if method not in self._given
+            for r in range(self._repeats)
+        ]
         return [each for each in needed if each not in self._learned]
 
     def learn(self, method: str, repeat: int, progress: Progress | None) -> None:
         """Learn by a method, with the seed of a repeat. Its warnings are in the record."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
-            self._learned[method, repeat] = learner_of(method)(self._problem, seed=self._child(repeat), progress=progress)
+            self._learned[method, repeat] = learner_of(method)(
+                self._problem, seed=self._child(repeat), progress=progress
+            )
 
     def conditions(self, name: str, repeat: int) -> tuple[Condition, ...]:
         """The conditions of a filter, with what was learned in a repeat.
@@ -74,7 +94,10 @@ class Learning:
         Raises:
             ConfigurationError: the text of the filter cannot be read.
         """
-        models = {method: self._given.get(method) or self._learned[method, repeat] for method in _methods(name)}
+        models = {
+            method: self._given.get(method) or self._learned[method, repeat]
+            for method in _methods(name)
+        }
         return parse_conditions(name, self._problem, models)
 
     def models(self) -> list[LearnedModel]:
@@ -91,7 +114,11 @@ class Learning:
 def _methods(name: str) -> list[str]:
     """The methods by which has to be learned what a filter's text rests on without naming a file."""
     parts = [part.split(":") for part in name.split("+")]
-    return [LEARNED[key].method for key, *settings in parts if key in LEARNED and not any(s.startswith("file=") for s in settings)]
+    return [
+        LEARNED[key].method
+        for key, *settings in parts
+        if key in LEARNED and not any(s.startswith("file=") for s in settings)
+    ]
 
 
 def _filter_of(method: str) -> str:
@@ -100,7 +127,9 @@ def _filter_of(method: str) -> str:
 
 def learned_of(conditions: Sequence[Condition]) -> list[LearnedModel]:
     """What conditions rest on, each model once."""
-    return list({id(c.learned): c.learned for c in conditions if isinstance(c, LearnedCondition)}.values())
+    return list(
+        {id(c.learned): c.learned for c in conditions if isinstance(c, LearnedCondition)}.values()
+    )
 
 
 def seconds_of(identifications: Sequence[Sequence[Condition]]) -> float | None:
@@ -110,9 +139,13 @@ def seconds_of(identifications: Sequence[Sequence[Condition]]) -> float | None:
 
 
 def describe(
-    identifications: Sequence[Sequence[Condition]], rates: Sequence[float], problem: SafetyProblem, knowledge: str
+    identifications: Sequence[Sequence[Condition]],
+    rates: Sequence[float],
+    problem: SafetyProblem,
+    knowledge: str,
 ) -> dict[str, Any] | None:
-    """What a row says of its learning: the method, its cost, and the rate with each identification; None without any."""
+    """What a row says of its learning: the method, its cost, and the rate with each identification;
+    None without any."""
     models = [model for conditions in identifications for model in learned_of(conditions)]
     if not models:
         return None
@@ -124,11 +157,22 @@ def describe(
         "seeds": [record.seed for record in records],
         "sha256": [model.sha256 for model in models],
         "files": sorted({str(model.path) for model in models if model.path is not None}),
-        "errors": {name: float(np.mean([record.errors[name] for record in records])) for name in records[0].errors}
-        if len({tuple(record.errors) for record in records}) == 1
-        else {},
+        "errors": (
+            {
+                name: float(np.mean([record.errors[name] for record in records]))
+                for name in records[0].errors
+            }
+            if len({tuple(record.errors) for record in records}) == 1
+            else {}
+        ),
         # Those of other identifications differ in their figures only.
-        "warnings": list({re.sub(r"[\d.e+-]+", "#", text): text for record in reversed(records) for text in record.warnings}.values()),
+        "warnings": list(
+            {
+                re.sub(r"[\d.e+-]+", "#", text): text
+                for record in reversed(records)
+                for text in record.warnings
+            }.values()
+        ),
         "remarks": _remarks(identifications[0], problem, knowledge),
         "rates": list(rates),
     }
@@ -136,7 +180,16 @@ def describe(
 
 def _remarks(conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str) -> list[str]:
     """What does not fit the heading of an evaluation: where the data came from, and what is known."""
-    differing = dict.fromkeys(", ".join(model.signature.differences(problem)) for model in learned_of(conditions))
+    differing = dict.fromkeys(
+        ", ".join(model.signature.differences(problem)) for model in learned_of(conditions)
+    )
     elsewhere = [f"it was learned of a plant with {text}" for text in differing if text]
     corrects = knowledge == "plant" and any(condition.corrects_model for condition in conditions)
-    return [*elsewhere, *(["it starts from the model, which it corrects, and does not know the plant"] if corrects else [])]
+    return [
+        *elsewhere,
+        *(
+            ["it starts from the model, which it corrects, and does not know the plant"]
+            if corrects
+            else []
+        ),
+    ]

@@ -26,7 +26,8 @@ class Refinement:
 
     Attributes:
         evaluations: with the control period dt as given, dt/2 and dt/4.
-        rows: for each filter its rates with these periods, the change between the last two, and a verdict.
+        rows: for each filter its rates with these periods, the change between the last two, and a
+            verdict.
     """
 
     evaluations: tuple[Evaluation, ...]
@@ -44,20 +45,28 @@ class Refinement:
 
 
 def refine(
-    problem: SafetyProblem | str, policy: Any = "nominal", *, progress: Progress | None = None, record: bool = False, **arguments: Any
+    problem: SafetyProblem | str,
+    policy: Any = "nominal",
+    *,
+    progress: Progress | None = None,
+    record: bool = False,
+    **arguments: Any,
 ) -> Refinement:
-    """Evaluate with the control period dt of a problem, with dt/2 and with dt/4: has the safety rate converged?
+    """Evaluate with the control period dt of a problem, with dt/2 and with dt/4: has the safety
+    rate converged?
 
     What filters rest on that is learned, is learned once, with the period dt.
 
-    Control, noise and the check of safety go with the period; `substeps` stay as they are. The horizon is the
-    number of whole periods dt that is simulated with the first. Episode i has the same seed each time, hence the same
-    start, but its noise is not the same path sampled more finely. The change is that of paired episodes.
+    Control, noise and the check of safety go with the period; `substeps` stay as they are. The
+    horizon is the number of whole periods dt that is simulated with the first. Episode i has the
+    same seed each time, hence the same start, but its noise is not the same path sampled more
+    finely. The change is that of paired episodes.
 
-    The verdict on a rate is "converged" where the interval of its change from dt/2 to dt/4 reaches no further than
-    `TOLERANCE` either way. Elsewhere it is "still changing" where the interval does not contain 0, and "not resolved"
-    where it does, so that more episodes are needed. It says nothing of still smaller periods. A rate with any of these periods
-    contradicts a bound as it does in `evaluate`: then that is withheld, and the verdict "contradicted".
+    The verdict on a rate is "converged" where the interval of its change from dt/2 to dt/4 reaches
+    no further than `TOLERANCE` either way. Elsewhere it is "still changing" where the interval does
+    not contain 0, and "not resolved" where it does, so that more episodes are needed. It says
+    nothing of still smaller periods. A rate with any of these periods contradicts a bound as it
+    does in `evaluate`: then that is withheld, and the verdict "contradicted".
 
     Args:
         problem: as for `evaluate`.
@@ -72,12 +81,25 @@ def refine(
         NumericalError: a simulation or a condition left the finite numbers.
     """
     if arguments.get("repeats", 1) != 1:
-        raise ConfigurationError("repeats are of the identification and refinement of the period: ask for one of the two")
+        raise ConfigurationError(
+            "repeats are of the identification and refinement of the period: ask for one of the two"
+        )
     if arguments.get("spec") is not None:
-        raise ConfigurationError("the control period of an env of somebody else is its own, and cannot be refined")
+        raise ConfigurationError(
+            "the control period of an env of somebody else is its own, and cannot be refined"
+        )
     first = evaluate(problem, policy, progress=_share(progress, 0), record=record, **arguments)
-    arguments |= {"options": None, "filters": [row["filter"] for row in first.rows], "bounds": False, "learned": first.learned}
-    finer = [evaluate(_divided(first.problem, d), policy, progress=_share(progress, i), **arguments) for i, d in enumerate(DIVISORS) if i]
+    arguments |= {
+        "options": None,
+        "filters": [row["filter"] for row in first.rows],
+        "bounds": False,
+        "learned": first.learned,
+    }
+    finer = [
+        evaluate(_divided(first.problem, d), policy, progress=_share(progress, i), **arguments)
+        for i, d in enumerate(DIVISORS)
+        if i
+    ]
     # The finer ones are nearer to continuous time, of which the bounds are.
     first = replace(first, rows=[_judged(row, finer) for row in first.rows])
     evaluations = (first, *finer)
@@ -96,7 +118,8 @@ def _of(evaluation: Evaluation, name: str) -> Row:
 
 
 def _share(progress: Progress | None, i: int) -> Progress | None:
-    """From the done part of the i-th evaluation to that of all: an evaluation has as much work as it has steps."""
+    """From the done part of the i-th evaluation to that of all: an evaluation has as much work as
+    it has steps."""
     if progress is None:
         return None
     before, all_steps = sum(DIVISORS[:i]), sum(DIVISORS)
@@ -111,10 +134,15 @@ def _divided(problem: SafetyProblem, divisor: int) -> SafetyProblem:
 def _row(name: str, evaluations: tuple[Evaluation, ...]) -> Row:
     cells = [_of(evaluation, name) for evaluation in evaluations]
     coarse, fine = evaluations[-2:]
-    low, high = paired_difference_interval(*fine.flags[name][0].table(coarse.flags[name][0]), fine.config["confidence"])
+    low, high = paired_difference_interval(
+        *fine.flags[name][0].table(coarse.flags[name][0]), fine.config["confidence"]
+    )
     return {
         "filter": name,
-        **{key: [cell[key] for cell in cells] for key in ("safe", "safety_rate", "ci_low", "ci_high")},
+        **{
+            key: [cell[key] for cell in cells]
+            for key in ("safe", "safety_rate", "ci_low", "ci_high")
+        },
         "change": cells[-1]["safety_rate"] - cells[-2]["safety_rate"],
         "change_low": low,
         "change_high": high,

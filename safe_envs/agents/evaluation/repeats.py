@@ -1,4 +1,5 @@
-"""Several identifications of one filter, as one row: intervals over identifications and over episodes."""
+"""Several identifications of one filter, as one row: intervals over identifications and over
+episodes."""
 
 from __future__ import annotations
 
@@ -11,12 +12,20 @@ import numpy as np
 from safe_envs.agents.evaluation.rollout import Row
 from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
 
-_MEANS = ("min_h_median", "min_h_p05", "intervention_rate", "infeasible_rate", "effort_mean", "return_mean")
+_MEANS = (
+    "min_h_median",
+    "min_h_p05",
+    "intervention_rate",
+    "infeasible_rate",
+    "effort_mean",
+    "return_mean",
+)
 _SUMS = ("episodes", "safe", "violations", "touching")
 
 
 def pooled(rows: Sequence[Row], confidence: float) -> Row:
-    """The rows of several identifications on the same episodes as one: sums, means, and intervals over both."""
+    """The rows of several identifications on the same episodes as one: sums, means, and intervals
+    over both."""
     if len(rows) == 1:
         return dict(rows[0])
     episodes = rows[0]["episodes"]
@@ -36,10 +45,14 @@ def interval_over(rates: Sequence[float], episodes: int, confidence: float) -> t
     """Interval of the mean rate of identifications that were all evaluated on the same episodes."""
     mean = math.fsum(rates) / len(rates)
     safe = round(mean * episodes)
-    return repeated_interval(rates, rate_interval(safe, episodes, confidence), confidence, (0.0, 1.0))
+    return repeated_interval(
+        rates, rate_interval(safe, episodes, confidence), confidence, (0.0, 1.0)
+    )
 
 
-def _curve(curves: Sequence[dict[str, list[Any]]], episodes: int, confidence: float) -> dict[str, list[Any]]:
+def _curve(
+    curves: Sequence[dict[str, list[Any]]], episodes: int, confidence: float
+) -> dict[str, list[Any]]:
     rates = np.array([curve["rate"] for curve in curves])
     intervals = [interval_over(column.tolist(), episodes, confidence) for column in rates.T]
     return {

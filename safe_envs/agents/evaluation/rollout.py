@@ -11,7 +11,13 @@ import numpy as np
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, Exponentials, smallest
 from safe_envs.agents.evaluation.comparison import SafetyBits
 from safe_envs.agents.evaluation.rounding import may_touch, touches
-from safe_envs.agents.evaluation.statistics import FirstValues, RunningSum, SafetyCurve, rate_interval, share
+from safe_envs.agents.evaluation.statistics import (
+    FirstValues,
+    RunningSum,
+    SafetyCurve,
+    rate_interval,
+    share,
+)
 from safe_envs.agents.evaluation.visited_states import Seen, Watch
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.policies.registry import Policy
@@ -51,7 +57,10 @@ class Recorder:
 
     def __init__(self, steps: int, states: int, episodes: int) -> None:
         if steps > _MOST_RECORDED:
-            raise ConfigurationError(f"an episode of {steps} steps is too long to draw; choose a horizon of at most {_MOST_RECORDED} steps")
+            raise ConfigurationError(
+                f"an episode of {steps} steps is too long to draw; choose a horizon of at most"
+                f" {_MOST_RECORDED} steps"
+            )
         self.barrier = np.full((steps + 1, min(episodes, _KEPT_BARRIERS)), np.nan)
         self.states = np.full((steps + 1, min(episodes, _KEPT_STATES), states), np.nan)
 
@@ -68,7 +77,8 @@ class Recorder:
 
 
 class EpisodeBatch:
-    """Counts of episodes that run side by side, an array entry for each; ended and surplus ones stay as they are."""
+    """Counts of episodes that run side by side, an array entry for each; ended and surplus ones
+    stay as they are."""
 
     def __init__(self, size: int, count: int, h: np.ndarray, x: Components, inputs: int) -> None:
         self.watch = Watch(x, h, inputs)
@@ -82,8 +92,16 @@ class EpisodeBatch:
         self.effort = np.zeros(size)
         self.returns = np.zeros(size)
 
-    def add(self, h: np.ndarray, x: tuple[Components, Components], u: Components, reward: np.ndarray, info: Info) -> None:
-        """Count a step with its smallest h; it counts for the filter only if the episode was safe up to its beginning.
+    def add(
+        self,
+        h: np.ndarray,
+        x: tuple[Components, Components],
+        u: Components,
+        reward: np.ndarray,
+        info: Info,
+    ) -> None:
+        """Count a step with its smallest h; it counts for the filter only if the episode was safe
+        up to its beginning.
 
         Args:
             h: smallest barrier value of the step.
@@ -130,7 +148,11 @@ class EpisodeStatistics:
         self.seen = Seen.nothing(problem)
         self._problem = problem
         self.flags = SafetyBits()
-        self._curve, self._dt, self._never = SafetyCurve(problem.steps), problem.dt, problem.steps + 1
+        self._curve, self._dt, self._never = (
+            SafetyCurve(problem.steps),
+            problem.dt,
+            problem.steps + 1,
+        )
         self._counted = self._interventions = self._infeasible = self._with_effort = 0
         self._effort, self._return, self._h_min = RunningSum(), RunningSum(), FirstValues()
 
@@ -152,10 +174,15 @@ class EpisodeStatistics:
         self.seen = self.seen.joined(wave.watch.seen(count))
         near = ~wave.safe[:count] & may_touch(wave.h_min[:count], wave.watch.depth[:count])
         if near.any():
-            self._touching += int(touches(self._problem, wave.h_min[:count][near], wave.watch.lowest.T[:count][near]).sum())
+            self._touching += int(
+                touches(
+                    self._problem, wave.h_min[:count][near], wave.watch.lowest.T[:count][near]
+                ).sum()
+            )
 
     def row(self, confidence: float) -> Row:
-        """The statistics of the episodes, with intervals of a confidence; None where no step counts."""
+        """The statistics of the episodes, with intervals of a confidence; None where no step
+        counts."""
         low, high = rate_interval(self.safe, self.episodes, confidence)
         p05, median = self._h_min.quantiles((0.05, 0.5))
         return {
@@ -193,13 +220,18 @@ def run_episodes(
         policy: anything with Stable-Baselines3's `predict`.
         episodes: how many.
         seed: whose children seed the episodes.
-        progress: told, after every step, how many episodes are done; the fraction tells of those under way.
+        progress: told, after every step, how many episodes are done; the fraction tells of those
+            under way.
         recorder: keeps trajectories, if any.
-        on_start: given the components of the start states of each wave, arrays of shape (num_envs,), and how many
-            of them, from the first, are of episodes that count.
+        on_start: given the components of the start states of each wave, arrays of shape
+            (num_envs,), and how many of them, from the first, are of episodes that count.
         bridge: looks at h between control instants too; it changes neither control nor noise.
     """
-    return totals_of(readable(env).problem, play(env, policy, range(episodes), seed, progress, recorder, bridge), on_start)
+    return totals_of(
+        readable(env).problem,
+        play(env, policy, range(episodes), seed, progress, recorder, bridge),
+        on_start,
+    )
 
 
 @dataclass(frozen=True)
@@ -217,7 +249,9 @@ class Played:
     starts: Components
 
 
-def totals_of(problem: SafetyProblem, waves: Iterable[Played], on_start: OnStart | None = None) -> EpisodeStatistics:
+def totals_of(
+    problem: SafetyProblem, waves: Iterable[Played], on_start: OnStart | None = None
+) -> EpisodeStatistics:
     """Add up waves, in order; see `run_episodes` for `on_start`."""
     totals = EpisodeStatistics(problem)
     for played in waves:
@@ -246,7 +280,11 @@ def play(
                 policy.begin(rows, seed)
             started = env.reset(seed=[episode_seed(seed, i) for i in rows])
             starts = world.components
-            watch = None if bridge is None else _Watch(bridge, Exponentials(seed, rows, bridge.draws), starts, started[1])
+            watch = (
+                None
+                if bridge is None
+                else _Watch(bridge, Exponentials(seed, rows, bridge.draws), starts, started[1])
+            )
             wave = _play(env, policy, started, first, count, progress, recorder, watch)
         yield Played(wave, count, starts)
 
@@ -254,7 +292,9 @@ def play(
 class _Watch:
     """Looks at h during each period of a wave."""
 
-    def __init__(self, bridge: BrownianBridge, draws: Exponentials, x: Components, info: Info) -> None:
+    def __init__(
+        self, bridge: BrownianBridge, draws: Exponentials, x: Components, info: Info
+    ) -> None:
         self._bridge, self._draws, self._x, self._barriers = bridge, draws, x, info["barrier"]
 
     def lowest(self, x: Components, barriers: np.ndarray) -> np.ndarray:
@@ -303,6 +343,8 @@ def _play(
     return wave
 
 
-def _executed(world: SafeVectorEnv | SafetyMonitorVector, actions: np.ndarray, info: Info) -> Components:
+def _executed(
+    world: SafeVectorEnv | SafetyMonitorVector, actions: np.ndarray, info: Info
+) -> Components:
     """Components of the executed input in physical units."""
     return tuple(info["safe_action"].T) if "safe_action" in info else world.physical_action(actions)

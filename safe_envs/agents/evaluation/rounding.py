@@ -1,4 +1,5 @@
-"""How exactly a barrier is known at a state in floating point: whether an episode violates, or only touches h = 0."""
+"""How exactly a barrier is known at a state in floating point: whether an episode violates, or only
+touches h = 0."""
 
 from __future__ import annotations
 
@@ -20,14 +21,16 @@ _NEARLY = 1e-6
 
 
 def may_touch(lowest: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """Which episodes are worth a look at by `touches`, which compiles formulas, by their smallest and their largest h, shape (B,)."""
+    """Which episodes are worth a look at by `touches`, which compiles formulas, by their smallest
+    and their largest h, shape (B,)."""
     return lowest >= -_NEARLY * largest
 
 
 def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Which of the smallest h <= 0 of episodes cannot be told from 0 in floating point, shape (B,).
 
-    That is so where |h| is at most 64 units of rounding of its terms and of what rounded states make of it.
+    That is so where |h| is at most 64 units of rounding of its terms and of what rounded states
+    make of it.
 
     Args:
         problem: whose barriers they are of.
@@ -35,7 +38,9 @@ def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.nda
         x: the states where they were, shape (B, n).
     """
     plant = problem.plant
-    compiled, ends = _parts(plant.states, tuple(plant.numeric(b.expression) for b in problem.barriers))
+    compiled, ends = _parts(
+        plant.states, tuple(plant.numeric(b.expression) for b in problem.barriers)
+    )
     with np.errstate(all="ignore"):
         parts = abs(stacked(compiled(*np.ascontiguousarray(x.T)), len(x)))
     sizes = np.max([parts[:, first:end].sum(axis=1) for first, end in pairwise(ends)], axis=0)
@@ -44,8 +49,12 @@ def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.nda
 
 @lru_cache(maxsize=64)
 def _parts(states: tuple[sp.Symbol, ...], barriers: tuple[sp.Expr, ...]) -> tuple[Any, list[int]]:
-    """The compiled terms of each barrier, and each state times its slope; and where those of a barrier end, after a 0."""
-    parts = [[*sp.Add.make_args(h), *(s * slope for s in states if not _jumps(slope := sp.diff(h, s)))] for h in barriers]
+    """The compiled terms of each barrier, and each state times its slope; and where those of a
+    barrier end, after a 0."""
+    parts = [
+        [*sp.Add.make_args(h), *(s * slope for s in states if not _jumps(slope := sp.diff(h, s)))]
+        for h in barriers
+    ]
     ends = np.cumsum([0, *map(len, parts)]).tolist()
     return compile_function(states, [part for each in parts for part in each], "arrays"), ends
 

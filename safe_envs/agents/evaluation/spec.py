@@ -35,7 +35,8 @@ BARE = "none"
 
 
 class EvaluationSpec:
-    """A world, a policy and filters. See `safe_envs.agents.evaluation.evaluate.evaluate` for the arguments and their errors.
+    """A world, a policy and filters. See `safe_envs.agents.evaluation.evaluate.evaluate` for the
+    arguments and their errors.
 
     Attributes:
         simulated: what is simulated.
@@ -62,7 +63,10 @@ class EvaluationSpec:
         repeats: int,
     ) -> None:
         require_whole("seed", seed, 0)
-        for name, value, allowed in (("knowledge", knowledge, ("model", "plant")), ("objective", objective, ("nearest", "clf"))):
+        for name, value, allowed in (
+            ("knowledge", knowledge, ("model", "plant")),
+            ("objective", objective, ("nearest", "clf")),
+        ):
             if value not in allowed:
                 raise ConfigurationError(f"{name} = {shown(value)}; {nearest(value, allowed)}")
         self.simulated = world_of(problem, options, spec)
@@ -73,8 +77,16 @@ class EvaluationSpec:
         self._texts = [_checked(name, self.problem) for name in self.names]
         self.learning = Learning(self.problem, self.names, learned, repeats, seed)
         if self.simulated.spec is not None and self.learning.missing():
-            raise ConfigurationError("a filter over an env of somebody else takes what was learned from a log: NAME:file=FILE")
-        self._policy, self._spec, self._knowledge, self._objective = policy, spec, knowledge, objective
+            raise ConfigurationError(
+                "a filter over an env of somebody else takes what was learned from a log:"
+                " NAME:file=FILE"
+            )
+        self._policy, self._spec, self._knowledge, self._objective = (
+            policy,
+            spec,
+            knowledge,
+            objective,
+        )
         self.filters: dict[str, list[tuple[Condition, ...]]] = {}
 
     def learn(self, part: Callable[[], Progress | None]) -> None:
@@ -87,12 +99,15 @@ class EvaluationSpec:
             self.learning.learn(method, repeat, part())
         for name in self.names:
             repeats = range(self.learning.repeats(name))
-            self.filters[name] = [() if name == BARE else self.learning.conditions(name, repeat) for repeat in repeats]
+            self.filters[name] = [
+                () if name == BARE else self.learning.conditions(name, repeat) for repeat in repeats
+            ]
 
     def env(self, conditions: Sequence[Condition], num_envs: int) -> Env:
         """A batch of envs behind the filter of conditions, after a first step.
 
-        That step compiles what the filter needs: an error shows before a long run, and the timing is of steps.
+        That step compiles what the filter needs: an error shows before a long run, and the timing
+        is of steps.
         """
         env = self.simulated.env(conditions, self._knowledge, self._objective, num_envs)
         env.reset(seed=0)
@@ -101,9 +116,14 @@ class EvaluationSpec:
         return env
 
     def drifting_env(self, conditions: Sequence[Condition], lengths: np.ndarray) -> Env:
-        """A batch of envs of this project's whose noise may drift, behind the filter of conditions; see `TiltedNoiseEnv`."""
+        """A batch of envs of this project's whose noise may drift, behind the filter of conditions;
+        see `TiltedNoiseEnv`."""
         env = TiltedNoiseEnv(self.problem, lengths)
-        return SafetyFilterVectorWrapper(env, conditions, self._knowledge, self._objective) if conditions else env
+        return (
+            SafetyFilterVectorWrapper(env, conditions, self._knowledge, self._objective)
+            if conditions
+            else env
+        )
 
     def config(self) -> dict[str, Any]:
         """All of it as JSON-able data, for filters that were read."""
@@ -112,11 +132,14 @@ class EvaluationSpec:
             "title": simulated.title,
             "env_id": simulated.env_id,
             "options": simulated.options,
-            "filter_spec": None if spec is None else spec if isinstance(spec, str) else type(spec).__name__,
+            "filter_spec": (
+                None if spec is None else spec if isinstance(spec, str) else type(spec).__name__
+            ),
             "problem": _describe(self.problem),
             "policy": _describe_policy(self._policy),
             "filters": [
-                {"name": name, "spec": text or spec_of(self.filters[name][0])} for name, text in zip(self.names, self._texts, strict=True)
+                {"name": name, "spec": text or spec_of(self.filters[name][0])}
+                for name, text in zip(self.names, self._texts, strict=True)
             ],
             "knowledge": self._knowledge,
             "objective": self._objective,
@@ -137,15 +160,19 @@ class Work:
 
 
 def _checked(name: str, problem: SafetyProblem) -> str | None:
-    """The text of a filter with all its parameters, where it rests on nothing learned; the others are read once that is there."""
+    """The text of a filter with all its parameters, where it rests on nothing learned; the others
+    are read once that is there."""
     if name == BARE:
         return BARE
     if BARE in name.split("+"):
         raise ConfigurationError(
-            f"filter {shown(name)}: {BARE!r} is the bare env, no condition of a barrier; give it alone or leave it out"
+            f"filter {shown(name)}: {BARE!r} is the bare env, no condition of a barrier; give it"
+            " alone or leave it out"
         )
     if re.split("[:+]", name)[0] not in (*CONDITIONS, *LEARNED):
-        raise ConfigurationError(f"unknown filter {shown(name)}; {nearest(name, (BARE, *CONDITIONS, *LEARNED))}")
+        raise ConfigurationError(
+            f"unknown filter {shown(name)}; {nearest(name, (BARE, *CONDITIONS, *LEARNED))}"
+        )
     if any(re.split(":", part)[0] in LEARNED for part in name.split("+")):
         require_readable(name, problem)
         return None

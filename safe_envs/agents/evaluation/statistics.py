@@ -21,10 +21,14 @@ def require_confidence(confidence: Any) -> None:
         ConfigurationError: it is not.
     """
     if not isinstance(confidence, int | float) or not 0.0 < confidence < 1.0:
-        raise ConfigurationError(f"confidence = {confidence!r}; give a number above 0 and below 1, such as 0.95")
+        raise ConfigurationError(
+            f"confidence = {confidence!r}; give a number above 0 and below 1, such as 0.95"
+        )
 
 
-def wilson_interval(successes: float, trials: float, confidence: float = 0.95) -> tuple[float, float]:
+def wilson_interval(
+    successes: float, trials: float, confidence: float = 0.95
+) -> tuple[float, float]:
     """Wilson's score interval for the probability of success of independent trials.
 
     Args:
@@ -40,7 +44,8 @@ def wilson_interval(successes: float, trials: float, confidence: float = 0.95) -
 
 
 def rate_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's interval, or Clopper and Pearson's exact one where all or none of the trials succeeded.
+    """Wilson's interval, or Clopper and Pearson's exact one where all or none of the trials
+    succeeded.
 
     Arguments and errors as for `wilson_interval`.
     """
@@ -48,7 +53,9 @@ def rate_interval(successes: int, trials: int, confidence: float = 0.95) -> tupl
     return float(low), float(high)
 
 
-def rate_band(successes: np.ndarray, trials: int, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+def rate_band(
+    successes: np.ndarray, trials: int, confidence: float = 0.95
+) -> tuple[np.ndarray, np.ndarray]:
     """`rate_interval` of each count of an array: the lower and the upper ends."""
     low, high = _wilson(successes, trials, _deviations(confidence))
     # The tail beyond the end on the one side is p^trials; the other end is 0 or 1.
@@ -59,45 +66,60 @@ def rate_band(successes: np.ndarray, trials: int, confidence: float = 0.95) -> t
 def paired_difference_interval(
     both: float, only_first: float, only_second: float, neither: float, confidence: float = 0.95
 ) -> tuple[float, float]:
-    """Newcombe's interval for the difference p1 - p2 of the rates of two outcomes of the same trials.
+    """Newcombe's interval for the difference p1 - p2 of the rates of two outcomes of the same
+    trials.
 
-    The Wilson intervals of the two rates, squared and added with the outcomes' phi correlation, which is corrected
-    for continuity where it is positive, and 0 where it is not defined.
+    The Wilson intervals of the two rates, squared and added with the outcomes' phi correlation,
+    which is corrected for continuity where it is positive, and 0 where it is not defined.
 
     Source: R. G. Newcombe, Statistics in Medicine 17 (1998) 2635-2650, method 10.
 
     Args:
-        both: trials in which both succeeded; a mean of several counts need not be whole, here and below.
+        both: trials in which both succeeded; a mean of several counts need not be whole, here and
+            below.
         only_first: trials in which only the first succeeded.
         only_second: trials in which only the second succeeded.
         neither: trials in which neither succeeded.
         confidence: of the two-sided interval.
 
     Raises:
-        ConfigurationError: there is no trial or a count is negative, or the confidence is out of range.
+        ConfigurationError: there is no trial or a count is negative, or the confidence is out of
+            range.
     """
     trials = both + only_first + only_second + neither
     if min(both, only_first, only_second, neither) < 0:
-        raise ConfigurationError(f"counts of pairs are {(both, only_first, only_second, neither)}; give whole numbers from 0")
+        raise ConfigurationError(
+            f"counts of pairs are {(both, only_first, only_second, neither)}; give whole numbers"
+            " from 0"
+        )
     first, second = both + only_first, both + only_second
     together = both * neither - only_first * only_second
     if together > 0:
         together = max(together - trials / 2, 0.0)
     margins = first * (trials - first) * second * (trials - second)
     phi = together / math.sqrt(margins) if margins else 0.0
-    (low1, high1), (low2, high2) = wilson_interval(first, trials, confidence), wilson_interval(second, trials, confidence)
+    (low1, high1), (low2, high2) = (
+        wilson_interval(first, trials, confidence),
+        wilson_interval(second, trials, confidence),
+    )
     p1, p2 = first / trials, second / trials
-    return p1 - p2 - _third_side(p1 - low1, high2 - p2, phi), p1 - p2 + _third_side(high1 - p1, p2 - low2, phi)
+    return p1 - p2 - _third_side(p1 - low1, high2 - p2, phi), p1 - p2 + _third_side(
+        high1 - p1, p2 - low2, phi
+    )
 
 
 def repeated_interval(
-    values: Sequence[float], of_trials: tuple[float, float], confidence: float, bounds: tuple[float, float]
+    values: Sequence[float],
+    of_trials: tuple[float, float],
+    confidence: float,
+    bounds: tuple[float, float],
 ) -> tuple[float, float]:
-    """Interval for the mean of a quantity over everything that was drawn once for all its trials, such as an identification.
+    """Interval for the mean of a quantity over everything that was drawn once for all its trials,
+    such as an identification.
 
-    All draws see the same trials, so that these do not average out: the distances from the mean to the ends of the interval
-    over trials and those of Student's interval over draws are added as squares. That is a little wide, since the spread of the
-    draws holds noise of the trials too.
+    All draws see the same trials, so that these do not average out: the distances from the mean to
+    the ends of the interval over trials and those of Student's interval over draws are added as
+    squares. That is a little wide, since the spread of the draws holds noise of the trials too.
 
     Args:
         values: one for each draw, at least two.
@@ -114,24 +136,35 @@ def repeated_interval(
     if len(values) < 2:
         raise ConfigurationError(f"{len(values)} draws were given; their spread needs at least 2")
     mean = math.fsum(values) / len(values)
-    half = float(stdtrit(len(values) - 1, 0.5 + confidence / 2.0) * np.std(values, ddof=1) / math.sqrt(len(values)))
+    half = float(
+        stdtrit(len(values) - 1, 0.5 + confidence / 2.0)
+        * np.std(values, ddof=1)
+        / math.sqrt(len(values))
+    )
     low, high = of_trials
-    return max(mean - math.hypot(mean - low, half), bounds[0]), min(mean + math.hypot(high - mean, half), bounds[1])
+    return max(mean - math.hypot(mean - low, half), bounds[0]), min(
+        mean + math.hypot(high - mean, half), bounds[1]
+    )
 
 
-def log_normal_interval(estimates: Sequence[float] | np.ndarray, confidence: float = 0.95) -> tuple[float, float]:
-    """Interval for the mean of positive estimates whose logarithms are nearly normal, as those of splitting are.
+def log_normal_interval(
+    estimates: Sequence[float] | np.ndarray, confidence: float = 0.95
+) -> tuple[float, float]:
+    """Interval for the mean of positive estimates whose logarithms are nearly normal, as those of
+    splitting are.
 
-    Cox's interval for the mean of a log-normal variable, exp(+- t sqrt(s^2/R + s^4/(2 (R - 1)))) with s the deviation of the R
-    logarithms and t the quantile of Student's distribution, laid around the mean of the estimates, which is unbiased whatever
-    their distribution. Student's interval of the estimates themselves misses to one side: the largest of them are the rarest.
+    Cox's interval for the mean of a log-normal variable, exp(+- t sqrt(s^2/R + s^4/(2 (R - 1))))
+    with s the deviation of the R logarithms and t the quantile of Student's distribution, laid
+    around the mean of the estimates, which is unbiased whatever their distribution. Student's
+    interval of the estimates themselves misses to one side: the largest of them are the rarest.
 
     Args:
         estimates: independent ones, at least two, all above 0.
         confidence: of the two-sided interval.
 
     Raises:
-        ConfigurationError: there are fewer than two estimates, one is not positive, or the confidence is out of range.
+        ConfigurationError: there are fewer than two estimates, one is not positive, or the
+            confidence is out of range.
 
     Source: X.-H. Zhou and S. Gao, Statistics in Medicine 16 (1997) 783-790.
     """
@@ -140,10 +173,14 @@ def log_normal_interval(estimates: Sequence[float] | np.ndarray, confidence: flo
     require_confidence(confidence)
     values = np.asarray(estimates, dtype=np.float64)
     if len(values) < 2 or not (values > 0.0).all():
-        raise ConfigurationError(f"{len(values)} estimates were given; give at least two, all above 0")
+        raise ConfigurationError(
+            f"{len(values)} estimates were given; give at least two, all above 0"
+        )
     degrees = len(values) - 1
     variance = float(np.var(np.log(values), ddof=1))
-    half = float(stdtrit(degrees, 0.5 + confidence / 2.0)) * math.sqrt(variance / len(values) + variance**2 / (2.0 * degrees))
+    half = float(stdtrit(degrees, 0.5 + confidence / 2.0)) * math.sqrt(
+        variance / len(values) + variance**2 / (2.0 * degrees)
+    )
     mean = math.fsum(values) / len(values)
     return mean * math.exp(-half), mean * math.exp(half)
 
@@ -185,7 +222,10 @@ def _deviations(confidence: float) -> float:
 
 def _counts(successes: float, trials: float) -> np.ndarray:
     if not 0 <= successes <= trials or trials < 1:
-        raise ConfigurationError(f"{successes} successes in {trials} trials; give at least one trial, and from 0 to all successes")
+        raise ConfigurationError(
+            f"{successes} successes in {trials} trials; give at least one trial, and from 0 to all"
+            " successes"
+        )
     return np.asarray(successes)
 
 
@@ -232,15 +272,25 @@ class SafetyCurve:
         self._lost = np.zeros(len(self.instants) + 1, dtype=np.int64)
 
     def add(self, first_violation: np.ndarray) -> None:
-        """Add episodes by the instants of their first violations, shape (B,); beyond the last for none."""
-        self._lost += np.bincount(np.searchsorted(self.instants, first_violation), minlength=len(self._lost))
+        """Add episodes by the instants of their first violations, shape (B,); beyond the last for
+        none."""
+        self._lost += np.bincount(
+            np.searchsorted(self.instants, first_violation), minlength=len(self._lost)
+        )
 
     def row(self, dt: float, confidence: float) -> dict[str, list[Any]]:
-        """Times in s, and for each the episodes safe up to it, their rate, and its pointwise interval."""
+        """Times in s, and for each the episodes safe up to it, their rate, and its pointwise
+        interval."""
         episodes = int(self._lost.sum())
         safe = episodes - np.cumsum(self._lost)[:-1]
         low, high = rate_band(safe, episodes, confidence)
-        columns = {"time": self.instants * dt, "safe": safe, "rate": safe / episodes, "ci_low": low, "ci_high": high}
+        columns = {
+            "time": self.instants * dt,
+            "safe": safe,
+            "rate": safe / episodes,
+            "ci_low": low,
+            "ci_high": high,
+        }
         return {name: values.tolist() for name, values in columns.items()}
 
 

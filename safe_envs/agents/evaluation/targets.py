@@ -1,4 +1,5 @@
-"""What an evaluation simulates: an env of this project, or one of somebody else, seen through a filter's spec."""
+"""What an evaluation simulates: an env of this project, or one of somebody else, seen through a
+filter's spec."""
 
 from __future__ import annotations
 
@@ -46,9 +47,13 @@ class NativeTarget:
     def __init__(self, problem: SafetyProblem | str, options: Mapping[str, Any] | None) -> None:
         self.env_id = full_id(problem) if isinstance(problem, str) else None
         if self.env_id is None and options:
-            raise ConfigurationError("options are the arguments of a registered id; configure the problem itself instead")
+            raise ConfigurationError(
+                "options are the arguments of a registered id; configure the problem itself instead"
+            )
         self.options = {k: v for k, v in (options or {}).items() if v is not None}
-        self.problem = problem if isinstance(problem, SafetyProblem) else load_problem(problem, options)
+        self.problem = (
+            problem if isinstance(problem, SafetyProblem) else load_problem(problem, options)
+        )
 
     @property
     def filter(self) -> str:
@@ -64,20 +69,27 @@ class NativeTarget:
         """Make a policy from its name; see `make_policy`."""
         return make_policy(name, self.problem, trust)
 
-    def env(self, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int) -> Env:
+    def env(
+        self, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int
+    ) -> Env:
         """A batch of envs behind the filter of conditions, or bare."""
         env = SafeVectorEnv(self.problem, num_envs)
-        return SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
+        return (
+            SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
+        )
 
     def is_deterministic(self, policy: Any) -> bool:
         """Whether all episodes are one and the same."""
-        noise = Integrator(self.problem.plant, self.problem.dt, self.problem.substeps, "arrays").channels
+        noise = Integrator(
+            self.problem.plant, self.problem.dt, self.problem.substeps, "arrays"
+        ).channels
         acts_alike = policy.deterministic if isinstance(policy, Policy) else True
         return acts_alike and not noise and not self.problem.starts[self.problem.start].uniforms
 
 
 class ExternalTarget:
-    """A registered env that knows nothing of safety, with the model of it that filters believe for its problem.
+    """A registered env that knows nothing of safety, with the model of it that filters believe for
+    its problem.
 
     Args:
         env_id: id of it.
@@ -91,7 +103,8 @@ class ExternalTarget:
         why_no_bound: nobody knows whether the model is the env.
 
     Raises:
-        ConfigurationError: the env is one of this project, has no time limit, or does not fit the spec.
+        ConfigurationError: the env is one of this project, has no time limit, or does not fit the
+            spec.
         gymnasium.error.Error: there is no such env.
     """
 
@@ -102,11 +115,14 @@ class ExternalTarget:
         self.options: dict[str, Any] = {}
         with gym.make(env_id) as env:
             if isinstance(getattr(env.unwrapped, "problem", None), SafetyProblem):
-                raise ConfigurationError(f"{env_id} has barriers of its own; leave the filter spec out")
+                raise ConfigurationError(
+                    f"{env_id} has barriers of its own; leave the filter spec out"
+                )
             steps = env.spec.max_episode_steps if env.spec else None
             if steps is None:
                 raise ConfigurationError(
-                    f"{env_id} has no time limit, so that its episodes have no length; register it with max_episode_steps"
+                    f"{env_id} has no time limit, so that its episodes have no length; register it"
+                    " with max_episode_steps"
                 )
             self.problem = spec.problem(env.unwrapped, env.action_space, env_id, steps)
             self._spaces = env.observation_space, env.action_space
@@ -128,19 +144,39 @@ class ExternalTarget:
             ConfigurationError: there is no such policy, or none for such an env.
         """
         if name == "nominal" and self.spec.nominal is None:
-            raise ConfigurationError("the filter spec has no nominal controller; give it one, or --policy zero, random or a .zip")
+            raise ConfigurationError(
+                "the filter spec has no nominal controller; give it one, or --policy zero, random"
+                " or a .zip"
+            )
         if name in POLICIES:
-            return _OfModel(make_policy(name, self.problem), self.spec, self.problem, self._spaces[1])
+            return _OfModel(
+                make_policy(name, self.problem), self.spec, self.problem, self._spaces[1]
+            )
         if len(policy_files(name)) > 1:
-            raise ConfigurationError(f"{name} holds a policy for envs of this project; give a .zip of Stable-Baselines3 for {self.env_id}")
+            raise ConfigurationError(
+                f"{name} holds a policy for envs of this project; give a .zip of Stable-Baselines3"
+                f" for {self.env_id}"
+            )
         return make_policy(name, self.problem, trust, self._spaces)
 
-    def env(self, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int) -> Env:
+    def env(
+        self, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int
+    ) -> Env:
         """A batch of envs behind the filter of conditions, or bare."""
         if knowledge != "model":
-            raise ConfigurationError(f"knowledge = {shown(knowledge)}: of an env of somebody else nothing is known but the model")
-        env = SafetyMonitorVector(gym.make_vec(self.env_id, num_envs=min(num_envs, _MOST_ENVS), vectorization_mode="sync"), self.spec)
-        return SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
+            raise ConfigurationError(
+                f"knowledge = {shown(knowledge)}: of an env of somebody else nothing is known but"
+                " the model"
+            )
+        env = SafetyMonitorVector(
+            gym.make_vec(
+                self.env_id, num_envs=min(num_envs, _MOST_ENVS), vectorization_mode="sync"
+            ),
+            self.spec,
+        )
+        return (
+            SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
+        )
 
     def is_deterministic(self, policy: Any) -> bool:
         """Nobody knows whether all episodes are one and the same."""
@@ -150,7 +186,9 @@ class ExternalTarget:
 class _OfModel(Policy):
     """A policy for the model's problem as one for the env: from its observations to its actions."""
 
-    def __init__(self, policy: Policy, spec: FilterSpec, problem: SafetyProblem, space: Any) -> None:
+    def __init__(
+        self, policy: Policy, spec: FilterSpec, problem: SafetyProblem, space: Any
+    ) -> None:
         self._policy, self._spec, self._space = policy, spec, space
         self.deterministic = policy.deterministic
         self._center, self._half = (np.array(part) for part in center_and_half_width(problem))
@@ -160,13 +198,22 @@ class _OfModel(Policy):
         self._policy.begin(episodes, seed)
 
     def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
         """Choose actions of the env; see `Policy.predict`."""
         x = self._spec.state(observation, np.shape(observation)[:-1])
         actions, state = self._policy.predict(x, state, episode_start, deterministic)
         space = self._space
-        return np.clip(self._spec.actions(self._center + self._half * actions), space.low, space.high).astype(space.dtype), state
+        return (
+            np.clip(
+                self._spec.actions(self._center + self._half * actions), space.low, space.high
+            ).astype(space.dtype),
+            state,
+        )
 
 
 def world_of(
@@ -182,5 +229,7 @@ def world_of(
     given = [name for name, value in (options or {}).items() if value is not None]
     if not isinstance(problem, str) or given:
         wrong = ", ".join(given) or "a SafetyProblem"
-        raise ConfigurationError(f"a filter spec is for the id of an env of somebody else, without {wrong}")
+        raise ConfigurationError(
+            f"a filter spec is for the id of an env of somebody else, without {wrong}"
+        )
     return ExternalTarget(problem, FilterSpec.load(spec) if isinstance(spec, str) else spec)

@@ -1,4 +1,5 @@
-"""Those states of episodes that say something against a bound, or of a violation: kept while the episodes run."""
+"""Those states of episodes that say something against a bound, or of a violation: kept while the
+episodes run."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ class Seen:
     """The states of episodes where most was missed, and where h was largest.
 
     Attributes:
-        missed: states before a first violation where the filter missed its conditions by most, one an episode, shape (E, n).
+        missed: states before a first violation where the filter missed its conditions by most, one
+            an episode, shape (E, n).
         actions: what was executed there, shape (E, m).
         slack: by how much the worst row was missed there, shape (E,), the largest first.
         deepest: states where the smallest h was largest, one an episode, shape (D, n).
@@ -62,7 +64,9 @@ class Watch:
         self.lowest = np.stack(x)
         """States (n, B) where an episode that violates has its smallest h."""
 
-    def add(self, before: Components, u: Components, slack: np.ndarray | None, counts: np.ndarray) -> None:
+    def add(
+        self, before: Components, u: Components, slack: np.ndarray | None, counts: np.ndarray
+    ) -> None:
         """Look at a step, from the state before it.
 
         Args:
@@ -80,7 +84,9 @@ class Watch:
         _keep(self._missed, before, worse)
         _keep(self._actions, u, worse)
 
-    def reached(self, x: Components, h: np.ndarray, h_min: np.ndarray, alive: np.ndarray, counts: np.ndarray) -> None:
+    def reached(
+        self, x: Components, h: np.ndarray, h_min: np.ndarray, alive: np.ndarray, counts: np.ndarray
+    ) -> None:
         """Look at the state that a step led to.
 
         Args:
@@ -102,7 +108,13 @@ class Watch:
         slack, depth = self._slack[:count], self.depth[:count]
         worst = _first(slack)
         worst, highest = worst[slack[worst] > 0.0], _first(depth)
-        return Seen(self._missed.T[worst], self._actions.T[worst], slack[worst], self._deepest.T[highest], depth[highest])
+        return Seen(
+            self._missed.T[worst],
+            self._actions.T[worst],
+            slack[worst],
+            self._deepest.T[highest],
+            depth[highest],
+        )
 
 
 def _keep(kept: np.ndarray, values: Any, where: np.ndarray) -> None:

@@ -1,4 +1,5 @@
-"""A limit on the threads of BLAS, which gain nothing on small networks and wait for each other on a busy machine."""
+"""A limit on the threads of BLAS, which gain nothing on small networks and wait for each other on a
+busy machine."""
 
 from __future__ import annotations
 
@@ -14,10 +15,13 @@ _BRING_A_BLAS = ("numpy", "scipy.linalg", "torch")
 
 def limited(threads: int = 1) -> AbstractContextManager[Any]:
     """Limit the threads of every BLAS that is loaded by now."""
-    return _controller(tuple(name in sys.modules for name in _BRING_A_BLAS)).limit(limits=threads, user_api="blas")
+    return _controller(tuple(name in sys.modules for name in _BRING_A_BLAS)).limit(
+        limits=threads, user_api="blas"
+    )
 
 
 @lru_cache
 def _controller(loaded: tuple[bool, ...]) -> ThreadpoolController:
-    """Find the libraries of this process, which takes longer than many a simulation, once for each set of them."""
+    """Find the libraries of this process, which takes longer than many a simulation, once for each
+    set of them."""
     return ThreadpoolController()

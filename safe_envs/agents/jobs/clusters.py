@@ -1,4 +1,5 @@
-"""joblib's own backends for Dask and Ray, with the loss of a worker told to joblib in place of waited for without end."""
+"""joblib's own backends for Dask and Ray, with the loss of a worker told to joblib in place of
+waited for without end."""
 
 from __future__ import annotations
 
@@ -48,7 +49,8 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
 
     Args:
         address: of the scheduler.
-        tell: told when it has no workers any more. Without any for minutes, joblib raises ConfigurationError.
+        tell: told when it has no workers any more. Without any for minutes, joblib raises
+            ConfigurationError.
 
     Raises:
         ConfigurationError: there is none, or it has no workers.
@@ -69,13 +71,16 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
             future = super().submit(func, callback)
             if callback is not None:
                 self._waiting[future] = callback
-                future.add_done_callback(lambda done: self._end(done, [args[0] for _, args, _ in func.items]))
+                future.add_done_callback(
+                    lambda done: self._end(done, [args[0] for _, args, _ in func.items])
+                )
             return future
 
         def _end(self, done: Any, cells: Sequence[Cell]) -> None:
             callback, error = self._waiting.pop(done), done.exception()
             if error is not None:
-                # Of a task that ended with an error outside of its function, joblib would never hear.
+                # Of a task that ended with an error outside of its function, joblib would never
+                # hear.
                 callback(TaskLostError(error, cells))
 
         def give_up(self, error: Exception) -> None:
@@ -86,14 +91,21 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
         _require_listener(re.sub("^(tcp|tls|ucx)://", "", address))
         client = Client(address, timeout=_PATIENCE, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise ConfigurationError(f"no Dask scheduler answers at {address} ({error}); start one by: dask scheduler") from error
+        raise ConfigurationError(
+            f"no Dask scheduler answers at {address} ({error}); start one by: dask scheduler"
+        ) from error
     with client:
         try:
             client.wait_for_workers(1, timeout=_PATIENCE)
         except TimeoutError as error:
-            raise ConfigurationError(f"the Dask scheduler at {address} has no workers; start some by: dask worker {address}") from error
+            raise ConfigurationError(
+                f"the Dask scheduler at {address} has no workers; start some by: dask worker"
+                f" {address}"
+            ) from error
         backend, ended = Dask(client), threading.Event()
-        watch = threading.Thread(target=_watch, args=(client, address, tell, backend.give_up, ended), daemon=True)
+        watch = threading.Thread(
+            target=_watch, args=(client, address, tell, backend.give_up, ended), daemon=True
+        )
         watch.start()
         try:
             # All at once: workers that come later get some, too.
@@ -102,8 +114,15 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
             ended.set()
 
 
-def _watch(client: Client, address: str, tell: Callable[[str], None], give_up: Callable[[Exception], None], ended: threading.Event) -> None:
-    """Look from time to time whether a scheduler has workers; say once that it has none, and give up when none come."""
+def _watch(
+    client: Client,
+    address: str,
+    tell: Callable[[str], None],
+    give_up: Callable[[Exception], None],
+    ended: threading.Event,
+) -> None:
+    """Look from time to time whether a scheduler has workers; say once that it has none, and give
+    up when none come."""
     looks = 0
     while not ended.wait(_LOOK):
         try:
@@ -113,11 +132,21 @@ def _watch(client: Client, address: str, tell: Callable[[str], None], give_up: C
         if ended.is_set():
             return
         if looks == 1:
-            tell(f"The Dask scheduler at {address} has no workers any more; waiting for some. Start them by: dask worker {address}")
+            tell(
+                f"The Dask scheduler at {address} has no workers any more; waiting for some. Start"
+                f" them by: dask worker {address}"
+            )
         if looks == _MOST_LOOKS:
             minutes = _LOOK * _MOST_LOOKS / 60
-            told = f"the Dask scheduler at {address} has had no workers for {minutes:g} minutes; start some by: dask worker {address}"
-            give_up(ConfigurationError(f"{told}, and start the sweep again: it goes on after what was computed"))
+            told = (
+                f"the Dask scheduler at {address} has had no workers for {minutes:g} minutes; start"
+                f" some by: dask worker {address}"
+            )
+            give_up(
+                ConfigurationError(
+                    f"{told}, and start the sweep again: it goes on after what was computed"
+                )
+            )
 
 
 @contextmanager
@@ -138,7 +167,9 @@ def ray_settings(address: str) -> Iterator[dict[str, Any]]:
         ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
     except (OSError, ValueError, RuntimeError) as error:
         reason = str(error).splitlines()[0]
-        raise ConfigurationError(f"no Ray cluster answers at {address} ({reason}); start one by: ray start --head") from error
+        raise ConfigurationError(
+            f"no Ray cluster answers at {address} ({reason}); start one by: ray start --head"
+        ) from error
     try:
         remote = {"max_restarts": -1, "max_task_retries": _RETRIES}
         yield {"backend": Ray(ray_remote_args=remote), "n_jobs": -1}
@@ -147,7 +178,8 @@ def ray_settings(address: str) -> Iterator[dict[str, Any]]:
 
 
 def _require_listener(address: str) -> None:
-    """Raise OSError unless something listens at HOST:PORT, ValueError for another form; the clusters' own clients try for long."""
+    """Raise OSError unless something listens at HOST:PORT, ValueError for another form; the
+    clusters' own clients try for long."""
     host, _, port = address.rpartition(":")
     if not (host and port.isdecimal() and "/" not in host):
         raise ValueError("this is not of the form HOST:PORT")

@@ -1,4 +1,5 @@
-"""Where the cells of a sweep are computed: by joblib in processes of this machine, on a Dask scheduler or on a Ray cluster."""
+"""Where the cells of a sweep are computed: by joblib in processes of this machine, on a Dask
+scheduler or on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -12,12 +13,19 @@ from typing import Any, cast
 from safe_envs.agents.jobs.clusters import TaskLostError, dask_settings, ray_settings
 from safe_envs.agents.jobs.processes import local_processes
 from safe_envs.agents.sweeps.cell import Cell, Outcome, compute
-from safe_envs.errors import ConfigurationError, SafeEnvsError, WorkersLostError, nearest, require_whole
+from safe_envs.errors import (
+    ConfigurationError,
+    SafeEnvsError,
+    WorkersLostError,
+    nearest,
+    require_whole,
+)
 
 BACKENDS = ("local", "dask", "ray")
 
 _MOST_LOSSES = 3
-"""How often processes of this machine may end before cells are computed one by one; clusters have a number of their own."""
+"""How often processes of this machine may end before cells are computed one by one; clusters have a
+number of their own."""
 
 _MOST_TRIED = 5
 """How many cells are tried, one by one, before it is said that none can be computed."""
@@ -48,7 +56,8 @@ class Backend:
         jobs: processes of this machine, for "local"; a cluster's workers are all used.
 
     Raises:
-        ConfigurationError: the backend is unknown, an address is missing or out of place, or a package is not installed.
+        ConfigurationError: the backend is unknown, an address is missing or out of place, or a
+            package is not installed.
     """
 
     backend: str = "local"
@@ -58,27 +67,44 @@ class Backend:
     def __post_init__(self) -> None:
         require_whole("jobs", self.jobs, 1)
         if self.backend not in BACKENDS:
-            raise ConfigurationError(f"backend = {self.backend!r}; {nearest(self.backend, BACKENDS)}")
+            raise ConfigurationError(
+                f"backend = {self.backend!r}; {nearest(self.backend, BACKENDS)}"
+            )
         if (self.address is None) != (self.backend == "local"):
-            wrong = "needs the address of its cluster" if self.address is None else "takes no address; name dask or ray as the backend"
+            wrong = (
+                "needs the address of its cluster"
+                if self.address is None
+                else "takes no address; name dask or ray as the backend"
+            )
             raise ConfigurationError(f"backend {self.backend} {wrong}")
         package = {"dask": "distributed", "ray": "ray"}.get(self.backend)
         if package is not None and find_spec(package) is None:
-            raise ConfigurationError(f'{package} is not installed; install it with pip install "safe-envs[{self.backend}]"')
+            raise ConfigurationError(
+                f"{package} is not installed; install it with pip install"
+                f' "safe-envs[{self.backend}]"'
+            )
 
 
-def run(cells: Iterable[Cell], place: Backend, keep: Callable[[Outcome], None], tell: Callable[[str], None] = lambda _: None) -> None:
+def run(
+    cells: Iterable[Cell],
+    place: Backend,
+    keep: Callable[[Outcome], None],
+    tell: Callable[[str], None] = lambda _: None,
+) -> None:
     """Compute cells, each once.
 
-    When a worker ends, what was under way is computed again. After several such losses those that were under way are computed one by
-    one, up to the first that ends its worker by itself (as for want of memory), which counts as failed; then the others go on side by
-    side. As long as nothing was computed at all, some cells from the whole of the list are tried one by one in place of those.
+    When a worker ends, what was under way is computed again. After several such losses those that
+    were under way are computed one by one, up to the first that ends its worker by itself (as for
+    want of memory), which counts as failed; then the others go on side by side. As long as nothing
+    was computed at all, some cells from the whole of the list are tried one by one in place of
+    those.
 
     Args:
         cells: what to compute. What comes out does not depend on their order.
         place: where.
         keep: told each outcome as soon as it is there, in the order of completion.
-        tell: told what the user should know while the others wait, such as that a cluster has no workers any more; by any thread.
+        tell: told what the user should know while the others wait, such as that a cluster has no
+            workers any more; by any thread.
 
     Raises:
         ConfigurationError: a cluster cannot be reached, or has no workers.
@@ -95,10 +121,14 @@ def run(cells: Iterable[Cell], place: Backend, keep: Callable[[Outcome], None], 
                 del missing[outcome.key]
                 any_computed = True
 
-    # Every pass through this loop makes them fewer: each cell that is tried alone is computed, or counts as failed.
+    # Every pass through this loop makes them fewer: each cell that is tried alone is computed, or
+    # counts as failed.
     while missing:
         try:
-            _persistently(lambda: take(list(missing.values())), _MOST_LOSSES if place.backend == "local" else 1)
+            _persistently(
+                lambda: take(list(missing.values())),
+                _MOST_LOSSES if place.backend == "local" else 1,
+            )
         except _LossError as loss:
             under_way = [cell for cell in loss.cells if cell.key in missing] if any_computed else []
             # One that was by itself need not be tried again; Dask names one of several.
@@ -107,14 +137,23 @@ def run(cells: Iterable[Cell], place: Backend, keep: Callable[[Outcome], None], 
             for cell in under_way or _spread(list(missing.values())):
                 error = loss if was_alone else _alone(cell, take)
                 if error is not None:
-                    keep(Outcome(cell.key, None, None, f"the process that computed it ended: {error}", 0.0))
+                    keep(
+                        Outcome(
+                            cell.key,
+                            None,
+                            None,
+                            f"the process that computed it ended: {error}",
+                            0.0,
+                        )
+                    )
                     del missing[cell.key]
                 if any_computed and (error is not None or not under_way):
                     break
             if missing and not any_computed:
                 raise WorkersLostError(
-                    f"no cell could be computed, since the processes for it end; the last: {error}. Look for the reason, such as too "
-                    "little memory or another installation on the workers, and start again"
+                    f"no cell could be computed, since the processes for it end; the last: {error}."
+                    " Look for the reason, such as too little memory or another installation on"
+                    " the workers, and start again"
                 ) from error
 
 
@@ -145,7 +184,9 @@ def _spread(cells: Sequence[Cell]) -> Sequence[Cell]:
     return [cells[k] for k in dict.fromkeys(places)]
 
 
-def _outcomes(cells: Sequence[Cell], place: Backend, tell: Callable[[str], None]) -> Generator[Outcome, None, None]:
+def _outcomes(
+    cells: Sequence[Cell], place: Backend, tell: Callable[[str], None]
+) -> Generator[Outcome, None, None]:
     """Outcomes as they come.
 
     Raises:
@@ -163,7 +204,10 @@ def _outcomes(cells: Sequence[Cell], place: Backend, tell: Callable[[str], None]
     with _settings(place, len(cells), tell) as settings:
         # One cell is one task, so that each is kept as soon as it is done.
         parallel = Parallel(return_as="generator_unordered", batch_size=1, **settings)  # pyright: ignore[reportArgumentType]
-        with closing(cast("Generator[Outcome, None, None]", parallel(tasks()))) as outcomes, warnings.catch_warnings():
+        with (
+            closing(cast("Generator[Outcome, None, None]", parallel(tasks()))) as outcomes,
+            warnings.catch_warnings(),
+        ):
             # joblib warns of what is not waited for, which is meant when this is closed early.
             warnings.simplefilter("ignore", UserWarning)
             try:

@@ -1,4 +1,5 @@
-"""Processes of this machine that end with the one that started them, and the episodes of an evaluation in several of them."""
+"""Processes of this machine that end with the one that started them, and the episodes of an
+evaluation in several of them."""
 
 from __future__ import annotations
 
@@ -26,9 +27,11 @@ _LOOK = 1.0
 
 
 def end_with_parent(parent: int) -> None:
-    """Let this process end soon after its parent, which may be killed without a word; for the initializer of a pool of processes.
+    """Let this process end soon after its parent, which may be killed without a word; for the
+    initializer of a pool of processes.
 
-    The operating system gives a process whose parent has ended another parent. (Windows does not: there it stays until it is idle.)
+    The operating system gives a process whose parent has ended another parent. (Windows does not:
+    there it stays until it is idle.)
 
     Args:
         parent: id of the process that started this one.
@@ -50,7 +53,9 @@ def local_processes(idle: int = 300) -> Any:
     """
     from joblib._parallel_backends import LokyBackend
 
-    return LokyBackend(idle_worker_timeout=idle, initializer=end_with_parent, initargs=(os.getpid(),))
+    return LokyBackend(
+        idle_worker_timeout=idle, initializer=end_with_parent, initargs=(os.getpid(),)
+    )
 
 
 def play_in_processes(
@@ -93,22 +98,35 @@ def play_in_processes(
                 progress(part.stop)
     except BrokenProcessPool as error:
         raise WorkersLostError(
-            f"jobs = {jobs}: a process that simulated episodes was ended from outside, as for want of memory; use fewer jobs or a smaller "
-            "num_envs"
+            f"jobs = {jobs}: a process that simulated episodes was ended from outside, as for want"
+            " of memory; use fewer jobs or a smaller num_envs"
         ) from error
 
 
 def _sent(setting: EvaluationSpec, conditions: Sequence[Condition], jobs: int) -> bytes:
     try:
         return cloudpickle.dumps((setting, conditions))
-    except Exception as error:  # Whatever an object of the user's raises where it is not made for this.
-        raise ConfigurationError(f"jobs = {jobs}: what is evaluated cannot be sent to another process ({error}); use jobs=1") from error
+    except (
+        Exception
+    ) as error:  # Whatever an object of the user's raises where it is not made for this.
+        raise ConfigurationError(
+            f"jobs = {jobs}: what is evaluated cannot be sent to another process ({error}); use"
+            " jobs=1"
+        ) from error
 
 
 def _played(sent: bytes, part: range, seed: int, num_envs: int, bridge: bool) -> list[Played]:
     setting, conditions = cloudpickle.loads(sent)
     env = setting.env(conditions, min(num_envs, len(part)))
     try:
-        return list(play(env, setting.actor, part, seed, bridge=BrownianBridge(setting.problem) if bridge else None))
+        return list(
+            play(
+                env,
+                setting.actor,
+                part,
+                seed,
+                bridge=BrownianBridge(setting.problem) if bridge else None,
+            )
+        )
     finally:
         env.close()

@@ -16,11 +16,13 @@ from safe_envs.wrappers.filter_qp import Program, Solver, UndefinedRowError
 
 
 class CLFController(Policy):
-    """Solves min w_u |u|^2 + w_d d^2 subject to AV + rate V <= d and the box, exactly, at every observation.
+    """Solves min w_u |u|^2 + w_d d^2 subject to AV + rate V <= d and the box, exactly, at every
+    observation.
 
-    It is the joint program of `safe_envs.wrappers.SafetyFilter` without barriers: put a filter with `objective="clf"` over
-    `ZeroController` for the one with them. With a single input there is no difference between that and a filter over this
-    controller, since the cost is convex; with several there is, since the nearest action is not the cheapest one.
+    It is the joint program of `safe_envs.wrappers.SafetyFilter` without barriers: put a filter with
+    `objective="clf"` over `ZeroController` for the one with them. With a single input there is no
+    difference between that and a filter over this controller, since the cost is convex; with
+    several there is, since the nearest action is not the cheapest one.
 
     Args:
         problem: whose model, box and features are taken.
@@ -35,17 +37,26 @@ class CLFController(Policy):
     def __init__(self, problem: SafetyProblem, clf: CLF | None = None) -> None:
         goal = clf or problem.clf
         if goal is None:
-            raise ConfigurationError(f"{problem.name} has no control Lyapunov function; use the policy nominal, or give one")
+            raise ConfigurationError(
+                f"{problem.name} has no control Lyapunov function; use the policy nominal, or"
+                " give one"
+            )
         self._name = problem.name
         self._width = len(problem.features)
         self._columns = _columns_of_states(problem)
         self._center, self._half = center_and_half_width(problem)
         low, high = [pair[0] for pair in problem.box], [pair[1] for pair in problem.box]
-        program = Program(problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal)
+        program = Program(
+            problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal
+        )
         self._floats, self._arrays = Solver(program, "floats"), Solver(program, "arrays")
 
     def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
         """Solve the program; see `Policy.predict`. Actions are in double precision.
 
@@ -62,9 +73,17 @@ class CLFController(Policy):
                 with np.errstate(all="ignore"):
                     inputs = self._arrays.best(tuple(x), [np.zeros(len(given))] * len(self._half))
         except (ArithmeticError, ValueError) as error:
-            row = given[error.index] if given.ndim == 2 and isinstance(error, UndefinedRowError) else given
-            raise NumericalError(f"the goal of {self._name!r} has no finite value at the observation {row.tolist()}") from error
-        actions = np.stack([(u - c) / w for u, c, w in zip(inputs, self._center, self._half, strict=True)], axis=-1)
+            row = (
+                given[error.index]
+                if given.ndim == 2 and isinstance(error, UndefinedRowError)
+                else given
+            )
+            raise NumericalError(
+                f"the goal of {self._name!r} has no finite value at the observation {row.tolist()}"
+            ) from error
+        actions = np.stack(
+            [(u - c) / w for u, c, w in zip(inputs, self._center, self._half, strict=True)], axis=-1
+        )
         return actions, state
 
 
@@ -72,5 +91,8 @@ def _columns_of_states(problem: SafetyProblem) -> list[int]:
     expressions = [feature.expression for feature in problem.features]
     hidden = [str(state) for state in problem.model.states if state not in expressions]
     if hidden:
-        raise ConfigurationError(f"the observation of {problem.name} does not hold {', '.join(hidden)}, which a CLF controller needs")
+        raise ConfigurationError(
+            f"the observation of {problem.name} does not hold {', '.join(hidden)}, which a CLF"
+            " controller needs"
+        )
     return [expressions.index(state) for state in problem.model.states]

@@ -17,8 +17,8 @@ BLOCK = 128
 class BlockPolicy(Policy):
     """Base of the policies that are networks.
 
-    A matrix product rounds a row differently in batches of different sizes. So every network call gets a block of
-    the same number of rows, with an episode always in the same row of its block.
+    A matrix product rounds a row differently in batches of different sizes. So every network call
+    gets a block of the same number of rows, with an episode always in the same row of its block.
 
     Args:
         width: number k of the entries of an observation.
@@ -37,7 +37,11 @@ class BlockPolicy(Policy):
         self._offset = episodes.start % BLOCK
 
     def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
         """Ask the network for its deterministic action; see `Policy.predict`.
 
@@ -49,5 +53,7 @@ class BlockPolicy(Policy):
         end = self._offset + len(rows)
         padded = np.zeros((-(-end // BLOCK) * BLOCK, self._width), dtype=np.float32)
         padded[self._offset : end] = rows
-        actions = np.concatenate([self.act(padded[k : k + BLOCK]) for k in range(0, len(padded), BLOCK)])[self._offset : end]
+        actions = np.concatenate(
+            [self.act(padded[k : k + BLOCK]) for k in range(0, len(padded), BLOCK)]
+        )[self._offset : end]
         return actions.reshape(*given.shape[:-1], -1), state

@@ -16,7 +16,8 @@ _CHUNK = 128
 
 
 class NominalController(Policy):
-    """The problem's nominal controller: it sees the observation and the model's parameters, never the plant.
+    """The problem's nominal controller: it sees the observation and the model's parameters, never
+    the plant.
 
     Args:
         problem: whose `nominal` laws, box and features are taken.
@@ -33,7 +34,11 @@ class NominalController(Policy):
         self._arrays = compile_function(symbols, laws, "arrays")
 
     def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
         """Evaluate the laws; actions are in double precision.
 
@@ -51,7 +56,9 @@ class NominalController(Policy):
             with np.errstate(all="ignore"):
                 inputs = self._arrays(*np.ascontiguousarray(given.T))
         actions = np.empty((*given.shape[:-1], len(self._box)))
-        for j, (u, (low, high), c, w) in enumerate(zip(inputs, self._box, self._center, self._half, strict=True)):
+        for j, (u, (low, high), c, w) in enumerate(
+            zip(inputs, self._box, self._center, self._half, strict=True)
+        ):
             actions[..., j] = (np.minimum(np.maximum(u, low), high) - c) / w
         if not np.isfinite(actions).all():
             rows = given.reshape(-1, self._width)
@@ -59,7 +66,10 @@ class NominalController(Policy):
         return actions, state
 
     def _undefined(self, observation: np.ndarray) -> NumericalError:
-        return NumericalError(f"the nominal controller of {self._name!r} has no finite value at the observation {observation.tolist()}")
+        return NumericalError(
+            f"the nominal controller of {self._name!r} has no finite value at the observation"
+            f" {observation.tolist()}"
+        )
 
 
 class ZeroController(Policy):
@@ -76,7 +86,11 @@ class ZeroController(Policy):
         self._action = np.array([(u - c) / w for u, c, w in zip(inputs, center, half, strict=True)])
 
     def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
         """Return the one action, for every observation; see `Policy.predict`."""
         given = checked_observation(observation, self._width)
@@ -86,8 +100,8 @@ class ZeroController(Policy):
 class RandomPolicy(Policy):
     """Independent actions, uniform in [-1, 1].
 
-    In an evaluation every episode has a stream of its own, so that its actions do not depend on the batch that it
-    is simulated in; elsewhere one generator serves all calls.
+    In an evaluation every episode has a stream of its own, so that its actions do not depend on the
+    batch that it is simulated in; elsewhere one generator serves all calls.
 
     Args:
         problem: whose number of inputs is taken.
@@ -104,13 +118,20 @@ class RandomPolicy(Policy):
 
     def begin(self, episodes: range, seed: int) -> None:
         """Give each episode its stream; see `Policy.begin`."""
-        # The env of episode i is seeded by the child (i,) of the seed; this is the child of that child.
-        self._streams = [np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i, 0))) for i in episodes]
+        # The env of episode i is seeded by the child (i,) of the seed; this is the child of that
+        # child.
+        self._streams = [
+            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i, 0))) for i in episodes
+        ]
         self._drawn = np.empty((len(episodes), _CHUNK, self._m))
         self._position = _CHUNK
 
     def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
         """Draw actions; see `Policy.predict`. They stay random with `deterministic`."""
         batch = checked_observation(observation, self._width).shape[:-1]
@@ -132,5 +153,7 @@ def checked_observation(observation: Any, width: int) -> np.ndarray:
     """
     given = np.asarray(observation, dtype=np.float64)
     if given.ndim not in (1, 2) or given.shape[-1] != width:
-        raise InvalidInputError(f"the observation has shape {given.shape}; the policy takes ({width},) or (B, {width})")
+        raise InvalidInputError(
+            f"the observation has shape {given.shape}; the policy takes ({width},) or (B, {width})"
+        )
     return given

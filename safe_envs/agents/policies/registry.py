@@ -18,7 +18,8 @@ POLICIES = ("nominal", "clf", "zero", "random")
 """Names that `make_policy` knows besides paths."""
 
 TENSORS = "policy.safetensors"
-"""Name of the file with the numbers of a policy that was saved as data; see `safe_envs.agents.policies.network`."""
+"""Name of the file with the numbers of a policy that was saved as data; see
+`safe_envs.agents.policies.network`."""
 
 DESCRIPTION = "policy.json"
 """Name of the file beside it that says what the numbers are."""
@@ -38,10 +39,11 @@ class Policy(ABC):
     deterministic: bool = True
 
     def begin(self, episodes: range, seed: int) -> None:  # noqa: B027  (most policies need not know)
-        """Learn which episodes the rows of the coming batches belong to, before each wave of an evaluation.
+        """Learn which episodes the rows of the coming batches belong to, before each wave of an
+        evaluation.
 
-        What a policy does in an episode may depend on the episode and the seed, never on the other rows: the
-        answer of an evaluation must not depend on the size of its waves.
+        What a policy does in an episode may depend on the episode and the seed, never on the other
+        rows: the answer of an evaluation must not depend on the size of its waves.
 
         Args:
             episodes: one for each row, surplus ones of the last wave included.
@@ -50,7 +52,11 @@ class Policy(ABC):
 
     @abstractmethod
     def predict(
-        self, observation: np.ndarray, state: Any = None, episode_start: np.ndarray | None = None, deterministic: bool = False
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
         """Choose actions.
 
@@ -65,19 +71,23 @@ class Policy(ABC):
         """
 
 
-def make_policy(name: str, problem: SafetyProblem, trust: bool = False, spaces: Spaces | None = None) -> Policy:
+def make_policy(
+    name: str, problem: SafetyProblem, trust: bool = False, spaces: Spaces | None = None
+) -> Policy:
     """Return a named policy, or load one that was trained.
 
     Args:
-        name: one of `POLICIES`; the folder where `safe-envs train` or `safe_envs.agents.policies.network.save_policy` put a policy, or one of the
-            two files of the policy in it; or the path of a .zip of Stable-Baselines3.
+        name: one of `POLICIES`; the folder where `safe-envs train` or
+            `safe_envs.agents.policies.network.save_policy` put a policy, or one of the two files of
+            the policy in it; or the path of a .zip of Stable-Baselines3.
         problem: which the policy is to act in.
         trust: load a .zip too, which runs code that it contains.
-        spaces: of observations and actions, which a .zip is to fit; by default those of the problem's env.
+        spaces: of observations and actions, which a .zip is to fit; by default those of the
+            problem's env.
 
     Raises:
-        ConfigurationError: there is neither such a name nor such a file, the file does not fit the problem, or it is a .zip
-            that is not trusted.
+        ConfigurationError: there is neither such a name nor such a file, the file does not fit the
+            problem, or it is a .zip that is not trusted.
     """
     from safe_envs.agents.policies import nominal
     from safe_envs.agents.policies.clf import CLFController
@@ -97,10 +107,12 @@ def make_policy(name: str, problem: SafetyProblem, trust: bool = False, spaces: 
         return load_policy(name, problem)
     if not os.path.isfile(files[0]):
         raise ConfigurationError(
-            f"unknown policy {shown(name)}; {nearest(name, POLICIES)}, a folder of `safe-envs train`, or the path of a Stable-Baselines3 "
-            ".zip: there is no such file"
+            f"unknown policy {shown(name)}; {nearest(name, POLICIES)}, a folder of `safe-envs"
+            " train`, or the path of a Stable-Baselines3 .zip: there is no such file"
         )
-    return _make_of_archive(files[0], spaces or (observation_box(problem), action_box(problem)), trust)
+    return _make_of_archive(
+        files[0], spaces or (observation_box(problem), action_box(problem)), trust
+    )
 
 
 def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
@@ -109,8 +121,9 @@ def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
     require_archive(path)
     if not trust:
         raise ConfigurationError(
-            f"loading {path} runs code that it contains; if you trust its source, pass --trust (in Python: trust=True), "
-            f"or give a folder of `safe-envs train`, whose {TENSORS} and {DESCRIPTION} hold no code"
+            f"loading {path} runs code that it contains; if you trust its source, pass --trust (in"
+            f" Python: trust=True), or give a folder of `safe-envs train`, whose {TENSORS} and"
+            f" {DESCRIPTION} hold no code"
         )
     return SB3Policy(path, *spaces)
 

@@ -18,14 +18,16 @@ from safe_envs.errors import ConfigurationError, shortened
 
 _MOST_BYTES = 100_000_000
 _STATISTICS = ("normalization.pkl", "vecnormalize.pkl", "*/vecnormalize.pkl")
-"""Where a VecNormalize lies beside a .zip: that of `safe-envs train`, one of RL Zoo, and the place where RL Zoo itself puts it."""
+"""Where a VecNormalize lies beside a .zip: that of `safe-envs train`, one of RL Zoo, and the place
+where RL Zoo itself puts it."""
 
 
 class SB3Policy(BlockPolicy):
     """The policy in a .zip of PPO, A2C, SAC, TD3 or DDPG, asked for its deterministic action.
 
-    Only the policy is built, not the algorithm around it, so that there is no need to know which one saved it. The file does not
-    say for which inputs its actions stand: that is left to the problem's box.
+    Only the policy is built, not the algorithm around it, so that there is no need to know which
+    one saved it. The file does not say for which inputs its actions stand: that is left to the
+    problem's box.
 
     Args:
         path: of the file. Loading it runs code that it contains: trust its source.
@@ -33,11 +35,14 @@ class SB3Policy(BlockPolicy):
         action_space: of that env.
 
     Raises:
-        ConfigurationError: the file is no archive of Stable-Baselines3, or its spaces are not those of the env; or beside it
-            lies the VecNormalize of its training, whose observations are not the env's.
+        ConfigurationError: the file is no archive of Stable-Baselines3, or its spaces are not those
+            of the env; or beside it lies the VecNormalize of its training, whose observations are
+            not the env's.
     """
 
-    def __init__(self, path: str | Path, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
+    def __init__(
+        self, path: str | Path, observation_space: gym.Space[Any], action_space: gym.Space[Any]
+    ) -> None:
         super().__init__(gym.spaces.flatdim(observation_space))
         self._network = _load(Path(path))
         require_spaces(f"the policy {path}", self._network, observation_space, action_space)
@@ -48,37 +53,60 @@ class SB3Policy(BlockPolicy):
 
 
 def require_archive(path: Path) -> None:
-    """Raise ConfigurationError unless a file looks like a whole policy of Stable-Baselines3; nothing in it is run."""
+    """Raise ConfigurationError unless a file looks like a whole policy of Stable-Baselines3;
+    nothing in it is run."""
     if not _is_archive(path):
         raise ConfigurationError(
-            f"{path} is not a policy that Stable-Baselines3 saved, or damaged, or larger than {_MOST_BYTES / 1e6:g} MB; give a .zip of "
-            "`model.save(...)`, or a folder of `safe-envs train`"
+            f"{path} is not a policy that Stable-Baselines3 saved, or damaged, or larger than"
+            f" {_MOST_BYTES / 1e6:g} MB; give a .zip of `model.save(...)`, or a folder of"
+            " `safe-envs train`"
         )
-    statistics = next((found for name in _STATISTICS for found in sorted(path.parent.glob(name))), None)
+    statistics = next(
+        (found for name in _STATISTICS for found in sorted(path.parent.glob(name))), None
+    )
     if statistics is not None:
         raise ConfigurationError(
-            f"{path} is not the whole policy: it was trained on normalised observations, and how these are normalised stands in "
-            f"{statistics}, not in the .zip. Give the folder of `safe-envs train`, or write the policy with its normalisation by "
-            "safe_envs.agents.policies.network.save_policy(model, folder, problem, normalization) and give that folder"
+            f"{path} is not the whole policy: it was trained on normalised observations, and how"
+            f" these are normalised stands in {statistics}, not in the .zip. Give the folder of"
+            " `safe-envs train`, or write the policy with its normalisation by"
+            " safe_envs.agents.policies.network.save_policy(model, folder, problem, normalization)"
+            " and give that folder"
         )
 
 
 def _is_archive(path: Path) -> bool:
     """Whether a file has the parts of a policy, none of which is large when it is unpacked."""
     try:
-        with open_regular(path, _MOST_BYTES) as stream, open_archive(stream, _MOST_BYTES) as archive:
+        with (
+            open_regular(path, _MOST_BYTES) as stream,
+            open_archive(stream, _MOST_BYTES) as archive,
+        ):
             if not {"data", "policy.pth"} <= set(archive.namelist()):
                 return False
             # What torch saves is an archive itself.
-            inner = [content for name in archive.namelist() if (content := archive.read(name)).startswith(b"PK")]
+            inner = [
+                content
+                for name in archive.namelist()
+                if (content := archive.read(name)).startswith(b"PK")
+            ]
             for content in inner:
                 open_archive(io.BytesIO(content), _MOST_BYTES).close()
             return True
-    except (OSError, EOFError, NotImplementedError, RuntimeError, ValueError, zipfile.BadZipFile, zlib.error):
+    except (
+        OSError,
+        EOFError,
+        NotImplementedError,
+        RuntimeError,
+        ValueError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ):
         return False
 
 
-def require_spaces(what: str, network: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
+def require_spaces(
+    what: str, network: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]
+) -> None:
     """Raise ConfigurationError unless a network takes an env's observations and gives its actions.
 
     Args:
@@ -87,16 +115,26 @@ def require_spaces(what: str, network: Any, observation_space: gym.Space[Any], a
         observation_space: of the env that it is to act in.
         action_space: of that env.
     """
-    spaces = (("observation", network.observation_space, observation_space), ("action", network.action_space, action_space))
+    spaces = (
+        ("observation", network.observation_space, observation_space),
+        ("action", network.action_space, action_space),
+    )
     for kind, trained, wanted in spaces:
         if trained != wanted:
-            raise ConfigurationError(f"{what} was trained for another {kind} space, {_difference(trained, wanted)}")
+            raise ConfigurationError(
+                f"{what} was trained for another {kind} space, {_difference(trained, wanted)}"
+            )
 
 
 def _difference(trained: gym.Space[Any], wanted: gym.Space[Any]) -> str:
-    if not (isinstance(trained, gym.spaces.Box) and isinstance(wanted, gym.spaces.Box)) or trained.shape != wanted.shape:
+    if (
+        not (isinstance(trained, gym.spaces.Box) and isinstance(wanted, gym.spaces.Box))
+        or trained.shape != wanted.shape
+    ):
         return f"{trained}; the env's is {wanted}"
-    theirs, ours = [f"between {space.low.tolist()} and {space.high.tolist()}" for space in (trained, wanted)]
+    theirs, ours = [
+        f"between {space.low.tolist()} and {space.high.tolist()}" for space in (trained, wanted)
+    ]
     return f"{theirs}; the env's is {ours}"
 
 
@@ -113,12 +151,15 @@ def _load(path: Path) -> Any:
         options = dict(saved.get("policy_kwargs") or {})
         if saved.get("use_sde"):
             options["use_sde"] = True
-        network = saved["policy_class"](saved["observation_space"], saved["action_space"], _no_learning, **options)
+        network = saved["policy_class"](
+            saved["observation_space"], saved["action_space"], _no_learning, **options
+        )
         network.load_state_dict(parameters["policy"])
     except Exception as error:  # What a pickle may raise has no limits.
         raise ConfigurationError(
-            f"{path} cannot be read as a policy ({type(error).__name__}: {shortened(str(error).partition(chr(10))[0])}); "
-            "it is damaged, or another version of Stable-Baselines3 saved it"
+            f"{path} cannot be read as a policy ({type(error).__name__}:"
+            f" {shortened(str(error).partition(chr(10))[0])}); it is damaged, or another version of"
+            " Stable-Baselines3 saved it"
         ) from error
     network.set_training_mode(False)
     return network.to("cpu")

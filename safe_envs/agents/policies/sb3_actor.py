@@ -20,14 +20,15 @@ _ACTIVATIONS = {
 def actor_of(network: Any) -> tuple[list[np.ndarray], list[np.ndarray], str]:
     """The layers that give the deterministic action, before it is squashed or clipped.
 
-    With gSDE the noise alone is of another kind: the deterministic action of PPO and A2C is the same. SAC bounds it by
-    another layer then, and is refused.
+    With gSDE the noise alone is of another kind: the deterministic action of PPO and A2C is the
+    same. SAC bounds it by another layer then, and is refused.
 
     Args:
         network: MlpPolicy of PPO, A2C, SAC, TD3 or DDPG.
 
     Returns:
-        Weights (outputs, inputs) and biases (outputs,) of each layer as float32, and the name of the activation between them.
+        Weights (outputs, inputs) and biases (outputs,) of each layer as float32, and the name of
+        the activation between them.
 
     Raises:
         ConfigurationError: the policy is of another kind.
@@ -41,11 +42,17 @@ def actor_of(network: Any) -> tuple[list[np.ndarray], list[np.ndarray], str]:
     linear, between = modules[::2], modules[1::2]
     for module in linear:
         if type(module) is not nn.Linear or module.bias is None:
-            raise _refused(f"it has a {type(module).__name__} where a fully connected layer with a bias is allowed")
+            raise _refused(
+                f"it has a {type(module).__name__} where a fully connected layer with a bias is"
+                " allowed"
+            )
     names = {_activation(module) for module in between}
     if len(names) > 1:
         raise _refused(f"it has several activations: {', '.join(sorted(names))}")
-    weights, biases = ([getattr(module, name).detach().cpu().float().numpy() for module in linear] for name in ("weight", "bias"))
+    weights, biases = (
+        [getattr(module, name).detach().cpu().float().numpy() for module in linear]
+        for name in ("weight", "bias")
+    )
     return weights, biases, names.pop() if names else "identity"
 
 
@@ -57,7 +64,10 @@ def _modules(network: Any) -> tuple[Any, list[Any]]:
 
     # Not isinstance: what a class derived from these does differently is unknown.
     if type(network) is ActorCriticPolicy:
-        return network.pi_features_extractor, [*network.mlp_extractor.policy_net, network.action_net]
+        return network.pi_features_extractor, [
+            *network.mlp_extractor.policy_net,
+            network.action_net,
+        ]
     if type(network) is SACPolicy:
         return network.actor.features_extractor, [*network.actor.latent_pi, network.actor.mu]
     if type(network) is TD3Policy:
@@ -67,7 +77,11 @@ def _modules(network: Any) -> tuple[Any, list[Any]]:
 
 
 def _activation(module: Any) -> str:
-    name = _ACTIVATIONS.get(repr(module)) if type(module).__module__ == "torch.nn.modules.activation" else None
+    name = (
+        _ACTIVATIONS.get(repr(module))
+        if type(module).__module__ == "torch.nn.modules.activation"
+        else None
+    )
     if name is None:
         raise _refused(f"its activation is {module}; allowed: {', '.join(_ACTIVATIONS)}")
     return name
@@ -75,6 +89,7 @@ def _activation(module: Any) -> str:
 
 def _refused(reason: str) -> ConfigurationError:
     return ConfigurationError(
-        f"this policy cannot be saved as data: {reason}. Train the MlpPolicy of PPO, A2C, SAC, TD3 or DDPG, without gSDE for SAC, "
-        "or keep the .zip of `model.save(...)`, which needs --trust"
+        f"this policy cannot be saved as data: {reason}. Train the MlpPolicy of PPO, A2C, SAC, TD3"
+        " or DDPG, without gSDE for SAC, or keep the .zip of `model.save(...)`, which needs"
+        " --trust"
     )

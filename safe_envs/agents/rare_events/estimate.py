@@ -16,7 +16,11 @@ from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, require_
 from safe_envs.agents.evaluation.evaluate import package_versions
 from safe_envs.agents.evaluation.rollout import Progress, Row
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Work
-from safe_envs.agents.evaluation.statistics import log_normal_interval, rate_interval, require_confidence
+from safe_envs.agents.evaluation.statistics import (
+    log_normal_interval,
+    rate_interval,
+    require_confidence,
+)
 from safe_envs.agents.policies.registry import Policy
 from safe_envs.agents.rare_events.importance_sampling import Drifting, optimal_tilt
 from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Repetitions, Splitting
@@ -54,7 +58,12 @@ class RareEvaluation:
 
     def document(self) -> dict[str, Any]:
         """The whole as JSON-able data."""
-        return {"config": self.config, "versions": package_versions(), "rows": self.rows, "timing": self.timing}
+        return {
+            "config": self.config,
+            "versions": package_versions(),
+            "rows": self.rows,
+            "timing": self.timing,
+        }
 
 
 def estimate_rare(
@@ -75,16 +84,21 @@ def estimate_rare(
     monitoring: str = "discrete",
     progress: Progress | None = None,
 ) -> RareEvaluation:
-    """Estimate the probability of a violation under each filter by splitting on h; see `safe_envs.agents.rare_events.splitting.Splitting`.
+    """Estimate the probability of a violation under each filter by splitting on h; see
+    `safe_envs.agents.rare_events.splitting.Splitting`.
 
-    The paths that violate, as splitting found them, say what importance sampling by a drift could do, see
-    `safe_envs.agents.rare_events.importance_sampling.optimal_tilt`. If that is less than half of splitting's relative error, it is tried; see `verdict`.
+    The paths that violate, as splitting found them, say what importance sampling by a drift could
+    do, see `safe_envs.agents.rare_events.importance_sampling.optimal_tilt`. If that is less than
+    half of splitting's relative error, it is tried; see `verdict`.
 
-    An episode is safe as in `safe_envs.agents.evaluation.evaluate.evaluate`. The intervals are those of independent repetitions; see
-    `safe_envs.agents.evaluation.statistics.log_normal_interval`. Where splitting cannot work a row has the reason in place of numbers.
+    An episode is safe as in `safe_envs.agents.evaluation.evaluate.evaluate`. The intervals are
+    those of independent repetitions; see
+    `safe_envs.agents.evaluation.statistics.log_normal_interval`. Where splitting cannot work a row
+    has the reason in place of numbers.
 
     Args:
-        problem: as for `evaluate`, but no env of somebody else, which cannot be put back to where it was.
+        problem: as for `evaluate`, but no env of somebody else, which cannot be put back to where
+            it was.
         policy: as for `evaluate`, without memory.
         filters: as for `evaluate`.
         trust: as for `evaluate`.
@@ -92,7 +106,8 @@ def estimate_rare(
         particles: episodes of a repetition.
         repetitions: independent ones, at least 10.
         seed: of all randomness.
-        num_envs: the most episodes side by side; another number is another draw of the same estimate.
+        num_envs: the most episodes side by side; another number is another draw of the same
+            estimate.
         knowledge: as for `evaluate`.
         objective: as for `evaluate`.
         confidence: of all intervals, between 0 and 1.
@@ -101,7 +116,8 @@ def estimate_rare(
         progress: told the part of the work that is done, from 0 to 1.
 
     Raises:
-        ConfigurationError: an argument names something unknown or is out of range, or the env or the policy cannot be split.
+        ConfigurationError: an argument names something unknown or is out of range, or the env or
+            the policy cannot be split.
         RelativeDegreeError: a condition does not suit a barrier.
         NumericalError: a simulation or a condition left the finite numbers.
     """
@@ -136,9 +152,15 @@ def estimate_rare(
         make = partial(setting.drifting_env, setting.filters[name][0])
         how = (make, setting.actor, seed, num_envs, bridge)
         row = {"filter": name, "policy": setting.config()["policy"]["name"]}
-        row |= _none(frozen) if frozen else _row(Splitting(*how), Drifting(*how), setting.problem, sizes, confidence, work)
+        row |= (
+            _none(frozen)
+            if frozen
+            else _row(Splitting(*how), Drifting(*how), setting.problem, sizes, confidence, work)
+        )
         seconds = time.perf_counter() - begun
-        speeds.append({"filter": name, "seconds": seconds, "steps_per_second": row["steps"] / seconds})
+        speeds.append(
+            {"filter": name, "seconds": seconds, "steps_per_second": row["steps"] / seconds}
+        )
         rows.append(row)
     config = {
         **setting.config(),
@@ -157,24 +179,50 @@ def _why_frozen(setting: EvaluationSpec) -> str:
     random = not actor.deterministic if isinstance(actor, Policy) else False
     if random or Integrator(world.plant, world.dt, world.substeps, "arrays").channels:
         return ""
-    return "nothing is random after the start, so that copies of an episode go on like it; plain episodes say all that there is"
+    return (
+        "nothing is random after the start, so that copies of an episode go on like it; plain"
+        " episodes say all that there is"
+    )
 
 
-def _row(splitting: Splitting, drifting: Drifting, problem: SafetyProblem, sizes: tuple[int, int], confidence: float, work: Work) -> Row:
+def _row(
+    splitting: Splitting,
+    drifting: Drifting,
+    problem: SafetyProblem,
+    sizes: tuple[int, int],
+    confidence: float,
+    work: Work,
+) -> Row:
     particles, repetitions = sizes
     power, pilot_steps = splitting.choose(particles, work.part())
     found = splitting.estimate(power, particles, repetitions, work.part())
     last_part = work.part()
     low, high = rate_interval(found.first, found.paths, confidence)
-    seen = {"violations": found.first, "ci_low": low, "ci_high": high, "outside": found.outside, "kept_length": found.kept_length}
+    seen = {
+        "violations": found.first,
+        "ci_low": low,
+        "ci_high": high,
+        "outside": found.outside,
+        "kept_length": found.kept_length,
+    }
     plain = {"episodes": found.paths, **seen}
-    rest = {"levels": float(found.levels.mean()), "steps": found.steps + pilot_steps, "plain": plain}
+    rest = {
+        "levels": float(found.levels.mean()),
+        "steps": found.steps + pilot_steps,
+        "plain": plain,
+    }
     if found.given_up:
         return _none(_why_none(found, particles, problem, plain)) | rest
-    split = _estimate("splitting on h" if power == POWERS[0] else "splitting on h/sqrt(T - t)", found.estimates, confidence)
+    split = _estimate(
+        "splitting on h" if power == POWERS[0] else "splitting on h/sqrt(T - t)",
+        found.estimates,
+        confidence,
+    )
     if not found.levels.any():
         split |= {"method": "plain episodes", "ci_low": low, "ci_high": high}
-    drift, drift_steps = _by_drift(drifting, problem, found, split["relative_error"], sizes, confidence, last_part)
+    drift, drift_steps = _by_drift(
+        drifting, problem, found, split["relative_error"], sizes, confidence, last_part
+    )
     answer, check, doubt = verdict(split, drift, plain)
     p, error = answer["probability"], answer["relative_error"]
     needed = (1.0 - p) / (p * error**2) if error else None
@@ -200,7 +248,8 @@ def _by_drift(
     confidence: float,
     progress: Progress | None,
 ) -> tuple[Row | None, int]:
-    """The estimate by importance sampling, if it promises to be much better, and the control periods that it took."""
+    """The estimate by importance sampling, if it promises to be much better, and the control
+    periods that it took."""
     length, deviation = optimal_tilt(found.girsanov_integrals, found.shares, problem.duration)
     if not _BETTER * deviation / math.sqrt(math.prod(sizes)) < to_beat:
         return None, 0
@@ -209,13 +258,19 @@ def _by_drift(
     except NumericalError:
         # Pushed far out, where nothing else would take it, a system may leave the finite numbers.
         return None, 0
-    return (_estimate(f"drift of {length:.3g}/sqrt(s)", estimates, confidence) if (estimates > 0.0).all() else None), steps
+    return (
+        _estimate(f"drift of {length:.3g}/sqrt(s)", estimates, confidence)
+        if (estimates > 0.0).all()
+        else None
+    ), steps
 
 
 def verdict(split: Row, drift: Row | None, plain: Row) -> tuple[Row, Row | None, str | None]:
-    """Which of two estimates is the answer, which the check on it, and what speaks against the answer, if anything.
+    """Which of two estimates is the answer, which the check on it, and what speaks against the
+    answer, if anything.
 
-    The drift's is the answer if its relative error is less than half of splitting's and their intervals overlap.
+    The drift's is the answer if its relative error is less than half of splitting's and their
+    intervals overlap.
 
     Args:
         split: estimate by splitting.
@@ -229,12 +284,23 @@ def verdict(split: Row, drift: Row | None, plain: Row) -> tuple[Row, Row | None,
         answer, check = split, drift
     if check is not None and not agree:
         told = f"[{check['ci_low']:.2g}, {check['ci_high']:.2g}]"
-        return answer, check, f"importance sampling says {check['probability']:.2g} {told}: take more particles"
+        return (
+            answer,
+            check,
+            f"importance sampling says {check['probability']:.2g} {told}: take more particles",
+        )
     if not _overlap(answer, plain):
         seen = f"{plain['violations']} violations among {plain['episodes']} contradict it"
         return answer, check, f"its first episodes are plain ones, and {seen}: take more particles"
     if float(np.std(np.log(answer["estimates"]))) > _ROUGH:
-        return answer, check, "its repetitions differ by large factors, so that the interval is rough: take more particles"
+        return (
+            answer,
+            check,
+            (
+                "its repetitions differ by large factors, so that the interval is rough: take more"
+                " particles"
+            ),
+        )
     return answer, check, None
 
 
@@ -258,7 +324,16 @@ def _estimate(method: str, estimates: np.ndarray, confidence: float) -> Row:
 
 def _none(reason: str) -> Row:
     """A row without an estimate."""
-    names = ("probability", "ci_low", "ci_high", "relative_error", "plain_episodes_needed", "plain_steps_needed", "doubt", "check")
+    names = (
+        "probability",
+        "ci_low",
+        "ci_high",
+        "relative_error",
+        "plain_episodes_needed",
+        "plain_steps_needed",
+        "doubt",
+        "check",
+    )
     nothing = {"levels": 0.0, "method": None, "steps": 0, "plain": None}
     return {"status": "none", "reason": reason, "estimates": [], **dict.fromkeys(names), **nothing}
 
@@ -268,16 +343,20 @@ def _why_none(found: Repetitions, particles: int, problem: SafetyProblem, plain:
     h = "h" if len(problem.barriers) == 1 else "h/h(start)"
     if found.stuck:
         reason = (
-            f"in {len(found.stuck)} of {repetitions} repetitions all {particles} particles stood at one level and none came below "
-            f"{h} = {min(found.stuck):.3g}. There h may be flat, jump or never fall, or those that come lower are too few: more particles "
-            "or a smaller dt may help"
+            f"in {len(found.stuck)} of {repetitions} repetitions all {particles} particles stood at"
+            f" one level and none came below {h} = {min(found.stuck):.3g}. There h may be flat,"
+            " jump or never fall, or those that come lower are too few: more particles or a"
+            " smaller dt may help"
         )
     else:
         reason = (
-            f"in {len(found.endless)} of {repetitions} repetitions the probability to come below {h} = {min(found.endless):.3g} is less "
-            f"than {LEAST:g} already; h = 0 may never be reached"
+            f"in {len(found.endless)} of {repetitions} repetitions the probability to come below"
+            f" {h} = {min(found.endless):.3g} is less than {LEAST:g} already; h = 0 may never be"
+            " reached"
         )
     if not plain["violations"]:
         return reason
-    seen = f"{plain['violations']} of the {plain['episodes']} plain episodes at its beginning violated"
+    seen = (
+        f"{plain['violations']} of the {plain['episodes']} plain episodes at its beginning violated"
+    )
     return f"{reason}. But {seen}, which says [{plain['ci_low']:.3g}, {plain['ci_high']:.3g}]"

@@ -1,4 +1,5 @@
-"""Probabilities of rare violations, by importance sampling: noise that drifts towards smaller h, and weights that undo it."""
+"""Probabilities of rare violations, by importance sampling: noise that drifts towards smaller h,
+and weights that undo it."""
 
 from __future__ import annotations
 
@@ -25,17 +26,20 @@ _STRONGEST = 64.0
 
 
 class TiltedNoiseEnv(SafeVectorEnv):
-    """`SafeVectorEnv` with dW - c e dt in place of dW, where e = sigma' grad h/|sigma' grad h| is the way on which h rises fastest.
+    """`SafeVectorEnv` with dW - c e dt in place of dW, where e = sigma' grad h/|sigma' grad h| is
+    the way on which h rises fastest.
 
-    Of several barriers the smallest counts. Where no noise reaches it, e = 0. The e of a control period is that of its beginning.
+    Of several barriers the smallest counts. Where no noise reaches it, e = 0. The e of a control
+    period is that of its beginning.
 
     Args:
         problem: what to simulate.
         lengths: c of each env, in 1/sqrt(s), shape (num_envs,); 0 for the noise as it is.
 
     Attributes:
-        girsanov_integrals: of each episode the integrals of e'dW, where W is what drives the system, and of e'e dt; shape (num_envs, 2). They
-            say the density of the noise so far over that with a drift: see `log_ratio`.
+        girsanov_integrals: of each episode the integrals of e'dW, where W is what drives the
+            system, and of e'e dt; shape (num_envs, 2). They say the density of the noise so far
+            over that with a drift: see `log_ratio`.
     """
 
     def __init__(self, problem: SafetyProblem, lengths: np.ndarray) -> None:
@@ -43,9 +47,18 @@ class TiltedNoiseEnv(SafeVectorEnv):
         plant = problem.plant
         diffusion = plant.numeric(plant.diffusion)
         live = plant.noise_channels
-        rows = [plant.numeric(gradient(plant, barrier.expression)) * diffusion for barrier in problem.barriers]
-        self._slopes = compile_function(plant.states, [row[0, j] for row in rows for j in live], "arrays")
-        self._barriers = compile_function(plant.states, [plant.numeric(barrier.expression) for barrier in problem.barriers], "arrays")
+        rows = [
+            plant.numeric(gradient(plant, barrier.expression)) * diffusion
+            for barrier in problem.barriers
+        ]
+        self._slopes = compile_function(
+            plant.states, [row[0, j] for row in rows for j in live], "arrays"
+        )
+        self._barriers = compile_function(
+            plant.states,
+            [plant.numeric(barrier.expression) for barrier in problem.barriers],
+            "arrays",
+        )
         self._shape = (len(rows), len(live), len(lengths))
         self._lengths = lengths
         self.girsanov_integrals = np.zeros((len(lengths), 2))
@@ -63,7 +76,8 @@ class TiltedNoiseEnv(SafeVectorEnv):
         return np.where(steepness > 0.0, steepest / np.where(steepness > 0.0, steepness, 1.0), 0.0)
 
     def drifted(self, draws: np.ndarray) -> np.ndarray:
-        """The draws of a period with the drift in them, substep by substep; notes how far they climb."""
+        """The draws of a period with the drift in them, substep by substep; notes how far they
+        climb."""
         if not draws.size:
             return draws
         root = math.sqrt(self.problem.dt / self.problem.substeps)
@@ -77,7 +91,9 @@ class TiltedNoiseEnv(SafeVectorEnv):
         """See `SafeVectorEnv.snapshot`."""
         return {**super().snapshot(), "girsanov_integrals": self.girsanov_integrals.copy()}
 
-    def restore(self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None) -> None:
+    def restore(
+        self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None
+    ) -> None:
         """See `SafeVectorEnv.restore`."""
         super().restore(snapshot, seed)
         self.girsanov_integrals = np.array(snapshot["girsanov_integrals"])
@@ -102,7 +118,8 @@ class _DriftingStreams(NoiseStreams):
 
 
 def log_ratio(girsanov_integrals: np.ndarray, lengths: Any) -> np.ndarray:
-    """Logarithm of the density of episodes' noise as it is over that with a drift, by Girsanov: c int e'dW + c^2/2 int e'e dt.
+    """Logarithm of the density of episodes' noise as it is over that with a drift, by Girsanov: c
+    int e'dW + c^2/2 int e'e dt.
 
     Args:
         girsanov_integrals: of the episodes, as in `TiltedNoiseEnv`, shape (..., 2).
@@ -111,11 +128,15 @@ def log_ratio(girsanov_integrals: np.ndarray, lengths: Any) -> np.ndarray:
     return lengths * girsanov_integrals[..., 0] + 0.5 * lengths**2 * girsanov_integrals[..., 1]
 
 
-def optimal_tilt(girsanov_integrals: np.ndarray, shares: np.ndarray, horizon: float) -> tuple[float, float]:
-    """The drift whose weights differ least, judged by episodes that end in a violation, however these were found.
+def optimal_tilt(
+    girsanov_integrals: np.ndarray, shares: np.ndarray, horizon: float
+) -> tuple[float, float]:
+    """The drift whose weights differ least, judged by episodes that end in a violation, however
+    these were found.
 
-    With the weight w of an episode the second moment under the drift is E[w; violation] without it. So episodes that the drift would
-    hardly ever show, since they violate on another way, count with their large weights.
+    With the weight w of an episode the second moment under the drift is E[w; violation] without it.
+    So episodes that the drift would hardly ever show, since they violate on another way, count with
+    their large weights.
 
     Args:
         girsanov_integrals: of episodes that violate, as in `TiltedNoiseEnv`, shape (B, 2).
@@ -123,7 +144,8 @@ def optimal_tilt(girsanov_integrals: np.ndarray, shares: np.ndarray, horizon: fl
         horizon: of an episode, in s.
 
     Returns:
-        The length c in 1/sqrt(s), and the deviation of what one episode with it says, relative to the probability.
+        The length c in 1/sqrt(s), and the deviation of what one episode with it says, relative to
+        the probability.
 
     Source: S. Asmussen and P. Glynn, Stochastic Simulation, Springer 2007, Ch. V and VI.
     """
@@ -137,7 +159,9 @@ def optimal_tilt(girsanov_integrals: np.ndarray, shares: np.ndarray, horizon: fl
         return float(found) - math.log(probability)
 
     # A sum of exponentials of convex functions: there is one minimum.
-    found: Any = minimize_scalar(log_second_moment, bounds=(0.0, _STRONGEST / math.sqrt(horizon)), method="bounded")
+    found: Any = minimize_scalar(
+        log_second_moment, bounds=(0.0, _STRONGEST / math.sqrt(horizon)), method="bounded"
+    )
     return float(found.x), math.sqrt(max(math.exp(min(found.fun, 700.0)) - 1.0, 0.0))
 
 
@@ -154,7 +178,8 @@ class Drifting:
         policy: anything with Stable-Baselines3's `predict`, without memory.
         seed: of all randomness.
         num_envs: the most episodes side by side.
-        bridge: looks at h between control instants too. Between given ends a bridge does not depend on a drift.
+        bridge: looks at h between control instants too. Between given ends a bridge does not depend
+            on a drift.
 
     Source: S. Asmussen and P. Glynn, Stochastic Simulation, Springer 2007, Ch. V and VI.
     """
@@ -165,7 +190,9 @@ class Drifting:
     num_envs: int
     bridge: BrownianBridge | None = None
 
-    def estimate(self, length: float, episodes: int, repetitions: int, progress: Progress | None = None) -> tuple[np.ndarray, int]:
+    def estimate(
+        self, length: float, episodes: int, repetitions: int, progress: Progress | None = None
+    ) -> tuple[np.ndarray, int]:
         """Estimate the probability.
 
         Args:
@@ -188,7 +215,8 @@ class Drifting:
         return weights.reshape(repetitions, episodes).mean(axis=1), steps
 
     def _weights(self, lengths: np.ndarray, spawn_key: tuple[int, ...]) -> tuple[np.ndarray, int]:
-        """Density ratio of each episode's noise up to its violation, 0 without one; and the control periods."""
+        """Density ratio of each episode's noise up to its violation, 0 without one; and the control
+        periods."""
         seed = np.random.SeedSequence(self.seed, spawn_key=spawn_key)
         env = self.make(lengths)
         world: Any = readable(env)
@@ -201,13 +229,17 @@ class Drifting:
         with blas_threads.limited():
             while alive.any():
                 x, before = world.components, info["barrier"]
-                actions, _ = self.policy.predict(observation, None, np.zeros(len(lengths), dtype=bool), deterministic=True)
+                actions, _ = self.policy.predict(
+                    observation, None, np.zeros(len(lengths), dtype=bool), deterministic=True
+                )
                 observation, _, terminated, truncated, info = env.step(actions)
                 steps += int(np.count_nonzero(alive))
                 after = info["barrier"]
                 lowest = after
                 if self.bridge is not None:
-                    lowest = self.bridge.lowest(x, before, after, generator.standard_exponential(after.shape))
+                    lowest = self.bridge.lowest(
+                        x, before, after, generator.standard_exponential(after.shape)
+                    )
                 hit = alive & (smallest(lowest) <= 0.0)
                 weights[hit] = np.exp(log_ratio(world.girsanov_integrals[hit], lengths[hit]))
                 alive &= ~hit & ~(terminated | truncated)

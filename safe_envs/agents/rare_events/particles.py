@@ -1,4 +1,5 @@
-"""Episodes that can be taken up again at each instant at which their score was better than ever before."""
+"""Episodes that can be taken up again at each instant at which their score was better than ever
+before."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ _FEWEST_ENVS = 64
 
 
 class Records:
-    """The instants at which each path was nearer to a violation than ever before, in arrays that grow as they fill.
+    """The instants at which each path was nearer to a violation than ever before, in arrays that
+    grow as they fill.
 
     Args:
         paths: how many.
@@ -49,7 +51,8 @@ class Records:
 
         Args:
             paths: which.
-            *entries: height, control instant, whether the episode ended there, state, observation, and `TiltedNoiseEnv.girsanov_integrals`.
+            *entries: height, control instant, whether the episode ended there, state, observation,
+              and `TiltedNoiseEnv.girsanov_integrals`.
         """
         rows = self._count[paths]
         if rows.size and int(rows.max()) == len(self._height):
@@ -59,7 +62,8 @@ class Records:
         self._count[paths] += 1
 
     def first_below(self, levels: np.ndarray, paths: np.ndarray) -> tuple[np.ndarray, ...]:
-        """The first records of paths below levels, one for each, in the order of the arguments of `add`."""
+        """The first records of paths below levels, one for each, in the order of the arguments of
+        `add`."""
         # Records fall along the first axis, and what was not filled is lower than all.
         rows = (self._height[:, paths] >= levels).sum(axis=0)
         return tuple(kept[rows, paths] for kept in self._kept)
@@ -72,19 +76,23 @@ class Records:
         room = len(self._height)
         for name in ("_height", "_time", "_ended", "_state", "_observation", "_climbed"):
             old = getattr(self, name)
-            fill = np.full((room, *old.shape[1:]), -np.inf if name == "_height" else 0, dtype=old.dtype)
+            fill = np.full(
+                (room, *old.shape[1:]), -np.inf if name == "_height" else 0, dtype=old.dtype
+            )
             setattr(self, name, np.concatenate([old, fill]))
 
 
 class Particles:
     """Paths of a policy in an env, up to their first violations.
 
-    The height of a path at control instant k of K is its smallest h since the last one, times (1 - k/(K + 1))^-p: for p = 0 that is
-    h, and for p = 1/2 it is h against what a Brownian motion may do in the time that is left. It is 0 or less at a violation. Of
-    several barriers, which may have units of their own, each is divided by its mean at the starts.
+    The height of a path at control instant k of K is its smallest h since the last one, times (1 -
+    k/(K + 1))^-p: for p = 0 that is h, and for p = 1/2 it is h against what a Brownian motion may
+    do in the time that is left. It is 0 or less at a violation. Of several barriers, which may have
+    units of their own, each is divided by its mean at the starts.
 
-    Noise is drawn by the envs, whose generators are seeded once and run on, so that paths that were taken up again get fresh
-    noise. What comes of it depends on the seed, and on the number of paths and of envs.
+    Noise is drawn by the envs, whose generators are seeded once and run on, so that paths that were
+    taken up again get fresh noise. What comes of it depends on the seed, and on the number of paths
+    and of envs.
 
     Args:
         make: envs for the paths, made without a drift.
@@ -98,7 +106,8 @@ class Particles:
         lowest: smallest height of each path, shape (paths,).
         steps: control periods that were simulated.
         outside: how many paths start where h <= 0.
-        kept_length: mean length of the paths from the starts that do not violate, in control periods; None without any.
+        kept_length: mean length of the paths from the starts that do not violate, in control
+            periods; None without any.
     """
 
     def __init__(
@@ -139,7 +148,12 @@ class Particles:
                 at_start = info["barrier"].mean(axis=0)
                 self._units = np.where(at_start > 0.0, at_start, 1.0)
             h = smallest(info["barrier"][:count] / self._units)
-            begun = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=bool), world.state[:count], observation[:count]
+            begun = (
+                np.zeros(count, dtype=np.int64),
+                np.zeros(count, dtype=bool),
+                world.state[:count],
+                observation[:count],
+            )
             # At the start the weight is 1.
             begun = (h, *begun, world.girsanov_integrals[:count])
             self.outside += int(np.count_nonzero(h <= 0.0))
@@ -148,11 +162,13 @@ class Particles:
         self.kept_length = float(kept.mean()) if kept.size else None
 
     def h_at_lowest(self, paths: np.ndarray) -> np.ndarray:
-        """The h of paths where their heights were smallest, of several barriers relative to the starts; shape as given."""
+        """The h of paths where their heights were smallest, of several barriers relative to the
+        starts; shape as given."""
         return self.lowest[paths] / self._weights[self._records.last(paths)[1], self._kind[paths]]
 
     def girsanov_integrals(self, paths: np.ndarray) -> np.ndarray:
-        """`TiltedNoiseEnv.girsanov_integrals` of paths where their heights were smallest, shape (B, 2)."""
+        """`TiltedNoiseEnv.girsanov_integrals` of paths where their heights were smallest, shape (B,
+        2)."""
         return self._records.last(paths)[5]
 
     def branch(self, paths: np.ndarray, parents: np.ndarray, levels: np.ndarray) -> None:
@@ -164,7 +180,8 @@ class Particles:
             levels: heights, each above its parent's smallest, shape (B,).
         """
         entries = self._records.first_below(levels, parents)
-        # Paths that have equally far to go share a batch, which takes as long as the longest of them.
+        # Paths that have equally far to go share a batch, which takes as long as the longest of
+        # them.
         order = np.argsort(entries[1], kind="stable")
         self._records.clear(paths)
         for first in range(0, len(paths), self._largest):
@@ -174,7 +191,11 @@ class Particles:
     def _resume(self, paths: np.ndarray, entries: tuple[np.ndarray, ...]) -> None:
         env: Any = self._env(len(paths))
         snapshot = env.snapshot()
-        for name, values in (("state", entries[3]), ("steps", entries[1]), ("girsanov_integrals", entries[5])):
+        for name, values in (
+            ("state", entries[3]),
+            ("steps", entries[1]),
+            ("girsanov_integrals", entries[5]),
+        ):
             snapshot[name][:] = values[0]
             snapshot[name][: len(paths)] = values
         snapshot["ended"][:] = False
@@ -183,8 +204,11 @@ class Particles:
         observation[: len(paths)] = entries[4]
         self._play(env, paths, observation, entries)
 
-    def _play(self, env: Env, paths: np.ndarray, observation: np.ndarray, entries: tuple[np.ndarray, ...]) -> np.ndarray:
-        """Simulate paths, in the first rows of an env, from entries of `Records.add` until they end or violate; return when."""
+    def _play(
+        self, env: Env, paths: np.ndarray, observation: np.ndarray, entries: tuple[np.ndarray, ...]
+    ) -> np.ndarray:
+        """Simulate paths, in the first rows of an env, from entries of `Records.add` until they end
+        or violate; return when."""
         world: Any = readable(env)
         count, records, kind = len(paths), self._records, self._kind[paths]
         lowest, time, ended = entries[0].copy(), entries[1].copy(), entries[2]
@@ -208,21 +232,36 @@ class Particles:
             if fell.size:
                 lowest[fell] = height[fell]
                 state = np.stack([component[fell] for component in world.components], axis=-1)
-                records.add(paths[fell], height[fell], time[fell], ended[fell], state, observation[fell], world.girsanov_integrals[fell])
+                records.add(
+                    paths[fell],
+                    height[fell],
+                    time[fell],
+                    ended[fell],
+                    state,
+                    observation[fell],
+                    world.girsanov_integrals[fell],
+                )
             alive &= (lowest > 0.0) & ~ended
         self.lowest[paths] = lowest
         return ends
 
     def _act(self, observation: np.ndarray) -> np.ndarray:
-        actions, memory = self._policy.predict(observation, None, np.zeros(len(observation), dtype=bool), deterministic=True)
+        actions, memory = self._policy.predict(
+            observation, None, np.zeros(len(observation), dtype=bool), deterministic=True
+        )
         if memory is not None:
-            raise ConfigurationError("the policy has a memory, which splitting cannot take up again; estimate with plain episodes")
+            raise ConfigurationError(
+                "the policy has a memory, which splitting cannot take up again; estimate with plain"
+                " episodes"
+            )
         return actions
 
     def _lowest(self, x: Any, before: np.ndarray | None, after: np.ndarray) -> np.ndarray:
         if self._bridge is None or before is None:
             return after
-        return self._bridge.lowest(x, before, after, self._generator.standard_exponential(after.shape))
+        return self._bridge.lowest(
+            x, before, after, self._generator.standard_exponential(after.shape)
+        )
 
     def _env(self, count: int) -> Env:
         """An env with at least so many episodes side by side, seeded when it is first used."""

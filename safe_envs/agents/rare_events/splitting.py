@@ -20,7 +20,8 @@ LEAST = 1e-20
 """Below this a probability is given up: its next level may be one that is never reached."""
 
 POWERS = (0.0, 0.5)
-"""Of the time that is left, in the two scores: see `safe_envs.agents.rare_events.particles.Particles`."""
+"""Of the time that is left, in the two scores: see
+`safe_envs.agents.rare_events.particles.Particles`."""
 
 _PILOTS = 10
 _FEWEST_PARTICLES = 50
@@ -42,7 +43,8 @@ class Repetitions:
         length: mean length of all of these, up to a violation, in control periods.
         stuck: for each repetition all of whose paths stood at one level, h there.
         endless: for each one that fell below `LEAST`, h of its last level.
-        girsanov_integrals: of the paths that violate, as in `safe_envs.agents.rare_events.importance_sampling.TiltedNoiseEnv`, shape (V, 2).
+        girsanov_integrals: of the paths that violate, as in
+            `safe_envs.agents.rare_events.importance_sampling.TiltedNoiseEnv`, shape (V, 2).
         shares: of the probability for which each of them stands, shape (V,).
     """
 
@@ -69,11 +71,12 @@ class Repetitions:
 class Splitting:
     """How to estimate the probability that h comes down to 0, several times, side by side.
 
-    Each repetition begins with `particles` episodes. A level is the height that a given share of them did not fall below; those are
-    killed, all of them where several stand at one level, and replaced: by copies of survivors, chosen at random, up to the first
-    instant at which they fell below the level, and from there with noise of their own. With K_i of N killed at level i, the
-    probability is the product of the 1 - K_i/N, times the share that violates in the end. That is unbiased for any share and for
-    any score; both count for the spread alone.
+    Each repetition begins with `particles` episodes. A level is the height that a given share of
+    them did not fall below; those are killed, all of them where several stand at one level, and
+    replaced: by copies of survivors, chosen at random, up to the first instant at which they fell
+    below the level, and from there with noise of their own. With K_i of N killed at level i, the
+    probability is the product of the 1 - K_i/N, times the share that violates in the end. That is
+    unbiased for any share and for any score; both count for the spread alone.
 
     Attributes:
         make: a filtered env, which is made without a drift.
@@ -83,8 +86,9 @@ class Splitting:
         bridge: looks at h between control instants too.
         killed: share at a level, at least, between 0 and 1.
 
-    Source: C.-E. Brehier, M. Gazeau, L. Goudenege, T. Lelievre, M. Rousset, Unbiasedness of some generalized adaptive multilevel
-        splitting algorithms, Annals of Applied Probability 26 (2016) 3559-3601.
+    Source: C.-E. Brehier, M. Gazeau, L. Goudenege, T. Lelievre, M. Rousset, Unbiasedness of some
+        generalized adaptive multilevel splitting algorithms, Annals of Applied Probability 26
+        (2016) 3559-3601.
     """
 
     make: MakeDrifting
@@ -94,8 +98,11 @@ class Splitting:
     bridge: BrownianBridge | None = None
     killed: float = KILLED
 
-    def choose(self, particles: int, progress: Callable[[float], None] | None = None) -> tuple[float, int]:
-        """Find the power whose estimates differ less, in a few small repetitions with each; 0 if violations are frequent.
+    def choose(
+        self, particles: int, progress: Callable[[float], None] | None = None
+    ) -> tuple[float, int]:
+        """Find the power whose estimates differ less, in a few small repetitions with each; 0 if
+        violations are frequent.
 
         Args:
             particles: of the estimation that is to come.
@@ -112,7 +119,13 @@ class Splitting:
         spreads = [_spread(part) for part in np.split(run.estimates, len(POWERS))]
         return (POWERS[0] if often else POWERS[spreads.index(min(spreads))]), run.paths.steps
 
-    def estimate(self, power: float, particles: int, repetitions: int, progress: Callable[[float], None] | None = None) -> Repetitions:
+    def estimate(
+        self,
+        power: float,
+        particles: int,
+        repetitions: int,
+        progress: Callable[[float], None] | None = None,
+    ) -> Repetitions:
         """Estimate the probability.
 
         Args:
@@ -143,7 +156,8 @@ class Splitting:
 
 
 def _spread(estimates: np.ndarray) -> tuple[int, float]:
-    """How much estimates differ: first by how many there are none, then by the deviation of the logarithms of the others."""
+    """How much estimates differ: first by how many there are none, then by the deviation of the
+    logarithms of the others."""
     found = estimates[estimates > 0.0]
     return len(estimates) - len(found), float(np.std(np.log(found))) if len(found) else 0.0
 
@@ -151,11 +165,18 @@ def _spread(estimates: np.ndarray) -> tuple[int, float]:
 class _Run:
     """Repetitions under way, after their first episodes."""
 
-    def __init__(self, how: Splitting, powers: np.ndarray, particles: int, spawn_key: Sequence[int]) -> None:
+    def __init__(
+        self, how: Splitting, powers: np.ndarray, particles: int, spawn_key: Sequence[int]
+    ) -> None:
         seed = np.random.SeedSequence(how.seed, spawn_key=spawn_key)
-        self._particles, self._rank = particles, min(max(round(how.killed * particles), 1), particles - 1)
+        self._particles, self._rank = (
+            particles,
+            min(max(round(how.killed * particles), 1), particles - 1),
+        )
         self._generator = np.random.default_rng(seed.spawn(1)[0])
-        self.paths = Particles(how.make, how.policy, np.repeat(powers, particles), seed, how.num_envs, how.bridge)
+        self.paths = Particles(
+            how.make, how.policy, np.repeat(powers, particles), seed, how.num_envs, how.bridge
+        )
         self.estimates, self.levels = np.ones(len(powers)), np.zeros(len(powers), dtype=np.int64)
         self.stuck: list[float] = []
         self.endless: list[float] = []
@@ -172,7 +193,9 @@ class _Run:
                 if not found:
                     return
                 active = list(found)
-                killed, parents, levels = (np.concatenate(parts) for parts in zip(*found.values(), strict=True))
+                killed, parents, levels = (
+                    np.concatenate(parts) for parts in zip(*found.values(), strict=True)
+                )
                 self.levels[active] += 1
                 highest = max(highest, float(levels.max()))
                 if progress:
@@ -180,13 +203,17 @@ class _Run:
                 self.paths.branch(killed, parents, levels)
 
     def violating(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the paths that violate, their `girsanov_integrals`, and the part of the estimated probability for which each stands."""
+        """Of the paths that violate, their `girsanov_integrals`, and the part of the estimated
+        probability for which each stands."""
         violate = self.paths.lowest.reshape(len(self.estimates), self._particles) <= 0.0
         each = self.estimates / (np.maximum(violate.sum(axis=1), 1) * len(self.estimates))
-        return self.paths.girsanov_integrals(np.flatnonzero(violate)), np.repeat(each, violate.sum(axis=1))
+        return self.paths.girsanov_integrals(np.flatnonzero(violate)), np.repeat(
+            each, violate.sum(axis=1)
+        )
 
     def _next_level(self, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Whom to kill, whom to continue in their place and from which level; None if the repetition is at its end."""
+        """Whom to kill, whom to continue in their place and from which level; None if the
+        repetition is at its end."""
         own = np.arange(r * self._particles, (r + 1) * self._particles)
         lowest = self.paths.lowest[own]
         place = self._particles - self._rank

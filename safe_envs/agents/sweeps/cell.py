@@ -1,4 +1,5 @@
-"""A cell of a sweep: one evaluation of one policy under one filter, what identifies it, and its result wherever it is computed."""
+"""A cell of a sweep: one evaluation of one policy under one filter, what identifies it, and its
+result wherever it is computed."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ _FRAMES = 3
 """How many lines of code an unexpected error is told with."""
 
 _ONE_AT_A_TIME = threading.Lock()
-"""A Dask worker may have several threads, but neither SymPy nor the limits of threadpoolctl are made for that."""
+"""A Dask worker may have several threads, but neither SymPy nor the limits of threadpoolctl are
+made for that."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,8 @@ class Cell:
 
     @property
     def env_id(self) -> str:
-        """Id of the env that it simulates; for a system of one's own, the id behind which such systems are.
+        """Id of the env that it simulates; for a system of one's own, the id behind which such
+        systems are.
 
         Raises:
             ConfigurationError: there is no such id, or neither or both of env and system are given.
@@ -68,7 +71,11 @@ class Cell:
         """The arguments of `gym.make`."""
         options = {name: self.settings[name] for name in ENV_OPTIONS if name in self.settings}
         for group in PARAMETERS:
-            of_group = {name.partition(".")[2]: value for name, value in self.settings.items() if name.startswith(f"{group}.")}
+            of_group = {
+                name.partition(".")[2]: value
+                for name, value in self.settings.items()
+                if name.startswith(f"{group}.")
+            }
             if of_group:
                 options[group] = of_group
         return options
@@ -94,7 +101,8 @@ class Outcome:
 
 
 def compute(cell: Cell) -> Outcome:
-    """Compute a cell, in any process that has this project in the same versions. What goes wrong is in the outcome."""
+    """Compute a cell, in any process that has this project in the same versions. What goes wrong is
+    in the outcome."""
     from threadpoolctl import threadpool_limits
 
     began = time.perf_counter()
@@ -105,14 +113,24 @@ def compute(cell: Cell) -> Outcome:
     except SafeEnvsError as error:
         return Outcome(cell.key, None, None, str(error), time.perf_counter() - began)
     except Exception as error:
-        return Outcome(cell.key, None, None, f"{type(error).__name__}: {error}{_where(error)}", time.perf_counter() - began)
+        return Outcome(
+            cell.key,
+            None,
+            None,
+            f"{type(error).__name__}: {error}{_where(error)}",
+            time.perf_counter() - began,
+        )
     return Outcome(cell.key, row, config, None, time.perf_counter() - began)
 
 
 def _where(error: Exception) -> str:
-    """The last lines of code that led to an error, with as much of their files' paths as is the same on all machines."""
+    """The last lines of code that led to an error, with as much of their files' paths as is the
+    same on all machines."""
     frames = traceback.extract_tb(error.__traceback__)[-_FRAMES:]
-    places = [f"{'/'.join(Path(frame.filename).parts[-2:])}:{frame.lineno} in {frame.name}" for frame in frames]
+    places = [
+        f"{'/'.join(Path(frame.filename).parts[-2:])}:{frame.lineno} in {frame.name}"
+        for frame in frames
+    ]
     return f" (at {', from '.join(reversed(places))})"
 
 
@@ -142,13 +160,20 @@ def _require_alike(cell: Cell) -> None:
     """
     here = versions()
     differing = [
-        f"{name} {here.get(name, 'missing')} in place of {value}" for name, value in cell.versions.items() if here.get(name) != value
+        f"{name} {here.get(name, 'missing')} in place of {value}"
+        for name, value in cell.versions.items()
+        if here.get(name) != value
     ]
     if differing:
-        raise ConfigurationError(f"the worker has {', '.join(differing)}; install the same versions on all machines")
+        raise ConfigurationError(
+            f"the worker has {', '.join(differing)}; install the same versions on all machines"
+        )
     for path, digest in cell.files.items():
         if checksum(Path(path)) != digest:
-            raise ConfigurationError(f"the worker finds another content in {path}; put all files of a sweep on a disk that workers share")
+            raise ConfigurationError(
+                f"the worker finds another content in {path}; put all files of a sweep on a disk"
+                " that workers share"
+            )
 
 
 def checksum(path: Path) -> str:
@@ -161,14 +186,15 @@ def checksum(path: Path) -> str:
         return hashlib.sha256(read_bytes(path)).hexdigest()
     except OSError as error:
         raise ConfigurationError(
-            f"{shortened(path)} cannot be read ({error.strerror}); check the path, and that it is on a disk that all workers of the "
-            "sweep share"
+            f"{shortened(path)} cannot be read ({error.strerror}); check the path, and that it is"
+            " on a disk that all workers of the sweep share"
         ) from error
 
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages on which results depend, and a checksum of this project's own code."""
+    """Versions of Python and of the packages on which results depend, and a checksum of this
+    project's own code."""
     digest = hashlib.sha256()
     root = Path(str(files("safe_envs")))
     for path in sorted(root.rglob("*.py")):

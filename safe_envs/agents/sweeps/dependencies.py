@@ -18,7 +18,10 @@ _FILE = re.compile("(?<=file=)[^:+]+")
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a cell with paths that mean the same in every process."""
-    found = {**settings, "filter": _FILE.sub(lambda match: os.path.realpath(match.group()), settings["filter"])}
+    found = {
+        **settings,
+        "filter": _FILE.sub(lambda match: os.path.realpath(match.group()), settings["filter"]),
+    }
     if policy_files(settings["policy"]) and os.path.exists(settings["policy"]):
         found["policy"] = os.path.realpath(settings["policy"])
     if "system" in settings:
@@ -39,10 +42,11 @@ def read_by(settings: Mapping[str, Any]) -> Iterator[Path]:
 
 
 def with_imported(path: Path) -> list[Path]:
-    """A file, and where it is one of Python those of its own folder that it imports, or that these import.
+    """A file, and where it is one of Python those of its own folder that it imports, or that these
+    import.
 
-    Nothing is run: every import statement counts, wherever in a file it stands. What is imported by another folder or by a name
-    that is made while the code runs is not found.
+    Nothing is run: every import statement counts, wherever in a file it stands. What is imported by
+    another folder or by a name that is made while the code runs is not found.
     """
     found: dict[Path, None] = {}
     left = [path]
@@ -50,12 +54,17 @@ def with_imported(path: Path) -> list[Path]:
         file = left.pop()
         if file not in found:
             found[file] = None
-            left += [each for folder, names in _imports(file, path.parent) for each in _files_of(folder, names)]
+            left += [
+                each
+                for folder, names in _imports(file, path.parent)
+                for each in _files_of(folder, names)
+            ]
     return list(found)
 
 
 def _imports(file: Path, root: Path) -> Iterable[tuple[Path, Sequence[str]]]:
-    """The import statements of a file: each as the folder in which it begins, and the names down from there."""
+    """The import statements of a file: each as the folder in which it begins, and the names down
+    from there."""
     if file.suffix != ".py":
         return
     try:
@@ -70,11 +79,17 @@ def _imports(file: Path, root: Path) -> Iterable[tuple[Path, Sequence[str]]]:
         elif isinstance(node, ast.ImportFrom):
             folder = file.parents[node.level - 1] if node.level else root
             # What is imported from a package may be a module of it.
-            yield from ((folder, [*(node.module or "").split("."), each.name]) for each in node.names)
+            yield from (
+                (folder, [*(node.module or "").split("."), each.name]) for each in node.names
+            )
 
 
 def _files_of(folder: Path, names: Sequence[str]) -> Iterable[Path]:
     """The modules and packages that are there of a dotted name."""
     for name in filter(None, names):
-        yield from (path for path in (folder / f"{name}.py", folder / name / "__init__.py") if path.is_file())
+        yield from (
+            path
+            for path in (folder / f"{name}.py", folder / name / "__init__.py")
+            if path.is_file()
+        )
         folder /= name

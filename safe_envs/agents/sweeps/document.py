@@ -1,4 +1,5 @@
-"""What a sweep's YAML file holds, without what YAML takes in silence: settings given twice, and numbers that are not as they look."""
+"""What a sweep's YAML file holds, without what YAML takes in silence: settings given twice, and
+numbers that are not as they look."""
 
 from __future__ import annotations
 
@@ -24,20 +25,32 @@ _DATE = "tag:yaml.org,2002:timestamp"
 
 
 class _Loader(yaml.SafeLoader):
-    """Of YAML's data, without code, aliases and tags: a few aliases of aliases stand for more than any memory holds."""
+    """Of YAML's data, without code, aliases and tags: a few aliases of aliases stand for more than
+    any memory holds."""
 
     # No setting takes a date, and there are texts that look like one.
     yaml_implicit_resolvers: ClassVar[Any] = {
-        first: [(tag, form) for tag, form in found if tag != _DATE] for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
+        first: [(tag, form) for tag, form in found if tag != _DATE]
+        for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
     }
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         """See `yaml.SafeLoader`; refuses aliases, tags, and what is nested deeper than any sweep."""
         event: Any = self.peek_event()
-        what = "an alias" if isinstance(event, yaml.AliasEvent) else "a tag" if event.tag is not None else ""
+        what = (
+            "an alias"
+            if isinstance(event, yaml.AliasEvent)
+            else "a tag"
+            if event.tag is not None
+            else ""
+        )
         if what or self.depth > _DEEPEST:
-            problem = f"{what} is not allowed; write the value itself" if what else f"it is nested more than {_DEEPEST} deep"
+            problem = (
+                f"{what} is not allowed; write the value itself"
+                if what
+                else f"it is nested more than {_DEEPEST} deep"
+            )
             raise ComposerError(None, None, problem, event.start_mark)
         self.depth += 1
         try:
@@ -50,14 +63,17 @@ class _Loader(yaml.SafeLoader):
         seen = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
-                raise ConstructorError(None, None, "a name is a list or a mapping; give a word", key.start_mark)
+                raise ConstructorError(
+                    None, None, "a name is a list or a mapping; give a word", key.start_mark
+                )
             if key.value in seen:
                 raise ConstructorError(None, None, f"{key.value!r} is given twice", key.start_mark)
             seen.add(key.value)
         return super().construct_mapping(node, deep)
 
     def construct_number(self, node: Any) -> int | float:
-        """A decimal number; refuses 010, which YAML takes for 8, 1:30, which it takes for 90, 1_000 and their kind."""
+        """A decimal number; refuses 010, which YAML takes for 8, 1:30, which it takes for 90, 1_000
+        and their kind."""
         if not _PLAIN.fullmatch(node.value):
             raise ConstructorError(None, None, f"{node.value} is no plain number", node.start_mark)
         return whole_or_real(node.value)
@@ -71,14 +87,20 @@ def document_in(path: Path) -> Any:
     """What a YAML file holds.
 
     Raises:
-        ConfigurationError: it cannot be read, is no YAML, or holds a name twice or a number in an odd form.
+        ConfigurationError: it cannot be read, is no YAML, or holds a name twice or a number in an
+            odd form.
     """
     try:
         return value_of(read_bytes(path, _MOST_BYTES).decode(), str(path))
     except OSError as error:
-        raise ConfigurationError(f"{shortened(path)} cannot be read: {error.strerror}; name a YAML file that says what to sweep") from error
+        raise ConfigurationError(
+            f"{shortened(path)} cannot be read: {error.strerror}; name a YAML file that says what"
+            " to sweep"
+        ) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path} is no YAML that says what to sweep: {shortened(error, 400)}") from error
+        raise ConfigurationError(
+            f"{path} is no YAML that says what to sweep: {shortened(error, 400)}"
+        ) from error
 
 
 def value_of(text: str, name: str) -> Any:

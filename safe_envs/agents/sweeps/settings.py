@@ -1,4 +1,5 @@
-"""What a sweep's file may hold: its sections, the names of settings, and values of the kind that each takes."""
+"""What a sweep's file may hold: its sections, the names of settings, and values of the kind that
+each takes."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ def sections(document: Any, what: str) -> tuple[Settings, dict[str, list[Any]], 
         what: how errors call it.
 
     Raises:
-        ConfigurationError: a section or a setting is unknown, or a value is not of its setting's kind.
+        ConfigurationError: a section or a setting is unknown, or a value is not of its setting's
+            kind.
     """
     given = _mapping(document, what, _SECTIONS)
     return (
@@ -48,17 +50,25 @@ def sections(document: Any, what: str) -> tuple[Settings, dict[str, list[Any]], 
 
 
 def complete(settings: Settings, what: str) -> Settings:
-    """The settings of a cell, in one order, with what is the same for every env where it was left open.
+    """The settings of a cell, in one order, with what is the same for every env where it was left
+    open.
 
     Raises:
         ConfigurationError: it has no filter, or not just one of env and system.
     """
     if ("env" in settings) == ("system" in settings):
-        raise ConfigurationError(f"{what}: a cell needs env: ENV_ID or system: FILE.py:NAME, one of the two")
+        raise ConfigurationError(
+            f"{what}: a cell needs env: ENV_ID or system: FILE.py:NAME, one of the two"
+        )
     if "filter" not in settings:
-        raise ConfigurationError(f"{what}: a cell has no filter; name one, or {BARE} for the bare env")
+        raise ConfigurationError(
+            f"{what}: a cell has no filter; name one, or {BARE} for the bare env"
+        )
     given = {**_DEFAULTS, **settings}
-    return {name: given[name] for name in sorted(given, key=lambda name: (name not in _NAMES, _rank(name), name))}
+    return {
+        name: given[name]
+        for name in sorted(given, key=lambda name: (name not in _NAMES, _rank(name), name))
+    }
 
 
 def text_of(value: Any) -> str:
@@ -81,7 +91,11 @@ def _mapping(given: Any, what: str, allowed: Sequence[str] | None) -> dict[str, 
         raise ConfigurationError(f"{what} is {shortened(text_of(given))}; give {form}")
     for name in given:
         if allowed is not None and name not in allowed:
-            hint = "a setting goes under fixed, a list of its values under grid" if _is_known(name) else nearest(name, allowed)
+            hint = (
+                "a setting goes under fixed, a list of its values under grid"
+                if _is_known(name)
+                else nearest(name, allowed)
+            )
             raise ConfigurationError(f"{what} has the section {shown(name)}; {hint}")
     return dict(given)
 
@@ -98,7 +112,10 @@ def _grid(given: Any, what: str) -> dict[str, list[Any]]:
     for name, values in lists.items():
         _require_known(name, what)
         if not isinstance(values, list) or not values:
-            raise ConfigurationError(f"{what}: {name} = {shortened(text_of(values))}; give a list of values, or put it under fixed")
+            raise ConfigurationError(
+                f"{what}: {name} = {shortened(text_of(values))}; give a list of values, or put it"
+                " under fixed"
+            )
     return {name: [_value(name, value, what) for value in values] for name, values in lists.items()}
 
 
@@ -106,7 +123,9 @@ def _listed(given: Any, what: str) -> list[Settings]:
     if given is None:
         return []
     if not isinstance(given, list) or not given:
-        raise ConfigurationError(f"{what} is {shortened(text_of(given))}; give a list, each entry with settings")
+        raise ConfigurationError(
+            f"{what} is {shortened(text_of(given))}; give a list, each entry with settings"
+        )
     return [_settings(each, f"{what}, entry {i}") for i, each in enumerate(given, 1)]
 
 
@@ -117,7 +136,11 @@ def _is_known(name: str) -> bool:
 
 def _require_known(name: str, what: str) -> None:
     if not _is_known(name):
-        hint = f"; give its parameters as {name}.NAME" if name in PARAMETERS else f"; {nearest(name, (*_NAMES, *_GROUPS))}"
+        hint = (
+            f"; give its parameters as {name}.NAME"
+            if name in PARAMETERS
+            else f"; {nearest(name, (*_NAMES, *_GROUPS))}"
+        )
         raise ConfigurationError(f"{what} has the setting {shown(name)}{hint}")
 
 
@@ -127,7 +150,9 @@ def _value(name: str, value: Any, what: str) -> Any:
         return _word(name, value, what)
     if name == "bounds":
         if not isinstance(value, bool):
-            raise ConfigurationError(f"{what}: bounds = {shortened(text_of(value))}; give true or false")
+            raise ConfigurationError(
+                f"{what}: bounds = {shortened(text_of(value))}; give true or false"
+            )
         return value
     if name in ("seed", "episodes", "substeps"):
         require_whole(f"{what}: {name}", value, 0 if name == "seed" else 1)
@@ -141,11 +166,13 @@ def _word(name: str, value: Any, what: str) -> str:
     if not isinstance(value, str):
         raise ConfigurationError(f"{what}: {name} = {shortened(text_of(value))}; give a text")
     if "\0" in value:
-        raise ConfigurationError(f"{what}: {name} = {shown(value)}, with a character that ends texts; leave it out")
+        raise ConfigurationError(
+            f"{what}: {name} = {shown(value)}, with a character that ends texts; leave it out"
+        )
     if name == "system" and not (":" in value and value.rpartition(":")[0].endswith(".py")):
         raise ConfigurationError(
-            f"{what}: system = {shortened(value)}; give FILE.py:NAME: by the content of that file a sweep tells which cells are done, "
-            "and a module has none of its own"
+            f"{what}: system = {shortened(value)}; give FILE.py:NAME: by the content of that file a"
+            " sweep tells which cells are done, and a module has none of its own"
         )
     if name == "env":
         try:
@@ -156,7 +183,8 @@ def _word(name: str, value: Any, what: str) -> str:
 
 
 def _number(name: str, value: Any, what: str) -> Any:
-    """A finite number; of a barrier as it is, since that may count something, and of all else as a float, to be one cell with its equals.
+    """A finite number; of a barrier as it is, since that may count something, and of all else as a
+    float, to be one cell with its equals.
 
     Words pass where an env takes them.
     """
@@ -168,7 +196,9 @@ def _number(name: str, value: Any, what: str) -> Any:
             if name == "start" or name.startswith("barrier."):
                 return value
     if not isinstance(given, int | float) or isinstance(given, bool):
-        raise ConfigurationError(f"{what}: {name} = {shortened(json.dumps(value, default=str))}; give a number")
+        raise ConfigurationError(
+            f"{what}: {name} = {shortened(json.dumps(value, default=str))}; give a number"
+        )
     if not abs(given) <= sys.float_info.max:
         raise ConfigurationError(f"{what}: {name} = {shortened(value)}; give a finite number")
     # 0.0 in place of -0.0, its equal.

@@ -1,4 +1,5 @@
-"""What a sweep is: from a file that names settings and their values to cells, each of which is one evaluation."""
+"""What a sweep is: from a file that names settings and their values to cells, each of which is one
+evaluation."""
 
 from __future__ import annotations
 
@@ -45,15 +46,17 @@ class Sweep:
 def read_sweep(path: Path, trust: bool = False) -> Sweep:
     """Read a sweep from a YAML file, and check all that can be checked before a cell is computed.
 
-    The file has the sections `fixed` (setting: value), `grid` (setting: list of values; lists multiply) and `cells` (a list of
-    setting: value). Settings are the arguments of an evaluation: see `docs/guides/sweep.md`.
+    The file has the sections `fixed` (setting: value), `grid` (setting: list of values; lists
+    multiply) and `cells` (a list of setting: value). Settings are the arguments of an evaluation:
+    see `docs/guides/sweep.md`.
 
     Args:
         path: of the file. Paths in it begin at the working directory.
         trust: load a policy's .zip, which runs code that it contains.
 
     Raises:
-        ConfigurationError: the file cannot be read, or a section, setting, id, filter, policy or value is not allowed.
+        ConfigurationError: the file cannot be read, or a section, setting, id, filter, policy or
+            value is not allowed.
         RelativeDegreeError: a filter does not suit a barrier.
     """
     sweep = sweep_of(document_in(path), trust, what=str(path))
@@ -75,33 +78,50 @@ def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Swe
     fixed, grid, given = sections(document, what)
     for name in (*grid, *itertools.chain.from_iterable(given)):
         if name in fixed:
-            raise ConfigurationError(f"{what}: {name} is fixed, and has other values too; give it once")
+            raise ConfigurationError(
+                f"{what}: {name} is fixed, and has other values too; give it once"
+            )
     count = 1
     for values in grid.values():
         count *= len(values)
     if count > _MOST_CELLS:
         raise ConfigurationError(f"{what}: the grid has {count} cells; the most are {_MOST_CELLS}")
-    chosen = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())] if grid else []
+    chosen = (
+        [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
+        if grid
+        else []
+    )
     chosen += given
     if not chosen:
         chosen = [{}]
-    once = {_equal(settings): settings for settings in (complete({**fixed, **each}, what) for each in chosen)}
+    once = {
+        _equal(settings): settings
+        for settings in (complete({**fixed, **each}, what) for each in chosen)
+    }
     cells = {cell.key: cell for cell in _cells(once.values(), trust)}
     return Sweep(tuple(cells.values()), tuple(_swept([cell.settings for cell in cells.values()])))
 
 
 def describe(cell: Cell, names: Iterable[str]) -> str:
     """A cell in a few words: the settings of these names."""
-    return ", ".join(f"{name} = {text_of(cell.settings[name])}" for name in names if name in cell.settings)
+    return ", ".join(
+        f"{name} = {text_of(cell.settings[name])}" for name in names if name in cell.settings
+    )
 
 
 def _equal(settings: Settings) -> str:
-    """The same for settings that differ in 1 and 1.0 of a barrier only, and so are of the same episodes."""
+    """The same for settings that differ in 1 and 1.0 of a barrier only, and so are of the same
+    episodes."""
 
     def one_form(value: Any) -> Any:
         return json.loads(json.dumps(value), parse_int=float)
 
-    return json.dumps({name: one_form(value) if name.startswith("barrier.") else value for name, value in settings.items()})
+    return json.dumps(
+        {
+            name: one_form(value) if name.startswith("barrier.") else value
+            for name, value in settings.items()
+        }
+    )
 
 
 def _cells(found: Iterable[Settings], trust: bool) -> Iterable[Cell]:
@@ -121,7 +141,8 @@ def _swept(settings: Sequence[Mapping[str, Any]]) -> Iterable[str]:
 
 
 def _check(sweep: Sweep, what: str) -> None:
-    """Make the problem, the filter and the policy of every cell that has a value, or one with its env, that none before it had.
+    """Make the problem, the filter and the policy of every cell that has a value, or one with its
+    env, that none before it had.
 
     Others would repeat it, and to make the problem of a large system takes a second.
 
@@ -130,9 +151,13 @@ def _check(sweep: Sweep, what: str) -> None:
     """
     seen: set[str] = set()
     for cell in sweep.cells:
-        beside = {name: [cell.settings.get(other) for other in others] for name, others in _BESIDE.items()}
+        beside = {
+            name: [cell.settings.get(other) for other in others] for name, others in _BESIDE.items()
+        }
         looked_at = {name: value for name, value in cell.settings.items() if name not in _NO_PART}
-        parts = {name: json.dumps([name, value, beside.get(name)]) for name, value in looked_at.items()}
+        parts = {
+            name: json.dumps([name, value, beside.get(name)]) for name, value in looked_at.items()
+        }
         new = {name for name, part in parts.items() if part not in seen}
         if not new:
             continue
@@ -148,11 +173,17 @@ def _check_cell(cell: Cell, derive: bool) -> None:
     settings = cell.settings
     for name, allowed in (("knowledge", ("model", "plant")), ("objective", ("nearest", "clf"))):
         if settings[name] not in allowed:
-            raise ConfigurationError(f"{name} = {shown(settings[name])}; {nearest(settings[name], allowed)}")
+            raise ConfigurationError(
+                f"{name} = {shown(settings[name])}; {nearest(settings[name], allowed)}"
+            )
     problem = load_problem(cell.env_id, cell.options)
     if settings["filter"] != BARE:
         require_readable(settings["filter"], problem)
-        rests_on_learned = any(part.split(":")[0] in LEARNED for part in settings["filter"].split("+"))
+        rests_on_learned = any(
+            part.split(":")[0] in LEARNED for part in settings["filter"].split("+")
+        )
         if derive and not rests_on_learned:
-            SafetyFilter.for_problem(problem, settings["filter"], settings["knowledge"], settings["objective"])
+            SafetyFilter.for_problem(
+                problem, settings["filter"], settings["knowledge"], settings["objective"]
+            )
     make_policy(settings["policy"], problem, cell.trust)

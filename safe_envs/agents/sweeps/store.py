@@ -1,4 +1,5 @@
-"""Results of a sweep on disk: a Parquet file for each cell, there whole or not at all, and the table of all of them."""
+"""Results of a sweep on disk: a Parquet file for each cell, there whole or not at all, and the
+table of all of them."""
 
 from __future__ import annotations
 
@@ -49,10 +50,12 @@ class Store:
 
     Args:
         folder: made if it is not there.
-        sweep: whose cells are kept in it. Those of another sweep in the same folder stay, and are read until one of this is there.
+        sweep: whose cells are kept in it. Those of another sweep in the same folder stay, and are
+            read until one of this is there.
 
     Attributes:
-        hidden: number of cells of another sweep, such as one with another grid or another version of the code.
+        hidden: number of cells of another sweep, such as one with another grid or another version
+            of the code.
 
     Raises:
         ConfigurationError: the folder cannot be made or written, or pyarrow is not installed.
@@ -64,15 +67,20 @@ class Store:
         try:
             (folder / _CELLS).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigurationError(f"{folder} cannot be made: {error.strerror}; give another folder") from error
+            raise ConfigurationError(
+                f"{folder} cannot be made: {error.strerror}; give another folder"
+            ) from error
         _remove_stale(folder)
         there = {key for key in self._cells if _file_of(folder, key).is_file()}
         self._finished = {key for key in there if _is_finished(_file_of(folder, key))}
         self._failed = there - self._finished
         self._index = {"cells": list(self._cells), "swept": list(sweep.swept)}
-        # The results of another sweep, as of another version of the code, can be read until there is one of this.
+        # The results of another sweep, as of another version of the code, can be read until there
+        # is one of this.
         before = _keys_before(folder)
-        self.hidden = sum(_file_of(folder, key).is_file() for key in before if key not in self._cells)
+        self.hidden = sum(
+            _file_of(folder, key).is_file() for key in before if key not in self._cells
+        )
         self._is_indexed = bool(there) or not before
         if self._is_indexed:
             self._write_index()
@@ -93,7 +101,11 @@ class Store:
         if not self._is_indexed:
             self._write_index()
         if outcome.error is None or not _is_finished(path):
-            self._write(lambda: write_atomically(path, lambda part: _write_table(part, self._cells[outcome.key], outcome)))
+            self._write(
+                lambda: write_atomically(
+                    path, lambda part: _write_table(part, self._cells[outcome.key], outcome)
+                )
+            )
             (self._finished if outcome.error is None else self._failed).add(outcome.key)
         else:
             self._finished.add(outcome.key)
@@ -108,20 +120,23 @@ class Store:
             write()
         except ConfigurationError as error:
             raise ConfigurationError(
-                f"{error}. {len(self._finished)} of {len(self._cells)} cells are finished and kept in {self._folder}; "
-                "start again then, and only the others are computed"
+                f"{error}. {len(self._finished)} of {len(self._cells)} cells are finished and kept"
+                f" in {self._folder}; start again then, and only the others are computed"
             ) from error
 
 
 def read(folder: Path | str) -> pa.Table:
     """The cells of a sweep that are there, in the order of its file.
 
-    Columns: `key`; each setting that is swept or that some cell has, null where another one leaves it to the env; counts and
-    statistics as in the rows of `safe_envs.agents.evaluation.evaluate.evaluate`; `error`, null for cells that did not fail; `seconds`, the only one that
-    depends on the machine; and as JSON the whole row, its configuration, the versions and the checksums of files.
+    Columns: `key`; each setting that is swept or that some cell has, null where another one leaves
+        it to the env; counts and
+    statistics as in the rows of `safe_envs.agents.evaluation.evaluate.evaluate`; `error`, null for
+    cells that did not fail; `seconds`, the only one that depends on the machine; and as JSON the
+    whole row, its configuration, the versions and the checksums of files.
 
     Raises:
-        ConfigurationError: the folder holds no sweep, a file in it cannot be read, or pyarrow is not installed.
+        ConfigurationError: the folder holds no sweep, a file in it cannot be read, or pyarrow is
+            not installed.
     """
     _require_pyarrow()
     import pyarrow as pa
@@ -136,16 +151,24 @@ def read(folder: Path | str) -> pa.Table:
         settings = [dict(json.loads(text)) for text in kept["settings"].to_pylist()]
     except (OSError, pa.ArrowException, KeyError, RecursionError, TypeError, ValueError) as error:
         raise ConfigurationError(
-            f"a file in {folder / _CELLS} cannot be read ({shortened(error)}); remove it and start the sweep again"
+            f"a file in {folder / _CELLS} cannot be read ({shortened(error)}); remove it and start"
+            " the sweep again"
         ) from error
     # A swept setting may be one of cells only that are not there yet.
     names = dict.fromkeys([*(name for each in settings for name in each), *index["swept"]])
-    columns = {"key": kept["key"], **{name: _column([each.get(name) for each in settings]) for name in names}}
-    return pa.table(columns | {name: kept[name] for name in kept.column_names if name not in ("key", "settings")})
+    columns = {
+        "key": kept["key"],
+        **{name: _column([each.get(name) for each in settings]) for name in names},
+    }
+    return pa.table(
+        columns
+        | {name: kept[name] for name in kept.column_names if name not in ("key", "settings")}
+    )
 
 
 def read_index(folder: Path) -> dict[str, Any]:
-    """Keys of all cells of a sweep in their order, under "cells", and names of the swept settings, under "swept".
+    """Keys of all cells of a sweep in their order, under "cells", and names of the swept settings,
+    under "swept".
 
     Raises:
         ConfigurationError: the folder holds no sweep.
@@ -154,11 +177,17 @@ def read_index(folder: Path) -> dict[str, Any]:
         index = json.loads(read_bytes(folder / INDEX, MOST_BYTES_OF_TEXT))
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigurationError(
-            f"{shortened(folder)} holds no sweep: it has no {INDEX}; give the folder of `safe-envs sweep ... --out`"
+            f"{shortened(folder)} holds no sweep: it has no {INDEX}; give the folder of `safe-envs"
+            " sweep ... --out`"
         ) from error
     texts = [index.get(name) if isinstance(index, dict) else None for name in ("cells", "swept")]
-    if not all(isinstance(each, list) and all(isinstance(text, str) for text in each) for each in texts):
-        raise ConfigurationError(f"{folder / INDEX} is not as `safe-envs sweep` writes it; run the sweep again, which writes it anew")
+    if not all(
+        isinstance(each, list) and all(isinstance(text, str) for text in each) for each in texts
+    ):
+        raise ConfigurationError(
+            f"{folder / INDEX} is not as `safe-envs sweep` writes it; run the sweep again, which"
+            " writes it anew"
+        )
     return index
 
 
@@ -170,7 +199,8 @@ def _keys_before(folder: Path) -> list[str]:
 
 
 def _remove_stale(folder: Path) -> None:
-    """Remove what was being written when a run was killed: nothing that is young, which another run may be writing."""
+    """Remove what was being written when a run was killed: nothing that is young, which another run
+    may be writing."""
     for path in (*folder.glob(f".{Path(INDEX).stem}.*"), *(folder / _CELLS).glob(".*.parquet")):
         with suppress(OSError):
             if time.time() - path.stat().st_mtime > _STALE:
@@ -179,7 +209,9 @@ def _remove_stale(folder: Path) -> None:
 
 def _require_pyarrow() -> None:
     if find_spec("pyarrow") is None:
-        raise ConfigurationError('pyarrow is not installed; install it with pip install "safe-envs[sweep]"')
+        raise ConfigurationError(
+            'pyarrow is not installed; install it with pip install "safe-envs[sweep]"'
+        )
 
 
 def _file_of(folder: Path, key: str) -> Path:
@@ -199,16 +231,25 @@ def _table_in(path: Path) -> pa.Table:
     """The row that the file of a cell holds.
 
     Raises:
-        OSError, ArrowException, ValueError: it cannot be read, or is not as `_write_table` writes it.
+        OSError, ArrowException, ValueError: it cannot be read, or is not as `_write_table` writes
+            it.
     """
     import pyarrow.parquet as pq
 
     with open_regular(path, MOST_BYTES_OF_TEXT) as stream:
         file = pq.ParquetFile(stream)
         told = file.metadata
-        parts = [told.row_group(i).column(j) for i in range(told.num_row_groups) for j in range(told.num_columns)]
-        # A few bytes under another compression, or in many rows, stand for more than the memory holds.
-        if told.num_rows != 1 or not {part.compression for part in parts} <= {"SNAPPY", "UNCOMPRESSED"}:
+        parts = [
+            told.row_group(i).column(j)
+            for i in range(told.num_row_groups)
+            for j in range(told.num_columns)
+        ]
+        # A few bytes under another compression, or in many rows, stand for more than the memory
+        # holds.
+        if told.num_rows != 1 or not {part.compression for part in parts} <= {
+            "SNAPPY",
+            "UNCOMPRESSED",
+        }:
             raise ValueError("it is no cell of a sweep")
         table = file.read()
     if table.schema != _schema():
@@ -219,8 +260,16 @@ def _table_in(path: Path) -> pa.Table:
 def _schema() -> pa.Schema:
     import pyarrow as pa
 
-    kinds = [("key", pa.string()), *((name, pa.int64()) for name in _COUNTS), *((name, pa.float64()) for name in _STATISTICS)]
-    kinds += [("error", pa.string()), ("seconds", pa.float64()), *((name, pa.string()) for name in _DOCUMENTS)]
+    kinds = [
+        ("key", pa.string()),
+        *((name, pa.int64()) for name in _COUNTS),
+        *((name, pa.float64()) for name in _STATISTICS),
+    ]
+    kinds += [
+        ("error", pa.string()),
+        ("seconds", pa.float64()),
+        *((name, pa.string()) for name in _DOCUMENTS),
+    ]
     return pa.schema(kinds)
 
 
@@ -229,10 +278,19 @@ def _write_table(path: Path, cell: Cell, outcome: Outcome) -> None:
     import pyarrow.parquet as pq
 
     row: Mapping[str, Any] = outcome.row or {}
-    documents = {"settings": cell.settings, "files": cell.files, "versions": cell.versions, "config": outcome.config, "row": outcome.row}
+    documents = {
+        "settings": cell.settings,
+        "files": cell.files,
+        "versions": cell.versions,
+        "config": outcome.config,
+        "row": outcome.row,
+    }
     columns = {"key": outcome.key, "error": outcome.error, "seconds": outcome.seconds}
     columns |= {name: row.get(name) for name in (*_COUNTS, *_STATISTICS)}
-    columns |= {name: None if document is None else json.dumps(document) for name, document in documents.items()}
+    columns |= {
+        name: None if document is None else json.dumps(document)
+        for name, document in documents.items()
+    }
     table = pa.Table.from_pylist([columns], schema=_schema())
     with path.open("wb") as file:
         pq.write_table(table, file)

@@ -38,19 +38,29 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     return getattr(stable_baselines3, name.upper())
 
 
-def new_model(name: str, envs: VecEnv, problem: SafetyProblem, settings: Mapping[str, Any], action: str | None, seed: int) -> BaseAlgorithm:
-    """Make an algorithm that has learned nothing yet; its `get_env()` is `envs`, normalised if the settings say so.
+def new_model(
+    name: str,
+    envs: VecEnv,
+    problem: SafetyProblem,
+    settings: Mapping[str, Any],
+    action: str | None,
+    seed: int,
+) -> BaseAlgorithm:
+    """Make an algorithm that has learned nothing yet; its `get_env()` is `envs`, normalised if the
+    settings say so.
 
     Args:
         name: see `algorithm_class`.
         envs: on which it learns.
         problem: of the envs.
         settings: hyperparameters of the algorithm, and `normalize`, `noise_type` and `noise_std`.
-        action: on which an off-policy algorithm learns behind a filter; None without a filter, or on-policy.
+        action: on which an off-policy algorithm learns behind a filter; None without a filter, or
+            on-policy.
         seed: of the algorithm.
 
     Raises:
-        ConfigurationError: the algorithm does not take these settings, or its policy cannot be saved as numbers.
+        ConfigurationError: the algorithm does not take these settings, or its policy cannot be
+            saved as numbers.
     """
     from safe_envs.agents.policies.sb3_actor import actor_of
 
@@ -59,7 +69,9 @@ def new_model(name: str, envs: VecEnv, problem: SafetyProblem, settings: Mapping
     _require_known(name, left)
     try:
         envs = _normalized(envs, left.pop("normalize", False), left.get("gamma", 0.99))
-        left |= _action_noise(left.pop("noise_type", None), left.pop("noise_std", None), problem.plant.m)
+        left |= _action_noise(
+            left.pop("noise_type", None), left.pop("noise_std", None), problem.plant.m
+        )
         if action is not None:
             left |= _replay(problem, action, left)
         if isinstance(left.get("train_freq"), list):
@@ -67,9 +79,18 @@ def new_model(name: str, envs: VecEnv, problem: SafetyProblem, settings: Mapping
         model: Any = algorithm_class(name)(env=envs, seed=seed, device="cpu", **left)
     except SafeEnvsError:
         raise
-    except (ArithmeticError, AssertionError, LookupError, RecursionError, SyntaxError, TypeError, ValueError) as error:
+    except (
+        ArithmeticError,
+        AssertionError,
+        LookupError,
+        RecursionError,
+        SyntaxError,
+        TypeError,
+        ValueError,
+    ) as error:
         raise ConfigurationError(
-            f"{name} does not take these hyperparameters: {str(error)[:SHOWN]}; they are {str(settings)[:SHOWN]}"
+            f"{name} does not take these hyperparameters: {str(error)[:SHOWN]}; they are"
+            f" {str(settings)[:SHOWN]}"
         ) from error
     # Better now than when the first checkpoint is written.
     actor_of(model.policy)
@@ -83,14 +104,21 @@ def _require_known(name: str, settings: Mapping[str, Any]) -> None:
     allowed += [*_OF_THE_ENV, *(_OF_THE_NOISE if name in OFF_POLICY else ())]
     for key, value in settings.items():
         if key not in allowed:
-            raise ConfigurationError(f"{name} does not take the hyperparameter {shown(key)}; {nearest(key, allowed)}")
+            raise ConfigurationError(
+                f"{name} does not take the hyperparameter {shown(key)}; {nearest(key, allowed)}"
+            )
         # Stable-Baselines3 would fail after the first rollout only.
-        if isinstance(value, str) and key in parameters and type(parameters[key].default) in (int, float):
+        if (
+            isinstance(value, str)
+            and key in parameters
+            and type(parameters[key].default) in (int, float)
+        ):
             raise ConfigurationError(f"{key} = {shown(value)}; give a number")
 
 
 def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:
-    """The size of the minibatches that a rollout is cut into: the given one, or the largest below it that leaves no rest.
+    """The size of the minibatches that a rollout is cut into: the given one, or the largest below
+    it that leaves no rest.
 
     Args:
         batch_size: wanted.
@@ -102,23 +130,28 @@ def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:
     """
     if isinstance(batch_size, bool) or not isinstance(batch_size, int) or batch_size < 2:
         raise ConfigurationError(f"batch_size = {batch_size!r}; give a whole number from 2")
-    fits = next((size for size in range(min(batch_size, rollout), 1, -1) if rollout % size == 0), rollout)
+    fits = next(
+        (size for size in range(min(batch_size, rollout), 1, -1) if rollout % size == 0), rollout
+    )
     if asked_for and fits != batch_size:
         raise ConfigurationError(
-            f"batch_size = {batch_size} does not divide the rollout of n_steps x num_envs = {rollout} steps; give {fits}"
+            f"batch_size = {batch_size} does not divide the rollout of n_steps x num_envs ="
+            f" {rollout} steps; give {fits}"
         )
     return fits
 
 
 def _normalized(envs: VecEnv, normalize: Any, gamma: float) -> VecEnv:
-    """The envs in a VecNormalize, as the Zoo's `normalize` says: a bool, a mapping, or the text of one."""
+    """The envs in a VecNormalize, as the Zoo's `normalize` says: a bool, a mapping, or the text of
+    one."""
     if isinstance(normalize, str):
         normalize = ast.literal_eval(normalize)
     if normalize is False or normalize is None:
         return envs
     if normalize is not True and not isinstance(normalize, Mapping):
         raise ConfigurationError(
-            f"normalize = {normalize!r}; give true, false, or a mapping such as {{norm_obs: true, norm_reward: false}}"
+            f"normalize = {normalize!r}; give true, false, or a mapping such as {{norm_obs: true,"
+            " norm_reward: false}"
         )
     from stable_baselines3.common.vec_env import VecNormalize
 
@@ -144,5 +177,10 @@ def _replay(problem: SafetyProblem, action: str, settings: dict[str, Any]) -> di
 
     given = [key for key in _OF_THE_BUFFER if key in settings]
     if given:
-        raise ConfigurationError(f"{', '.join(given)}: behind a filter the replay buffer is that of --action; leave it out")
-    return replay_options(problem, action, n_steps=settings.pop("n_steps", 1), gamma=settings.pop("gamma", 0.99))
+        raise ConfigurationError(
+            f"{', '.join(given)}: behind a filter the replay buffer is that of --action; leave"
+            " it out"
+        )
+    return replay_options(
+        problem, action, n_steps=settings.pop("n_steps", 1), gamma=settings.pop("gamma", 0.99)
+    )

@@ -1,4 +1,5 @@
-"""What happens while an agent is trained, for Stable-Baselines3's logger: safety of episodes, interventions, infeasible steps."""
+"""What happens while an agent is trained, for Stable-Baselines3's logger: safety of episodes,
+interventions, infeasible steps."""
 
 from __future__ import annotations
 
@@ -23,7 +24,8 @@ _LONGEST = 1_000_000
 
 
 class SafetyFigures(BaseCallback):
-    """Counts what the infos of a `SafeVecEnv` say, and records it under `safety/` whenever a rollout ends.
+    """Counts what the infos of a `SafeVecEnv` say, and records it under `safety/` whenever a
+    rollout ends.
 
     | key | meaning |
     |---|---|
@@ -47,10 +49,14 @@ class SafetyFigures(BaseCallback):
         counts["steps"] += len(batch["violation"])
         counts["violations"] += int(batch["violation"].sum())
         if "intervention" in batch:
-            counts["interventions"] = counts.get("interventions", 0) + int(batch["intervention"].sum())
+            counts["interventions"] = counts.get("interventions", 0) + int(
+                batch["intervention"].sum()
+            )
             counts["infeasible"] = counts.get("infeasible", 0) + int((~batch["feasible"]).sum())
         if done.size:
-            ended = zip(batch["episode_cost"][done].tolist(), batch["h_min"][done].tolist(), strict=True)
+            ended = zip(
+                batch["episode_cost"][done].tolist(), batch["h_min"][done].tolist(), strict=True
+            )
             counts["episodes"] = list(deque([*counts["episodes"], *map(list, ended)], _EPISODES))
         return True
 
@@ -66,8 +72,16 @@ class SafetyFigures(BaseCallback):
         """
         whole = [count for name, count in counts.items() if name != "episodes"]
         ended = [number for episode in counts["episodes"] for number in episode]
-        known = {"steps", "violations", "episodes"} <= set(counts) <= {*self.counts, "interventions", "infeasible"}
-        if not (known and all(type(n) is int and n >= 0 for n in whole) and len(ended) == 2 * len(counts["episodes"]) <= 2 * _EPISODES):
+        known = (
+            {"steps", "violations", "episodes"}
+            <= set(counts)
+            <= {*self.counts, "interventions", "infeasible"}
+        )
+        if not (
+            known
+            and all(type(n) is int and n >= 0 for n in whole)
+            and len(ended) == 2 * len(counts["episodes"]) <= 2 * _EPISODES
+        ):
             raise ValueError(f"the counts are {list(counts)}")
         if not all(type(number) in (int, float) and math.isfinite(number) for number in ended):
             raise ValueError("the last episodes are not numbers")
@@ -77,28 +91,44 @@ class SafetyFigures(BaseCallback):
         """The figures by name; those of episodes from the first one on that ended."""
         counts = self.counts
         found = {"violations": float(counts["violations"])}
-        found |= {name: counts[name] / counts["steps"] for name in ("interventions", "infeasible") if name in counts}
+        found |= {
+            name: counts[name] / counts["steps"]
+            for name in ("interventions", "infeasible")
+            if name in counts
+        }
         if counts["episodes"]:
             cost, h_min = np.array(counts["episodes"]).T
-            found |= {"rate": float(np.mean(cost == 0)), "episode_cost": float(cost.mean()), "h_min": float(h_min.mean())}
+            found |= {
+                "rate": float(np.mean(cost == 0)),
+                "episode_cost": float(cost.mean()),
+                "h_min": float(h_min.mean()),
+            }
         return found
 
 
 class ProgressLog(KVWriter):
-    """Everything that is logged, as a line of JSON for each dump, in a file that a resumed training goes on with.
+    """Everything that is logged, as a line of JSON for each dump, in a file that a resumed training
+    goes on with.
 
     Args:
         path: of the file.
-        until: lines of later steps are dropped: they were written after the checkpoint from which a training goes on.
+        until: lines of later steps are dropped: they were written after the checkpoint from which a
+            training goes on.
     """
 
     def __init__(self, path: Path, until: int) -> None:
         self._path = path
         write_atomically(path, lambda part: _copy(path, part, until))
 
-    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+    def write(
+        self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
+    ) -> None:
         """Append a line; numbers that are not finite are null."""
-        numbers = {key: _number(value) for key, value in sorted(key_values.items()) if isinstance(value, int | float | np.number)}
+        numbers = {
+            key: _number(value)
+            for key, value in sorted(key_values.items())
+            if isinstance(value, int | float | np.number)
+        }
         with writing(self._path), self._path.open("a") as stream:
             stream.write(json.dumps({"step": step, **numbers}, allow_nan=False) + "\n")
 
@@ -132,7 +162,9 @@ def _lines(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
             if len(text) == _LONGEST:
                 raise ValueError("a line is too long")
         except (LookupError, RecursionError, TypeError, ValueError) as error:
-            raise ConfigurationError(f"{path} cannot be read ({error}); it is damaged or altered: remove it") from error
+            raise ConfigurationError(
+                f"{path} cannot be read ({error}); it is damaged or altered: remove it"
+            ) from error
 
 
 def _number(value: Any) -> float | int | None:

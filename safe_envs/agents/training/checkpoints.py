@@ -1,7 +1,8 @@
-"""Checkpoints of a training: written whole or not at all, and all that it takes to go on as if nothing had happened.
+"""Checkpoints of a training: written whole or not at all, and all that it takes to go on as if
+nothing had happened.
 
-What a training goes on from is data: JSON, and arrays in safetensors. `model.zip` and `normalization.pkl` are for the users of
-Stable-Baselines3; they hold code, and are never read here.
+What a training goes on from is data: JSON, and arrays in safetensors. `model.zip` and
+`normalization.pkl` are for the users of Stable-Baselines3; they hold code, and are never read here.
 """
 
 from __future__ import annotations
@@ -41,7 +42,12 @@ from safe_envs.problem.problem import SafetyProblem
 if TYPE_CHECKING:
     from safe_envs.agents.training.callbacks import SafetyFigures
 
-_STATE, _LEARNER, _BUFFER, _ENVS = "state.json", "learner.safetensors", "replay_buffer.safetensors", "envs.safetensors"
+_STATE, _LEARNER, _BUFFER, _ENVS = (
+    "state.json",
+    "learner.safetensors",
+    "replay_buffer.safetensors",
+    "envs.safetensors",
+)
 _MODEL, _SCALES = "model.zip", "normalization.pkl"
 _OF_THE_POLICY = (_MODEL, _SCALES, TENSORS, DESCRIPTION)
 _CHECKPOINT = "checkpoint_"
@@ -54,10 +60,21 @@ _HEADER = 1_000_000
 """Bytes, at most, of what a file of arrays has besides them: their names, types and shapes."""
 
 _PER_PARAMETER = 8
-"""Numbers, at most, that the networks and optimizers of a learner have for one of a new learner, which has no optimizers' state yet."""
+"""Numbers, at most, that the networks and optimizers of a learner have for one of a new learner,
+which has no optimizers' state yet."""
 
 # What JSON, safetensors and those who read them raise on damaged files.
-_DAMAGED = (AttributeError, ArithmeticError, LookupError, OSError, RecursionError, RuntimeError, SafetensorError, TypeError, ValueError)
+_DAMAGED = (
+    AttributeError,
+    ArithmeticError,
+    LookupError,
+    OSError,
+    RecursionError,
+    RuntimeError,
+    SafetensorError,
+    TypeError,
+    ValueError,
+)
 
 
 def last_checkpoint(folder: Path) -> Path | None:
@@ -71,7 +88,9 @@ def remove_unfinished(folder: Path) -> None:
         shutil.rmtree(part, ignore_errors=True)
 
 
-def keep_checkpoint(folder: Path, model: Any, problem: SafetyProblem, figures: SafetyFigures, seconds: float) -> Path:
+def keep_checkpoint(
+    folder: Path, model: Any, problem: SafetyProblem, figures: SafetyFigures, seconds: float
+) -> Path:
     """Write a whole checkpoint beside the last one, and only then remove that.
 
     Args:
@@ -139,16 +158,28 @@ def restore_model(checkpoint: Path, model: Any, figures: SafetyFigures, n_timest
             raise ValueError(f"{_STATE} holds no names with values")
         if document.get("format") != _FORMAT:
             raise ConfigurationError(
-                f"{checkpoint} was written by another version, whose checkpoints this one does not read; "
-                "go on with the version that wrote it, or start the training again in another folder"
+                f"{checkpoint} was written by another version, whose checkpoints this one does not"
+                " read; go on with the version that wrote it, or start the training again in"
+                " another folder"
             )
         begin(model)
-        restore_learner(model, _arrays(checkpoint / _LEARNER, _PER_PARAMETER * _size(learner_arrays(model))), document["counters"])
+        restore_learner(
+            model,
+            _arrays(checkpoint / _LEARNER, _PER_PARAMETER * _size(learner_arrays(model))),
+            document["counters"],
+        )
         buffer = getattr(model, "replay_buffer", None)
         # A finished training has dropped its buffer.
-        if buffer is not None and (model.num_timesteps < n_timesteps or (checkpoint / _BUFFER).exists()):
+        if buffer is not None and (
+            model.num_timesteps < n_timesteps or (checkpoint / _BUFFER).exists()
+        ):
             most = sum(getattr(buffer, name).nbytes for name in buffer_arrays(buffer))
-            restore_buffer(buffer, _arrays(checkpoint / _BUFFER, most), document["buffer"]["pos"], document["buffer"]["full"])
+            restore_buffer(
+                buffer,
+                _arrays(checkpoint / _BUFFER, most),
+                document["buffer"]["pos"],
+                document["buffer"]["full"],
+            )
         figures.restore(document["counts"])
         if type(document["seconds"]) is not float or not 0.0 <= document["seconds"] < math.inf:
             raise ValueError(f"it took {document['seconds']!r} seconds")
@@ -156,9 +187,11 @@ def restore_model(checkpoint: Path, model: Any, figures: SafetyFigures, n_timest
 
 
 def resume_episodes(checkpoint: Path, model: Any, seed: int) -> None:
-    """Put the envs of a model where they were at its checkpoint, with the randomness of a seed from then on.
+    """Put the envs of a model where they were at its checkpoint, with the randomness of a seed from
+    then on.
 
-    A training that goes on does this at each of its checkpoints too, so that one which was interrupted does the same.
+    A training that goes on does this at each of its checkpoints too, so that one which was
+    interrupted does the same.
     """
     with _reading(checkpoint):
         envs = model.get_env()
@@ -174,7 +207,8 @@ def _reading(checkpoint: Path) -> Iterator[None]:
         raise
     except _DAMAGED as error:
         raise ConfigurationError(
-            f"the checkpoint {checkpoint} cannot be read ({type(error).__name__}: {error}); start the training anew in another folder"
+            f"the checkpoint {checkpoint} cannot be read ({type(error).__name__}: {error}); start"
+            " the training anew in another folder"
         ) from error
 
 
@@ -204,7 +238,9 @@ def copy_policy(checkpoint: Path, target: Path) -> None:
         target.mkdir(exist_ok=True)
     for name in _OF_THE_POLICY:
         if (checkpoint / name).exists():
-            write_atomically(target / name, lambda part, name=name: shutil.copyfile(checkpoint / name, part))
+            write_atomically(
+                target / name, lambda part, name=name: shutil.copyfile(checkpoint / name, part)
+            )
 
 
 def drop_replay_buffer(checkpoint: Path) -> None:

@@ -21,7 +21,8 @@ PARTS = 10
 
 @dataclass(frozen=True)
 class Training:
-    """What is trained, on what, and for how long. JSON-able; `Training.of` fills in what the hyperparameters say.
+    """What is trained, on what, and for how long. JSON-able; `Training.of` fills in what the
+    hyperparameters say.
 
     Attributes:
         env_id: full id.
@@ -33,11 +34,13 @@ class Training:
         num_envs: copies.
         hyperparameters: of the algorithm, by the Zoo's names.
         seed: of everything random.
-        action: on which an off-policy algorithm learns; see `safe_envs.agents.training.replay_buffer`.
+        action: on which an off-policy algorithm learns; see
+            `safe_envs.agents.training.replay_buffer`.
         intervention_penalty: see `safe_envs.agents.training.vec_env.make_sb3_env`.
         eval_freq: steps between evaluations, which are kept as checkpoints too.
         eval_episodes: of each evaluation.
-        threads: of torch and BLAS. Small networks are many times slower on several threads of a busy machine.
+        threads: of torch and BLAS. Small networks are many times slower on several threads of a
+            busy machine.
 
     Raises:
         ConfigurationError: a value is not allowed.
@@ -62,8 +65,17 @@ class Training:
         try:
             json.dumps(asdict(self), allow_nan=False)
         except (TypeError, ValueError) as error:
-            raise ConfigurationError(f"a training is kept as JSON: {error}; give numbers, texts, lists and mappings") from error
-        for name, least in (("n_timesteps", 1), ("num_envs", 1), ("seed", 0), ("eval_freq", 1), ("eval_episodes", 1), ("threads", 1)):
+            raise ConfigurationError(
+                f"a training is kept as JSON: {error}; give numbers, texts, lists and mappings"
+            ) from error
+        for name, least in (
+            ("n_timesteps", 1),
+            ("num_envs", 1),
+            ("seed", 0),
+            ("eval_freq", 1),
+            ("eval_episodes", 1),
+            ("threads", 1),
+        ):
             require_whole(name, getattr(self, name), least)
         if self.seed >= 2**32:
             raise ConfigurationError(f"seed = {self.seed}; torch takes whole numbers below 2^32")
@@ -71,12 +83,13 @@ class Training:
             raise ConfigurationError(f"action = {self.action!r}; {nearest(self.action, ACTIONS)}")
         if self.action != ACTIONS[0] and not self.learns_on_executed:
             raise ConfigurationError(
-                f"action = {self.action!r} is for SAC and TD3 behind a filter; leave it out: others learn on what they propose"
+                f"action = {self.action!r} is for SAC and TD3 behind a filter; leave it out: others"
+                " learn on what they propose"
             )
         if self.action == ACTIONS[0] and self.learns_on_executed and self.intervention_penalty:
             raise ConfigurationError(
-                "an intervention penalty is of the proposed action, and the executed one, on which is learned, has none; "
-                "give --action both or proposed too, or no penalty"
+                "an intervention penalty is of the proposed action, and the executed one, on which"
+                " is learned, has none; give --action both or proposed too, or no penalty"
             )
 
     @property
@@ -103,7 +116,8 @@ class Training:
         eval_episodes: int = 200,
         threads: int = 1,
     ) -> Training:
-        """A training with the hyperparameters of `agents/hyperparams`, as far as nothing else is given.
+        """A training with the hyperparameters of `agents/hyperparams`, as far as nothing else is
+        given.
 
         Args:
             env_id: registered id, with or without its namespace.
@@ -127,12 +141,17 @@ class Training:
         known, given = full_id(env_id), dict(settings or {})
         found = {**hyperparameters(algorithm, known), **given}
         steps, copies = found.pop("n_timesteps"), found.pop("n_envs")
-        steps, copies = (default if chosen is None else chosen for chosen, default in ((n_timesteps, steps), (num_envs, copies)))
+        steps, copies = (
+            default if chosen is None else chosen
+            for chosen, default in ((n_timesteps, steps), (num_envs, copies))
+        )
         require_whole("n_timesteps", steps, 1)
         require_whole("num_envs", copies, 1)
         if algorithm == "ppo":
             require_whole("n_steps", found["n_steps"], 1)
-            found["batch_size"] = whole_batches(found["batch_size"], found["n_steps"] * copies, "batch_size" in given)
+            found["batch_size"] = whole_batches(
+                found["batch_size"], found["n_steps"] * copies, "batch_size" in given
+            )
         if algorithm in OFF_POLICY:
             # The whole training, where Stable-Baselines3 would set aside a million rows.
             found.setdefault("buffer_size", min(_MOST_ROWS, steps * (2 if action == "both" else 1)))

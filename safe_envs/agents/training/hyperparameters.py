@@ -1,4 +1,5 @@
-"""Hyperparameters of Stable-Baselines3's algorithms for each env, in the RL Zoo's format and by its names."""
+"""Hyperparameters of Stable-Baselines3's algorithms for each env, in the RL Zoo's format and by its
+names."""
 
 from __future__ import annotations
 
@@ -29,13 +30,19 @@ def hyperparameters(algorithm: str, env_id: str) -> dict[str, Any]:
 
     if algorithm not in ALGORITHMS:
         raise ConfigurationError(f"--algo {shortened(algorithm)}: {nearest(algorithm, ALGORITHMS)}")
-    table = yaml.safe_load(files("safe_envs.agents.training").joinpath("hyperparams", f"{algorithm}.yml").read_text())
+    table = yaml.safe_load(
+        files("safe_envs.agents.training").joinpath("hyperparams", f"{algorithm}.yml").read_text()
+    )
     return dict(table.get(env_id, table["default"]))
 
 
 def scheduled(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings with the Zoo's texts such as lin_3e-4 as functions of the part of the training that is left."""
-    return {k: _linear(k, v) if k in _SCHEDULED and isinstance(v, str) else v for k, v in settings.items()}
+    """The settings with the Zoo's texts such as lin_3e-4 as functions of the part of the training
+    that is left."""
+    return {
+        k: _linear(k, v) if k in _SCHEDULED and isinstance(v, str) else v
+        for k, v in settings.items()
+    }
 
 
 def _linear(name: str, text: str) -> Callable[[float], float]:
@@ -44,6 +51,8 @@ def _linear(name: str, text: str) -> Callable[[float], float]:
             raise ValueError
         first = real(text.removeprefix(_LINEAR))
     except ValueError as error:
-        raise ConfigurationError(f"{name} = {shown(text)}; give a number, or {_LINEAR}NUMBER for one that falls to 0") from error
+        raise ConfigurationError(
+            f"{name} = {shown(text)}; give a number, or {_LINEAR}NUMBER for one that falls to 0"
+        ) from error
     # Whole rollouts may lead beyond the end of the training, where less than nothing is left.
     return lambda left: max(left, 0.0) * first

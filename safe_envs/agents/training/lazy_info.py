@@ -14,11 +14,13 @@ _get = dict.get
 class LazyInfo(dict[str, Any]):
     """A dict like the scalar env's info, whose entries are made when they are first read.
 
-    Reading a key makes its entry, with the type that the scalar env reports; whatever looks at all keys (iteration,
-    `items`, `==`, ...) makes all. A `copy()` stays lazy and keeps `batch` and `index`; a pickle or a deep copy is a
-    plain dict of this env's entries. Two are equal if their entries are, and arrays if all their elements are.
+    Reading a key makes its entry, with the type that the scalar env reports; whatever looks at all
+    keys (iteration, `items`, `==`, ...) makes all. A `copy()` stays lazy and keeps `batch` and
+    `index`; a pickle or a deep copy is a plain dict of this env's entries. Two are equal if their
+    entries are, and arrays if all their elements are.
 
-    Give `json.dumps` a `dict(info)`: its C code takes an info of which no array was read yet for empty, and writes "{}".
+    Give `json.dumps` a `dict(info)`: its C code takes an info of which no array was read yet for
+    empty, and writes "{}".
 
     Attributes:
         batch: arrays by key, with the batch in front; the infos of a step share them, so read only.
@@ -52,7 +54,8 @@ class LazyInfo(dict[str, Any]):
 
     def copy(self) -> LazyInfo:
         """Return an info with the same entries, as lazy as this one."""
-        # VecMonitor copies the info of each env that is done: a callback should find `batch` there as well.
+        # VecMonitor copies the info of each env that is done: a callback should find `batch` there
+        # as well.
         twin = LazyInfo(self.batch, self.index)
         twin._left = self._left
         # What is made already and no more, unlike `twin.update(self)`.
@@ -68,7 +71,9 @@ class LazyInfo(dict[str, Any]):
         if not isinstance(other, dict):
             return NotImplemented
         mine, theirs = dict(self), dict(other)
-        return mine.keys() == theirs.keys() and all(_same(value, theirs[key]) for key, value in mine.items())
+        return mine.keys() == theirs.keys() and all(
+            _same(value, theirs[key]) for key, value in mine.items()
+        )
 
     def __ne__(self, other: object) -> bool:
         equal = self == other
@@ -83,7 +88,11 @@ class LazyInfo(dict[str, Any]):
 
 
 def _same(a: Any, b: Any) -> bool:
-    return np.array_equal(a, b) if isinstance(a, np.ndarray) or isinstance(b, np.ndarray) else a is b or a == b
+    return (
+        np.array_equal(a, b)
+        if isinstance(a, np.ndarray) or isinstance(b, np.ndarray)
+        else a is b or a == b
+    )
 
 
 def _after_making_all(name: str) -> Callable[..., Any]:
@@ -98,6 +107,14 @@ def _after_making_all(name: str) -> Callable[..., Any]:
 
 
 _OF_ALL_KEYS = ("keys", "values", "items", "pop", "popitem", "setdefault", "clear")
-_OF_ALL_KEYS += ("__iter__", "__reversed__", "__len__", "__or__", "__ror__", "__repr__", "__delitem__")
+_OF_ALL_KEYS += (
+    "__iter__",
+    "__reversed__",
+    "__len__",
+    "__or__",
+    "__ror__",
+    "__repr__",
+    "__delitem__",
+)
 for _name in _OF_ALL_KEYS:
     setattr(LazyInfo, _name, _after_making_all(_name))

@@ -1,7 +1,9 @@
-"""The state of a learner of Stable-Baselines3 as arrays, without pickle: reading it back runs no code.
+"""The state of a learner of Stable-Baselines3 as arrays, without pickle: reading it back runs no
+code.
 
-A restored learner is built from the hyperparameters of its training first, as a new one is. So a checkpoint holds only what training
-changes, and its arrays must have the names, shapes and types of those of the new learner.
+A restored learner is built from the hyperparameters of its training first, as a new one is. So a
+checkpoint holds only what training changes, and its arrays must have the names, shapes and types of
+those of the new learner.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ _OBSERVED = ("_last_obs", "_last_original_obs", "_last_episode_starts")
 _COUNTERS = ("num_timesteps", "_n_updates", "_episode_num")
 _ROWS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 _EPISODES = {"r": np.float32, "l": np.int32}
-"""Entries of the last episodes that a VecMonitor reports, which the logged means are taken of in these types."""
+"""Entries of the last episodes that a VecMonitor reports, which the logged means are taken of in
+these types."""
 
 
 def counters(model: Any) -> dict[str, int]:
@@ -31,7 +34,8 @@ def counters(model: Any) -> dict[str, int]:
 
 
 def begin(model: Any) -> None:
-    """Reset the envs of a new model, so that it has all arrays that one in training has but for those of its optimizers."""
+    """Reset the envs of a new model, so that it has all arrays that one in training has but for
+    those of its optimizers."""
     envs, scales = model.get_env(), model.get_vec_normalize_env()
     model._last_obs = envs.reset()
     model._last_episode_starts = np.ones(envs.num_envs, dtype=bool)
@@ -47,20 +51,32 @@ def learner_arrays(model: Any) -> Arrays:
     Args:
         model: between two rollouts, or after `begin`.
     """
-    found = {f"{name}/{key}": tensor for name, state in _networks(model) for key, tensor in state.items()}
+    found = {
+        f"{name}/{key}": tensor for name, state in _networks(model) for key, tensor in state.items()
+    }
     found |= {name: getattr(model, name) for name in _variables(model)}
     for name, optimizer in _optimizers(model):
         for i, entries in optimizer.state_dict()["state"].items():
             found |= {f"{name}/{i}/{key}": tensor for key, tensor in entries.items()}
     arrays = {name: tensor.detach().cpu().numpy() for name, tensor in found.items()}
-    arrays |= {name: getattr(model, name) for name in _OBSERVED if getattr(model, name, None) is not None}
+    arrays |= {
+        name: getattr(model, name) for name in _OBSERVED if getattr(model, name, None) is not None
+    }
     for layer, moments in _moments(model.get_vec_normalize_env()):
-        arrays |= {f"{layer}/{key}": np.asarray(getattr(moments, key), dtype=float) for key in ("mean", "var", "count")}
+        arrays |= {
+            f"{layer}/{key}": np.asarray(getattr(moments, key), dtype=float)
+            for key in ("mean", "var", "count")
+        }
     episodes = model.ep_info_buffer or ()
-    return arrays | {f"episodes/{key}": np.array([e[key] for e in episodes], dtype=kind) for key, kind in _EPISODES.items()}
+    return arrays | {
+        f"episodes/{key}": np.array([e[key] for e in episodes], dtype=kind)
+        for key, kind in _EPISODES.items()
+    }
 
 
-def restore_learner(model: Any, arrays: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> None:
+def restore_learner(
+    model: Any, arrays: Mapping[str, np.ndarray], counts: Mapping[str, int]
+) -> None:
     """Give a new model what `learner_arrays` and `counters` returned of another one.
 
     Args:
@@ -72,7 +88,9 @@ def restore_learner(model: Any, arrays: Mapping[str, np.ndarray], counts: Mappin
         ValueError: they are not those of such a model.
     """
     _require_whole(model, arrays)
-    if set(counts) != set(counters(model)) or any(type(count) is not int or count < 0 for count in counts.values()):
+    if set(counts) != set(counters(model)) or any(
+        type(count) is not int or count < 0 for count in counts.values()
+    ):
         raise ValueError(f"the counters are {dict(counts)}")
     for name, value in counts.items():
         setattr(model, name, value)
@@ -86,20 +104,25 @@ def restore_learner(model: Any, arrays: Mapping[str, np.ndarray], counts: Mappin
         moments.mean, moments.var = (arrays[f"{layer}/{key}"].copy()[()] for key in ("mean", "var"))
         moments.count = arrays[f"{layer}/count"].item()
     rows = zip(*(arrays[f"episodes/{key}"] for key in _EPISODES), strict=True)
-    model.ep_info_buffer = deque([dict(zip(_EPISODES, row, strict=True)) for row in rows], model._stats_window_size)
+    model.ep_info_buffer = deque(
+        [dict(zip(_EPISODES, row, strict=True)) for row in rows], model._stats_window_size
+    )
     model.ep_success_buffer = deque(maxlen=model._stats_window_size)
 
 
 def buffer_arrays(buffer: ReplayBuffer) -> Arrays:
     """Return the rows of a replay buffer that are filled, as views.
 
-    A buffer that saves memory has the last next observation in the row after them, where the next step's observation replaces it.
+    A buffer that saves memory has the last next observation in the row after them, where the next
+    step's observation replaces it.
     """
     rows = buffer.buffer_size if buffer.full else buffer.pos
     return {name: getattr(buffer, name)[:rows] for name in _ROWS if hasattr(buffer, name)}
 
 
-def restore_buffer(buffer: ReplayBuffer, arrays: Mapping[str, np.ndarray], pos: Any, full: Any) -> None:
+def restore_buffer(
+    buffer: ReplayBuffer, arrays: Mapping[str, np.ndarray], pos: Any, full: Any
+) -> None:
     """Fill a new replay buffer with what `buffer_arrays` returned of one with the same arguments.
 
     Args:
@@ -112,7 +135,9 @@ def restore_buffer(buffer: ReplayBuffer, arrays: Mapping[str, np.ndarray], pos: 
         ValueError: they are not those of such a buffer.
     """
     if type(pos) is not int or type(full) is not bool or not 0 <= pos < buffer.buffer_size:
-        raise ValueError(f"the replay buffer of {buffer.buffer_size} rows is at row {pos!r}, full: {full!r}")
+        raise ValueError(
+            f"the replay buffer of {buffer.buffer_size} rows is at row {pos!r}, full: {full!r}"
+        )
     buffer.pos, buffer.full = pos, full
     _require_alike(arrays, buffer_arrays(buffer))
     for name, rows in buffer_arrays(buffer).items():
@@ -120,7 +145,8 @@ def restore_buffer(buffer: ReplayBuffer, arrays: Mapping[str, np.ndarray], pos: 
 
 
 def env_arrays(envs: VecEnv) -> Arrays:
-    """Return where the episodes of a `SafeVecEnv` and of the VecMonitor and VecNormalize over it stand, as arrays by name."""
+    """Return where the episodes of a `SafeVecEnv` and of the VecMonitor and VecNormalize over it
+    stand, as arrays by name."""
     found = dict(envs.unwrapped.snapshot())  # pyright: ignore[reportAttributeAccessIssue]
     return found | {f"{name}_of_layers": getattr(layer, name) for layer, name in _sums(envs)}
 
@@ -145,7 +171,11 @@ def restore_envs(envs: VecEnv, arrays: Mapping[str, np.ndarray], seed: int) -> N
 def _require_whole(model: Any, arrays: Mapping[str, np.ndarray]) -> None:
     """Raise ValueError unless arrays are those of a model in training."""
     of_optimizers = _shapes_by_parameter(model)
-    begun = {name: array for name, array in learner_arrays(model).items() if not name.startswith("episodes/")}
+    begun = {
+        name: array
+        for name, array in learner_arrays(model).items()
+        if not name.startswith("episodes/")
+    }
     extra = {name: array for name, array in arrays.items() if name not in begun}
     _require_alike({name: array for name, array in arrays.items() if name in begun}, begun)
     lengths = {extra.pop(f"episodes/{key}", np.empty(())).shape for key in _EPISODES}
@@ -172,14 +202,17 @@ def _restore_tensors(model: Any, arrays: Mapping[str, np.ndarray]) -> None:
             if key.startswith(f"{name}/"):
                 i, entry = key.removeprefix(f"{name}/").split("/")
                 entries.setdefault(int(i), {})[entry] = torch.tensor(array)
-        # Learning rates follow from schedules before each update; all else in the groups from the hyperparameters.
+        # Learning rates follow from schedules before each update; all else in the groups from the
+        # hyperparameters.
         optimizer.load_state_dict({**optimizer.state_dict(), "state": entries})
 
 
 def _networks(model: Any) -> Iterator[tuple[str, dict[str, Any]]]:
     """The tensors of each network, by name, which share memory with it."""
     optimizers = dict(_optimizers(model))
-    yield from ((name, state) for name, state in model.get_parameters().items() if name not in optimizers)
+    yield from (
+        (name, state) for name, state in model.get_parameters().items() if name not in optimizers
+    )
 
 
 def _optimizers(model: Any) -> Iterator[tuple[str, Any]]:
@@ -198,10 +231,13 @@ def _variables(model: Any) -> list[str]:
 
 
 def _shapes_by_parameter(model: Any) -> dict[str, tuple[int, ...]]:
-    """The shape of each parameter by NAME/NUMBER, under which an optimizer keeps what belongs to it."""
+    """The shape of each parameter by NAME/NUMBER, under which an optimizer keeps what belongs to
+    it."""
     found: dict[str, tuple[int, ...]] = {}
     for name, optimizer in _optimizers(model):
-        parameters = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+        parameters = [
+            parameter for group in optimizer.param_groups for parameter in group["params"]
+        ]
         found |= {f"{name}/{i}": tuple(parameter.shape) for i, parameter in enumerate(parameters)}
     return found
 
@@ -209,7 +245,11 @@ def _shapes_by_parameter(model: Any) -> dict[str, tuple[int, ...]]:
 def _moments(scales: Any) -> Iterator[tuple[str, Any]]:
     """The running means of a VecNormalize, by name."""
     if scales is not None:
-        yield from ((name, getattr(scales, name)) for name in ("obs_rms", "ret_rms") if hasattr(scales, name))
+        yield from (
+            (name, getattr(scales, name))
+            for name in ("obs_rms", "ret_rms")
+            if hasattr(scales, name)
+        )
 
 
 def _sums(envs: VecEnv) -> list[tuple[Any, str]]:
@@ -217,13 +257,18 @@ def _sums(envs: VecEnv) -> list[tuple[Any, str]]:
     from stable_baselines3.common.vec_env import VecMonitor, VecNormalize, unwrap_vec_wrapper
 
     monitor, scales = (unwrap_vec_wrapper(envs, layer) for layer in (VecMonitor, VecNormalize))
-    of_monitor = [] if monitor is None else [(monitor, "episode_returns"), (monitor, "episode_lengths")]
+    of_monitor = (
+        [] if monitor is None else [(monitor, "episode_returns"), (monitor, "episode_lengths")]
+    )
     return of_monitor + ([] if scales is None else [(scales, "returns")])
 
 
 def _require_alike(arrays: Mapping[str, np.ndarray], wanted: Mapping[str, np.ndarray]) -> None:
     """Raise ValueError unless arrays have the names, shapes and types of others."""
     for name in sorted({*arrays, *wanted}):
-        kinds = [None if name not in some else (some[name].shape, some[name].dtype) for some in (arrays, wanted)]
+        kinds = [
+            None if name not in some else (some[name].shape, some[name].dtype)
+            for some in (arrays, wanted)
+        ]
         if kinds[0] != kinds[1]:
             raise ValueError(f"{name} is {kinds[0]} in place of {kinds[1]}")

@@ -1,29 +1,38 @@
-"""Which action a learner behind a filter learns on: the executed one off-policy, the proposed one on-policy.
+"""Which action a learner behind a filter learns on: the executed one off-policy, the proposed one
+on-policy.
 
-A policy proposes a, a filter executes u(a). Stable-Baselines3 stores a: `_store_transition` knows of no other action.
+A policy proposes a, a filter executes u(a). Stable-Baselines3 stores a: `_store_transition` knows
+of no other action.
 
-Off-policy (SAC, TD3, DDPG) the default here is the executed action. Any (state, action, reward, next state) that the system
-produced is a sample for Q, whoever chose the action, and what produced the next state is u: so Q learns what was done.
-With the proposals Q is that of the filtered env instead, constant along all actions that the filter maps to one. With the
-executed actions alone Q is extrapolated at actions that the filter never lets through; "both" also fills those in,
+Off-policy (SAC, TD3, DDPG) the default here is the executed action. Any (state, action, reward,
+next state) that the system produced is a sample for Q, whoever chose the action, and what produced
+the next state is u: so Q learns what was done. With the proposals Q is that of the filtered env
+instead, constant along all actions that the filter maps to one. With the executed actions alone Q
+is extrapolated at actions that the filter never lets through; "both" also fills those in,
 consistently, as the filter passes its own answer on unchanged.
 
-A penalty on interventions (`SafeVecEnv`) is a function of the proposal: r - c |u - a| belongs to (s, a). Stored with u it would be
-noise, as the same u follows from many a. So the rewards go as with Krasowski et al.: the penalised r to (s, a), the env's own r to
-(s, u), which the buffers get by adding the infos' "intervention_penalty" back (up to the rounding of rewards to single precision),
-also in n-step returns. A penalty thus has no effect with "executed"; `Training` refuses that.
+A penalty on interventions (`SafeVecEnv`) is a function of the proposal: r - c |u - a| belongs to
+(s, a). Stored with u it would be noise, as the same u follows from many a. So the rewards go as
+with Krasowski et al.: the penalised r to (s, a), the env's own r to (s, u), which the buffers get
+by adding the infos' "intervention_penalty" back (up to the rounding of rewards to single
+precision), also in n-step returns. A penalty thus has no effect with "executed"; `Training` refuses
+that.
 
-On-policy (PPO, A2C) the proposal has to stay, and no buffer for it is offered. The loss weights a sample by
-pi_new(a | s) / pi_old(a | s) with the stored log-probability of the a that was sampled. With u in its place the ratio is not
-1 before the first update, and u has no density under pi that could be stored: all proposals beyond a barrier row are
-mapped onto it. The filter is part of the env there. Stable-Baselines3 treats its own clipping to the box in the same way:
+On-policy (PPO, A2C) the proposal has to stay, and no buffer for it is offered. The loss weights a
+sample by pi_new(a | s) / pi_old(a | s) with the stored log-probability of the a that was sampled.
+With u in its place the ratio is not 1 before the first update, and u has no density under pi that
+could be stored: all proposals beyond a barrier row are mapped onto it. The filter is part of the
+env there. Stable-Baselines3 treats its own clipping to the box in the same way:
 `OnPolicyAlgorithm.collect_rollouts` sends the clipped action to the env and stores the sampled one.
 
-Sources: Krasowski et al., "Provably Safe Reinforcement Learning: Conceptual Analysis, Survey, and Benchmarking", 2022,
-arXiv:2205.06750, on the learning tuples; Gros, Zanon, Bemporad, "Safe Reinforcement Learning via Projection on a Safe Set: How to
-Achieve Optimality?", 2020, arXiv:2004.00915, on what a projection does to Q-learning and to policy gradients; Markgraf et al.,
-"Safe Reinforcement Learning using Action Projection: Safeguard the Policy or the Environment?", 2025, arXiv:2509.12833, on actions
-that are mapped to one; Schulman et al., "Proximal Policy Optimization Algorithms", 2017, arXiv:1707.06347, on the ratio.
+Sources: Krasowski et al., "Provably Safe Reinforcement Learning: Conceptual Analysis, Survey, and
+    Benchmarking", 2022,
+arXiv:2205.06750, on the learning tuples; Gros, Zanon, Bemporad, "Safe Reinforcement Learning via
+Projection on a Safe Set: How to Achieve Optimality?", 2020, arXiv:2004.00915, on what a projection
+does to Q-learning and to policy gradients; Markgraf et al., "Safe Reinforcement Learning using
+Action Projection: Safeguard the Policy or the Environment?", 2025, arXiv:2509.12833, on actions
+that are mapped to one; Schulman et al., "Proximal Policy Optimization Algorithms", 2017,
+arXiv:1707.06347, on the ratio.
 """
 
 from __future__ import annotations
@@ -47,10 +56,12 @@ _ROUNDING = 1e-6
 class FilteredReplayBuffer(ReplayBuffer):
     """A replay buffer that stores what a filter executed.
 
-    It takes `info["safe_action"]`, which is physical, to [-1, 1] in double precision. An env that reports none has no filter: its
-    proposal is stored, as Stable-Baselines3 does. With "both" each step fills two rows, so that the buffer holds half as many steps;
-    also where the two actions are equal, as one row holds a step of all envs: so each step has the same weight for any number of envs.
-    A row of the executed action has the env's own reward, to which `info["intervention_penalty"]`, if there is one, is added back.
+    It takes `info["safe_action"]`, which is physical, to [-1, 1] in double precision. An env that
+    reports none has no filter: its proposal is stored, as Stable-Baselines3 does. With "both" each
+    step fills two rows, so that the buffer holds half as many steps; also where the two actions are
+    equal, as one row holds a step of all envs: so each step has the same weight for any number of
+    envs. A row of the executed action has the env's own reward, to which
+    `info["intervention_penalty"]`, if there is one, is added back.
 
     Args:
         args: those of `ReplayBuffer`.
@@ -59,21 +70,33 @@ class FilteredReplayBuffer(ReplayBuffer):
         kwargs: those of `ReplayBuffer`.
 
     Raises:
-        ConfigurationError: an argument is not allowed, or "both" is combined with `optimize_memory_usage`.
+        ConfigurationError: an argument is not allowed, or "both" is combined with
+            `optimize_memory_usage`.
     """
 
-    def __init__(self, *args: Any, box: Sequence[Sequence[float]], action: str = "executed", **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, box: Sequence[Sequence[float]], action: str = "executed", **kwargs: Any
+    ) -> None:
         if action not in ACTIONS:
             raise ConfigurationError(f"action = {action!r}; {nearest(str(action), ACTIONS)}")
         super().__init__(*args, **kwargs)
         if action == "both" and self.optimize_memory_usage:
             # There a row's next observation is the observation of the row after it, here the twin.
-            raise ConfigurationError("action = 'both' needs a next observation in each row; set optimize_memory_usage=False")
+            raise ConfigurationError(
+                "action = 'both' needs a next observation in each row; set"
+                " optimize_memory_usage=False"
+            )
         self.action = action
         self._center, self._half = _center_and_half_width(box, self.action_dim)
 
     def add(
-        self, obs: np.ndarray, next_obs: np.ndarray, action: np.ndarray, reward: np.ndarray, done: np.ndarray, infos: list[dict[str, Any]]
+        self,
+        obs: np.ndarray,
+        next_obs: np.ndarray,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
     ) -> None:
         """Store one step of every env.
 
@@ -89,12 +112,20 @@ class FilteredReplayBuffer(ReplayBuffer):
             ConfigurationError: an executed action is not in the box.
         """
         if self.action != "proposed":
-            super().add(obs, next_obs, self._executed(action, infos), _own_reward(reward, infos), done, infos)
+            super().add(
+                obs,
+                next_obs,
+                self._executed(action, infos),
+                _own_reward(reward, infos),
+                done,
+                infos,
+            )
         if self.action != "executed":
             super().add(obs, next_obs, action, reward, done, infos)
 
     def _executed(self, proposed: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
-        """The executed actions in [-1, 1], shape (n_envs, m); the proposals of envs without a filter."""
+        """The executed actions in [-1, 1], shape (n_envs, m); the proposals of envs without a
+        filter."""
         each = _of_each(infos, "safe_action")
         if isinstance(each, np.ndarray):
             return self._normalized(each)
@@ -111,22 +142,27 @@ class FilteredReplayBuffer(ReplayBuffer):
         if not (np.abs(actions - clipped) <= _ROUNDING).all():
             low, high = self._center - self._half, self._center + self._half
             raise ConfigurationError(
-                f"the executed actions {physical.tolist()} are not between {low.tolist()} and {high.tolist()}; "
-                "give the box of the env's problem, as replay_options(env) does"
+                f"the executed actions {physical.tolist()} are not between {low.tolist()} and"
+                f" {high.tolist()}; give the box of the env's problem, as replay_options(env) does"
             )
         return clipped
 
 
 class FilteredNStepReplayBuffer(FilteredReplayBuffer, NStepReplayBuffer):
-    """The same for n-step returns, with the arguments `n_steps` and `gamma`; the action is that of the first step.
+    """The same for n-step returns, with the arguments `n_steps` and `gamma`; the action is that of
+    the first step.
 
     Raises:
-        ConfigurationError: as above, or `action` is "both": consecutive rows have to be consecutive steps.
+        ConfigurationError: as above, or `action` is "both": consecutive rows have to be consecutive
+            steps.
     """
 
     def __init__(self, *args: Any, action: str = "executed", **kwargs: Any) -> None:
         if action == "both":
-            raise ConfigurationError("action = 'both' stores each step twice, which n-step returns would count twice; set n_steps=1")
+            raise ConfigurationError(
+                "action = 'both' stores each step twice, which n-step returns would count twice;"
+                " set n_steps=1"
+            )
         super().__init__(*args, action=action, **kwargs)
 
 
@@ -136,23 +172,31 @@ def replay_options(
     n_steps: int = 1,
     gamma: float = 0.99,
 ) -> dict[str, Any]:
-    """Arguments of SAC, TD3 and DDPG that make them learn on an action, as in `SAC("MlpPolicy", env, **replay_options(env))`.
+    """Arguments of SAC, TD3 and DDPG that make them learn on an action, as in `SAC("MlpPolicy",
+    env, **replay_options(env))`.
 
     Args:
         source: the problem, or an env of it with or without filter.
         action: "executed", "proposed" or "both".
-        n_steps: of the returns. It is not to be given to the algorithm, which ignores it beside a buffer class.
-        gamma: discount. With `n_steps` > 1 the buffer needs it too, and it is among the returned arguments.
+        n_steps: of the returns. It is not to be given to the algorithm, which ignores it beside a
+            buffer class.
+        gamma: discount. With `n_steps` > 1 the buffer needs it too, and it is among the returned
+            arguments.
 
     Raises:
-        ConfigurationError: the env is not one of this project, its parts differ in their boxes, or an argument is not allowed.
+        ConfigurationError: the env is not one of this project, its parts differ in their boxes, or
+            an argument is not allowed.
     """
     require_whole("n_steps", n_steps, 1)
     settings = {"box": _box_of(source), "action": action}
     if n_steps == 1:
         return {"replay_buffer_class": FilteredReplayBuffer, "replay_buffer_kwargs": settings}
     settings |= {"n_steps": n_steps, "gamma": gamma}
-    return {"replay_buffer_class": FilteredNStepReplayBuffer, "replay_buffer_kwargs": settings, "gamma": gamma}
+    return {
+        "replay_buffer_class": FilteredNStepReplayBuffer,
+        "replay_buffer_kwargs": settings,
+        "gamma": gamma,
+    }
 
 
 def _own_reward(reward: np.ndarray, infos: Sequence[Any]) -> np.ndarray:
@@ -164,24 +208,38 @@ def _own_reward(reward: np.ndarray, infos: Sequence[Any]) -> np.ndarray:
 
 
 def _of_each(infos: Sequence[Any], key: str) -> np.ndarray | list[Any]:
-    """An entry of every info: an array over the envs if they are views of one batch that has it; else a list, None where it is missing.
+    """An entry of every info: an array over the envs if they are views of one batch that has it;
+    else a list, None where it is missing.
 
     An info may have `batch`, a dict of arrays over the envs, and `index`, its row in them.
     """
     batch = getattr(infos[0], "batch", None)
-    if batch is None or key not in batch or any(getattr(info, "batch", None) is not batch for info in infos):
+    if (
+        batch is None
+        or key not in batch
+        or any(getattr(info, "batch", None) is not batch for info in infos)
+    ):
         return [info.get(key) for info in infos]
     return batch[key][[info.index for info in infos]]
 
 
-def _center_and_half_width(box: Sequence[Sequence[float]], inputs: int) -> tuple[np.ndarray, np.ndarray]:
+def _center_and_half_width(
+    box: Sequence[Sequence[float]], inputs: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Physical input = center + half width * action; both of shape (m,)."""
     try:
         pairs = np.array(box, dtype=np.float64)
     except (TypeError, ValueError):
         pairs = np.empty(0)
-    if pairs.shape != (inputs, 2) or not np.all(np.isfinite(pairs)) or np.any(pairs[:, 0] >= pairs[:, 1]):
-        raise ConfigurationError(f"box = {box!r}; give a finite (low, high) with low < high for each of the {inputs} inputs")
+    if (
+        pairs.shape != (inputs, 2)
+        or not np.all(np.isfinite(pairs))
+        or np.any(pairs[:, 0] >= pairs[:, 1])
+    ):
+        raise ConfigurationError(
+            f"box = {box!r}; give a finite (low, high) with low < high for each of the {inputs}"
+            " inputs"
+        )
     return 0.5 * (pairs[:, 0] + pairs[:, 1]), 0.5 * (pairs[:, 1] - pairs[:, 0])
 
 
@@ -189,10 +247,17 @@ def _box_of(source: Any) -> tuple[tuple[float, float], ...]:
     if isinstance(source, SafetyProblem):
         return source.box
     try:
-        problems = source.get_attr("problem") if isinstance(source, VecEnv) else [source.unwrapped.problem]
+        problems = (
+            source.get_attr("problem") if isinstance(source, VecEnv) else [source.unwrapped.problem]
+        )
         boxes = {problem.box for problem in problems}
     except AttributeError as error:
-        raise ConfigurationError(f"{source} is not one of this project's envs; give one, or a SafetyProblem") from error
+        raise ConfigurationError(
+            f"{source} is not one of this project's envs; give one, or a SafetyProblem"
+        ) from error
     if len(boxes) > 1:
-        raise ConfigurationError(f"the envs have different boxes {sorted(boxes)}; one learner needs one box for all of them")
+        raise ConfigurationError(
+            f"the envs have different boxes {sorted(boxes)}; one learner needs one box for all of"
+            " them"
+        )
     return boxes.pop()

@@ -1,7 +1,9 @@
-"""Training Stable-Baselines3's agents with a filter in the loop: in parts that can be gone on with, each of them evaluated.
+"""Training Stable-Baselines3's agents with a filter in the loop: in parts that can be gone on with,
+each of them evaluated.
 
-Each part begins with randomness of its own, which hangs on nothing but the seed and the number of steps until then; the episodes
-go on from one part to the next. So a training that was interrupted goes on after its last whole part exactly as it would have.
+Each part begins with randomness of its own, which hangs on nothing but the seed and the number of
+steps until then; the episodes go on from one part to the next. So a training that was interrupted
+goes on after its last whole part exactly as it would have.
 """
 
 from __future__ import annotations
@@ -40,46 +42,68 @@ from safe_envs.registry import load_problem
 _OF_EVALUATIONS = 2**32 - 1
 """Key of their seeds, which no number of steps is."""
 
-_CONFIG, _EVALUATIONS, _PROGRESS, _BEST, _LOCK = "config.json", "evaluations.json", "progress.jsonl", "best", ".lock"
+_CONFIG, _EVALUATIONS, _PROGRESS, _BEST, _LOCK = (
+    "config.json",
+    "evaluations.json",
+    "progress.jsonl",
+    "best",
+    ".lock",
+)
 
 _SHOWN = ("safety_rate", "ci_low", "ci_high", "return_mean")
 """Of an evaluation, what is logged and shown."""
 
 _MOST_TEXT = 30_000_000
-"""Bytes of a file of JSON, at most: an evaluation takes a thousand, and what is read may take 25 times as much memory."""
+"""Bytes of a file of JSON, at most: an evaluation takes a thousand, and what is read may take 25
+times as much memory."""
 
 Told = Callable[[float], None]
 """Told the part of the training that is done, from 0 to 1."""
 
 
-def train(training: Training, folder: Path, *, resume: bool = False, tensorboard: Path | None = None, tell: Told | None = None) -> float:
-    """Train an agent, and leave in a folder all that is needed to use it and to know how it came about.
+def train(
+    training: Training,
+    folder: Path,
+    *,
+    resume: bool = False,
+    tensorboard: Path | None = None,
+    tell: Told | None = None,
+) -> float:
+    """Train an agent, and leave in a folder all that is needed to use it and to know how it came
+    about.
 
-    The folder holds `config.json` with the versions, `progress.jsonl` with all that was logged, `evaluations.json`, the policy as
-    `policy.safetensors` with `policy.json` and as Stable-Baselines3's `model.zip` (beside it `normalization.pkl`, if observations
-    are normalised), in `best` those with the highest return in an evaluation, whatever their safety, and the last checkpoint.
-    Evaluations have episodes of their own, so that none of them is among those of `safe-envs evaluate`.
+    The folder holds `config.json` with the versions, `progress.jsonl` with all that was logged,
+    `evaluations.json`, the policy as `policy.safetensors` with `policy.json` and as
+    Stable-Baselines3's `model.zip` (beside it `normalization.pkl`, if observations are normalised),
+    in `best` those with the highest return in an evaluation, whatever their safety, and the last
+    checkpoint. Evaluations have episodes of their own, so that none of them is among those of
+    `safe-envs evaluate`.
 
     Args:
         training: what to do.
-        folder: a new one, or with `resume` that of an interrupted training. Nothing in it is run; Stable-Baselines3's files are not read.
+        folder: a new one, or with `resume` that of an interrupted training. Nothing in it is run;
+            Stable-Baselines3's files are not read.
         resume: go on after the last checkpoint.
-        tensorboard: folder of logs for tensorboard, in which this training gets one by the name of its own.
+        tensorboard: folder of logs for tensorboard, in which this training gets one by the name of
+            its own.
         tell: told how far the training is.
 
     Returns:
         The processor's seconds that the learning took, in all its runs, evaluations left out.
 
     Raises:
-        ConfigurationError: the folder holds something else, another training writes to it, or it cannot be written, as on a full disk;
-            or the training is not the one that is resumed.
+        ConfigurationError: the folder holds something else, another training writes to it, or it
+            cannot be written, as on a full disk; or the training is not the one that is resumed.
     """
     import torch
 
     torch.set_num_threads(training.threads)
     folder = Path(folder)
     if tensorboard is not None and find_spec("tensorboard") is None:
-        raise ConfigurationError("--tensorboard: tensorboard is not installed; install it with pip install safe-envs[tensorboard]")
+        raise ConfigurationError(
+            "--tensorboard: tensorboard is not installed; install it with pip install"
+            " safe-envs[tensorboard]"
+        )
     _require_folder(folder, training, resume)
     # Before a folder is made for it: its arguments may be refused.
     begun = None if resume else _Session(training, folder)
@@ -87,8 +111,14 @@ def train(training: Training, folder: Path, *, resume: bool = False, tensorboard
         try:
             wanted.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise ConfigurationError(f"the folder {shortened(wanted)} cannot be made: {error.strerror}; give another one") from error
-    with locked(folder / _LOCK, f"another training is writing to {folder} just now; wait until it has ended, or give another folder"):
+            raise ConfigurationError(
+                f"the folder {shortened(wanted)} cannot be made: {error.strerror}; give another one"
+            ) from error
+    with locked(
+        folder / _LOCK,
+        f"another training is writing to {folder} just now; wait until it has ended, or give"
+        " another folder",
+    ):
         # Another training may have begun in it since.
         _require_folder(folder, training, resume)
         session = begun or _Session(training, folder, resume=True)
@@ -113,33 +143,52 @@ def _require_folder(folder: Path, training: Training, resume: bool) -> None:
     """Raise ConfigurationError unless the folder is new, or that of the same training."""
     if not resume:
         # A training that did not reach its first checkpoint leaves nothing that could be lost.
-        if os.path.isdir(folder) and {path.name for path in folder.iterdir()} <= {_CONFIG, _EVALUATIONS, _PROGRESS, _LOCK}:
+        if os.path.isdir(folder) and {path.name for path in folder.iterdir()} <= {
+            _CONFIG,
+            _EVALUATIONS,
+            _PROGRESS,
+            _LOCK,
+        }:
             return
         if os.path.exists(folder):
             what = "is not empty" if os.path.isdir(folder) else "is a file"
-            raise ConfigurationError(f"--out {folder} {what}; give a new folder, or go on with the training in one by --resume")
+            raise ConfigurationError(
+                f"--out {folder} {what}; give a new folder, or go on with the training in one by"
+                " --resume"
+            )
         return
     path = folder / _CONFIG
     if not os.path.isfile(path):
-        raise ConfigurationError(f"--resume: {shortened(folder)} holds no training; start it without --resume")
+        raise ConfigurationError(
+            f"--resume: {shortened(folder)} holds no training; start it without --resume"
+        )
     try:
         known = _flat(_read(path)["training"])
     except (LookupError, OSError, RecursionError, TypeError, ValueError) as error:
         raise ConfigurationError(
-            f"--resume: {path} cannot be read ({error}); it is damaged or altered: start anew in another folder"
+            f"--resume: {path} cannot be read ({error}); it is damaged or altered: start anew in"
+            " another folder"
         ) from error
     wanted = _flat(json.loads(json.dumps(asdict(training))))
     # What another system changes besides, such as a default, comes after it.
-    for name in sorted({*known, *wanted}, key=lambda name: (name != "env_id", name != "system", name)):
+    for name in sorted(
+        {*known, *wanted}, key=lambda name: (name != "env_id", name != "system", name)
+    ):
         if known.get(name) != wanted.get(name):
             raise ConfigurationError(
-                f"--resume: the training in {folder} has {name} = {known.get(name)!r}, not {wanted.get(name)!r}; give the same arguments"
+                f"--resume: the training in {folder} has {name} = {known.get(name)!r}, not"
+                f" {wanted.get(name)!r}; give the same arguments"
             )
 
 
 def _flat(document: Mapping[str, Any]) -> dict[str, Any]:
     """A training's attributes, the hyperparameters and a system of one's own among them."""
-    return {**document, **document["hyperparameters"], "hyperparameters": None, "system": document["options"].get("system")}
+    return {
+        **document,
+        **document["hyperparameters"],
+        "hyperparameters": None,
+        "system": document["options"].get("system"),
+    }
 
 
 class _Session:
@@ -166,10 +215,14 @@ class _Session:
             )
         )
         action = training.action if training.learns_on_executed else None
-        self._model: Any = new_model(training.algorithm, envs, self._problem, training.hyperparameters, action, training.seed)
+        self._model: Any = new_model(
+            training.algorithm, envs, self._problem, training.hyperparameters, action, training.seed
+        )
         checkpoint = last_checkpoint(folder) if resume else None
         if checkpoint is not None:
-            self.seconds = restore_model(checkpoint, self._model, self._figures, training.n_timesteps)
+            self.seconds = restore_model(
+                checkpoint, self._model, self._figures, training.n_timesteps
+            )
         known = _read_evaluations(folder / _EVALUATIONS) if resume else []
         self._evaluations = [e for e in known if e["timesteps"] <= self._model.num_timesteps]
 
@@ -187,7 +240,9 @@ class _Session:
             of_run = TensorBoardOutputFormat(str(tensorboard / folder.resolve().name))
             of_run.writer.close()
             # What was logged after the checkpoint is logged anew.
-            of_run.writer = SummaryWriter(of_run.writer.log_dir, purge_step=done + 1 if done else None)
+            of_run.writer = SummaryWriter(
+                of_run.writer.log_dir, purge_step=done + 1 if done else None
+            )
             outputs.append(of_run)
         self._model.set_logger(Logger(str(folder), outputs))
 
@@ -195,7 +250,9 @@ class _Session:
         """Train part by part, from where the model is, and leave the finished policy."""
         training, model, folder = self._training, self._model, self._folder
         checkpoint = last_checkpoint(folder)
-        if checkpoint is not None and model.num_timesteps > max((e["timesteps"] for e in self._evaluations), default=0):
+        if checkpoint is not None and model.num_timesteps > max(
+            (e["timesteps"] for e in self._evaluations), default=0
+        ):
             self._evaluate(checkpoint)
         while model.num_timesteps < training.n_timesteps:
             end = (model.num_timesteps // training.eval_freq + 1) * training.eval_freq
@@ -226,7 +283,9 @@ class _Session:
 
         # Schedules are of the whole training, not of its part.
         of_part = model._update_current_progress_remaining
-        model._update_current_progress_remaining = lambda done, _: of_part(done, training.n_timesteps)
+        model._update_current_progress_remaining = lambda done, _: of_part(
+            done, training.n_timesteps
+        )
         began = time.process_time()
         try:
             model.learn(
@@ -235,12 +294,20 @@ class _Session:
                 log_interval=4 if training.algorithm in OFF_POLICY else 1,
                 reset_num_timesteps=False,
             )
-        except (ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        except (
+            ArithmeticError,
+            AssertionError,
+            LookupError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        ) as error:
             if isinstance(error, SafeEnvsError):
                 raise
             raise ConfigurationError(
-                f"the training failed after {model.num_timesteps} steps ({type(error).__name__}: {str(error)[:SHOWN]}): "
-                f"it diverged, or a hyperparameter is not allowed; they are {str(training.hyperparameters)[:SHOWN]}"
+                f"the training failed after {model.num_timesteps} steps ({type(error).__name__}:"
+                f" {str(error)[:SHOWN]}): it diverged, or a hyperparameter is not allowed; they are"
+                f" {str(training.hyperparameters)[:SHOWN]}"
             ) from error
         finally:
             del model._update_current_progress_remaining
@@ -249,7 +316,8 @@ class _Session:
         model.logger.dump(model.num_timesteps)
 
     def _evaluate(self, checkpoint: Path) -> None:
-        """Evaluate the checkpoint as `safe-envs evaluate` would, and keep it if its return is the best so far."""
+        """Evaluate the checkpoint as `safe-envs evaluate` would, and keep it if its return is the
+        best so far."""
         training, model = self._training, self._model
         seed = _child_seed(training.seed, _OF_EVALUATIONS)
         found = evaluate(
@@ -264,7 +332,14 @@ class _Session:
         )
         row = {k: v for k, v in found.rows[0].items() if k not in ("curve", "policy")}
         best = max((e["return_mean"] for e in self._evaluations), default=-np.inf)
-        self._evaluations.append({"timesteps": model.num_timesteps, "seed": seed, **row, "training": self._figures.figures()})
+        self._evaluations.append(
+            {
+                "timesteps": model.num_timesteps,
+                "seed": seed,
+                **row,
+                "training": self._figures.figures(),
+            }
+        )
         if row["return_mean"] > best:
             copy_policy(checkpoint, self._folder / _BEST)
         for key in _SHOWN:
@@ -284,12 +359,19 @@ def _read_evaluations(path: Path) -> list[dict[str, Any]]:
     try:
         rows = _read(path)
         for row in rows:
-            numbers = [row["timesteps"], *(row[name] for name in _SHOWN), row["training"]["violations"]]
-            if not all(type(number) in (int, float) and math.isfinite(number) for number in numbers):
+            numbers = [
+                row["timesteps"],
+                *(row[name] for name in _SHOWN),
+                row["training"]["violations"],
+            ]
+            if not all(
+                type(number) in (int, float) and math.isfinite(number) for number in numbers
+            ):
                 raise ValueError(f"its numbers are {numbers}")
     except (LookupError, OSError, RecursionError, TypeError, ValueError) as error:
         raise ConfigurationError(
-            f"--resume: {path} cannot be read ({error}); it is damaged or altered: start anew in another folder"
+            f"--resume: {path} cannot be read ({error}); it is damaged or altered: start anew in"
+            " another folder"
         ) from error
     return rows
 

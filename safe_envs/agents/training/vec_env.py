@@ -1,4 +1,5 @@
-"""The native vector env for Stable-Baselines3: its `VecEnv`, filtered or bare, without a loop over the envs.
+"""The native vector env for Stable-Baselines3: its `VecEnv`, filtered or bare, without a loop over
+the envs.
 
 This module imports Stable-Baselines3, and with it torch.
 """
@@ -29,7 +30,10 @@ from safe_envs.wrappers.conditions import Condition
 
 _TRUNCATED = "TimeLimit.truncated"
 _TAKEN_OFF = "intervention_penalty"
-_OF_ONE_ENV = {"observation_space": "single_observation_space", "action_space": "single_action_space"}
+_OF_ONE_ENV = {
+    "observation_space": "single_observation_space",
+    "action_space": "single_action_space",
+}
 _TUPLES_OF_ENVS = ("np_random", "np_random_seed")
 _OF_THE_BATCH = ("reset", "step", "step_physical", "close")
 
@@ -52,11 +56,13 @@ def make_sb3_env(
     Args:
         env_id: registered id, with or without its namespace.
         num_envs: size of the batch.
-        filter: a `Condition` for every barrier, one for each, or their text; None or "none" for the bare env.
+        filter: a `Condition` for every barrier, one for each, or their text; None or "none" for the
+            bare env.
         knowledge: what the filter knows; see `SafetyFilterWrapper`.
         objective: of the filter; see `SafetyFilterWrapper`.
         intervention_penalty: see `SafeVecEnv`.
-        seed: env i is seeded by seed + i at its first reset; an algorithm's own `seed` comes later and replaces it.
+        seed: env i is seeded by seed + i at its first reset; an algorithm's own `seed` comes later
+            and replaces it.
         **options: arguments of `gym.make`; those that are None are left out.
 
     Raises:
@@ -69,7 +75,13 @@ def make_sb3_env(
     given = {key: value for key, value in options.items() if value is not None}
     # This refuses ids of other projects, whose vector envs take other arguments.
     require_ours(env_id)
-    env = gym.make_vec(full_id(env_id), int(num_envs), "vector_entry_point", autoreset_mode=AutoresetMode.SAME_STEP.value, **given)
+    env = gym.make_vec(
+        full_id(env_id),
+        int(num_envs),
+        "vector_entry_point",
+        autoreset_mode=AutoresetMode.SAME_STEP.value,
+        **given,
+    )
     if filter is not None and filter != BARE:
         env = SafetyFilterVectorWrapper(env, filter, knowledge, objective)
     result = SafeVecEnv(env, intervention_penalty)
@@ -81,36 +93,45 @@ def make_sb3_env(
 class SafeVecEnv(VecEnv):
     """What DummyVecEnv does over the scalar envs, done by the native vector env.
 
-    The infos are `LazyInfo`s: their entries are made when they are read. The info of an env that is done shows the
-    last step of its episode, with "terminal_observation"; "TimeLimit.truncated" says whether only time ended it.
-    Options of `set_options` are used up by `reset` and change nothing, as with the scalar envs, which have none.
+    The infos are `LazyInfo`s: their entries are made when they are read. The info of an env that is
+    done shows the last step of its episode, with "terminal_observation"; "TimeLimit.truncated" says
+    whether only time ended it. Options of `set_options` are used up by `reset` and change nothing,
+    as with the scalar envs, which have none.
 
-    The algorithms learn on the action that the policy proposed, and on-policy ones have to: they see a filter only
-    through the transition, in which all proposals that it corrects to the same action look alike. So nothing draws
-    the policy away from proposals that need correction, unless a penalty does. What it takes off a reward is in the infos
-    as "intervention_penalty", float64 of shape (num_envs,) in `batch_info`; zeros at reset, and no such key if c is 0.
-    `safe_envs.agents.training.replay_buffer` stores executed actions with the reward before the penalty.
+    The algorithms learn on the action that the policy proposed, and on-policy ones have to: they
+    see a filter only through the transition, in which all proposals that it corrects to the same
+    action look alike. So nothing draws the policy away from proposals that need correction, unless
+    a penalty does. What it takes off a reward is in the infos as "intervention_penalty", float64 of
+    shape (num_envs,) in `batch_info`; zeros at reset, and no such key if c is 0.
+    `safe_envs.agents.training.replay_buffer` stores executed actions with the reward before the
+    penalty.
 
     Attributes:
         env: the native vector env, filtered or bare.
-        batch_info: arrays by key of the last step or reset, with the batch in front; envs that are done have those of
-            the last step of their episode.
+        batch_info: arrays by key of the last step or reset, with the batch in front; envs that are
+            done have those of the last step of their episode.
 
     Args:
         env: with same-step reset.
-        intervention_penalty: c >= 0; the reward is reduced by c |u_safe - u_nominal|, the Euclidean distance of
-            `info`'s actions in units of the half widths of the box.
+        intervention_penalty: c >= 0; the reward is reduced by c |u_safe - u_nominal|, the Euclidean
+            distance of `info`'s actions in units of the half widths of the box.
 
     Raises:
-        ConfigurationError: the env is another one, or resets otherwise; or the penalty is out of range, or is given
-            without a filter.
+        ConfigurationError: the env is another one, or resets otherwise; or the penalty is out of
+            range, or is given without a filter.
     """
 
     def __init__(self, env: gym.vector.VectorEnv, intervention_penalty: float = 0.0) -> None:
         if not isinstance(env, SafeVectorEnv | SafetyFilterVectorWrapper):
-            raise ConfigurationError(f"{env} is neither one of this project's vector envs nor a filter over one; use make_sb3_env")
+            raise ConfigurationError(
+                f"{env} is neither one of this project's vector envs nor a filter over one; use"
+                " make_sb3_env"
+            )
         if env.metadata["autoreset_mode"] != AutoresetMode.SAME_STEP:
-            raise ConfigurationError(f"{env} has autoreset_mode {env.metadata['autoreset_mode'].value!r}; make it with 'SameStep'")
+            raise ConfigurationError(
+                f"{env} has autoreset_mode {env.metadata['autoreset_mode'].value!r}; make it with"
+                " 'SameStep'"
+            )
         _require_penalty(intervention_penalty, isinstance(env, SafetyFilterVectorWrapper))
         self.env = env
         self.batch_info: Info = {}
@@ -119,7 +140,8 @@ class SafeVecEnv(VecEnv):
         self._half = np.array(center_and_half_width(self._native.problem)[1])
         self._actions = np.empty(0)
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)
-        # Stable-Baselines3 lists the modes that this very env can be shown in, Gymnasium those that it could be made with.
+        # Stable-Baselines3 lists the modes that this very env can be shown in, Gymnasium those that
+        # it could be made with.
         self.metadata = {**env.metadata, "render_modes": self.metadata["render_modes"]}
 
     def reset(self) -> np.ndarray:
@@ -140,11 +162,12 @@ class SafeVecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Hold the actions for one control period, and start a new episode in each env that is done.
+        """Hold the actions for one control period, and start a new episode in each env that is
+        done.
 
         Returns:
-            Observations, float32 (num_envs, n); rewards, float32 (num_envs,); dones, bool (num_envs,); a dict for
-            each env.
+            Observations, float32 (num_envs, n); rewards, float32 (num_envs,); dones, bool
+            (num_envs,); a dict for each env.
 
         Raises:
             InvalidInputError: the actions have another shape or are not finite.
@@ -158,7 +181,9 @@ class SafeVecEnv(VecEnv):
         batch[_TRUNCATED] = truncated & ~terminated
         self.batch_info = batch
         if self._penalty:
-            distance = np.linalg.norm((batch["safe_action"] - batch["nominal_action"]) / self._half, axis=1)
+            distance = np.linalg.norm(
+                (batch["safe_action"] - batch["nominal_action"]) / self._half, axis=1
+            )
             batch[_TAKEN_OFF] = self._penalty * distance
             reward = reward - batch[_TAKEN_OFF]
         infos = self._infos(batch)
@@ -184,7 +209,11 @@ class SafeVecEnv(VecEnv):
     def get_images(self) -> Sequence[np.ndarray | None]:
         """Return a picture of each env, None for each where the render mode is not "rgb_array"."""
         if self.render_mode != "rgb_array":
-            warnings.warn(f"render_mode = {self.render_mode!r}, so that there are no images; make the env with 'rgb_array'", stacklevel=2)
+            warnings.warn(
+                f"render_mode = {self.render_mode!r}, so that there are no images; make the env"
+                " with 'rgb_array'",
+                stacklevel=2,
+            )
             return [None] * self.num_envs
         pictures: Any = self.env.render()
         return list(pictures)
@@ -192,8 +221,9 @@ class SafeVecEnv(VecEnv):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the filter's wrapper or else of the native env, for each env.
 
-        Each env gets its row of an array with the batch in front, like `state`, or of each array in a tuple or list of
-        them, like `executed`, and its own spaces and generator; of anything else, all get the same object.
+        Each env gets its row of an array with the batch in front, like `state`, or of each array in
+        a tuple or list of them, like `executed`, and its own spaces and generator; of anything
+        else, all get the same object.
 
         Raises:
             AttributeError: neither has it.
@@ -208,17 +238,29 @@ class SafeVecEnv(VecEnv):
 
         Raises:
             AttributeError: it is a property that cannot be set.
-            ConfigurationError: some envs are left out, which share their attributes with the others.
+            ConfigurationError: some envs are left out, which share their attributes with the
+                others.
         """
         if set(self._get_indices(indices)) != set(range(self.num_envs)):
-            raise ConfigurationError(f"{attr_name!r} is shared by all {self.num_envs} envs; set it without indices, or make another VecEnv")
+            raise ConfigurationError(
+                f"{attr_name!r} is shared by all {self.num_envs} envs; set it without indices, or"
+                " make another VecEnv"
+            )
         holder = next((layer for layer in self._layers() if attr_name in vars(layer)), self._native)
         setattr(holder, attr_name, value)
 
-    def env_method(self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the filter's wrapper or else of the native env, once for the whole batch.
+    def env_method(
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
+    ) -> list[Any]:
+        """Call a method of the filter's wrapper or else of the native env, once for the whole
+        batch.
 
-        Its arguments have the batch in front, and its result is handed out as by `get_attr`; of `render`, each env gets its picture.
+        Its arguments have the batch in front, and its result is handed out as by `get_attr`; of
+        `render`, each env gets its picture.
 
         Raises:
             AttributeError: neither has it.
@@ -230,15 +272,21 @@ class SafeVecEnv(VecEnv):
         if method_name == "has_wrapper_attr":
             return [self.has_attr(*method_args) for _ in self._get_indices(indices)]
         if method_name in _OF_THE_BATCH:
-            raise ConfigurationError(f"env_method does not call {method_name!r}, which acts on all envs at once; call that of the VecEnv")
+            raise ConfigurationError(
+                f"env_method does not call {method_name!r}, which acts on all envs at once; call"
+                " that of the VecEnv"
+            )
         result = self._find(method_name)(*method_args, **method_kwargs)
         if method_name == "render" and result is not None:
             return [result[i] for i in self._get_indices(indices)]
         return self._for_each(result, indices)
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Say for each env whether it is in such a wrapper; `SafetyFilterWrapper` stands for that of vector envs as well."""
-        wanted = SafetyFilterVectorWrapper if wrapper_class is SafetyFilterWrapper else wrapper_class
+        """Say for each env whether it is in such a wrapper; `SafetyFilterWrapper` stands for that
+        of vector envs as well."""
+        wanted = (
+            SafetyFilterVectorWrapper if wrapper_class is SafetyFilterWrapper else wrapper_class
+        )
         wrapped = any(isinstance(layer, wanted) for layer in self._layers())
         return [wrapped for _ in self._get_indices(indices)]
 
@@ -284,7 +332,10 @@ def _require_penalty(penalty: Any, filtered: bool) -> None:
     if not isinstance(penalty, numbers.Real) or not 0.0 <= float(penalty) < math.inf:
         raise ConfigurationError(f"intervention_penalty = {penalty!r}; give a finite number from 0")
     if penalty and not filtered:
-        raise ConfigurationError(f"intervention_penalty = {penalty!r} without a filter, which alone intervenes; give a filter, or 0")
+        raise ConfigurationError(
+            f"intervention_penalty = {penalty!r} without a filter, which alone intervenes; give a"
+            " filter, or 0"
+        )
 
 
 def _arrays(info: Info) -> Info:

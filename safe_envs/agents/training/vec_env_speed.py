@@ -14,8 +14,15 @@ from safe_envs.registry import full_id
 from safe_envs.wrappers import SafetyFilterWrapper
 
 
-def speeds(env_id: str, num_envs: int = 64, filter: str | None = None, steps: int = 100, rounds: int = 6) -> dict[str, float]:  # noqa: A002
-    """Measure env steps per second of `SafeVecEnv` and of DummyVecEnv over the scalar envs, with what every algorithm reads of infos.
+def speeds(
+    env_id: str,
+    num_envs: int = 64,
+    filter: str | None = None,  # noqa: A002
+    steps: int = 100,
+    rounds: int = 6,
+) -> dict[str, float]:
+    """Measure env steps per second of `SafeVecEnv` and of DummyVecEnv over the scalar envs, with
+    what every algorithm reads of infos.
 
     Args:
         env_id: registered id.
@@ -34,11 +41,15 @@ def speeds(env_id: str, num_envs: int = 64, filter: str | None = None, steps: in
 
     venvs = (make_sb3_env(env_id, num_envs, filter), DummyVecEnv([scalar] * num_envs))
     inputs = len(venvs[0].get_attr("problem")[0].inputs)
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (steps, num_envs, inputs)).astype(np.float32)
+    actions = (
+        np.random.default_rng(0).uniform(-1.0, 1.0, (steps, num_envs, inputs)).astype(np.float32)
+    )
     best = dict.fromkeys((type(venv).__name__ for venv in venvs), 0.0)
     for _ in range(rounds):
         for venv in venvs:
-            best[type(venv).__name__] = max(best[type(venv).__name__], num_envs * steps / _seconds(venv, actions))
+            best[type(venv).__name__] = max(
+                best[type(venv).__name__], num_envs * steps / _seconds(venv, actions)
+            )
     return best
 
 

@@ -25,10 +25,13 @@ def make_scene(problem: SafetyProblem) -> Scene:
     """The scene that a problem names; by default its plane, or else a bar for each state.
 
     Raises:
-        ConfigurationError: there is no such scene, or it shows states that the problem does not have.
+        ConfigurationError: there is no such scene, or it shows states that the problem does not
+            have.
     """
     name = problem.scene or ("bars" if problem.plane is None else "plane")
     if name not in SCENES:
         raise ConfigurationError(f"{problem.name} has scene {name!r}; {nearest(name, SCENES)}")
     module, class_name = SCENES[name].split(":")
-    return getattr(importlib.import_module(f"safe_envs.rendering.scenes.{module}"), class_name)(problem)
+    return getattr(importlib.import_module(f"safe_envs.rendering.scenes.{module}"), class_name)(
+        problem
+    )

@@ -6,15 +6,34 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range, grown, ticks
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.safe_set import Barriers, tint
-from safe_envs.rendering.scenes.base import Scene, draw_point, draw_trail, draw_violation, warning_color
+from safe_envs.rendering.scenes.base import (
+    Scene,
+    draw_point,
+    draw_trail,
+    draw_violation,
+    warning_color,
+)
 from safe_envs.rendering.snapshot import EpisodeSnapshot
-from safe_envs.rendering.style import EDGE, GREY, INK, LINE, PANEL, SMALL, UNSAFE, VIOLATION, bound, label, number
+from safe_envs.rendering.style import (
+    EDGE,
+    GREY,
+    INK,
+    LINE,
+    PANEL,
+    SMALL,
+    UNSAFE,
+    VIOLATION,
+    bound,
+    label,
+    number,
+)
 
 _LEFT, _WIDTH, _TOP, _BOTTOM = 40, 520, 58, 532
 _MOST = 10
 _HIGHEST = 240.0
 _WITH_ENDS, _WITH_TRAIL = 60.0, 100.0
-"""Pixels from one state to the next from which there is room for the ends of its range, and for its trail."""
+"""Pixels from one state to the next from which there is room for the ends of its range, and for its
+trail."""
 
 
 class BarsScene(Scene):
@@ -34,18 +53,35 @@ class BarsScene(Scene):
         more = len(self.names) - len(self._ranges)
         rest = f" (and {more} more)" if more else ""
         below = "; below it, its trail" if self._pitch >= _WITH_TRAIL else ""
-        canvas.text(f"States{rest}: tinted where each is safe while the others stay{below}", (_LEFT, 18), INK, SMALL, bold=True)
+        canvas.text(
+            f"States{rest}: tinted where each is safe while the others stay{below}",
+            (_LEFT, 18),
+            INK,
+            SMALL,
+            bold=True,
+        )
         for i, usual in enumerate(self._ranges):
-            self._draw_bar(canvas, moment, i, round(_TOP + i * self._pitch), *grown(usual, moment.states[:, i]))
+            self._draw_bar(
+                canvas, moment, i, round(_TOP + i * self._pitch), *grown(usual, moment.states[:, i])
+            )
 
-    def _draw_bar(self, canvas: Canvas, moment: EpisodeSnapshot, i: int, top: int, low: float, high: float) -> None:
+    def _draw_bar(
+        self, canvas: Canvas, moment: EpisodeSnapshot, i: int, top: int, low: float, high: float
+    ) -> None:
         value = float(moment.state[i])
 
         def place(at: float) -> float:
             return _LEFT + _WIDTH * (min(max(at, low), high) - low) / (high - low)
 
         canvas.text(label(self.names[i], self.problem.states[i].unit), (_LEFT, top), INK, SMALL)
-        canvas.text(number(value, max(abs(low), abs(high))), (_LEFT + _WIDTH, top), INK, SMALL, bold=True, align=(1.0, 0.0))
+        canvas.text(
+            number(value, max(abs(low), abs(high))),
+            (_LEFT + _WIDTH, top),
+            INK,
+            SMALL,
+            bold=True,
+            align=(1.0, 0.0),
+        )
         bar = (_LEFT, top + 20, _WIDTH, 14)
         canvas.fill(bar, UNSAFE)
         for start, end in self._barriers.intervals(moment.state, i, low, high):
@@ -59,9 +95,24 @@ class BarsScene(Scene):
         draw_point(canvas, (place(value), top + 27), warning_color(moment))
         if self._pitch >= _WITH_ENDS:
             for end, side in ((low, 0.0), (high, 1.0)):
-                canvas.text(bound(end), (_LEFT + side * _WIDTH, top + 38), GREY, SMALL - 2, align=(side, 0.0))
+                canvas.text(
+                    bound(end),
+                    (_LEFT + side * _WIDTH, top + 38),
+                    GREY,
+                    SMALL - 2,
+                    align=(side, 0.0),
+                )
         if self._pitch >= _WITH_TRAIL:
-            self._draw_trail(canvas, moment, i, Axes((_LEFT, top + 56, _WIDTH, round(self._pitch) - 72), (low, high), self._times(moment)))
+            self._draw_trail(
+                canvas,
+                moment,
+                i,
+                Axes(
+                    (_LEFT, top + 56, _WIDTH, round(self._pitch) - 72),
+                    (low, high),
+                    self._times(moment),
+                ),
+            )
 
     def _times(self, moment: EpisodeSnapshot) -> Range:
         now = float(moment.times[-1])
@@ -76,4 +127,10 @@ class BarsScene(Scene):
         if moment.violated is not None:
             draw_violation(canvas, axes, (float(moment.violated[i]), moment.violated_at))
         canvas.frame((left - 1, top - 1, width + 2, height + 2), LINE)
-        canvas.text(f"{self.problem.horizon:g} s ago", (left + 4, top + height - 1), GREY, SMALL - 2, align=(0.0, 1.0))
+        canvas.text(
+            f"{self.problem.horizon:g} s ago",
+            (left + 4, top + height - 1),
+            GREY,
+            SMALL - 2,
+            align=(0.0, 1.0),
+        )

@@ -1,4 +1,5 @@
-"""What the scenes share: the states that they show, the part of the world that is seen, and the trail."""
+"""What the scenes share: the states that they show, the part of the world that is seen, and the
+trail."""
 
 from __future__ import annotations
 
@@ -14,7 +15,17 @@ from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.safe_set import Barriers, barriers_in
 from safe_envs.rendering.scenes.ranges import first_range
 from safe_envs.rendering.snapshot import EpisodeSnapshot
-from safe_envs.rendering.style import EXECUTED, INFEASIBLE, INK, INTERVENING, PAPER, SKY, VIOLATION, Color, mix
+from safe_envs.rendering.style import (
+    EXECUTED,
+    INFEASIBLE,
+    INK,
+    INTERVENING,
+    PAPER,
+    SKY,
+    VIOLATION,
+    Color,
+    mix,
+)
 
 _MOST_POINTS = 1000
 _AGES = 12
@@ -44,8 +55,8 @@ class Scene(ABC):
         """
         if name not in self.names:
             raise ConfigurationError(
-                f"the scene {self.problem.scene!r} shows a state {name!r}, and {self.problem.name} has {', '.join(self.names)}; "
-                "choose another scene"
+                f"the scene {self.problem.scene!r} shows a state {name!r}, and {self.problem.name}"
+                f" has {', '.join(self.names)}; choose another scene"
             )
         return self.names.index(name)
 
@@ -54,7 +65,8 @@ class Scene(ABC):
         return self.problem.states[self.index(name)].unit
 
     def range_of(self, i: int) -> Range:
-        """The workspace of a state; where that has no end, the range that is explored, or else one around the starts."""
+        """The workspace of a state; where that has no end, the range that is explored, or else one
+        around the starts."""
         state = self.problem.states[i]
         if math.isfinite(state.low) and math.isfinite(state.high):
             return state.low, state.high
@@ -64,14 +76,19 @@ class Scene(ABC):
             return first_range(self.problem, i)
 
     def window(self, i: int, j: int) -> tuple[Range, Range]:
-        """The part of a plane of two states to look at: around the safe set if that is bounded in it, else the workspace."""
+        """The part of a plane of two states to look at: around the safe set if that is bounded in
+        it, else the workspace."""
         shown = self.range_of(i), self.range_of(j)
         chosen = barriers_in(self.problem, (i, j))
         if not chosen:
             return shown
         x, y = (np.linspace(*r, 121) for r in shown)
-        components = [x[:, None] if k == i else y[None, :] if k == j else 0.0 for k in range(len(self.names))]
-        safe = np.broadcast_to((Barriers(self.problem, chosen)(components) >= 0.0).all(axis=0), (len(x), len(y)))
+        components = [
+            x[:, None] if k == i else y[None, :] if k == j else 0.0 for k in range(len(self.names))
+        ]
+        safe = np.broadcast_to(
+            (Barriers(self.problem, chosen)(components) >= 0.0).all(axis=0), (len(x), len(y))
+        )
         if not safe.any():
             return shown
         return _around(x[safe.any(axis=1)], shown[0]), _around(y[safe.any(axis=0)], shown[1])
@@ -88,7 +105,8 @@ def warning_color(moment: EpisodeSnapshot, usual: Color = EXECUTED) -> Color:
 
 
 def draw_trail(canvas: Canvas, axes: Axes, x: np.ndarray, y: np.ndarray, h: np.ndarray) -> None:
-    """Draw where the state was, the darker the later, and in the warning colour where it was not safe.
+    """Draw where the state was, the darker the later, and in the warning colour where it was not
+    safe.
 
     Args:
         canvas: to draw on.
@@ -102,7 +120,9 @@ def draw_trail(canvas: Canvas, axes: Axes, x: np.ndarray, y: np.ndarray, h: np.n
     canvas.within(axes.box)
     for age, part in enumerate(np.array_split(np.arange(len(places)), _AGES), start=1):
         if part.size:
-            canvas.path(places[part[0] : part[-1] + 2], mix(EXECUTED, mix(SKY, PAPER, 0.45), age / _AGES), 2)
+            canvas.path(
+                places[part[0] : part[-1] + 2], mix(EXECUTED, mix(SKY, PAPER, 0.45), age / _AGES), 2
+            )
     for run in runs(unsafe):
         canvas.path(places[run], VIOLATION, 3)
     canvas.within(None)

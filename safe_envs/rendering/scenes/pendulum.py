@@ -19,7 +19,8 @@ _PLANE: Box = (76, 244, 504, 242)
 
 
 class PendulumScene(Scene):
-    """The state theta is the angle from the upright, clockwise; the parameter l, if there is one, the length of the rod in m."""
+    """The state theta is the angle from the upright, clockwise; the parameter l, if there is one,
+    the length of the rod in m."""
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem)
@@ -27,7 +28,14 @@ class PendulumScene(Scene):
         self._reach = self.range_of(self._angle)
         self._barriers = Barriers(problem)
         self._plane = Plane(self, ("theta", "thetadot"), _PLANE)
-        self._length = next((float(value) for symbol, value in problem.plant.parameters.items() if symbol.name == "l"), None)
+        self._length = next(
+            (
+                float(value)
+                for symbol, value in problem.plant.parameters.items()
+                if symbol.name == "l"
+            ),
+            None,
+        )
 
     def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         """Draw the rod and the plane."""
@@ -54,7 +62,13 @@ class PendulumScene(Scene):
             for angle in (start, end):
                 if low < angle < high:
                     outer = at(angle, length + 22)
-                    canvas.text(number(angle), outer, EDGE, SMALL, align=(0.5 - 0.5 * math.copysign(1.0, angle), 0.5))
+                    canvas.text(
+                        number(angle),
+                        outer,
+                        EDGE,
+                        SMALL,
+                        align=(0.5 - 0.5 * math.copysign(1.0, angle), 0.5),
+                    )
         canvas.dashes(np.array([pivot, at(0.0, length + 10)]), GREY)
         base = pivot[1] + 12
         canvas.line((pivot[0] - 150, base), (pivot[0] + 150, base), INK, 2)
@@ -70,6 +84,12 @@ class PendulumScene(Scene):
         size = "" if self._length is None else f"l = {self._length:g} m"
         canvas.text(size, (left, top + height - 34), GREY, SMALL)
         canvas.text(f"θ = {number(theta, 1.0)} rad", (left, top - 8), INK, SMALL, bold=True)
-        canvas.text("safe at this speed", (left + width, top - 8), mix(EDGE, INK, 0.7), SMALL, align=(1.0, 0.0))
+        canvas.text(
+            "safe at this speed",
+            (left + width, top - 8),
+            mix(EDGE, INK, 0.7),
+            SMALL,
+            align=(1.0, 0.0),
+        )
         canvas.fill((left + width - 142, top - 6, 14, 12), tint(1))
         canvas.frame((left + width - 142, top - 6, 14, 12), EDGE)

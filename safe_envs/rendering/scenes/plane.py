@@ -10,7 +10,13 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range, grown
 from safe_envs.rendering.canvas import Box, Canvas
 from safe_envs.rendering.safe_set import LEVELS, Barriers, SafeSet, tint
-from safe_envs.rendering.scenes.base import Scene, draw_point, draw_trail, draw_violation, warning_color
+from safe_envs.rendering.scenes.base import (
+    Scene,
+    draw_point,
+    draw_trail,
+    draw_violation,
+    warning_color,
+)
 from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import label
 
@@ -18,13 +24,16 @@ BOX = (76, 20, 504, 466)
 """Of a plane that takes the whole scene."""
 
 _LONGEST = 4.0
-"""How many times longer than wide a plane may be to be drawn to scale: a longer one would be a line."""
+"""How many times longer than wide a plane may be to be drawn to scale: a longer one would be a
+line."""
 
 
 class Plane:
-    """The safe set, the trail and the state in a box of a scene, the other states held at their values now.
+    """The safe set, the trail and the state in a box of a scene, the other states held at their
+    values now.
 
-    What does not change is drawn once: all of it, unless a barrier depends on states that are not in the plane.
+    What does not change is drawn once: all of it, unless a barrier depends on states that are not
+    in the plane.
 
     Args:
         scene: that it is part of.
@@ -54,12 +63,16 @@ class Plane:
         self._shown = shown or scene.window(self.x, self.y)
         self._barriers = Barriers(problem, chosen)
         inside = {problem.plant.states[i] for i in (self.x, self.y) if i >= 0}
-        self._changes = any(problem.barriers[k].expression.free_symbols - inside for k in self._barriers.chosen)
+        self._changes = any(
+            problem.barriers[k].expression.free_symbols - inside for k in self._barriers.chosen
+        )
         self._views: dict[Axes, tuple[SafeSet | None, Canvas]] = {}
 
     def background(self, canvas: Canvas, moment: EpisodeSnapshot) -> Axes:
         """Draw the safe set and the axes, which grow where the trail leaves them."""
-        ranges = [grown(r, _values(moment, i)) for r, i in zip(self._shown, (self.x, self.y), strict=True)]
+        ranges = [
+            grown(r, _values(moment, i)) for r, i in zip(self._shown, (self.x, self.y), strict=True)
+        ]
         axes = Axes.equal(self._box, *ranges) if self._equal else Axes(self._box, *ranges)
         if axes not in self._views:
             self._views[axes] = self._view(axes, moment)
@@ -70,8 +83,12 @@ class Plane:
         return axes
 
     def _view(self, axes: Axes, moment: EpisodeSnapshot) -> tuple[SafeSet | None, Canvas]:
-        safe_set = SafeSet(self._barriers, axes, (self.x, self.y)) if len(self._barriers.chosen) else None
-        furniture = Canvas((axes.box[0] + axes.box[2] + 20, axes.box[1] + axes.box[3] + 42), clear=True)
+        safe_set = (
+            SafeSet(self._barriers, axes, (self.x, self.y)) if len(self._barriers.chosen) else None
+        )
+        furniture = Canvas(
+            (axes.box[0] + axes.box[2] + 20, axes.box[1] + axes.box[3] + 42), clear=True
+        )
         if safe_set is None:
             furniture.fill(axes.box, tint(LEVELS - 1))
         elif not self._changes:
@@ -107,14 +124,17 @@ def _values(moment: EpisodeSnapshot, i: int) -> np.ndarray:
 
 
 class PlaneScene(Scene):
-    """The plane of the problem, for the whole scene; to scale where the units of its axes are the same, and it is no long road."""
+    """The plane of the problem, for the whole scene; to scale where the units of its axes are the
+    same, and it is no long road."""
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem)
         names = problem.plane or (self.names[0], self.names[-1])
         shown = self.window(self.index(names[0]), self.index(names[1]))
         wide, tall = (high - low for low, high in shown)
-        alike = self.unit(names[0]) == self.unit(names[1]) and max(wide, tall) <= _LONGEST * min(wide, tall)
+        alike = self.unit(names[0]) == self.unit(names[1]) and max(wide, tall) <= _LONGEST * min(
+            wide, tall
+        )
         self._plane = Plane(self, names, BOX, equal=alike, shown=shown)
 
     def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:

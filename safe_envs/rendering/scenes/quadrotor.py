@@ -14,7 +14,20 @@ from safe_envs.rendering.scenes.base import Scene, warning_color
 from safe_envs.rendering.scenes.plane import BOX, Plane
 from safe_envs.rendering.scenes.time_series import StripScene, reference_of
 from safe_envs.rendering.snapshot import EpisodeSnapshot
-from safe_envs.rendering.style import EDGE, GOAL, GREEN, GREY, INK, PAPER, SMALL, UNSAFE, VIOLATION, Color, mix, number
+from safe_envs.rendering.style import (
+    EDGE,
+    GOAL,
+    GREEN,
+    GREY,
+    INK,
+    PAPER,
+    SMALL,
+    UNSAFE,
+    VIOLATION,
+    Color,
+    mix,
+    number,
+)
 
 _ARM = 30.0
 _ELEVATION = math.radians(14)
@@ -22,13 +35,21 @@ _DIAL = (512, 76, 48)
 
 
 def rotation(phi: float, theta: float, psi: float) -> np.ndarray:
-    """From body to world: yaw after pitch after roll, so that the last column is the direction of the thrust."""
+    """From body to world: yaw after pitch after roll, so that the last column is the direction of
+    the thrust."""
     (a, b), (c, d), (e, f) = ((math.cos(angle), math.sin(angle)) for angle in (phi, theta, psi))
-    return np.array([[c * e, d * e * b - f * a, d * e * a + f * b], [c * f, d * f * b + e * a, d * f * a - e * b], [-d, c * b, c * a]])
+    return np.array(
+        [
+            [c * e, d * e * b - f * a, d * e * a + f * b],
+            [c * f, d * f * b + e * a, d * f * a - e * b],
+            [-d, c * b, c * a],
+        ]
+    )
 
 
 def draw_craft(canvas: Canvas, at: tuple[float, float], attitude: np.ndarray, color: Color) -> None:
-    """Draw the symbol of a quadrotor, seen along y from a little above; its size is fixed in pixels."""
+    """Draw the symbol of a quadrotor, seen along y from a little above; its size is fixed in
+    pixels."""
 
     def seen(points: np.ndarray) -> np.ndarray:
         world = points @ attitude.T
@@ -59,9 +80,11 @@ class AltitudeScene(StripScene):
 
 
 class SideView(Scene):
-    """The plane of x and z to scale, with the quadrotor at its attitude, enlarged, and a dial of its tilt.
+    """The plane of x and z to scale, with the quadrotor at its attitude, enlarged, and a dial of
+    its tilt.
 
-    The plane shows the barriers that depend on the position alone, and the dial those that depend on roll and pitch alone.
+    The plane shows the barriers that depend on the position alone, and the dial those that depend
+    on roll and pitch alone.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -69,13 +92,17 @@ class SideView(Scene):
         place = [self.index(name) for name in ("x", "y", "z")]
         self._angles = [self.index(name) for name in ("phi", "theta", "psi")]
         shown = self.range_of(place[0]), self.range_of(place[2])
-        self._plane = Plane(self, ("x", "z"), BOX, chosen=barriers_in(problem, place), equal=True, shown=shown)
+        self._plane = Plane(
+            self, ("x", "z"), BOX, chosen=barriers_in(problem, place), equal=True, shown=shown
+        )
         self._references = [reference_of(problem, name) for name in ("x", "z")]
         tilts = barriers_in(problem, self._angles[:2])
         self._limits: list[tuple[float, float]] = []
         if tilts:
             reach = self.range_of(self._angles[1])
-            self._limits = Barriers(problem, tilts).intervals(np.zeros(len(self.names)), self._angles[1], *reach)
+            self._limits = Barriers(problem, tilts).intervals(
+                np.zeros(len(self.names)), self._angles[1], *reach
+            )
 
     def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
         """Draw the quadrotor and what it is to follow."""
@@ -91,13 +118,18 @@ class SideView(Scene):
 
     def _draw_reference(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> None:
         now = moment.times[-1:]
-        x, z = (None if reference is None else float(reference(now)[0]) for reference in self._references)
+        x, z = (
+            None if reference is None else float(reference(now)[0])
+            for reference in self._references
+        )
         if z is None:
             return
         at = axes.place(0.0 if x is None else x, z)
         ink = mix(GOAL, INK, 0.6)
         if x is None:
-            canvas.dashes(np.array([(axes.box[0], at[1]), (axes.box[0] + axes.box[2], at[1])]), GOAL, 2)
+            canvas.dashes(
+                np.array([(axes.box[0], at[1]), (axes.box[0] + axes.box[2], at[1])]), GOAL, 2
+            )
             canvas.text("reference", (axes.box[0] + 6, at[1] + 2), ink, SMALL)
             return
         canvas.disk(at, 11, None, PAPER, 5)
@@ -106,14 +138,19 @@ class SideView(Scene):
         canvas.text("reference", (at[0], at[1] - 14), ink, SMALL, align=(0.5, 1.0))
 
     def _draw_dial(self, canvas: Canvas, attitude: np.ndarray) -> None:
-        """The angle between the thrust and the vertical, in the plane of both, to the side of the thrust that is seen."""
+        """The angle between the thrust and the vertical, in the plane of both, to the side of the
+        thrust that is seen."""
         x, y, radius = _DIAL
         up = attitude[:, 2]
         tilt = math.copysign(math.acos(min(max(float(up[2]), -1.0), 1.0)), float(up[0]))
         safe = not self._limits or any(low <= tilt <= high for low, high in self._limits)
         canvas.fill((x - radius - 8, y - radius - 6, 2 * radius + 16, radius + 36), PAPER, 6)
         canvas.frame((x - radius - 8, y - radius - 6, 2 * radius + 16, radius + 36), GREY, 1, 6)
-        canvas.shape(_sector((x, y), radius, -math.pi / 2, math.pi / 2), UNSAFE if self._limits else mix(GREEN, PAPER, 0.1), GREY)
+        canvas.shape(
+            _sector((x, y), radius, -math.pi / 2, math.pi / 2),
+            UNSAFE if self._limits else mix(GREEN, PAPER, 0.1),
+            GREY,
+        )
         for low, high in self._limits:
             canvas.shape(_sector((x, y), radius, low, high), mix(GREEN, PAPER, 0.2), EDGE, 2)
         canvas.line((x, y), (x, y - radius), GREY)
@@ -122,7 +159,12 @@ class SideView(Scene):
         canvas.text(f"tilt {number(abs(tilt))} rad", (x, y + 6), INK, SMALL, align=(0.5, 0.0))
 
 
-def _sector(center: tuple[float, float], radius: float, low: float, high: float) -> list[tuple[float, float]]:
+def _sector(
+    center: tuple[float, float], radius: float, low: float, high: float
+) -> list[tuple[float, float]]:
     """Corners of a sector between two angles from the vertical, clockwise."""
     angles = np.linspace(low, high, 25).tolist()
-    return [center, *((center[0] + radius * math.sin(a), center[1] - radius * math.cos(a)) for a in angles)]
+    return [
+        center,
+        *((center[0] + radius * math.sin(a), center[1] - radius * math.cos(a)) for a in angles),
+    ]

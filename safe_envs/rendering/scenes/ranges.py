@@ -1,4 +1,5 @@
-"""The part of a state's axis to look at first, where neither a workspace nor an exploration says it."""
+"""The part of a state's axis to look at first, where neither a workspace nor an exploration says
+it."""
 
 from __future__ import annotations
 
@@ -11,13 +12,15 @@ from safe_envs.rendering.safe_set import Barriers
 
 _DRAWN = 64
 _HALF_POWERS = range(-16, 27)
-"""The reaches that are tried are 2^(k/2) in the unit of the state: from a few thousandths to some thousands."""
+"""The reaches that are tried are 2^(k/2) in the unit of the state: from a few thousandths to some
+thousands."""
 
 _SPARE = 1.25
 
 
 def first_range(problem: SafetyProblem, i: int) -> Range:
-    """A range with round ends around the starts and the edge of the safe set that is nearest to them along a state.
+    """A range with round ends around the starts and the edge of the safe set that is nearest to
+    them along a state.
 
     Args:
         problem: whose starts and barriers are looked at.
@@ -29,7 +32,11 @@ def first_range(problem: SafetyProblem, i: int) -> Range:
     for power in _HALF_POWERS:
         reach = 2.0 ** (power / 2)
         ends = low - reach, high + reach
-        if any(ends[0] < edge < ends[1] for safe in barriers.intervals(middle, i, *ends) for edge in safe):
+        if any(
+            ends[0] < edge < ends[1]
+            for safe in barriers.intervals(middle, i, *ends)
+            for edge in safe
+        ):
             return _rounded(low - _SPARE * reach, high + _SPARE * reach)
     return _rounded(low - 1.0, high + 1.0)
 

@@ -11,9 +11,30 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes
 from safe_envs.rendering.canvas import Box, Canvas
 from safe_envs.rendering.safe_set import STEP, Barriers, tint
-from safe_envs.rendering.scenes.base import Scene, draw_point, draw_trail, draw_violation, thinned, warning_color
+from safe_envs.rendering.scenes.base import (
+    Scene,
+    draw_point,
+    draw_trail,
+    draw_violation,
+    thinned,
+    warning_color,
+)
 from safe_envs.rendering.snapshot import EpisodeSnapshot
-from safe_envs.rendering.style import EDGE, GREY, HATCH, INK, LINE, PAPER, SMALL, UNSAFE, VIOLATION, Color, label, mix, number
+from safe_envs.rendering.style import (
+    EDGE,
+    GREY,
+    HATCH,
+    INK,
+    LINE,
+    PAPER,
+    SMALL,
+    UNSAFE,
+    VIOLATION,
+    Color,
+    label,
+    mix,
+    number,
+)
 
 _ROAD: Box = (90, 84, 420, 64)
 _CHART: Box = (76, 232, 504, 254)
@@ -26,8 +47,8 @@ _MOST = 250
 class Road(Scene):
     """The plane of the problem names the own speed and the gap.
 
-    Distances on the road are to scale, from bumper to bumper; the cars are symbols of a fixed size. What is required is the gap
-    at which the smallest barrier vanishes at the speeds of that moment.
+    Distances on the road are to scale, from bumper to bumper; the cars are symbols of a fixed size.
+    What is required is the gap at which the smallest barrier vanishes at the speeds of that moment.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -40,13 +61,23 @@ class Road(Scene):
     def _other_speed(self) -> int | float | None:
         """The lead's speed: another state in the unit of the own one, or else the parameter v_f."""
         unit = self.problem.states[self._speed].unit
-        others = [i for i, s in enumerate(self.problem.states) if s.unit == unit and i != self._speed]
+        others = [
+            i for i, s in enumerate(self.problem.states) if s.unit == unit and i != self._speed
+        ]
         if others:
             return others[0]
-        return next((float(value) for symbol, value in self.problem.plant.parameters.items() if symbol.name == "v_f"), None)
+        return next(
+            (
+                float(value)
+                for symbol, value in self.problem.plant.parameters.items()
+                if symbol.name == "v_f"
+            ),
+            None,
+        )
 
     def required(self, states: np.ndarray) -> np.ndarray:
-        """The gap at which the smallest barrier vanishes at the other values of some states, shape (k,), by bisection."""
+        """The gap at which the smallest barrier vanishes at the other values of some states, shape
+        (k,), by bisection."""
         low, high = (np.full(len(states), bound) for bound in self.range_of(self._gap))
         columns = [states[:, i] for i in range(states.shape[1])]
         for _ in range(_HALVINGS):
@@ -85,18 +116,41 @@ class Road(Scene):
         canvas.line((edge, top - 4), (edge, top + height + 4), EDGE, 3)
         _draw_car(canvas, (own - _CAR[0] / 2, top + height / 2), warning_color(moment))
         _draw_car(canvas, (lead + _CAR[0] / 2, top + height / 2), GREY)
-        self._draw_dimension(canvas, own, lead, top - 12, f"gap {number(gap)} m", INK if gap >= required else VIOLATION, True)
-        self._draw_dimension(canvas, own, edge, top + height + 14, f"required {number(required)} m", EDGE, False)
+        self._draw_dimension(
+            canvas,
+            own,
+            lead,
+            top - 12,
+            f"gap {number(gap)} m",
+            INK if gap >= required else VIOLATION,
+            True,
+        )
+        self._draw_dimension(
+            canvas, own, edge, top + height + 14, f"required {number(required)} m", EDGE, False
+        )
         self._draw_speeds(canvas, moment, own, lead)
 
-    def _draw_dimension(self, canvas: Canvas, start: float, end: float, y: float, text: str, color: Color, above: bool) -> None:
+    def _draw_dimension(
+        self,
+        canvas: Canvas,
+        start: float,
+        end: float,
+        y: float,
+        text: str,
+        color: Color,
+        above: bool,
+    ) -> None:
         middle = 0.5 * (start + end)
         canvas.arrow((middle, y), (start, y), color)
         canvas.arrow((middle, y), (end, y), color)
         at = (max(middle, start + 60), y - 4 if above else y + 4)
-        canvas.text(text, at, mix(color, INK, 0.7), SMALL, bold=True, align=(0.5, 1.0 if above else 0.0))
+        canvas.text(
+            text, at, mix(color, INK, 0.7), SMALL, bold=True, align=(0.5, 1.0 if above else 0.0)
+        )
 
-    def _draw_speeds(self, canvas: Canvas, moment: EpisodeSnapshot, own: float, lead: float) -> None:
+    def _draw_speeds(
+        self, canvas: Canvas, moment: EpisodeSnapshot, own: float, lead: float
+    ) -> None:
         y = _ROAD[1] + _ROAD[3] + 34
         speed = float(moment.state[self._speed])
         canvas.text(f"own {number(speed)} m/s", (14, y), INK, SMALL)
@@ -104,10 +158,16 @@ class Road(Scene):
             other = float(moment.state[self._lead]) if isinstance(self._lead, int) else self._lead
             canvas.text(f"lead {number(other)} m/s", (586, y), INK, SMALL, align=(1.0, 0.0))
 
-    def _draw_chart(self, canvas: Canvas, moment: EpisodeSnapshot, kept: np.ndarray, required: np.ndarray) -> None:
+    def _draw_chart(
+        self, canvas: Canvas, moment: EpisodeSnapshot, kept: np.ndarray, required: np.ndarray
+    ) -> None:
         times, gaps = moment.times[kept], moment.states[kept, self._gap]
         end = max(self.problem.horizon, float(times[-1]))
-        axes = Axes(_CHART, (end - self.problem.horizon, end), (0.0, _reach(max(float(gaps.max()), float(required.max())))))
+        axes = Axes(
+            _CHART,
+            (end - self.problem.horizon, end),
+            (0.0, _reach(max(float(gaps.max()), float(required.max())))),
+        )
         canvas.fill(_CHART, PAPER)
         canvas.within(_CHART)
         edge = axes.places(times, required)
@@ -121,7 +181,13 @@ class Road(Scene):
         canvas.path(edge, EDGE, 3)
         ahead = np.array([edge[-1], (_CHART[0] + _CHART[2], edge[-1, 1])])
         canvas.dashes(ahead, EDGE, 1)
-        canvas.text("required now", (ahead[1, 0] - 6, edge[-1, 1] - 3), mix(EDGE, INK, 0.7), SMALL, align=(1.0, 1.0))
+        canvas.text(
+            "required now",
+            (ahead[1, 0] - 6, edge[-1, 1] - 3),
+            mix(EDGE, INK, 0.7),
+            SMALL,
+            align=(1.0, 1.0),
+        )
         canvas.within(None)
         draw_trail(canvas, axes, moment.times, moment.states[:, self._gap], moment.h)
         if moment.violated is not None:
@@ -133,7 +199,8 @@ class Road(Scene):
 
 @lru_cache(maxsize=8)
 def _furniture(axes: Axes, y_label: str) -> Canvas:
-    """The grid of the chart, drawn once, of which few are kept: after the horizon each step has another one."""
+    """The grid of the chart, drawn once, of which few are kept: after the horizon each step has
+    another one."""
     drawn = Canvas((600, 540), clear=True)
     axes.furnish(drawn, "t [s]", y_label)
     return drawn

@@ -21,7 +21,8 @@ _LINE: Box = (484, 20, 96, 466)
 
 
 def reference_of(problem: SafetyProblem, name: str) -> Callable[[np.ndarray], np.ndarray] | None:
-    """The reference that a state is to follow, over times in s: a feature of its name and "_ref", of the time alone; or None."""
+    """The reference that a state is to follow, over times in s: a feature of its name and "_ref",
+    of the time alone; or None."""
     for feature in problem.features:
         if feature.name == f"{name}_ref" and feature.expression.free_symbols <= {TIME}:
             compiled = compile_function((TIME,), [feature.expression], "arrays")
@@ -30,7 +31,8 @@ def reference_of(problem: SafetyProblem, name: str) -> Callable[[np.ndarray], np
 
 
 class StripScene(Scene):
-    """A state over time to the left, and at the right where it is now on its line, at the same height.
+    """A state over time to the left, and at the right where it is now on its line, at the same
+    height.
 
     Args:
         problem: that is drawn.
@@ -42,7 +44,11 @@ class StripScene(Scene):
         self._state = self.index(name)
         self._reference = reference_of(problem, name)
         self._chart = Plane(
-            self, ("", name), _CHART, shown=((0.0, problem.horizon), self.range_of(self._state)), decorate=self._draw_reference
+            self,
+            ("", name),
+            _CHART,
+            shown=((0.0, problem.horizon), self.range_of(self._state)),
+            decorate=self._draw_reference,
         )
         self._barriers = Barriers(problem)
         self._lines: dict[Range, Canvas] = {}
@@ -76,7 +82,9 @@ class StripScene(Scene):
             places = axes.places(times, self._reference(times))
             canvas.dashes(places, GOAL, 2)
             top = places[np.argmin(places[:, 1])]
-            canvas.text("reference", (top[0], top[1] - 4), mix(GOAL, INK, 0.6), SMALL, align=(0.5, 1.0))
+            canvas.text(
+                "reference", (top[0], top[1] - 4), mix(GOAL, INK, 0.6), SMALL, align=(0.5, 1.0)
+            )
 
     def _line(self, axes: Axes, moment: EpisodeSnapshot) -> Canvas:
         """The line with the safe set on it, drawn once, unless a barrier depends on other states."""

@@ -44,30 +44,43 @@ class Circle:
         return np.stack(np.broadcast_arrays(*self.middle(*states.T), states[:, 0])[:2], axis=-1)
 
 
-def circle_of(problem: SafetyProblem, expression: sp.Expr, x: sp.Symbol, y: sp.Symbol) -> Circle | None:
-    """The circle on which an expression vanishes in the plane of two coordinates; None if it is another curve."""
+def circle_of(
+    problem: SafetyProblem, expression: sp.Expr, x: sp.Symbol, y: sp.Symbol
+) -> Circle | None:
+    """The circle on which an expression vanishes in the plane of two coordinates; None if it is
+    another curve."""
     if not expression.is_polynomial(x, y):
         return None
     polynomial = sp.Poly(expression, x, y)
     square, mixed, other = (polynomial.coeff_monomial(term) for term in (x**2, x * y, y**2))
-    if polynomial.total_degree() != 2 or not (square.is_number and other.is_number and mixed.is_number):
+    if polynomial.total_degree() != 2 or not (
+        square.is_number and other.is_number and mixed.is_number
+    ):
         return None
     if float(square) != float(other) or float(mixed) != 0.0:
         return None
     middle = [-polynomial.coeff_monomial(s) / (2 * square) for s in (x, y)]
     area = middle[0] ** 2 + middle[1] ** 2 - polynomial.coeff_monomial(1) / square
-    # Constant up to cos^2 + sin^2 and rounding, which numbers tell more surely than a simplification.
-    (areas,) = compile_function(problem.plant.states, [area], "arrays")(*np.random.default_rng(0).uniform(-3, 3, (problem.plant.n, 8)))
+    # Constant up to cos^2 + sin^2 and rounding, which numbers tell more surely than a
+    # simplification.
+    (areas,) = compile_function(problem.plant.states, [area], "arrays")(
+        *np.random.default_rng(0).uniform(-3, 3, (problem.plant.n, 8))
+    )
     if not np.ptp(areas) <= 1e-9 * np.max(areas):
         return None
-    return Circle(math.sqrt(float(np.max(areas))), bool(square < 0), compile_function(problem.plant.states, middle, "arrays"))
+    return Circle(
+        math.sqrt(float(np.max(areas))),
+        bool(square < 0),
+        compile_function(problem.plant.states, middle, "arrays"),
+    )
 
 
 class TopView(Scene):
     """The plane of x and y; a triangle points along theta.
 
-    Vehicles are points, so that the triangle has a fixed size in pixels. Obstacles are where a barrier that is positive outside
-    a circle is negative: at their places now, with the way that they came, and after a violation where they were then.
+    Vehicles are points, so that the triangle has a fixed size in pixels. Obstacles are where a
+    barrier that is positive outside a circle is negative: at their places now, with the way that
+    they came, and after a violation where they were then.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -75,7 +88,9 @@ class TopView(Scene):
         self._heading = self.index("theta")
         x, y = (problem.plant.states[self.index(name)] for name in ("x", "y"))
         circles = [circle_of(problem, barrier.expression, x, y) for barrier in problem.barriers]
-        self._obstacles = [circle for circle in circles if circle is not None and not circle.encloses]
+        self._obstacles = [
+            circle for circle in circles if circle is not None and not circle.encloses
+        ]
         self._goal = None if problem.goal is None else circle_of(problem, problem.goal, x, y)
         self._rings = len(self._obstacles) == len(circles)
         self._plane = Plane(self, ("x", "y"), BOX, chosen=[] if self._rings else None, equal=True)
@@ -101,7 +116,9 @@ class TopView(Scene):
         canvas.text("goal", (at[0], at[1] - radius - 3), INK, SMALL, align=(0.5, 1.0))
 
     def _draw_obstacles(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> None:
-        ways = [axes.places(*obstacle.middles(moment.states[-60:]).T) for obstacle in self._obstacles]
+        ways = [
+            axes.places(*obstacle.middles(moment.states[-60:]).T) for obstacle in self._obstacles
+        ]
         sizes = [obstacle.radius * axes.scale[0] for obstacle in self._obstacles]
         if self._rings:
             # What the field of h would show, and much quicker: the circles move.
@@ -115,31 +132,59 @@ class TopView(Scene):
             canvas.disk(middle, 2, INK)
             if size >= 14.0:
                 canvas.line(middle, (middle[0] + size, middle[1]), INK)
-                canvas.text(f"{obstacle.radius:g} m", (middle[0] + size / 2, middle[1] - 1), INK, SMALL - 2, align=(0.5, 1.0))
+                canvas.text(
+                    f"{obstacle.radius:g} m",
+                    (middle[0] + size / 2, middle[1] - 1),
+                    INK,
+                    SMALL - 2,
+                    align=(0.5, 1.0),
+                )
 
     def _draw_hit(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> None:
-        """Outline the obstacles that the vehicle was in at the first violation, where they were then; they may be elsewhere now."""
+        """Outline the obstacles that the vehicle was in at the first violation, where they were
+        then; they may be elsewhere now."""
         if moment.violated is None:
             return
         vehicle = moment.violated[[self.index("x"), self.index("y")]]
         for obstacle in self._obstacles:
             then, now = obstacle.middles(np.stack([moment.violated, moment.state]))
-            if math.dist(then, vehicle) > obstacle.radius or math.dist(then, now) * axes.scale[0] < _MOVED:
+            if (
+                math.dist(then, vehicle) > obstacle.radius
+                or math.dist(then, now) * axes.scale[0] < _MOVED
+            ):
                 continue
-            at, size, color = axes.place(*then), obstacle.radius * axes.scale[0], mix(VIOLATION, PAPER, 0.6)
+            at, size, color = (
+                axes.place(*then),
+                obstacle.radius * axes.scale[0],
+                mix(VIOLATION, PAPER, 0.6),
+            )
             canvas.disk(at, size, None, color, 2)
             # On the far side of the vehicle, whose trail and mark are on the near one.
             up = vehicle[1] < then[1]
             edge = at[1] - size - 2 if up else at[1] + size + 2
-            canvas.text(f"at {moment.violated_at:.2f} s", (at[0], edge), mix(color, INK, 0.6), SMALL, align=(0.5, float(up)))
+            canvas.text(
+                f"at {moment.violated_at:.2f} s",
+                (at[0], edge),
+                mix(color, INK, 0.6),
+                SMALL,
+                align=(0.5, float(up)),
+            )
 
 
-def draw_vehicle(canvas: Canvas, at: tuple[float, float], heading: float, moment: EpisodeSnapshot) -> None:
+def draw_vehicle(
+    canvas: Canvas, at: tuple[float, float], heading: float, moment: EpisodeSnapshot
+) -> None:
     """Draw a triangle that points along a heading, and a line ahead of it."""
     ahead = math.cos(heading), -math.sin(heading)
     aside = -ahead[1], ahead[0]
     canvas.line(at, (at[0] + 2.2 * _LENGTH * ahead[0], at[1] + 2.2 * _LENGTH * ahead[1]), INK)
     outline = [(1.0, 0.0), (-0.6, 0.6), (-0.3, 0.0), (-0.6, -0.6)]
     for size, fill, edge in ((_LENGTH + 3, PAPER, PAPER), (_LENGTH, warning_color(moment), INK)):
-        corners = [(at[0] + size * (a * ahead[0] + b * aside[0]), at[1] + size * (a * ahead[1] + b * aside[1])) for a, b in outline]
+        corners = [
+            (
+                at[0] + size * (a * ahead[0] + b * aside[0]),
+                at[1] + size * (a * ahead[1] + b * aside[1]),
+            )
+            for a, b in outline
+        ]
         canvas.shape(corners, fill, edge)

@@ -1,4 +1,5 @@
-"""The picture of an evaluation: h and the safety rate over time, and trajectories with the safe set."""
+"""The picture of an evaluation: h and the safety rate over time, and trajectories with the safe
+set."""
 
 from __future__ import annotations
 
@@ -20,7 +21,8 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.scripts.reports.rates import percent
 
-# Okabe and Ito's palette, which the colour-blind can tell apart; the bare env is always the same warm colour.
+# Okabe and Ito's palette, which the colour-blind can tell apart; the bare env is always the same
+# warm colour.
 _BARE_COLOR = "#D55E00"
 COLORS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 UNSAFE = "#B9B9B9"
@@ -49,7 +51,9 @@ def require_format(path: Path) -> None:
     formats = sorted(set(Figure().canvas.get_supported_filetypes()) - {"pgf"})
     suffix = path.suffix.removeprefix(".").lower()
     if suffix not in formats:
-        raise ConfigurationError(f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, formats)}")
+        raise ConfigurationError(
+            f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, formats)}"
+        )
 
 
 def draw(evaluation: Evaluation, path: Path) -> None:
@@ -76,10 +80,13 @@ def _policy_name(path: Path) -> str:
 
 
 def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
-    """A legend of handles with labels below the panels, in as many columns as fit; a label too long for one is written smaller."""
+    """A legend of handles with labels below the panels, in as many columns as fit; a label too long
+    for one is written smaller."""
     size, share = mpl.rcParams["font.size"], 1.0
     for columns in range(min(len(handles), _MOST_COLUMNS), 0, -1):
-        legend = figure.legend(handles=handles, loc="outside lower center", ncols=columns, fontsize=size)
+        legend = figure.legend(
+            handles=handles, loc="outside lower center", ncols=columns, fontsize=size
+        )
         share = legend.get_window_extent().width / figure.bbox.width
         if share <= 1.0:
             return
@@ -106,8 +113,18 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
         low, median, high = np.nanquantile(h, (0.05, 0.5, 0.95), axis=1)
         axes.fill_between(time, low, high, color=colors[name], alpha=0.09, linewidth=0)
         axes.plot(time, np.stack([low, high], axis=1), color=colors[name], linewidth=0.6, alpha=0.6)
-        axes.plot(time, median, color=colors[name], linewidth=2.2, label=f"{name}: {percent(row['safety_rate'])} safe")
-        lowest, highest, last = min(lowest, low.min()), max(highest, high.max()), max(last, time[-1])
+        axes.plot(
+            time,
+            median,
+            color=colors[name],
+            linewidth=2.2,
+            label=f"{name}: {percent(row['safety_rate'])} safe",
+        )
+        lowest, highest, last = (
+            min(lowest, low.min()),
+            max(highest, high.max()),
+            max(last, time[-1]),
+        )
     # Far below 0 it does not matter how far: what is seen of the filters shall not shrink for that.
     bottom = max(lowest, -highest) if highest > 0.0 else lowest
     margin = 0.05 * max(highest - bottom, 1e-3)
@@ -121,17 +138,22 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
 
 
 def _draw_curve(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
-    """Rate of the episodes that are safe so far, with its pointwise band, at least until the last violation."""
+    """Rate of the episodes that are safe so far, with its pointwise band, at least until the last
+    violation."""
     for row in evaluation.rows:
         curve, color = row["curve"], colors[row["filter"]]
         low, rate, high = (100 * np.array(curve[key]) for key in ("ci_low", "rate", "ci_high"))
         axes.fill_between(curve["time"], low, high, color=color, alpha=0.2, linewidth=0)
         axes.plot(curve["time"], rate, color=color, linewidth=1.8)
-        axes.set_xlim(right=max(axes.get_xlim()[1], curve["time"][curve["safe"].index(curve["safe"][-1])]))
+        axes.set_xlim(
+            right=max(axes.get_xlim()[1], curve["time"][curve["safe"].index(curve["safe"][-1])])
+        )
     lowest = min(row["curve"]["ci_low"][-1] for row in evaluation.rows)
     bottom = 100 * lowest - 4 * (1 - lowest)
     axes.set(ylim=(bottom, 100 + 4 * (1 - lowest)), xlabel="time (s)", ylabel="safe so far (%)")
-    axes.set_title(f"Safety rate, with its pointwise {100 * evaluation.config['confidence']:.10g} % band")
+    axes.set_title(
+        f"Safety rate, with its pointwise {100 * evaluation.config['confidence']:.10g} % band"
+    )
 
 
 def _draw_plane(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
@@ -142,7 +164,9 @@ def _draw_plane(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> N
     across, up = [names.index(name) for name in problem.plane or ()]
     paths = {name: recorder.states[:, :_SHOWN] for name, recorder in evaluation.recorders.items()}
     for name, states in paths.items():
-        axes.plot(states[:, :, across], states[:, :, up], color=colors[name], linewidth=0.9, alpha=0.8)
+        axes.plot(
+            states[:, :, across], states[:, :, up], color=colors[name], linewidth=0.9, alpha=0.8
+        )
     starts = next(iter(paths.values()))[0]
     axes.plot(starts[:, across], starts[:, up], "o", color="black", markersize=3.5, zorder=3)
     everywhere = np.concatenate([states.reshape(-1, problem.plant.n) for states in paths.values()])
@@ -151,10 +175,16 @@ def _draw_plane(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> N
     if units[across] == units[up]:
         axes.set_aspect("equal")
     horizontal, vertical, h = _on_grid(safe, limits)
-    axes.contourf(horizontal, vertical, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35, zorder=0)
+    axes.contourf(
+        horizontal, vertical, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35, zorder=0
+    )
     axes.contour(horizontal, vertical, h, levels=[0.0], colors="black", linewidths=1.2, zorder=1)
     labels = [f"{names[i]} ({units[i]})" if units[i] else names[i] for i in (across, up)]
-    axes.set(xlabel=labels[0], ylabel=labels[1], title=f"Safe set{_when(problem)} and {len(starts)} episodes, dots at their starts")
+    axes.set(
+        xlabel=labels[0],
+        ylabel=labels[1],
+        title=f"Safe set{_when(problem)} and {len(starts)} episodes, dots at their starts",
+    )
 
 
 def _when(problem: SafetyProblem) -> str:
@@ -163,25 +193,36 @@ def _when(problem: SafetyProblem) -> str:
     return " (at the start)" if {str(s) for s in used} - set(problem.plane or ()) else ""
 
 
-def _safe_function(problem: SafetyProblem, across: int, up: int, start: np.ndarray) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+def _safe_function(
+    problem: SafetyProblem, across: int, up: int, start: np.ndarray
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """The smallest barrier as a function of the plane, with the other states as at the start."""
-    barriers = compile_function(problem.plant.states, tuple(b.expression for b in problem.barriers), "arrays")
+    barriers = compile_function(
+        problem.plant.states, tuple(b.expression for b in problem.barriers), "arrays"
+    )
 
     def smallest(horizontal: np.ndarray, vertical: np.ndarray) -> np.ndarray:
         state: list[Any] = list(start)
         state[across], state[up] = horizontal, vertical
-        return np.minimum.reduce([np.broadcast_to(value, horizontal.shape) for value in barriers(*state)])
+        return np.minimum.reduce(
+            [np.broadcast_to(value, horizontal.shape) for value in barriers(*state)]
+        )
 
     return smallest
 
 
-def _on_grid(safe: Callable[[np.ndarray, np.ndarray], np.ndarray], limits: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _on_grid(
+    safe: Callable[[np.ndarray, np.ndarray], np.ndarray], limits: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     horizontal, vertical = np.meshgrid(*[np.linspace(low, high, _GRID) for low, high in limits])
     return horizontal, vertical, safe(horizontal, vertical)
 
 
-def _limits(safe: Callable[[np.ndarray, np.ndarray], np.ndarray], points: np.ndarray, alike: bool) -> np.ndarray:
-    """Limits (low, high) of both axes: the trajectories, and the whole safe set if it is bounded and not far larger."""
+def _limits(
+    safe: Callable[[np.ndarray, np.ndarray], np.ndarray], points: np.ndarray, alike: bool
+) -> np.ndarray:
+    """Limits (low, high) of both axes: the trajectories, and the whole safe set if it is bounded
+    and not far larger."""
     limits = np.stack([np.nanmin(points, axis=0), np.nanmax(points, axis=0)], axis=1)
     width = np.maximum(limits[:, 1] - limits[:, 0], 1e-3)
     horizontal, vertical, h = _on_grid(safe, limits + np.outer(width, (-1.0, 1.0)))
@@ -189,7 +230,13 @@ def _limits(safe: Callable[[np.ndarray, np.ndarray], np.ndarray], points: np.nda
     edge = inside[0].any() or inside[-1].any() or inside[:, 0].any() or inside[:, -1].any()
     if inside.any() and not edge:
         region = np.stack([horizontal[inside], vertical[inside]])
-        limits = np.stack([np.minimum(limits[:, 0], region.min(axis=1)), np.maximum(limits[:, 1], region.max(axis=1))], axis=1)
+        limits = np.stack(
+            [
+                np.minimum(limits[:, 0], region.min(axis=1)),
+                np.maximum(limits[:, 1], region.max(axis=1)),
+            ],
+            axis=1,
+        )
     width = limits[:, 1] - limits[:, 0]
     # Equal scales fill the panel only if it shows a square.
     half = np.full(2, width.max() / 2) if alike else np.maximum(width, 1e-3) / 2

@@ -31,7 +31,9 @@ def require_film(path: Path) -> None:
         gymnasium.error.DependencyNotInstalled: what draws, or what writes such files, is missing.
     """
     if path.suffix.lower() not in SUFFIXES:
-        raise ConfigurationError(f"--out {path} ends in {path.suffix!r}; give a file that ends in {', '.join(SUFFIXES)}")
+        raise ConfigurationError(
+            f"--out {path} ends in {path.suffix!r}; give a file that ends in {', '.join(SUFFIXES)}"
+        )
     require_writable(path)
     from safe_envs.rendering.viewer import require_pygame
 
@@ -44,7 +46,8 @@ def steps_a_frame(path: Path, dt: float, steps: int) -> int:
     """After how many control periods there is a frame, so that the film runs in real time.
 
     Args:
-        path: of the film: a .gif shows at most 50 frames a second and 600 in all, a .mp4 60 a second.
+        path: of the film: a .gif shows at most 50 frames a second and 600 in all, a .mp4 60 a
+            second.
         dt: control period in s.
         steps: of the longest episode.
     """
@@ -68,7 +71,9 @@ def write_film(path: Path, frames: Iterable[np.ndarray], seconds: float) -> int:
         ConfigurationError: see `require_film`.
     """
     counted = _Counted(frames)
-    write = {".mp4": _write_video, ".gif": _write_animation, ".png": _write_still}[path.suffix.lower()]
+    write = {".mp4": _write_video, ".gif": _write_animation, ".png": _write_still}[
+        path.suffix.lower()
+    ]
     write_atomically(path, lambda part: write(part, iter(counted), seconds))
     return 1 if path.suffix.lower() == ".png" else counted.count
 
@@ -87,7 +92,9 @@ def _video_writer() -> Any:
     try:
         from moviepy.video.io.ffmpeg_writer import FFMPEG_VideoWriter
     except ImportError as error:
-        raise gym.error.DependencyNotInstalled('a .mp4 needs moviepy: pip install "safe-envs[render]"; or write a .gif') from error
+        raise gym.error.DependencyNotInstalled(
+            'a .mp4 needs moviepy: pip install "safe-envs[render]"; or write a .gif'
+        ) from error
     return FFMPEG_VideoWriter
 
 
@@ -95,7 +102,10 @@ def _write_video(path: Path, frames: Iterator[np.ndarray], seconds: float) -> No
     first = next(frames)
     height, width, _ = first.shape
     writer = _video_writer()(str(path), (width, height), 1.0 / seconds)
-    process, stopped = writer.proc, OSError(errno.EIO, "ffmpeg stopped before the end, as for want of room")
+    process, stopped = (
+        writer.proc,
+        OSError(errno.EIO, "ffmpeg stopped before the end, as for want of room"),
+    )
     try:
         for frame in itertools.chain([first], frames):
             try:
@@ -116,16 +126,25 @@ def _write_animation(path: Path, frames: Iterator[np.ndarray], seconds: float) -
     palette, shown, lengths = _palette(first), _durations(seconds), []
 
     def reduced(pixels: np.ndarray) -> Image.Image:
-        # The library looks up how long a frame is shown after it has taken the frame, of which nobody knows how many there will be.
+        # The library looks up how long a frame is shown after it has taken the frame, of which
+        # nobody knows how many there will be.
         lengths.append(next(shown))
         return Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE)
 
-    reduced(first).save(path, save_all=True, append_images=(reduced(frame) for frame in frames), duration=lengths, loop=0)
+    reduced(first).save(
+        path,
+        save_all=True,
+        append_images=(reduced(frame) for frame in frames),
+        duration=lengths,
+        loop=0,
+    )
 
 
 def _durations(seconds: float) -> Iterator[int]:
-    """How long each frame of an animation is shown, in ms: a frame ends at the multiple of 10 ms nearest to its true end."""
-    # The format counts in hundredths of a second. Rounding the ends, not the lengths, carries the error on to the next frame.
+    """How long each frame of an animation is shown, in ms: a frame ends at the multiple of 10 ms
+    nearest to its true end."""
+    # The format counts in hundredths of a second. Rounding the ends, not the lengths, carries the
+    # error on to the next frame.
     end = 0
     for k in itertools.count(1):
         start, end = end, max(end + 1, round(100 * k * seconds))
@@ -147,8 +166,17 @@ def _palette(frame: np.ndarray) -> Any:
 
     from safe_envs.rendering import style
 
-    named = [c for name, c in vars(style).items() if name.isupper() and isinstance(c, tuple) and len(c) == 3 and name != "SIZE"]
-    swatches = [style.mix(c, under, share) for c in named for under in (style.PAPER, style.INK) for share in (1.0, 0.75, 0.5, 0.25)]
+    named = [
+        c
+        for name, c in vars(style).items()
+        if name.isupper() and isinstance(c, tuple) and len(c) == 3 and name != "SIZE"
+    ]
+    swatches = [
+        style.mix(c, under, share)
+        for c in named
+        for under in (style.PAPER, style.INK)
+        for share in (1.0, 0.75, 0.5, 0.25)
+    ]
     strip = np.repeat(np.repeat(np.array(swatches, dtype=np.uint8)[None], 24, axis=0), 24, axis=1)
     width = frame.shape[1]
     rows = [strip[:, k : k + width] for k in range(0, strip.shape[1], width)]

@@ -1,4 +1,5 @@
-"""The picture of an identification: each learned function against the truth, and what is believed of the noise."""
+"""The picture of an identification: each learned function against the truth, and what is believed
+of the noise."""
 
 from __future__ import annotations
 
@@ -31,7 +32,9 @@ _HEADROOM = 1.3
 _SIDE, _WIDEST_SIDE, _LEAST_WIDTH = 2.9, 3.4, 7.6
 _TINY, _HUGE = 0.02, 2e4
 
-_ESTIMATE_HANDLE = Line2D([], [], color=COLORS[0], marker="o", linestyle="", markersize=4, label="estimate at a state")
+_ESTIMATE_HANDLE = Line2D(
+    [], [], color=COLORS[0], marker="o", linestyle="", markersize=4, label="estimate at a state"
+)
 _COUNTS_HANDLE = Patch(color=COLORS[0], alpha=0.6, label="estimates at all states")
 _SAMPLES_HANDLE = Patch(color=COLORS[1], alpha=0.6, label="samples of the posterior")
 _TRUTH_HANDLE = Line2D([], [], color=_TRUTH, linewidth=1.4, label="truth")
@@ -46,7 +49,9 @@ def draw(found: Identification, path: Path) -> None:
     """
     levels = _levels(found)
     rest = [function for function in found.shown if function.name not in levels]
-    shown = sorted(rest, key=lambda function: (-function.size, -function.error))[: _MOST - len(levels)]
+    shown = sorted(rest, key=lambda function: (-function.size, -function.error))[
+        : _MOST - len(levels)
+    ]
     count = len(shown) + len(levels)
     down = max(math.ceil(count / _ACROSS), 1)
     across = max(math.ceil(count / down), 1)
@@ -66,7 +71,9 @@ def draw(found: Identification, path: Path) -> None:
             axes[0].text(0.5, 0.5, "There is nothing to compare.", ha="center", va="center")
         if handles:
             add_legend(figure, list(handles))
-        left = f", the largest {len(shown)} of {len(rest)} functions" if len(shown) < len(rest) else ""
+        left = (
+            f", the largest {len(shown)} of {len(rest)} functions" if len(shown) < len(rest) else ""
+        )
         figure.suptitle(f"{found.title}, {found.learned.method}{left}\n{found.setup}", fontsize=11)
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
 
@@ -78,18 +85,27 @@ def _levels(found: Identification) -> dict[str, tuple[int, Function]]:
         return {}
     named = {function.name: function for function in found.functions}
     names = [f"covariance[{s}, {s}]" for s in found.problem.plant.states]
-    noisy = [(i, named[name]) for i, name in enumerate(names) if diffusion.squares[i] > 0 and _constant(named[name].truth)]
+    noisy = [
+        (i, named[name])
+        for i, name in enumerate(names)
+        if diffusion.squares[i] > 0 and _constant(named[name].truth)
+    ]
     return {function.name: (i, function) for i, function in noisy[:_MOST_LEVELS]}
 
 
 def _constant_noise(found: Identification) -> Diffusion | None:
     """The noise that was learned, if it is constant."""
     learned = found.learned
-    return learned.diffusion if isinstance(learned, Posterior) and learned.diffusion.features is None else None
+    return (
+        learned.diffusion
+        if isinstance(learned, Posterior) and learned.diffusion.features is None
+        else None
+    )
 
 
 def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
-    """The estimates against a truth that varies, and how often they occur for one that does not; returns what the legend needs."""
+    """The estimates against a truth that varies, and how often they occur for one that does not;
+    returns what the legend needs."""
     off = "truth 0" if function.relative is None else f"error {percent(function.relative)}"
     axes.set_title(f"{function.name}: {off}")
     power = _power(np.concatenate([function.truth, function.estimate]))
@@ -101,17 +117,36 @@ def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
     if _constant(truth) and not alone:
         axes.hist(estimate, bins=30, color=COLORS[0], alpha=0.6)
         axes.axvline(truth[0], ymax=1.0 / _HEADROOM, color=_TRUTH, linewidth=1.4)
-        axes.set(xlabel=_label("estimate", function.unit, power), ylabel="states", ylim=(0.0, _HEADROOM * axes.get_ylim()[1]))
+        axes.set(
+            xlabel=_label("estimate", function.unit, power),
+            ylabel="states",
+            ylim=(0.0, _HEADROOM * axes.get_ylim()[1]),
+        )
         _tidy(axes)
         return _COUNTS_HANDLE
     both = np.concatenate([truth, estimate])
-    # Around a single point there is no scale but that of the value itself, unless the error is larger.
+    # Around a single point there is no scale but that of the value itself, unless the error is
+    # larger.
     room = max(np.ptp(both), _AROUND * abs(both).max()) if alone else 0.05 * np.ptp(both)
     limits = (both.min() - room, both.max() + room)
     axes.plot(limits, limits, color=_TRUTH, linewidth=1.0)
     size, opacity = (6.0, 1.0) if alone else (2.5, 0.45)
-    axes.plot(truth, estimate, "o", color=COLORS[0], markersize=size, markeredgewidth=0, alpha=opacity, rasterized=True)
-    axes.set(xlim=limits, ylim=limits, xlabel=_label("truth", function.unit, power), ylabel=_label("estimate", function.unit, power))
+    axes.plot(
+        truth,
+        estimate,
+        "o",
+        color=COLORS[0],
+        markersize=size,
+        markeredgewidth=0,
+        alpha=opacity,
+        rasterized=True,
+    )
+    axes.set(
+        xlim=limits,
+        ylim=limits,
+        xlabel=_label("truth", function.unit, power),
+        ylabel=_label("estimate", function.unit, power),
+    )
     _tidy(axes)
     return _ESTIMATE_HANDLE
 
@@ -120,11 +155,22 @@ def _draw_level(axes: Axes, found: Identification, index: int, function: Functio
     """What is believed of the noise of a state, as in Fig. 6.2 of the thesis."""
     noise, state = _constant_noise(found), found.problem.states[index]
     assert noise is not None
-    samples = sigma_samples(noise.squares[index], noise.count, noise.alpha, noise.beta, _SAMPLES, np.random.default_rng(found.seed))
+    samples = sigma_samples(
+        noise.squares[index],
+        noise.count,
+        noise.alpha,
+        noise.beta,
+        _SAMPLES,
+        np.random.default_rng(found.seed),
+    )
     power = _power(samples)
     axes.hist(samples / 10.0**power, bins=40, density=True, color=COLORS[1], alpha=0.6)
     axes.axvline(float(np.sqrt(function.truth[0])) / 10.0**power, color=_TRUTH, linewidth=1.4)
-    axes.set(title=f"sigma of {state.symbol}", xlabel=_label("sigma", f"{state.unit or 1}/√s", power), ylabel="density")
+    axes.set(
+        title=f"sigma of {state.symbol}",
+        xlabel=_label("sigma", f"{state.unit or 1}/√s", power),
+        ylabel="density",
+    )
     _tidy(axes)
 
 
@@ -150,7 +196,11 @@ def _label(name: str, unit: str, power: int) -> str:
 
 def _range(name: str, values: np.ndarray) -> str:
     """Values in words: the number where they are constant, else from where to where they reach."""
-    return f"{name} {values[0]:.4g}" if _constant(values) else f"{name} {values.min():.3g} to {values.max():.3g}"
+    return (
+        f"{name} {values[0]:.4g}"
+        if _constant(values)
+        else f"{name} {values.min():.3g} to {values.max():.3g}"
+    )
 
 
 def _constant(values: np.ndarray) -> bool:

@@ -44,9 +44,20 @@ class Layout:
     panels: tuple[str, ...]
 
     @classmethod
-    def of(cls, rows: Sequence[Row], swept: Sequence[str], x: str | None = None, lines: str | None = None) -> Layout:
-        """The given settings, or else the one with most numbers across, and the filter, or the one with most values, as lines."""
-        rest = [name for name in swept if name not in (x, lines) and (name != _SEED or _SEED in (x, lines))]
+    def of(
+        cls,
+        rows: Sequence[Row],
+        swept: Sequence[str],
+        x: str | None = None,
+        lines: str | None = None,
+    ) -> Layout:
+        """The given settings, or else the one with most numbers across, and the filter, or the one
+        with most values, as lines."""
+        rest = [
+            name
+            for name in swept
+            if name not in (x, lines) and (name != _SEED or _SEED in (x, lines))
+        ]
 
         def variety(name: str) -> tuple[bool, int]:
             return _is_numeric(rows, name), len(_values(rows, name))
@@ -109,22 +120,41 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
     places = [None] if layout.x is None else _values(everything, layout.x)
     position: dict[Any, Any] = {value: value if numeric else k for k, value in enumerate(places)}
     kinds = [None] if layout.lines is None else _values(everything, layout.lines)
-    colors = _shades(len(kinds)) if layout.lines and _is_numeric(everything, layout.lines) else COLORS
+    colors = (
+        _shades(len(kinds)) if layout.lines and _is_numeric(everything, layout.lines) else COLORS
+    )
     for k, kind in enumerate(kinds):
         of_kind = [row for row in rows if layout.lines is None or row[layout.lines] == kind]
-        found = [(position[place], rate) for place in places if (rate := _rate(_at(of_kind, layout.x, place)))]
+        found = [
+            (position[place], rate)
+            for place in places
+            if (rate := _rate(_at(of_kind, layout.x, place)))
+        ]
         color = _BARE_COLOR if kind == BARE else colors[k % len(colors)]
-        label = None if layout.lines is None else _text(kind) if layout.lines == "filter" else f"{layout.lines} = {_text(kind)}"
+        label = (
+            None
+            if layout.lines is None
+            else _text(kind)
+            if layout.lines == "filter"
+            else f"{layout.lines} = {_text(kind)}"
+        )
         if numeric:
             _draw_band(axes, found, color, label)
         else:
             # Beside each other, since they would hide each other.
-            _draw_bars(axes, [(at + 0.12 * (k - (len(kinds) - 1) / 2), rate) for at, rate in found], color, label)
+            _draw_bars(
+                axes,
+                [(at + 0.12 * (k - (len(kinds) - 1) / 2), rate) for at, rate in found],
+                color,
+                label,
+            )
     axes.set_xlabel("" if layout.x is None else layout.x)
     if numeric and all(isinstance(place, int) for place in places):
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if not numeric:
-        axes.set_xticks(list(position.values()), ["" if layout.x is None else _text(place) for place in places])
+        axes.set_xticks(
+            list(position.values()), ["" if layout.x is None else _text(place) for place in places]
+        )
     axes.set_ylim(-3, 103)
 
 
@@ -133,18 +163,27 @@ def _shades(count: int) -> list[Any]:
     return [mpl.colormaps["viridis"](0.9 * k / max(count - 1, 1)) for k in range(count)]
 
 
-def _draw_band(axes: Axes, found: Sequence[tuple[float, Rate]], color: Any, label: str | None) -> None:
+def _draw_band(
+    axes: Axes, found: Sequence[tuple[float, Rate]], color: Any, label: str | None
+) -> None:
     at = [place for place, _ in found]
     rate, low, high = ([100 * each[i] for _, each in found] for i in range(3))
     axes.fill_between(at, low, high, color=color, alpha=0.2, linewidth=0)
     axes.plot(at, rate, "o-", color=color, linewidth=1.8, markersize=3.5, label=label)
 
 
-def _draw_bars(axes: Axes, found: Sequence[tuple[float, Rate]], color: Any, label: str | None) -> None:
+def _draw_bars(
+    axes: Axes, found: Sequence[tuple[float, Rate]], color: Any, label: str | None
+) -> None:
     at = [place for place, _ in found]
     rate, low, high = ([100 * each[i] for _, each in found] for i in range(3))
-    lengths = [[r - a for r, a in zip(rate, low, strict=True)], [b - r for r, b in zip(rate, high, strict=True)]]
-    axes.errorbar(at, rate, yerr=lengths, fmt="o", color=color, markersize=4, capsize=3, label=label)
+    lengths = [
+        [r - a for r, a in zip(rate, low, strict=True)],
+        [b - r for r, b in zip(rate, high, strict=True)],
+    ]
+    axes.errorbar(
+        at, rate, yerr=lengths, fmt="o", color=color, markersize=4, capsize=3, label=label
+    )
 
 
 def _at(rows: Iterable[Row], name: str | None, value: Any) -> list[Row]:
@@ -152,9 +191,11 @@ def _at(rows: Iterable[Row], name: str | None, value: Any) -> list[Row]:
 
 
 def _rate(rows: Sequence[Row]) -> Rate | None:
-    """The rate of cells that differ in their seeds only, whose episodes are independent; None without any.
+    """The rate of cells that differ in their seeds only, whose episodes are independent; None
+    without any.
 
-    Where each seed learned anew what its filter rests on, its episodes have that in common, and the interval is over both.
+    Where each seed learned anew what its filter rests on, its episodes have that in common, and the
+    interval is over both.
     """
     if not rows:
         return None
@@ -164,11 +205,14 @@ def _rate(rows: Sequence[Row]) -> Rate | None:
     of_episodes = rate_interval(safe, episodes)
     if len({_learned(row) for row in rows}) == 1:
         return safe / episodes, *of_episodes
-    return safe / episodes, *repeated_interval([row["safety_rate"] for row in rows], of_episodes, 0.95, (0.0, 1.0))
+    return safe / episodes, *repeated_interval(
+        [row["safety_rate"] for row in rows], of_episodes, 0.95, (0.0, 1.0)
+    )
 
 
 def _learned(row: Row) -> tuple[str, ...]:
-    """Checksums of the models on which the filter of a cell rests; none for one that learned nothing."""
+    """Checksums of the models on which the filter of a cell rests; none for one that learned
+    nothing."""
     return tuple((json.loads(row["row"])["learning"] or {}).get("sha256", ()))
 
 
@@ -179,7 +223,9 @@ def _values(rows: Sequence[Row], name: str) -> list[Any]:
 
 
 def _is_numeric(rows: Sequence[Row], name: str) -> bool:
-    return all(isinstance(row[name], int | float) and not isinstance(row[name], bool) for row in rows)
+    return all(
+        isinstance(row[name], int | float) and not isinstance(row[name], bool) for row in rows
+    )
 
 
 def _title(names: Sequence[str], values: Sequence[Any]) -> str:

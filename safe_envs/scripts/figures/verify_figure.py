@@ -1,4 +1,5 @@
-"""The picture of a verification: where no action meets the conditions, h, and the boundaries, over a plane of the state."""
+"""The picture of a verification: where no action meets the conditions, h, and the boundaries, over
+a plane of the state."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ Evaluate = Callable[[np.ndarray], np.ndarray]
 def draw(title: str, found: Verification, starts: np.ndarray, path: Path) -> None:
     """Draw a verification, and write the picture whole or not at all.
 
-    A plane is drawn with the other states as at the worst state and, beside it, with all values of the others at once.
+    A plane is drawn with the other states as at the worst state and, beside it, with all values of
+    the others at once.
 
     Args:
         title: what the env is called.
@@ -59,24 +61,49 @@ def draw(title: str, found: Verification, starts: np.ndarray, path: Path) -> Non
         if several:
             _draw_shares(figure, panels[1], found, worst, starts)
         figure.legend(handles=_legend(found), loc="outside lower center", ncols=6 if several else 3)
-        figure.suptitle(f"{title}, {spec_of(formulas.conditions)}\n{describe_system(problem)}", fontsize=11)
+        figure.suptitle(
+            f"{title}, {spec_of(formulas.conditions)}\n{describe_system(problem)}", fontsize=11
+        )
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
 
 
 def _legend(found: Verification) -> list[Patch | Line2D]:
-    formulas, missed = found.formulas, (found.safe.shortfall or (found.kept or found.safe).shortfall) > 0.0
+    formulas, missed = (
+        found.formulas,
+        (found.safe.shortfall or (found.kept or found.safe).shortfall) > 0.0,
+    )
     degree = max(stage.stop - stage.start for stage in formulas.stages)
     several = formulas.problem.plant.n > 2
-    handles: list[Patch | Line2D] = [Patch(color=_INFEASIBLE, alpha=0.6, label="no action meets the condition")] if missed else []
+    handles: list[Patch | Line2D] = (
+        [Patch(color=_INFEASIBLE, alpha=0.6, label="no action meets the condition")]
+        if missed
+        else []
+    )
     handles += [
         Patch(color=UNSAFE, alpha=0.5, label="unsafe"),
         Line2D([], [], color="black", linewidth=1.4, label="h = 0"),
     ]
-    handles += [Line2D([], [], color=COLORS[j - 1], linestyle="--", label=f"b_{j} = 0") for j in range(1, degree)]
+    handles += [
+        Line2D([], [], color=COLORS[j - 1], linestyle="--", label=f"b_{j} = 0")
+        for j in range(1, degree)
+    ]
     cross = "worst state" if (found.kept or found.safe).shortfall else "least to spare"
-    handles.append(Line2D([], [], color=_INFEASIBLE, marker="X", markeredgecolor="black", linestyle="", markersize=9, label=cross))
+    handles.append(
+        Line2D(
+            [],
+            [],
+            color=_INFEASIBLE,
+            marker="X",
+            markeredgecolor="black",
+            linestyle="",
+            markersize=9,
+            label=cross,
+        )
+    )
     label = "starts, projected" if several else "starts"
-    handles.append(Line2D([], [], color=COLORS[0], marker="o", linestyle="", markersize=4, label=label))
+    handles.append(
+        Line2D([], [], color=COLORS[0], marker="o", linestyle="", markersize=4, label=label)
+    )
     return handles
 
 
@@ -86,17 +113,26 @@ def _plane(problem: SafetyProblem) -> tuple[int, int]:
     return names.index(across), names.index(up)
 
 
-def _window(found: Verification, axes: tuple[int, ...], starts: np.ndarray, worst: np.ndarray) -> np.ndarray:
-    """Limits of the axes, shape (len(axes), 2): C within the workspace with some room, or where it has no end what happens in it."""
+def _window(
+    found: Verification, axes: tuple[int, ...], starts: np.ndarray, worst: np.ndarray
+) -> np.ndarray:
+    """Limits of the axes, shape (len(axes), 2): C within the workspace with some room, or where it
+    has no end what happens in it."""
     region, formulas = found.region, found.formulas
     points = region.draw(14, np.random.default_rng(0))
     inside = points[formulas.barrier_level(points) >= 0.0]
     if not len(inside):
         return np.stack([region.low, region.high], axis=1)[list(axes)]
-    shown = inside if not found.beyond else np.concatenate([starts, worst[None], _near_edges(found, points)])
+    shown = (
+        inside
+        if not found.beyond
+        else np.concatenate([starts, worst[None], _near_edges(found, points)])
+    )
     low, high = shown.min(axis=0), shown.max(axis=0)
     room = 0.12 * (high - low) + 1e-3 * (region.high - region.low)
-    return np.stack([np.maximum(region.low, low - room), np.minimum(region.high, high + room)], axis=1)[list(axes)]
+    return np.stack(
+        [np.maximum(region.low, low - room), np.minimum(region.high, high + room)], axis=1
+    )[list(axes)]
 
 
 def _near_edges(found: Verification, points: np.ndarray) -> np.ndarray:
@@ -108,7 +144,12 @@ def _near_edges(found: Verification, points: np.ndarray) -> np.ndarray:
 def _draw_slice(axes: Axes, found: Verification, worst: np.ndarray, starts: np.ndarray) -> None:
     formulas, problem = found.formulas, found.formulas.problem
     across, up = _plane(problem)
-    horizontal, vertical = np.meshgrid(*[np.linspace(low, high, _GRID) for low, high in _window(found, (across, up), starts, worst)])
+    horizontal, vertical = np.meshgrid(
+        *[
+            np.linspace(low, high, _GRID)
+            for low, high in _window(found, (across, up), starts, worst)
+        ]
+    )
     x = np.tile(worst, (horizontal.size, 1))
     x[:, across], x[:, up] = horizontal.ravel(), vertical.ravel()
     chain = formulas.chain(x)
@@ -119,7 +160,9 @@ def _draw_slice(axes: Axes, found: Verification, worst: np.ndarray, starts: np.n
         return values.reshape(horizontal.shape)
 
     grid = (horizontal, vertical)
-    axes.contourf(*grid, shaped(missed), levels=[0.5, 2.0], colors=[_INFEASIBLE], alpha=0.6, zorder=1)
+    axes.contourf(
+        *grid, shaped(missed), levels=[0.5, 2.0], colors=[_INFEASIBLE], alpha=0.6, zorder=1
+    )
     axes.contourf(*grid, shaped(h), levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.5, zorder=0)
     axes.contour(*grid, shaped(h), levels=[0.0], colors="black", linewidths=1.4, zorder=3)
     if np.nanmax(h) > 1e-3 * min(b.deepest_h for b in found.barriers) or found.beyond:
@@ -130,20 +173,36 @@ def _draw_slice(axes: Axes, found: Verification, worst: np.ndarray, starts: np.n
     for stage in formulas.stages:
         for j in range(stage.start + 1, stage.stop):
             style = {"colors": COLORS[j - stage.start - 1], "linestyles": "--", "linewidths": 1.2}
-            axes.contour(*grid, np.where(shaped(h) >= 0.0, shaped(chain[:, j]), np.nan), levels=[0.0], zorder=3, **style)
+            axes.contour(
+                *grid,
+                np.where(shaped(h) >= 0.0, shaped(chain[:, j]), np.nan),
+                levels=[0.0],
+                zorder=3,
+                **style,
+            )
     _mark(axes, problem, (across, up), worst, starts)
-    others = [f"{s.symbol} = {worst[i] + 0.0:.3g}" for i, s in enumerate(problem.states) if i not in (across, up)]
+    others = [
+        f"{s.symbol} = {worst[i] + 0.0:.3g}"
+        for i, s in enumerate(problem.states)
+        if i not in (across, up)
+    ]
     listing = ", ".join(others) if len(others) < _LISTED else "other states"
     axes.set_title(f"Contours of h; {listing} as at the worst state" if others else "Contours of h")
 
 
-def _draw_shares(figure: Figure, axes: Axes, found: Verification, worst: np.ndarray, starts: np.ndarray) -> None:
-    """For which part of the other states, within the intersection of the C_j, no action meets the conditions."""
+def _draw_shares(
+    figure: Figure, axes: Axes, found: Verification, worst: np.ndarray, starts: np.ndarray
+) -> None:
+    """For which part of the other states, within the intersection of the C_j, no action meets the
+    conditions."""
     formulas, problem = found.formulas, found.formulas.problem
     plane = _plane(problem)
     # Several conditions take a solver: a coarser picture of a tenth of the states.
     coarser = len(formulas.stages) > 1
-    ticks = [np.linspace(low, high, _COARSE // 2 if coarser else _COARSE) for low, high in _window(found, plane, starts, worst)]
+    ticks = [
+        np.linspace(low, high, _COARSE // 2 if coarser else _COARSE)
+        for low, high in _window(found, plane, starts, worst)
+    ]
     horizontal, vertical = np.meshgrid(*ticks)
     others = _others(found, 2 ** (_OTHERS_LOG2 - 2 * coarser))
     inside, missed = np.zeros(horizontal.size), np.zeros(horizontal.size)
@@ -156,7 +215,9 @@ def _draw_shares(figure: Figure, axes: Axes, found: Verification, worst: np.ndar
         share = np.where(inside > 0, 100.0 * missed / inside, np.nan).reshape(horizontal.shape)
     top = max(float(np.nanmax(share)) if np.isfinite(share).any() else 0.0, 1.0)
     colors = LinearSegmentedColormap.from_list("infeasible", ["#FFFFFF", _INFEASIBLE])
-    image = axes.pcolormesh(horizontal, vertical, share, cmap=colors, vmin=0.0, vmax=top, rasterized=True)
+    image = axes.pcolormesh(
+        horizontal, vertical, share, cmap=colors, vmin=0.0, vmax=top, rasterized=True
+    )
     axes.set_facecolor(to_rgba(UNSAFE, 0.5))
     where = "C" if formulas.first_order else "the intersection of the C_j"
     rest = [str(s.symbol) for i, s in enumerate(problem.states) if i not in plane]
@@ -166,27 +227,54 @@ def _draw_shares(figure: Figure, axes: Axes, found: Verification, worst: np.ndar
 
 
 def _others(found: Verification, count: int) -> np.ndarray:
-    """States whose coordinates outside the plane are tried: evenly spread ones, or of the set where these would rarely be in it."""
+    """States whose coordinates outside the plane are tried: evenly spread ones, or of the set where
+    these would rarely be in it."""
     rng = np.random.default_rng(0)
     if found.formulas.problem.plant.n == 3 or found.kept is None:
         return found.region.draw(count.bit_length() - 1, rng)
-    points = sample("the intersection of the C_j", found.formulas.kept_level, found.region, count, rng).points
+    points = sample(
+        "the intersection of the C_j", found.formulas.kept_level, found.region, count, rng
+    ).points
     return points[rng.choice(len(points), count, replace=False)]
 
 
 def _missed(formulas: Formulas, x: np.ndarray, level: Evaluate) -> np.ndarray:
-    """1 where a condition is missed and 0 where none is, for states (B, n) with level >= 0; NaN elsewhere."""
+    """1 where a condition is missed and 0 where none is, for states (B, n) with level >= 0; NaN
+    elsewhere."""
     found, inside = np.full(len(x), np.nan), level(x) >= 0.0
     if inside.any():
         found[inside] = formulas.missed(x[inside]) > 0.0
     return found
 
 
-def _mark(axes: Axes, problem: SafetyProblem, plane: tuple[int, int], worst: np.ndarray, starts: np.ndarray) -> None:
+def _mark(
+    axes: Axes,
+    problem: SafetyProblem,
+    plane: tuple[int, int],
+    worst: np.ndarray,
+    starts: np.ndarray,
+) -> None:
     shown = starts[:_SHOWN_STARTS]
     limits = axes.get_xlim(), axes.get_ylim()
-    axes.plot(shown[:, plane[0]], shown[:, plane[1]], "o", color=COLORS[0], markersize=2.5 if len(shown) > 1 else 6, alpha=0.7, zorder=4)
-    axes.plot(worst[plane[0]], worst[plane[1]], "X", color=_INFEASIBLE, markeredgecolor="black", markersize=10, zorder=5, clip_on=False)
+    axes.plot(
+        shown[:, plane[0]],
+        shown[:, plane[1]],
+        "o",
+        color=COLORS[0],
+        markersize=2.5 if len(shown) > 1 else 6,
+        alpha=0.7,
+        zorder=4,
+    )
+    axes.plot(
+        worst[plane[0]],
+        worst[plane[1]],
+        "X",
+        color=_INFEASIBLE,
+        markeredgecolor="black",
+        markersize=10,
+        zorder=5,
+        clip_on=False,
+    )
     axes.set(xlim=limits[0], ylim=limits[1])
     _label(axes, problem, plane)
 
@@ -213,12 +301,34 @@ def _draw_line(axes: Axes, found: Verification, worst: np.ndarray, starts: np.nd
         axes.plot(x[:, 0], chain[:, j], "--", color=COLORS[j - 1])
     axes.axhline(0.0, color="black", linewidth=0.6)
     transform = axes.get_xaxis_transform()
-    axes.fill_between(x[:, 0], 0, 1, where=list(chain[:, 0] < 0.0), color=UNSAFE, alpha=0.5, linewidth=0, transform=transform)
+    axes.fill_between(
+        x[:, 0],
+        0,
+        1,
+        where=list(chain[:, 0] < 0.0),
+        color=UNSAFE,
+        alpha=0.5,
+        linewidth=0,
+        transform=transform,
+    )
     missed = _missed(formulas, x, formulas.barrier_level) == 1.0
-    axes.fill_between(x[:, 0], 0, 1, where=list(missed), color=_INFEASIBLE, alpha=0.6, linewidth=0, transform=transform)
+    axes.fill_between(
+        x[:, 0],
+        0,
+        1,
+        where=list(missed),
+        color=_INFEASIBLE,
+        alpha=0.6,
+        linewidth=0,
+        transform=transform,
+    )
     shown = starts[:_SHOWN_STARTS]
-    axes.plot(shown[:, 0], formulas.chain(shown)[:, 0], "o", color=COLORS[0], markersize=2.5, alpha=0.7)
-    axes.plot(worst[0], 0.0, "X", color=_INFEASIBLE, markeredgecolor="black", markersize=10, zorder=5)
+    axes.plot(
+        shown[:, 0], formulas.chain(shown)[:, 0], "o", color=COLORS[0], markersize=2.5, alpha=0.7
+    )
+    axes.plot(
+        worst[0], 0.0, "X", color=_INFEASIBLE, markeredgecolor="black", markersize=10, zorder=5
+    )
     axes.set(
         xlim=(low, high),
         xlabel=_name(state.symbol.name, state.unit),

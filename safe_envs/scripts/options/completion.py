@@ -1,4 +1,5 @@
-"""What a shell offers after a part of a word. Nothing heavy is imported: it answers between two keystrokes."""
+"""What a shell offers after a part of a word. Nothing heavy is imported: it answers between two
+keystrokes."""
 
 from __future__ import annotations
 
@@ -6,7 +7,19 @@ from collections.abc import Callable, Sequence
 
 from safe_envs.systems import ENV_IDS
 
-FILTERS = ("none", "cbf", "ecbf", "hocbf", "rcbf", "srcbf", "szcbf", "scbf", "learned-hocbf", "ddscbf", "bayesian-scbf")
+FILTERS = (
+    "none",
+    "cbf",
+    "ecbf",
+    "hocbf",
+    "rcbf",
+    "srcbf",
+    "szcbf",
+    "scbf",
+    "learned-hocbf",
+    "ddscbf",
+    "bayesian-scbf",
+)
 """Names of filters, as `safe_envs.wrappers.conditions` knows them: that takes too long to ask."""
 
 POLICIES = ("nominal", "clf", "zero", "random")
@@ -18,7 +31,12 @@ ALGORITHMS = ("ppo", "a2c", "sac", "td3")
 
 def env_ids(incomplete: str) -> list[str]:
     """Registered ids, with or without their namespace."""
-    return [name for env_id in ENV_IDS for name in (env_id, env_id.partition("/")[2]) if name.startswith(incomplete)]
+    return [
+        name
+        for env_id in ENV_IDS
+        for name in (env_id, env_id.partition("/")[2])
+        if name.startswith(incomplete)
+    ]
 
 
 def words(allowed: Sequence[str]) -> Callable[[str], list[str]]:
@@ -39,7 +57,24 @@ def artefacts(incomplete: str) -> list[str]:
 
 
 ARTEFACTS = (
-    *(f"figure-{n}" for n in ("3.1", "3.2a", "3.2b", "3.3", "4.1", "4.2", "4.3", "5.1", "5.2", "5.3a", "5.3b", "5.3c", "5.3d")),
+    *(
+        f"figure-{n}"
+        for n in (
+            "3.1",
+            "3.2a",
+            "3.2b",
+            "3.3",
+            "4.1",
+            "4.2",
+            "4.3",
+            "5.1",
+            "5.2",
+            "5.3a",
+            "5.3b",
+            "5.3c",
+            "5.3d",
+        )
+    ),
     *(f"figure-6.{n}" for n in range(1, 5)),
     *(f"table-{n}" for n in ("4.1", "5.1", "5.2", "6.1", "6.2", "6.3", "6.4")),
     "example-4.2.2",

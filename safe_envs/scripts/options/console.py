@@ -30,9 +30,15 @@ from safe_envs.scripts.options.number_options import strict
 _LEAST_WIDTH = 104
 _PIPE_WIDTH = 240
 _LONGEST = 2000
-"""Characters of an error, at most: what somebody else's code or file says in it may be of any length."""
+"""Characters of an error, at most: what somebody else's code or file says in it may be of any
+length."""
 
-_TOO_LARGE = ("can't allocate memory", "Maximum allowed dimension exceeded", "Maximum allowed size exceeded", "array is too big")
+_TOO_LARGE = (
+    "can't allocate memory",
+    "Maximum allowed dimension exceeded",
+    "Maximum allowed size exceeded",
+    "array is too big",
+)
 """What PyTorch and NumPy say of sizes beyond the memory, where it is no MemoryError."""
 
 _UNWRITABLE = {errno.ENOSPC, errno.EFBIG, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)}
@@ -41,8 +47,20 @@ _UNWRITABLE = {errno.ENOSPC, errno.EFBIG, errno.EROFS, getattr(errno, "EDQUOT", 
 STDOUT = Path("-")
 """As the file of --json: the standard output, which has nothing else on it then."""
 
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print the tables only: no progress bar, no headings, no notes.")]
-Json = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write the results; - writes them to stdout, and nothing else.")]
+Quiet = Annotated[
+    bool,
+    typer.Option(
+        "--quiet", "-q", help="Print the tables only: no progress bar, no headings, no notes."
+    ),
+]
+Json = Annotated[
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        help="Write the results; - writes them to stdout, and nothing else.",
+    ),
+]
 
 
 class _Terminal:
@@ -98,19 +116,28 @@ def quietly(quiet: bool, silent: bool = False) -> Iterator[None]:
 
 
 def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
-    """The function of a command with the option --quiet, strict numbers, and no other output where its --json goes to stdout."""
+    """The function of a command with the option --quiet, strict numbers, and no other output where
+    its --json goes to stdout."""
 
     @functools.wraps(command)
     def wrapped(*, quiet: bool = False, **arguments: Any) -> None:
         with quietly(quiet, silent=STDOUT in (arguments.get("json"), arguments.get("json_file"))):
             command(**arguments)
 
-    option = inspect.Parameter("quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Quiet)
-    return with_signature(wrapped, [*map(strict, inspect.signature(command, eval_str=True).parameters.values()), option])
+    option = inspect.Parameter(
+        "quiet", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Quiet
+    )
+    return with_signature(
+        wrapped,
+        [*map(strict, inspect.signature(command, eval_str=True).parameters.values()), option],
+    )
 
 
-def with_signature(function: Callable[..., None], parameters: Sequence[inspect.Parameter]) -> Callable[..., None]:
-    """Let a function have these parameters for typer, which asks its signature and its annotations; returns it."""
+def with_signature(
+    function: Callable[..., None], parameters: Sequence[inspect.Parameter]
+) -> Callable[..., None]:
+    """Let a function have these parameters for typer, which asks its signature and its annotations;
+    returns it."""
     function.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
     function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return function
@@ -126,7 +153,8 @@ def stdout() -> Console:
 
 
 def require_result(path: Path | None) -> None:
-    """Raise ConfigurationError if the file of --json cannot be written: asked before a long run, not after it."""
+    """Raise ConfigurationError if the file of --json cannot be written: asked before a long run,
+    not after it."""
     if path is not None and path != STDOUT:
         require_writable(path)
 
@@ -165,12 +193,20 @@ def run(command: Callable[[], object]) -> None:
         if error.errno not in _UNWRITABLE:
             raise
         _drop_output()
-        _fail(f"cannot write {error.filename or 'the output'}: {error.strerror}; make room, or choose another place")
+        _fail(
+            f"cannot write {error.filename or 'the output'}: {error.strerror}; make room, or choose"
+            " another place"
+        )
     except (MemoryError, RuntimeError, ValueError) as error:
-        if not isinstance(error, MemoryError) and not any(text in str(error) for text in _TOO_LARGE):
+        if not isinstance(error, MemoryError) and not any(
+            text in str(error) for text in _TOO_LARGE
+        ):
             raise
         reason = str(error) or type(error).__name__
-        _fail(f"not enough memory for what was asked ({reason}); choose smaller settings, or fewer episodes")
+        _fail(
+            f"not enough memory for what was asked ({reason}); choose smaller settings, or fewer"
+            " episodes"
+        )
     except Exception as error:
         # Not imported before it is needed: completion has to be quick.
         from gymnasium.error import Error
@@ -190,7 +226,8 @@ def _drop_output() -> None:
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Let a request to terminate, as job managers send it, end like Ctrl-C: with the processes that were started."""
+    """Let a request to terminate, as job managers send it, end like Ctrl-C: with the processes that
+    were started."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -206,17 +243,27 @@ def _terminable() -> Iterator[None]:
 
 
 def _fail(message: str) -> NoReturn:
-    Console(stderr=True).print(f"[bold red]Error:[/] [red]{escape(shortened(message, _LONGEST))}[/]", soft_wrap=True, highlight=False)
+    Console(stderr=True).print(
+        f"[bold red]Error:[/] [red]{escape(shortened(message, _LONGEST))}[/]",
+        soft_wrap=True,
+        highlight=False,
+    )
     sys.exit(2)
 
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
-    """A progress bar on stderr, if that is a terminal: yields the function to tell which part is done, or None."""
+    """A progress bar on stderr, if that is a terminal: yields the function to tell which part is
+    done, or None."""
     if _Terminal.quiet or not sys.stderr.isatty():
         yield None
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda done: bar.update(task, completed=done)

@@ -1,4 +1,5 @@
-"""The options that say which env is meant: once for all commands that take them, which are handed an `EnvOptions`."""
+"""The options that say which env is meant: once for all commands that take them, which are handed
+an `EnvOptions`."""
 
 from __future__ import annotations
 
@@ -19,26 +20,51 @@ _OPTIONS: dict[str, Any] = {
     "env_id": Annotated[
         str | None,
         typer.Argument(
-            metavar="[ENV_ID]", help="Registered id; `safe-envs list` shows all.", show_default=False, autocompletion=completion.env_ids
+            metavar="[ENV_ID]",
+            help="Registered id; `safe-envs list` shows all.",
+            show_default=False,
+            autocompletion=completion.env_ids,
         ),
     ],
     "system": Annotated[
         str | None,
         typer.Option(
-            metavar="FILE.py:NAME", help="In place of ENV_ID: a SafetyProblem of your own or a function that returns one. Runs the file."
+            metavar="FILE.py:NAME",
+            help=(
+                "In place of ENV_ID: a SafetyProblem of your own or a function that returns one."
+                " Runs the file."
+            ),
         ),
     ],
     "noise": Annotated[
-        str | None, typer.Option(metavar="X", help="Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.")
+        str | None,
+        typer.Option(
+            metavar="X",
+            help="Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.",
+        ),
     ],
-    "plant": Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter of the simulated system. Repeatable.")],
-    "model": Annotated[list[str] | None, typer.Option(metavar="K=V", help="Parameter that the designer believes. Repeatable.")],
-    "barrier": Annotated[list[str] | None, typer.Option(metavar="K=V", help="Argument of the barrier. Repeatable.")],
+    "plant": Annotated[
+        list[str] | None,
+        typer.Option(metavar="K=V", help="Parameter of the simulated system. Repeatable."),
+    ],
+    "model": Annotated[
+        list[str] | None,
+        typer.Option(metavar="K=V", help="Parameter that the designer believes. Repeatable."),
+    ],
+    "barrier": Annotated[
+        list[str] | None, typer.Option(metavar="K=V", help="Argument of the barrier. Repeatable.")
+    ],
     "dt": Annotated[float | None, typer.Option(help="Control period in s.")],
     "substeps": Annotated[int | None, typer.Option(help="Integration steps in a control period.")],
     "horizon": Annotated[float | None, typer.Option(help="Length of an episode in s.")],
-    "box": Annotated[list[str] | None, typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each.")],
-    "start": Annotated[str | None, typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution.")],
+    "box": Annotated[
+        list[str] | None,
+        typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each."),
+    ],
+    "start": Annotated[
+        str | None,
+        typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution."),
+    ],
 }
 _READERS: dict[str, Callable[[Any], Any]] = {
     "noise": read_noise,
@@ -69,7 +95,8 @@ class EnvOptions:
         """The id that gym knows.
 
         Raises:
-            ConfigurationError: there is no such id, or not just one of ENV_ID and --system was given.
+            ConfigurationError: there is no such id, or not just one of ENV_ID and --system was
+                given.
         """
         # Not imported before it is needed: completion has to be quick.
         from safe_envs.registry import which_env
@@ -84,7 +111,10 @@ class EnvOptions:
             ConfigurationError: a text cannot be read.
         """
         system = {} if self.system is None else {"system": self.system}
-        return system | {name: _READERS[name](value) if name in _READERS else value for name, value in self.changes.items()}
+        return system | {
+            name: _READERS[name](value) if name in _READERS else value
+            for name, value in self.changes.items()
+        }
 
     def evaluate_command(self, *words: str) -> str:
         """A command line that evaluates something in the same env, quoted for a shell.
@@ -93,7 +123,11 @@ class EnvOptions:
             *words: what else is to stand in it.
         """
         env = [self.full_id] if self.system is None else ["--system", self.system]
-        changes = [f"--{name}={text}" for name, value in self.changes.items() for text in (value if isinstance(value, list) else [value])]
+        changes = [
+            f"--{name}={text}"
+            for name, value in self.changes.items()
+            for text in (value if isinstance(value, list) else [value])
+        ]
         return shlex.join(["safe-envs", "evaluate", *env, *words, *changes])
 
 
@@ -109,11 +143,18 @@ def with_env(command: Callable[..., None], without: Sequence[str] = ()) -> Calla
     @functools.wraps(command)
     def wrapped(**arguments: Any) -> None:
         given = {name: arguments.pop(name, None) for name in options}
-        changes = {name: value for name, value in given.items() if name not in ("env_id", "system") and value not in (None, [])}
+        changes = {
+            name: value
+            for name, value in given.items()
+            if name not in ("env_id", "system") and value not in (None, [])
+        }
         command(env=EnvOptions(given["env_id"], given["system"], changes), **arguments)
 
     found: list[inspect.Parameter] = []
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
-        of_env = [parameter.replace(name=name, default=None, annotation=option) for name, option in options.items()]
+        of_env = [
+            parameter.replace(name=name, default=None, annotation=option)
+            for name, option in options.items()
+        ]
         found += of_env if parameter.name == "env" else [parameter]
     return with_signature(wrapped, found)

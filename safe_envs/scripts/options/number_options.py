@@ -15,7 +15,8 @@ from safe_envs.number_text import whole_or_real
 
 
 def strict(parameter: inspect.Parameter) -> inspect.Parameter:
-    """The parameter of a command; where it is an option that takes a number, one that takes no other text than others do.
+    """The parameter of a command; where it is an option that takes a number, one that takes no
+    other text than others do.
 
     Typer itself takes for a number whatever Python does: digits of other scripts, and 1_000.
     """
@@ -39,7 +40,9 @@ def _reader(kind: type[int] | type[float], least: float | None) -> Callable[[Any
         except ValueError:
             number = None
         if number is None or (kind is int and not isinstance(number, int)):
-            raise typer.BadParameter(f"{shown(text)} is not a valid {'integer' if kind is int else 'float'}.")
+            raise typer.BadParameter(
+                f"{shown(text)} is not a valid {'integer' if kind is int else 'float'}."
+            )
         if least is not None and number < least:
             raise typer.BadParameter(f"{shown(number)} is not in the range x>={least}.")
         return kind(number)

@@ -17,7 +17,14 @@ from safe_envs.scripts.options.console import STDOUT
 
 Knowledge = Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")]
 Trust = Annotated[
-    bool, typer.Option("--trust", help="Load a policy that is a .zip. That runs code in it: only for files whose source you trust.")
+    bool,
+    typer.Option(
+        "--trust",
+        help=(
+            "Load a policy that is a .zip. That runs code in it: only for files whose source you"
+            " trust."
+        ),
+    ),
 ]
 Seed = Annotated[int, typer.Option(help="Seed of all randomness.")]
 FORMATS = ".png, .pdf, .svg, or another format of matplotlib."
@@ -32,11 +39,20 @@ def numbers(option: str, text: str) -> list[float]:
     try:
         return [real(entry) for entry in text.split(",")]
     except ValueError as error:
-        raise ConfigurationError(f"{option} {shown(text)} is no number or list of numbers with commas between") from error
+        raise ConfigurationError(
+            f"{option} {shown(text)} is no number or list of numbers with commas between"
+        ) from error
 
 
-def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = None, inputs: Iterable[tuple[str, Path]] = ()) -> None:
-    """Check, before any work, that --out, --json and --plot can be written, each to a file of its own.
+def require_outputs(
+    json: Path | None,
+    plot: Path | None,
+    *,
+    out: Path | None = None,
+    inputs: Iterable[tuple[str, Path]] = (),
+) -> None:
+    """Check, before any work, that --out, --json and --plot can be written, each to a file of its
+    own.
 
     Args:
         json: of --json, if given.
@@ -54,7 +70,9 @@ def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = 
         require_writable(path)
         place = os.path.realpath(path)
         if place in taken:
-            raise ConfigurationError(f"{option} {path} would overwrite the file of {taken[place]}; name another file")
+            raise ConfigurationError(
+                f"{option} {path} would overwrite the file of {taken[place]}; name another file"
+            )
         taken[place] = f"{option} {path}"
     if plot is not None:
         from safe_envs.scripts.figures.evaluation_figure import require_format
@@ -63,9 +81,14 @@ def require_outputs(json: Path | None, plot: Path | None, *, out: Path | None = 
 
 
 def inputs_of(
-    system: str | None, policy: str = "nominal", filters: Iterable[str] = (), learned: Iterable[Path] = (), filter_spec: str | None = None
+    system: str | None,
+    policy: str = "nominal",
+    filters: Iterable[str] = (),
+    learned: Iterable[Path] = (),
+    filter_spec: str | None = None,
 ) -> Iterator[tuple[str, Path]]:
-    """Options and the files that a command may read: of FILE.py:NAME, of a policy, of --learned, and of filters with file=FILE."""
+    """Options and the files that a command may read: of FILE.py:NAME, of a policy, of --learned,
+    and of filters with file=FILE."""
     from safe_envs.agents.policies.registry import policy_files
 
     for option, place in (("--system", system), ("--filter-spec", filter_spec)):
@@ -122,14 +145,17 @@ def parameters(option: str, texts: Sequence[str], words: bool = False) -> dict[s
         words: whether a value may be a word.
 
     Raises:
-        ConfigurationError: an entry has no name, comes twice, or its value is no number where it must be one.
+        ConfigurationError: an entry has no name, comes twice, or its value is no number where it
+            must be one.
     """
     found: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")
         if not name or not equals or not value or name in found:
             problem = "comes twice" if name in found else "is not of this form"
-            raise ConfigurationError(f"{option} {shown(text)} {problem}; give NAME=VALUE, once for each parameter")
+            raise ConfigurationError(
+                f"{option} {shown(text)} {problem}; give NAME=VALUE, once for each parameter"
+            )
         found[name] = _value(option, text, value, words)
     return found
 
@@ -140,4 +166,6 @@ def _value(option: str, text: str, value: str, words: bool) -> float | str:
     except ValueError as error:
         if words:
             return value
-        raise ConfigurationError(f"{option} {shown(text)}: {shown(value)} is not a number") from error
+        raise ConfigurationError(
+            f"{option} {shown(text)}: {shown(value)} is not a number"
+        ) from error

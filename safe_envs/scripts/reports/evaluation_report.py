@@ -28,8 +28,9 @@ _COLUMNS = (
 )
 _WIDEST = 1000
 ESTIMATED = (
-    "a bound is estimated: a theorem, with a supremum and a shortfall from a search of the safe set, and as far as these episodes do not "
-    "contradict it. It counts leaving the workspace as an end, not as a violation."
+    "a bound is estimated: a theorem, with a supremum and a shortfall from a search of the safe"
+    " set, and as far as these episodes do not contradict it. It counts leaving the workspace as an"
+    " end, not as a violation."
 )
 """What an estimated bound is."""
 
@@ -51,7 +52,11 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
         name, rate, *rest = _cells(row, speed["steps_per_second"])
         table.add_row(Text(name), rate, *[cell(row, speed) for cell in learned.values()], *rest)
     _print_table(console, table)
-    compared = [] if evaluation.repeats else [c for c in evaluation.comparisons if BARE not in (c["first"], c["second"])]
+    compared = (
+        []
+        if evaluation.repeats
+        else [c for c in evaluation.comparisons if BARE not in (c["first"], c["second"])]
+    )
     if compared:
         _say(console, f"Difference of the safety rates on the same episodes [{interval}]:")
     for comparison in compared:
@@ -66,7 +71,11 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
 def print_refinement(console: Console, refinement: Refinement) -> None:
     """Print the safety rates with each control period, and whether they have converged."""
     interval = _interval(refinement.evaluations[0])
-    _say(console, f"\nRefinement: safe [{interval}] with smaller control periods, from the same seeds but with noise that is not coupled")
+    _say(
+        console,
+        f"\nRefinement: safe [{interval}] with smaller control periods, from the same seeds but"
+        " with noise that is not coupled",
+    )
     table = _table(*[f"dt = {dt:g} s" for dt in refinement.periods])
     for row in refinement.rows:
         rates = zip(row["safety_rate"], row["ci_low"], row["ci_high"], strict=True)
@@ -77,21 +86,37 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
         return
     for row in refinement.rows:
         change = _points(row["change"], row["change_low"], row["change_high"])
-        _say(console, f"  {row['filter']}: {_VERDICTS[row['verdict']].format(change, row['withheld'])}")
+        _say(
+            console,
+            f"  {row['filter']}: {_VERDICTS[row['verdict']].format(change, row['withheld'])}",
+        )
     reach = f"{100 * TOLERANCE:g} points"
-    _say(console, f"Converged: the {interval} of the change from dt/2 to dt/4 reaches no further than {reach} either way.")
+    _say(
+        console,
+        f"Converged: the {interval} of the change from dt/2 to dt/4 reaches no further than {reach}"
+        " either way.",
+    )
 
 
 def heading(evaluation: Evaluation) -> Text:
     """What was evaluated, in two lines."""
     config = evaluation.config
     title = Text(evaluation.title, style="bold")
-    repeats = max((row["learning"]["repeats"] for row in evaluation.rows if row["learning"]), default=1)
+    repeats = max(
+        (row["learning"]["repeats"] for row in evaluation.rows if row["learning"]), default=1
+    )
     often = f" x {repeats} identifications" if repeats > 1 else ""
-    title.append(f" | policy {config['policy']['name']} | {config['episodes']} episodes{often} | seed {config['seed']}", style="not bold")
+    title.append(
+        f" | policy {config['policy']['name']} | {config['episodes']} episodes{often} | seed"
+        f" {config['seed']}",
+        style="not bold",
+    )
     goal = ", joint program with the goal" if config["objective"] == "clf" else ""
     watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
-    title.append(f"\n{_told(evaluation)}{watched}; filters know the {config['knowledge']}{goal}", style="not bold")
+    title.append(
+        f"\n{_told(evaluation)}{watched}; filters know the {config['knowledge']}{goal}",
+        style="not bold",
+    )
     return title
 
 
@@ -114,8 +139,18 @@ def describe_plant(problem: SafetyProblem) -> str:
     plant = {p.name: value for p, value in problem.plant.parameters.items()}
     model = {p.name: value for p, value in problem.model.parameters.items()}
     noise = ", ".join(f"{name} = {plant[name]:g}" for name in problem.noise)
-    differing = [f"{name} = {plant[name]:g} (model {model[name]:g})" for name in plant if plant[name] != model[name]]
-    told = f"noise {noise}" if any(plant[name] for name in problem.noise) else "fixed noise" if problem.plant.noisy else "no noise"
+    differing = [
+        f"{name} = {plant[name]:g} (model {model[name]:g})"
+        for name in plant
+        if plant[name] != model[name]
+    ]
+    told = (
+        f"noise {noise}"
+        if any(plant[name] for name in problem.noise)
+        else "fixed noise"
+        if problem.plant.noisy
+        else "no noise"
+    )
     mismatch = f"plant {', '.join(differing)}" if differing else "model = plant"
     return f"{told}, {mismatch}"
 
@@ -126,7 +161,9 @@ def _interval(evaluation: Evaluation) -> str:
 
 def _table(*columns: str) -> Table:
     """A table with a column of filters before those named."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True)
+    table = Table(
+        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True
+    )
     table.add_column("filter", overflow="fold", vertical="bottom")
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
@@ -135,7 +172,10 @@ def _table(*columns: str) -> Table:
 
 def _print_table(console: Console, table: Table) -> None:
     # A column that is cut off would be a number that is wrong.
-    console.width = max(console.width, console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum)
+    console.width = max(
+        console.width,
+        console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum,
+    )
     console.print()
     console.print(table)
     console.print()
@@ -151,8 +191,9 @@ def _describe(comparison: Comparison) -> str:
     if p is None:
         return f"{first} - {second}: {difference}, over identifications and episodes"
     return (
-        f"{first} - {second}: {difference}, McNemar p {'< 1e-10' if p < 1e-10 else f'= {p:.2g}'} "
-        f"(safe with one only: {first} {comparison['only_first']}, {second} {comparison['only_second']})"
+        f"{first} - {second}: {difference}, McNemar p {'< 1e-10' if p < 1e-10 else f'= {p:.2g}'}"
+        f" (safe with one only: {first} {comparison['only_first']}, {second}"
+        f" {comparison['only_second']})"
     )
 
 
@@ -173,8 +214,8 @@ def _notes(evaluation: Evaluation) -> list[str]:
         notes += bridge_notes(evaluation.problem)
     if evaluation.repeats:
         notes.append(
-            "nothing is random here (no noise, a fixed start, a deterministic policy), so that all episodes are "
-            "one and the same: the interval says nothing."
+            "nothing is random here (no noise, a fixed start, a deterministic policy), so that all"
+            " episodes are one and the same: the interval says nothing."
         )
     return notes
 
@@ -186,8 +227,8 @@ def _of_bound(row: Row) -> list[str]:
         notes.append(f"no bound for {name}: {row['bound_note']}")
     if row["outside_rate"]:
         notes.append(
-            f"{100 * row['outside_rate']:.3g} % of the starts lie outside the sets C_j = {{b_j >= 0}}, j >= 1, that {name} keeps: "
-            "nothing is promised from there"
+            f"{100 * row['outside_rate']:.3g} % of the starts lie outside the sets C_j = {{b_j >="
+            f" 0}}, j >= 1, that {name} keeps: nothing is promised from there"
         )
     return notes
 
@@ -197,8 +238,13 @@ def _of_violations(row: Row) -> list[str]:
     touching, violations = row["touching"], row["violations"]
     if not touching:
         return []
-    some = "all violations" if touching == violations else f"{touching} of the {violations} violations"
-    return [f"{some} of {row['filter']} come no lower than h = 0 to rounding: they touch the edge, and safe is h > 0"]
+    some = (
+        "all violations" if touching == violations else f"{touching} of the {violations} violations"
+    )
+    return [
+        f"{some} of {row['filter']} come no lower than h = 0 to rounding: they touch the edge, and"
+        " safe is h > 0"
+    ]
 
 
 def unsafe_starts(share: float) -> list[str]:
@@ -212,8 +258,8 @@ def unsafe_starts(share: float) -> list[str]:
 def early_end(name: str, which: str, length: float, steps: int) -> str:
     """A note on episodes that do not last as long as they might."""
     return (
-        f"with {name} the {which} ends after {length:.1f} of {steps} steps, at the goal or outside the workspace; its safety is that of "
-        "the instants until then."
+        f"with {name} the {which} ends after {length:.1f} of {steps} steps, at the goal or outside"
+        " the workspace; its safety is that of the instants until then."
     )
 
 

@@ -36,9 +36,15 @@ _VANISHING = 1e-9
 _MOST_NAMED = 8
 _ERRORS = {
     "learned-hocbf": "of the residuals: root mean square and 95 % quantile",
-    "network": "of the network against the labels, median; and what noise in the data makes of the labels, as their standard error",
+    "network": (
+        "of the network against the labels, median; and what noise in the data makes of the labels,"
+        " as their standard error"
+    ),
     "direct": "of the covariances, root mean square",
-    "bayesian": "of the rates per s, root mean square; what noise in the data makes of it; and in standard deviations of the prediction",
+    "bayesian": (
+        "of the rates per s, root mean square; what noise in the data makes of it; and in standard"
+        " deviations of the prediction"
+    ),
 }
 """What the held-out errors of each method are, or of its way."""
 
@@ -80,7 +86,11 @@ class Function:
     @property
     def relative(self) -> float | None:
         """The error as a part of the truth; None where the truth is 0."""
-        return None if self.size <= _VANISHING * self.error or not self.size else self.error / self.size
+        return (
+            None
+            if self.size <= _VANISHING * self.error or not self.size
+            else self.error / self.size
+        )
 
     @property
     def vanishes(self) -> bool:
@@ -110,8 +120,15 @@ class Source:
         return cls(path, float(data.dt.min()), float(data.dt.max()), data.seed)
 
     def __str__(self) -> str:
-        steps = f"{self.shortest:g} s" if self.shortest == self.longest else f"{self.shortest:g} to {self.longest:g} s"
-        return f"in steps of {steps}, {'from elsewhere' if self.seed is None else f'of the seed {self.seed}'}"
+        steps = (
+            f"{self.shortest:g} s"
+            if self.shortest == self.longest
+            else f"{self.shortest:g} to {self.longest:g} s"
+        )
+        return (
+            f"in steps of {steps},"
+            f" {'from elsewhere' if self.seed is None else f'of the seed {self.seed}'}"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +162,11 @@ class Identification:
     @property
     def shown(self) -> list[Function]:
         """The functions that are not 0 in truth and estimate."""
-        return [] if isinstance(self.functions, str) else [function for function in self.functions if not function.vanishes]
+        return (
+            []
+            if isinstance(self.functions, str)
+            else [function for function in self.functions if not function.vanishes]
+        )
 
     @property
     def setup(self) -> str:
@@ -157,22 +178,30 @@ class Identification:
     @property
     def notes(self) -> list[str]:
         """What has to be known to read the numbers."""
-        return [*self.learned.record.warnings, *([self.functions] if isinstance(self.functions, str) else [])]
+        return [
+            *self.learned.record.warnings,
+            *([self.functions] if isinstance(self.functions, str) else []),
+        ]
 
 
 def compare(learned: LearnedModel, problem: SafetyProblem, seed: int) -> tuple[Function, ...] | str:
-    """Hold the learned functions against the plant's at fresh states of the region that is explored; or say why there is no truth."""
+    """Hold the learned functions against the plant's at fresh states of the region that is
+    explored; or say why there is no truth."""
     x = draw_states(problem, STATES, np.random.default_rng([seed, _FRESH]))
     try:
         pairs = learned.compare(problem, x)
     except ConfigurationError as error:
         return str(error)
     units = {v.symbol.name: v.unit for v in (*problem.states, *problem.inputs)}
-    return tuple(Function(name, unit_of(name, units), truth, estimate) for name, (truth, estimate) in pairs.items())
+    return tuple(
+        Function(name, unit_of(name, units), truth, estimate)
+        for name, (truth, estimate) in pairs.items()
+    )
 
 
 def unit_of(name: str, units: Mapping[str, str]) -> str:
-    """The unit of an entry of drift, input matrix or covariance by its name; empty for others, whose barriers have none.
+    """The unit of an entry of drift, input matrix or covariance by its name; empty for others,
+    whose barriers have none.
 
     Args:
         name: such as f[v], g[v, u], covariance[v, z].
@@ -204,15 +233,28 @@ def print_report(console: Console, found: Identification) -> None:
     title.append(f" | method {found.learned.method} | {origin}", style="not bold")
     title.append(f"\n{found.setup}", style="not bold")
     console.print(title, soft_wrap=True, highlight=False)
-    of, details = ("", "") if found.source is None else (f" of {found.source.path}", f", {found.source}")
-    amount = f"{record.transitions:,} transitions{of} that last {record.observed:,.6g} s together{details}"
+    of, details = (
+        ("", "") if found.source is None else (f" of {found.source.path}", f", {found.source}")
+    )
+    amount = (
+        f"{record.transitions:,} transitions{of} that last {record.observed:,.6g} s"
+        f" together{details}"
+    )
     _say(console, f"\nLearned in {_seconds(record.seconds)} from {amount}")
-    _say(console, f"Settings: {', '.join(f'{name} = {_setting(value)}' for name, value in record.settings.items())}")
+    _say(
+        console,
+        "Settings:"
+        f" {', '.join(f'{name} = {_setting(value)}' for name, value in record.settings.items())}",
+    )
     if record.errors:
         _head(console, "Held-out errors", _ERRORS[record.settings.get("way", found.learned.method)])
         console.print(_errors_table(record.errors))
     if found.shown:
-        _head(console, "Truth against estimate", f"the plant and what was learned of it at {STATES} fresh states")
+        _head(
+            console,
+            "Truth against estimate",
+            f"the plant and what was learned of it at {STATES} fresh states",
+        )
         console.print(_functions_table(found.shown))
     _say_vanishing(console, found)
     if found.notes:
@@ -223,10 +265,18 @@ def print_report(console: Console, found: Identification) -> None:
 
 
 def _say_vanishing(console: Console, found: Identification) -> None:
-    names = [] if isinstance(found.functions, str) else [function.name for function in found.functions if function.vanishes]
+    names = (
+        []
+        if isinstance(found.functions, str)
+        else [function.name for function in found.functions if function.vanishes]
+    )
     more = len(names) - _MOST_NAMED
     if names:
-        _say(console, f"\n0 in truth and estimate: {', '.join(names[:_MOST_NAMED])}{f' and {more} more' if more > 0 else ''}")
+        _say(
+            console,
+            "\n0 in truth and estimate:"
+            f" {', '.join(names[:_MOST_NAMED])}{f' and {more} more' if more > 0 else ''}",
+        )
 
 
 def document(found: Identification) -> dict[str, Any]:
@@ -249,7 +299,10 @@ def document(found: Identification) -> dict[str, Any]:
             {
                 "name": function.name,
                 "unit": function.unit or None,
-                **{key: _finite(getattr(function, key)) for key in ("size", "error", "relative", "largest")},
+                **{
+                    key: _finite(getattr(function, key))
+                    for key in ("size", "error", "relative", "largest")
+                },
             }
             for function in functions
         ],
@@ -258,10 +311,13 @@ def document(found: Identification) -> dict[str, Any]:
 
 
 def _errors_table(errors: Mapping[str, float]) -> Table:
-    """Errors by name; where all names are of the form "what kind", a row for each what and a column for each kind."""
+    """Errors by name; where all names are of the form "what kind", a row for each what and a column
+    for each kind."""
     split = [tuple(name.rpartition(" ")[::2]) for name in errors]
     whats, kinds = (list(dict.fromkeys(parts)) for parts in zip(*split, strict=True))
-    if len(split) < len(whats) * len(kinds) or not all(what and kind.isidentifier() for what, kind in split):
+    if len(split) < len(whats) * len(kinds) or not all(
+        what and kind.isidentifier() for what, kind in split
+    ):
         whats, kinds, split = list(errors), ["error"], [(name, "error") for name in errors]
     values = dict(zip(split, errors.values(), strict=True))
     table = _table("of", *kinds)
@@ -272,18 +328,32 @@ def _errors_table(errors: Mapping[str, float]) -> Table:
 
 def _functions_table(functions: Sequence[Function]) -> Table:
     units = any(function.unit for function in functions)
-    table = _table("function", "truth, rms", "error, rms", "relative", "largest error", *(["unit"] if units else []))
+    table = _table(
+        "function",
+        "truth, rms",
+        "error, rms",
+        "relative",
+        "largest error",
+        *(["unit"] if units else []),
+    )
     if units:
         table.columns[-1].justify = "left"
     for function in functions:
         relative = "-" if function.relative is None else percent(function.relative)
-        cells = [_number(function.size), _number(function.error), relative, _number(function.largest)]
+        cells = [
+            _number(function.size),
+            _number(function.error),
+            relative,
+            _number(function.largest),
+        ]
         table.add_row(Text(function.name), *cells, *([function.unit] if units else []))
     return table
 
 
 def _table(first: str, *columns: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=True, show_edge=False, collapse_padding=True)
+    table = Table(
+        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=True, show_edge=False, collapse_padding=True
+    )
     table.add_column(first, overflow="fold")
     for name in columns:
         table.add_column(name, justify="right", no_wrap=True)
@@ -291,7 +361,9 @@ def _table(first: str, *columns: str) -> Table:
 
 
 def _head(console: Console, name: str, text: str) -> None:
-    console.print(Text.assemble((f"\n{name}", "bold"), f": {text}"), soft_wrap=True, highlight=False)
+    console.print(
+        Text.assemble((f"\n{name}", "bold"), f": {text}"), soft_wrap=True, highlight=False
+    )
 
 
 def _say(console: Console, text: str) -> None:
@@ -313,7 +385,8 @@ def _setting(value: Any) -> str:
 
 
 def percent(share: float) -> str:
-    """A share with two digits, without an exponent for a large one; a rounding error is only bounded."""
+    """A share with two digits, without an exponent for a large one; a rounding error is only
+    bounded."""
     if share < _ROUNDING:
         return f"< {100 * _ROUNDING:g} %"
     return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"

@@ -1,4 +1,5 @@
-"""What the table of an evaluation says of learning: its time, the worst identification, bounds over posteriors, and notes."""
+"""What the table of an evaluation says of learning: its time, the worst identification, bounds over
+posteriors, and notes."""
 
 from __future__ import annotations
 
@@ -35,30 +36,42 @@ def learned_notes(rows: Sequence[Row], problem: SafetyProblem) -> list[str]:
     if not repeats:
         return []
     untried = not any(row["posterior_bound"] for row in rows) and _may_have_a_bound(problem)
-    hint = "; for bayesian-scbf:simultaneous=P one may be estimated over the posterior" if untried else ""
+    hint = (
+        "; for bayesian-scbf:simultaneous=P one may be estimated over the posterior"
+        if untried
+        else ""
+    )
     notes = [f"no bound for what rests on something learned{hint}."]
     if repeats > 1:
         notes.append(
-            f"the intervals take the rates of the {repeats} identifications for nearly normal: bad ones that are rarer than about 1 in "
+            f"the intervals take the rates of the {repeats} identifications for nearly normal: bad"
+            " ones that are rarer than about 1 in "
             f'{repeats} go unseen, and "worst ident." is the worst of those seen.'
         )
     for row in rows:
         learning, bound = row["learning"], row["posterior_bound"]
         if learning and learning["files"]:
             notes.append(
-                f"{row['filter']} was learned before, from {learning['transitions']:,} transitions: {', '.join(learning['files'])}"
+                f"{row['filter']} was learned before, from {learning['transitions']:,} transitions:"
+                f" {', '.join(learning['files'])}"
             )
         elif learning:
             each = " each" if learning["repeats"] > 1 else ""
-            notes.append(f"{row['filter']} was learned from {learning['transitions']:,} transitions{each}.")
-        notes += [f"{row['filter']}: {warning}" for warning in ([*learning["remarks"], *learning["warnings"]] if learning else ())]
+            notes.append(
+                f"{row['filter']} was learned from {learning['transitions']:,} transitions{each}."
+            )
+        notes += [
+            f"{row['filter']}: {warning}"
+            for warning in ([*learning["remarks"], *learning["warnings"]] if learning else ())
+        ]
         if bound and bound["note"]:
             notes.append(f"bound of {row['filter']} over the posterior: {bound['note']}")
         if bound and "delta" in bound:
             notes.append(
-                f"bound of {row['filter']} over the posterior: (1 - delta)(h_0 - (m + e) T)/c, estimated, with probability delta = "
-                f"{bound['delta']:.3g} that the identification misses the system, shortfall m = {bound['shortfall']:.3g}, bias of the "
-                f"steps e = {bound['bias']:.3g}, c = {bound['supremum']:.3g}."
+                f"bound of {row['filter']} over the posterior: (1 - delta)(h_0 - (m + e) T)/c,"
+                f" estimated, with probability delta = {bound['delta']:.3g} that the identification"
+                f" misses the system, shortfall m = {bound['shortfall']:.3g}, bias of the steps e ="
+                f" {bound['bias']:.3g}, c = {bound['supremum']:.3g}."
             )
     return notes
 
@@ -69,11 +82,15 @@ def _repeats(rows: Sequence[Row]) -> int:
 
 
 def _may_have_a_bound(problem: SafetyProblem) -> bool:
-    """Whether a problem has one barrier, of relative degree 1: for others there is no robust condition, on which such a bound rests."""
+    """Whether a problem has one barrier, of relative degree 1: for others there is no robust
+    condition, on which such a bound rests."""
     if len(problem.barriers) != 1:
         return False
     (barrier,) = problem.barriers
-    return not all(vanishes(problem.plant, entry) for entry in lie_derivative_g(problem.plant, barrier.expression))
+    return not all(
+        vanishes(problem.plant, entry)
+        for entry in lie_derivative_g(problem.plant, barrier.expression)
+    )
 
 
 def _seconds(_: Row, speed: Mapping[str, Any]) -> str:

@@ -29,7 +29,9 @@ _COLUMNS = (
 _WIDEST = 1000
 
 
-def run_rare(json: Path | None, refused: Mapping[str, Any], env: Any, policy: str, **arguments: Any) -> None:
+def run_rare(
+    json: Path | None, refused: Mapping[str, Any], env: Any, policy: str, **arguments: Any
+) -> None:
     """Estimate, print the answer and write it.
 
     Args:
@@ -44,9 +46,13 @@ def run_rare(json: Path | None, refused: Mapping[str, Any], env: Any, policy: st
     """
     given = [name for name, value in refused.items() if value]
     if given:
-        raise ConfigurationError(f"--rare does not go with {', '.join(given)}; leave one of them out")
+        raise ConfigurationError(
+            f"--rare does not go with {', '.join(given)}; leave one of them out"
+        )
     with progress_bar("Splitting") as tell:
-        answer = estimate_rare(env, policy, progress=tell, **{k: v for k, v in arguments.items() if v is not None})
+        answer = estimate_rare(
+            env, policy, progress=tell, **{k: v for k, v in arguments.items() if v is not None}
+        )
     print_rare(stdout(), answer)
     write_result(json, answer.document)
 
@@ -56,7 +62,9 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
     config = answer.config
     interval = f"{100 * config['confidence']:.10g} % interval"
     console.print(_heading(answer), soft_wrap=True, highlight=False)
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True)
+    table = Table(
+        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True
+    )
     table.add_column("filter", overflow="fold", vertical="bottom")
     table.add_column(f"P(violation) [{interval}]", justify="right", no_wrap=True, vertical="bottom")
     for name in _COLUMNS:
@@ -64,7 +72,10 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
     for row, speed in zip(answer.rows, answer.timing["rows"], strict=True):
         table.add_row(Text(row["filter"]), *_cells(row, speed["steps_per_second"]))
     # A column that is cut off would be a number that is wrong.
-    console.width = max(console.width, console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum)
+    console.width = max(
+        console.width,
+        console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum,
+    )
     console.print()
     console.print(table)
     console.print()
@@ -82,10 +93,17 @@ def _heading(answer: RareEvaluation) -> Text:
     config = answer.config
     title = Text(config["title"], style="bold")
     how = f"{config['repetitions']} repetitions of {config['particles']} particles"
-    title.append(f" | policy {config['policy']['name']} | rare violations, {how} | seed {config['seed']}", style="not bold")
+    title.append(
+        f" | policy {config['policy']['name']} | rare violations, {how} | seed {config['seed']}",
+        style="not bold",
+    )
     watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
     goal = ", joint program with the goal" if config["objective"] == "clf" else ""
-    title.append(f"\n{describe_system(answer.problem)}{watched}; filters know the {config['knowledge']}{goal}", style="not bold")
+    title.append(
+        f"\n{describe_system(answer.problem)}{watched}; filters know the"
+        f" {config['knowledge']}{goal}",
+        style="not bold",
+    )
     return title
 
 
@@ -109,15 +127,24 @@ def _probability(row: Row) -> str:
 
 def _notes(answer: RareEvaluation) -> list[str]:
     rows, steps = answer.rows, answer.problem.steps
-    notes = [f"doubt the estimate of {row['filter']}: {row['doubt']}." for row in rows if row["doubt"]]
-    notes += [f"the check on {row['filter']}, by {row['check']['method']}, is {_probability(row['check'])}" for row in rows if row["check"]]
+    notes = [
+        f"doubt the estimate of {row['filter']}: {row['doubt']}." for row in rows if row["doubt"]
+    ]
+    notes += [
+        f"the check on {row['filter']}, by {row['check']['method']}, is"
+        f" {_probability(row['check'])}"
+        for row in rows
+        if row["check"]
+    ]
     plain = [row["plain"] for row in rows if row["plain"]]
     if plain:
         notes += unsafe_starts(plain[0]["outside"] / plain[0]["episodes"])
     notes += [
         early_end(row["filter"], "mean episode without a violation", length, steps)
         for row in rows
-        if row["plain"] and (length := row["plain"]["kept_length"]) is not None and length < 0.99 * steps
+        if row["plain"]
+        and (length := row["plain"]["kept_length"]) is not None
+        and length < 0.99 * steps
     ]
     if answer.config["monitoring"] == "continuous":
         notes += bridge_notes(answer.problem)

@@ -20,5 +20,12 @@ def _percents(*rates: float) -> list[str]:
     """With one digit, or as many more as it takes to tell each from 0 and from 1 that is neither."""
     # What rounding has left of 0 and 1 is the same.
     open_ended = [rate for rate in rates if 1e-12 < rate < 1.0 - 1e-12]
-    digits = next((d for d in range(1, _MOST_DIGITS) if all(0.0 < round(100 * rate, d) < 100.0 for rate in open_ended)), _MOST_DIGITS)
+    digits = next(
+        (
+            d
+            for d in range(1, _MOST_DIGITS)
+            if all(0.0 < round(100 * rate, d) < 100.0 for rate in open_ended)
+        ),
+        _MOST_DIGITS,
+    )
     return [f"{100 * rate:.{digits}f}" for rate in rates]

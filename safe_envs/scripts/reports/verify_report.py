@@ -25,7 +25,13 @@ _NOTHING = 1e-6
 """What a coordinate of a state found by a search is off by, in parts of the workspace."""
 
 _NO_BOUND = ("hypothesis fails", "not established")
-_COLORS = {"estimated": "green", "hypothesis fails": "red", "withheld": "red", "no bound": "yellow", "not established": "yellow"}
+_COLORS = {
+    "estimated": "green",
+    "hypothesis fails": "red",
+    "withheld": "red",
+    "no bound": "yellow",
+    "not established": "yellow",
+}
 
 
 def print_report(
@@ -41,15 +47,26 @@ def print_report(
     formulas = found.formulas
     problem = formulas.problem
     title = Text(name, style="bold")
-    title.append(f" | filter {spec_of(formulas.conditions)} | start {problem.start}", style="not bold")
-    title.append(f"\n{describe_system(problem)}; the conditions know the {formulas.knowledge}", style="not bold")
+    title.append(
+        f" | filter {spec_of(formulas.conditions)} | start {problem.start}", style="not bold"
+    )
+    title.append(
+        f"\n{describe_system(problem)}; the conditions know the {formulas.knowledge}",
+        style="not bold",
+    )
     console.print(title, soft_wrap=True, highlight=False)
     _section(console, "Safe set", _set_lines(found, starts))
     for barrier in found.barriers:
         _section(
-            console, f"Barrier {barrier.name}: relative degree {barrier.degree} with {barrier.condition}", _barrier_lines(found, barrier)
+            console,
+            f"Barrier {barrier.name}: relative degree {barrier.degree} with {barrier.condition}",
+            _barrier_lines(found, barrier),
         )
-    _section(console, "Where no action in the box meets the condition" + "s" * (len(found.barriers) > 1), _part_lines(found))
+    _section(
+        console,
+        "Where no action in the box meets the condition" + "s" * (len(found.barriers) > 1),
+        _part_lines(found),
+    )
     _print_bounds(console, found, starts, bounds)
     numbers = {bound.name: str(i) for i, bound in enumerate(bounds, start=1)}
     for measurement in measurements:
@@ -58,12 +75,18 @@ def print_report(
         _say(console, _verdict(measurements, numbers))
     _say(
         console,
-        "\nSuprema, shortfalls and shares are estimates from samples and a local search. The bounds are about conditions that "
-        f"are met at every instant, not every {problem.dt:g} s, and count leaving the workspace as an end, not as a violation.",
+        "\nSuprema, shortfalls and shares are estimates from samples and a local search. The"
+        f" bounds are about conditions that are met at every instant, not every {problem.dt:g} s,"
+        " and count leaving the workspace as an end, not as a violation.",
     )
 
 
-def document(config: dict[str, Any], found: Verification, bounds: Sequence[Bound], measurements: Sequence[Measurement]) -> dict[str, Any]:
+def document(
+    config: dict[str, Any],
+    found: Verification,
+    bounds: Sequence[Bound],
+    measurements: Sequence[Measurement],
+) -> dict[str, Any]:
     """All that was found as strict JSON: what is infinite or not defined is null."""
     formulas = found.formulas
     return _plain(
@@ -81,7 +104,10 @@ def document(config: dict[str, Any], found: Verification, bounds: Sequence[Bound
             "undefined": found.undefined,
             "safe": vars(found.safe),
             "kept": vars(found.kept) if found.kept else None,
-            "barriers": [{**vars(b), "vanishes": b.vanishes, "unbounded": math.isinf(b.supremum)} for b in found.barriers],
+            "barriers": [
+                {**vars(b), "vanishes": b.vanishes, "unbounded": math.isinf(b.supremum)}
+                for b in found.barriers
+            ],
             "bounds": [vars(b) for b in bounds],
             "measurements": [_measured(m) for m in measurements],
         }
@@ -90,7 +116,9 @@ def document(config: dict[str, Any], found: Verification, bounds: Sequence[Bound
 
 def _measured(found: Measurement) -> dict[str, Any]:
     horizons = [{**vars(h), "bounds": [vars(b) for b in h.bounds]} for h in found.horizons]
-    return {key: getattr(found, key) for key in ("start", "state", "episodes", "repeats")} | {"horizons": horizons}
+    return {key: getattr(found, key) for key in ("start", "state", "episodes", "repeats")} | {
+        "horizons": horizons
+    }
 
 
 def _plain(value: Any) -> Any:
@@ -117,40 +145,54 @@ def _say(console: Console, text: str) -> None:
 
 
 def _searched(found: Verification) -> str:
-    """What shares are of: C, or what is left of it in ranges that were chosen for states without any."""
+    """What shares are of: C, or what is left of it in ranges that were chosen for states without
+    any."""
     return "the part of C that is searched" if found.beyond and found.region.chosen.any() else "C"
 
 
 def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
     ranges = f" ({'; '.join(found.region.notes)})" if found.region.notes else ""
     lines = [
-        f"{found.drawn} states were drawn from the workspace{ranges}; C is {_percent(found.safe.share)} of it, and "
-        f"{found.safe.points} of its states are looked at",
+        (
+            f"{found.drawn} states were drawn from the workspace{ranges}; C is"
+            f" {_percent(found.safe.share)} of it, and {found.safe.points} of its states are"
+            " looked at"
+        ),
     ]
     if found.beyond and found.region.chosen.any():
         lines.append("C reaches beyond these ranges: shares and shortfalls are of the part inside")
     elif found.beyond:
-        lines.append("C reaches beyond the workspace: shares, shortfalls and suprema are of the part inside, where the episodes are")
+        lines.append(
+            "C reaches beyond the workspace: shares, shortfalls and suprema are of the part inside,"
+            " where the episodes are"
+        )
     if found.undefined:
         lines.append(
-            f"a condition has no finite value on {_percent(found.undefined)} of {_searched(found)}; nothing can be met or missed there"
+            f"a condition has no finite value on {_percent(found.undefined)} of {_searched(found)};"
+            " nothing can be met or missed there"
         )
     if found.kept is None:
         lines.append("the sets C_j = {b_j >= 0} have no state in common: nothing is kept")
     elif not found.formulas.first_order:
         lines.append(
-            f"the intersection of the C_j = {{b_j >= 0}}, which the condition keeps, is {_percent(found.kept.share)} of {_searched(found)}"
+            "the intersection of the C_j = {b_j >= 0}, which the condition keeps, is"
+            f" {_percent(found.kept.share)} of {_searched(found)}"
         )
         outside = _outside(found, starts)
         if outside:
-            lines.append(f"{_percent(outside)} of the starts are in C and outside this intersection: nothing is promised from there")
+            lines.append(
+                f"{_percent(outside)} of the starts are in C and outside this intersection: nothing"
+                " is promised from there"
+            )
     return lines
 
 
 def _outside(found: Verification, starts: np.ndarray) -> float:
     """The share of starts that are safe, but not in the set that the condition keeps."""
     chain = found.formulas.chain(starts)
-    return float(((chain[:, found.formulas.barriers] > 0.0).all(axis=1) & (chain <= 0.0).any(axis=1)).mean())
+    return float(
+        ((chain[:, found.formulas.barriers] > 0.0).all(axis=1) & (chain <= 0.0).any(axis=1)).mean()
+    )
 
 
 def _barrier_lines(found: Verification, b: BarrierFindings) -> list[str]:
@@ -158,22 +200,42 @@ def _barrier_lines(found: Verification, b: BarrierFindings) -> list[str]:
     size = f"{_number(b.typical)} in the median"
     if b.vanishes:
         lines = [
-            f"leading term: it vanishes at {_state(problem, b.leading_at)}: there the input has no say, and the condition holds only if "
-            "its offset is >= 0",
-            f"  its reach over the box is {size}, below {100 * SMALL:g} % of that on {_percent(b.small)} of {_searched(found)}"
-            + (f"; no action meets the condition on {_percent(b.small_infeasible)} of this part" if b.small else ""),
+            (
+                f"leading term: it vanishes at {_state(problem, b.leading_at)}: there the input has"
+                " no say, and the condition holds only if its offset is >= 0"
+            ),
+            f"  its reach over the box is {size}, below {100 * SMALL:g} % of that on"
+            f" {_percent(b.small)} of {_searched(found)}"
+            + (
+                f"; no action meets the condition on {_percent(b.small_infeasible)} of this part"
+                if b.small
+                else ""
+            ),
         ]
     else:
-        lines = [f"leading term: it vanishes nowhere in C; its reach over the box is at least {_number(b.leading)}, {size}"]
+        lines = [
+            "leading term: it vanishes nowhere in C; its reach over the box is at least"
+            f" {_number(b.leading)}, {size}"
+        ]
     missed = f"misses it by {_number(b.deepest_shortfall)}" if b.deepest_shortfall else "meets it"
     lines.append(
-        f"deepest state of the workspace: h = {_number(b.deepest_h)} at {_state(problem, b.deepest)}; there the best action {missed}"
+        f"deepest state of the workspace: h = {_number(b.deepest_h)} at"
+        f" {_state(problem, b.deepest)}; there the best action {missed}"
     )
     if math.isinf(b.supremum):
         lines.append(f"sup h over C {b.growth}")
     else:
-        over = "" if b.degree == 1 else " over the intersection: " + ", ".join(f"c_{j} = {_number(c)}" for j, c in enumerate(b.suprema))
-        lines.append(f"sup h over C = {_number(b.supremum)};{over}" if over else f"sup h over C = c = {_number(b.supremum)}")
+        over = (
+            ""
+            if b.degree == 1
+            else " over the intersection: "
+            + ", ".join(f"c_{j} = {_number(c)}" for j, c in enumerate(b.suprema))
+        )
+        lines.append(
+            f"sup h over C = {_number(b.supremum)};{over}"
+            if over
+            else f"sup h over C = c = {_number(b.supremum)}"
+        )
     return lines
 
 
@@ -188,42 +250,82 @@ def _describe_part(found: Verification, part: Part) -> str:
     at = _state(found.formulas.problem, part.worst)
     if not part.shortfall:
         return f"nowhere; the least to spare is at {at}"
-    share = _percent(part.infeasible) if part.infeasible else f"less than {_percent(1.0 / part.points)}"
+    share = (
+        _percent(part.infeasible) if part.infeasible else f"less than {_percent(1.0 / part.points)}"
+    )
     return f"{share}, missed by up to {_number(part.shortfall)} at {at}"
 
 
-def _print_bounds(console: Console, found: Verification, starts: np.ndarray, bounds: Sequence[Bound]) -> None:
+def _print_bounds(
+    console: Console, found: Verification, starts: np.ndarray, bounds: Sequence[Bound]
+) -> None:
     problem = found.formulas.problem
-    where = f"at {_state(problem, starts[0])}" if len(starts) == 1 else f"on average over {len(starts)} starts {problem.start!r}"
-    console.print(f"\n[bold]Bounds on the probability of no violation[/] {escape(where)}, T = {problem.duration:g} s", highlight=False)
+    where = (
+        f"at {_state(problem, starts[0])}"
+        if len(starts) == 1
+        else f"on average over {len(starts)} starts {problem.start!r}"
+    )
+    console.print(
+        f"\n[bold]Bounds on the probability of no violation[/] {escape(where)}, T ="
+        f" {problem.duration:g} s",
+        highlight=False,
+    )
     table = _table()
     for name in ("", "bound", "value", "status with the c and m found", "why"):
-        table.add_column(name, justify="right" if name == "value" else "left", no_wrap=name in ("", "value"))
+        table.add_column(
+            name, justify="right" if name == "value" else "left", no_wrap=name in ("", "value")
+        )
     for i, bound in enumerate(bounds, start=1):
         empty = bound.status == "estimated" and not bound.value
         status = f"[{_COLORS[bound.status]}]{bound.status}[/]{', but empty' if empty else ''}"
         table.add_row(str(i), escape(bound.name), _value(bound), status, escape(bound.reason))
     console.print(table)
     if any(bound.status == "estimated" for bound in bounds):
-        _say(console, "Estimated: a theorem, with the c and m found. Larger ones that the search missed would make the bound smaller.")
+        _say(
+            console,
+            "Estimated: a theorem, with the c and m found. Larger ones that the search missed would"
+            " make the bound smaller.",
+        )
     if any(bound.status in _NO_BOUND and bound.value is not None for bound in bounds):
-        _say(console, "In brackets: what a formula gives whose hypotheses fail here, or whose proof does; that is no bound.")
+        _say(
+            console,
+            "In brackets: what a formula gives whose hypotheses fail here, or whose proof does;"
+            " that is no bound.",
+        )
 
 
 def _value(bound: Bound) -> str:
-    return f"({_percent(bound.value)})" if bound.status in _NO_BOUND and bound.value is not None else _percent(bound.value)
+    return (
+        f"({_percent(bound.value)})"
+        if bound.status in _NO_BOUND and bound.value is not None
+        else _percent(bound.value)
+    )
 
 
-def _print_measurement(console: Console, problem: SafetyProblem, policy: str, found: Measurement, numbers: dict[str, str]) -> None:
+def _print_measurement(
+    console: Console,
+    problem: SafetyProblem,
+    policy: str,
+    found: Measurement,
+    numbers: dict[str, str],
+) -> None:
     at = "" if found.state is None else f", {_state(problem, found.state)}"
     heading = f"from {found.start}{at}: {found.episodes} episodes of the policy {policy}"
     console.print(f"\n[bold]Measured[/] {escape(heading)}", highlight=False, soft_wrap=True)
     table = _table()
     names = [bound.name for bound in found.horizons[0].bounds]
-    for name in ("T", "no violation [95 % interval]", *[f"bound {numbers.setdefault(n, str(len(numbers) + 1))}" for n in names]):
+    for name in (
+        "T",
+        "no violation [95 % interval]",
+        *[f"bound {numbers.setdefault(n, str(len(numbers) + 1))}" for n in names],
+    ):
         table.add_column(name, justify="right", no_wrap=True)
     for horizon in found.horizons:
-        table.add_row(f"{horizon.time:g} s", escape(percent_in(horizon.rate, horizon.ci_low, horizon.ci_high)), *_marked(horizon, names))
+        table.add_row(
+            f"{horizon.time:g} s",
+            escape(percent_in(horizon.rate, horizon.ci_low, horizon.ci_high)),
+            *_marked(horizon, names),
+        )
     console.print(table)
     if found.repeats:
         _say(console, "Nothing is random here: all episodes are one and the same.")
@@ -247,16 +349,23 @@ def _verdict(measurements: Sequence[Measurement], numbers: dict[str, str]) -> st
     if not bounds:
         return "\nThere is no bound that the measurement could contradict."
     if not wrong:
-        return "\nThe measurement contradicts no bound." if not withheld else f"\nWithheld: {withheld}"
-    listing = "; ".join(f"{numbers[name]}, {bounds[name].status} ({name})" for name in sorted(wrong, key=lambda name: int(numbers[name])))
+        return (
+            "\nThe measurement contradicts no bound." if not withheld else f"\nWithheld: {withheld}"
+        )
+    listing = "; ".join(
+        f"{numbers[name]}, {bounds[name].status} ({name})"
+        for name in sorted(wrong, key=lambda name: int(numbers[name]))
+    )
     return (
-        f"\nThe measurement contradicts bound {listing}. The interval of the rate lies below it, with the 5 % of error shared by all "
-        "comparisons of this report."
+        f"\nThe measurement contradicts bound {listing}. The interval of the rate lies below it,"
+        " with the 5 % of error shared by all comparisons of this report."
     )
 
 
 def _table() -> Table:
-    return Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=True, show_edge=False, collapse_padding=True)
+    return Table(
+        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=True, show_edge=False, collapse_padding=True
+    )
 
 
 def _state(problem: SafetyProblem, x: np.ndarray) -> str:
@@ -273,4 +382,6 @@ def _number(value: float) -> str:
 
 def _percent(share: float | None) -> str:
     """A share with two digits below 1 %, so that a small one is not read as none."""
-    return percent(share) if share is None or share == 0.0 or share >= 0.01 else f"{100 * share:.2g} %"
+    return (
+        percent(share) if share is None or share == 0.0 or share >= 0.01 else f"{100 * share:.2g} %"
+    )

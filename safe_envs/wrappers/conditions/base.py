@@ -1,4 +1,5 @@
-"""What a condition is: the rule that turns a system and a barrier into an affine constraint on the input."""
+"""What a condition is: the rule that turns a system and a barrier into an affine constraint on the
+input."""
 
 from __future__ import annotations
 
@@ -13,7 +14,15 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import Components
 from safe_envs.dynamics.identities import pieces_fit
-from safe_envs.dynamics.lie import Derivative, generator, has_kinks, lie_derivative_f, lie_derivative_g, relative_degree, tidied
+from safe_envs.dynamics.lie import (
+    Derivative,
+    generator,
+    has_kinks,
+    lie_derivative_f,
+    lie_derivative_g,
+    relative_degree,
+    tidied,
+)
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, SystemDefinitionError, shown
 from safe_envs.problem.barrier import Barrier
@@ -26,7 +35,8 @@ FIRST_ORDER = "first-order"
 
 
 class Terms(Protocol):
-    """Numbers that a row takes from something learned: they stand in its expressions as symbols of their own."""
+    """Numbers that a row takes from something learned: they stand in its expressions as symbols of
+    their own."""
 
     @property
     def symbols(self) -> tuple[sp.Symbol, ...]:
@@ -49,13 +59,15 @@ class AffineConstraint:
     Attributes:
         coefficient: a, an expression for each input.
         offset: b.
-        chain: b_0 = h, ..., b_(r-1); the condition keeps the intersection of {b_j >= 0}, not C itself.
-        demand: of a reciprocal condition, which asks for a u + b >= demand where h > 0 and has no meaning elsewhere. There
-            a u + b is the rate of h, and all that is left is to make that as large as the other rows allow.
-        change: rate of the row while the input is held, an expression of states and inputs, where a margin of first order
-            is asked for.
-        uncertainty: where a and b are known up to an error only, the entries (i, j), i <= j, of the symmetric Q(x) with which
-            the condition asks for a u + b >= sqrt([1, u]' Q [1, u]).
+        chain: b_0 = h, ..., b_(r-1); the condition keeps the intersection of {b_j >= 0}, not C
+            itself.
+        demand: of a reciprocal condition, which asks for a u + b >= demand where h > 0 and has no
+            meaning elsewhere. There a u + b is the rate of h, and all that is left is to make that
+            as large as the other rows allow.
+        change: rate of the row while the input is held, an expression of states and inputs, where a
+            margin of first order is asked for.
+        uncertainty: where a and b are known up to an error only, the entries (i, j), i <= j, of the
+            symmetric Q(x) with which the condition asks for a u + b >= sqrt([1, u]' Q [1, u]).
         terms: what stands for numbers of something learned in the expressions, besides the states.
     """
 
@@ -68,27 +80,37 @@ class AffineConstraint:
     terms: Terms | None = None
 
     @classmethod
-    def after(cls, model: ControlAffineSDE, chain: Sequence[sp.Expr], offset: sp.Expr, demand: sp.Expr | None = None) -> AffineConstraint:
+    def after(
+        cls,
+        model: ControlAffineSDE,
+        chain: Sequence[sp.Expr],
+        offset: sp.Expr,
+        demand: sp.Expr | None = None,
+    ) -> AffineConstraint:
         """The constraint L_g b_(r-1) u + offset >= 0, or >= demand, at the end of a chain."""
         a = lie_derivative_g(model, chain[-1])
-        return cls(tuple(tidied(a[0, j]) for j in range(model.m)), tidied(offset), tuple(chain), demand)
+        return cls(
+            tuple(tidied(a[0, j]) for j in range(model.m)), tidied(offset), tuple(chain), demand
+        )
 
 
 @dataclass(frozen=True)
 class Condition(ABC):
     """Base of the conditions, which are small frozen dataclasses of their parameters.
 
-    A condition holds in continuous time, but an input is held for a control period dt. Along the held input the row
-    psi = a u + b changes by dt psi' + O(dt^2), with psi' the derivative along the flow (for stochastic conditions the
-    generator: then it is the expectation that changes). `sampling_margin` "first-order" therefore asks for
-    psi + dt min(psi', 0) >= 0, so that psi stays nonnegative over the period up to O(dt^2); psi' is quadratic in u and is
-    taken at the action that the condition without a margin allows, which is O(dt) away. A number asks for psi >= that
+    A condition holds in continuous time, but an input is held for a control period dt. Along the
+    held input the row psi = a u + b changes by dt psi' + O(dt^2), with psi' the derivative along
+    the flow (for stochastic conditions the generator: then it is the expectation that changes).
+    `sampling_margin` "first-order" therefore asks for psi + dt min(psi', 0) >= 0, so that psi stays
+    nonnegative over the period up to O(dt^2); psi' is quadratic in u and is taken at the action
+    that the condition without a margin allows, which is O(dt) away. A number asks for psi >= that
     number.
 
     Attributes:
         name: by which `parse_condition` and the command line know it.
         stochastic: whether it takes the noise into account.
-        corrects_model: whether it corrects what the model gets wrong, so that it is of no use to a filter that knows the plant.
+        corrects_model: whether it corrects what the model gets wrong, so that it is of no use to a
+            filter that knows the plant.
         sampling_margin: "none", "first-order", or a number >= 0 in the units of the row.
 
     Raises:
@@ -105,8 +127,14 @@ class Condition(ABC):
         margin = self.sampling_margin
         if margin in ("none", FIRST_ORDER):
             return
-        if isinstance(margin, bool) or not isinstance(margin, int | float) or not 0 <= margin < math.inf:
-            raise ConfigurationError(f"sampling_margin = {shown(margin)}; allowed: none, {FIRST_ORDER}, or a number >= 0")
+        if (
+            isinstance(margin, bool)
+            or not isinstance(margin, int | float)
+            or not 0 <= margin < math.inf
+        ):
+            raise ConfigurationError(
+                f"sampling_margin = {shown(margin)}; allowed: none, {FIRST_ORDER}, or a number >= 0"
+            )
 
     @property
     def derivative(self) -> Derivative:
@@ -121,12 +149,14 @@ class Condition(ABC):
 
         Raises:
             RelativeDegreeError: the condition does not suit the barrier's relative degree.
-            SystemDefinitionError: a class-K function cannot be differentiated as often as the chain needs.
+            SystemDefinitionError: a class-K function cannot be differentiated as often as the chain
+                needs.
         """
         return _constraint(self, model, barrier)
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
-        """The system that the condition differentiates along: the model, unless it has learned another."""
+        """The system that the condition differentiates along: the model, unless it has learned
+        another."""
         return model
 
     @abstractmethod
@@ -139,7 +169,8 @@ class Condition(ABC):
         """The condition with the rates p_1..p_r of a problem for its parameters."""
 
     def chain_rates(self, degree: int) -> tuple[float, ...] | None:
-        """alpha_1..alpha_r of the chain b_j = D b_(j-1) + alpha_j b_(j-1); None where it is not of this form."""
+        """alpha_1..alpha_r of the chain b_j = D b_(j-1) + alpha_j b_(j-1); None where it is not of
+        this form."""
         return None
 
     @property
@@ -151,7 +182,12 @@ class Condition(ABC):
     def spec(self) -> str:
         """The text from which `parse_condition` makes the same condition."""
         margin = {} if self.sampling_margin == "none" else {"sampling_margin": self.sampling_margin}
-        return ":".join([self.name, *(f"{key}={_text(value)}" for key, value in {**self.parameters, **margin}.items())])
+        return ":".join(
+            [
+                self.name,
+                *(f"{key}={_text(value)}" for key, value in {**self.parameters, **margin}.items()),
+            ]
+        )
 
 
 def _text(value: Any) -> str:
@@ -159,16 +195,27 @@ def _text(value: Any) -> str:
 
 
 @lru_cache(maxsize=256)
-def _constraint(condition: Condition, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
-    """Remembered, for the bounds of a filter need the rows that it has, and derivatives of long expressions take their time."""
+def _constraint(
+    condition: Condition, model: ControlAffineSDE, barrier: Barrier
+) -> AffineConstraint:
+    """Remembered, for the bounds of a filter need the rows that it has, and derivatives of long
+    expressions take their time."""
     model = condition.believed(model)
     found = condition.derived(model, barrier)
     # The generator differentiates twice each time; only the last derivative may jump.
     times = len(found.chain) + (condition.sampling_margin == FIRST_ORDER)
-    if not pieces_fit(barrier.expression, model.states, (2 if condition.stochastic and model.noisy else 1) * times - 1):
+    if not pieces_fit(
+        barrier.expression,
+        model.states,
+        (2 if condition.stochastic and model.noisy else 1) * times - 1,
+    ):
         raise _not_smooth(barrier)
     if condition.sampling_margin == FIRST_ORDER:
-        row = sum(a * u for a, u in zip(found.coefficient, model.inputs, strict=True)) + found.offset - (found.demand or 0)
+        row = (
+            sum(a * u for a, u in zip(found.coefficient, model.inputs, strict=True))
+            + found.offset
+            - (found.demand or 0)
+        )
         by_input = (lie_derivative_g(model, row) * sp.Matrix(model.inputs))[0, 0]
         return replace(found, change=resolved(condition.derivative(model, row) + by_input, barrier))
     if condition.sampling_margin != "none":
@@ -189,16 +236,21 @@ def chain_of(
 
     Raises:
         RelativeDegreeError: the number of functions is not the relative degree, or there is none.
-        SystemDefinitionError: the barrier or a class-K function cannot be differentiated as often as the chain needs.
+        SystemDefinitionError: the barrier or a class-K function cannot be differentiated as often
+            as the chain needs.
     """
     degree = relative_degree(model, barrier.expression, derivative)
     if alphas is not None and len(alphas) != degree:
-        raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree} and needs as many rates; {len(alphas)} given")
+        raise RelativeDegreeError(
+            f"barrier {barrier.name} has relative degree {degree} and needs as many rates;"
+            f" {len(alphas)} given"
+        )
     for j, alpha in enumerate(alphas or (), start=1):
         if isinstance(alpha, ClassK) and not alpha.is_smooth(degree - j):
             raise SystemDefinitionError(
-                f"class-K function {alpha} is the {j}. of {degree} and needs {degree - j} continuous derivatives, which it has not at 0; "
-                "use an odd power or another smooth function there"
+                f"class-K function {alpha} is the {j}. of {degree} and needs {degree - j}"
+                " continuous derivatives, which it has not at 0; use an odd power or another"
+                " smooth function there"
             )
     chain = [barrier.expression]
     for alpha in alphas or (None,) * degree:
@@ -208,10 +260,12 @@ def chain_of(
 
 
 def resolved(expression: Any, barrier: Barrier) -> sp.Expr:
-    """A derivative of a chain without what sympy adds at the kinks of class-K functions like s |s|, where it has no weight.
+    """A derivative of a chain without what sympy adds at the kinks of class-K functions like s |s|,
+    where it has no weight.
 
     Raises:
-        SystemDefinitionError: the kink is the barrier's own: there the chain would jump, and Ito's formula miss a local time.
+        SystemDefinitionError: the kink is the barrier's own: there the chain would jump, and Ito's
+            formula miss a local time.
     """
     if not expression.has(sp.DiracDelta, sp.Derivative, sp.Subs):
         return expression
@@ -222,6 +276,6 @@ def resolved(expression: Any, barrier: Barrier) -> sp.Expr:
 
 def _not_smooth(barrier: Barrier) -> SystemDefinitionError:
     return SystemDefinitionError(
-        f"barrier {barrier.name} = {barrier.expression} cannot be differentiated as often as is needed; give a smooth one, of real "
-        "symbols, or one barrier for each of its pieces"
+        f"barrier {barrier.name} = {barrier.expression} cannot be differentiated as often as is"
+        " needed; give a smooth one, of real symbols, or one barrier for each of its pieces"
     )

@@ -19,7 +19,8 @@ from safe_envs.wrappers.conditions.base import AffineConstraint, Condition, chai
 from safe_envs.wrappers.conditions.class_k import ClassK, Rate, positive_rates, rates
 
 _STEPS = 100
-"""Of the search for poles. Gains of real negative ones need fewer; others could keep it busy for seconds."""
+"""Of the search for poles. Gains of real negative ones need fewer; others could keep it busy for
+seconds."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +43,13 @@ class CBF(Condition):
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint; a relative degree other than 1 is a `RelativeDegreeError`."""
         try:
-            return AffineConstraint.after(model, *chain_of(model, barrier, (self.alpha,), lie_derivative_f))
+            return AffineConstraint.after(
+                model, *chain_of(model, barrier, (self.alpha,), lie_derivative_f)
+            )
         except RelativeDegreeError as error:
-            raise RelativeDegreeError(f"{error}. A cbf is for relative degree 1; use hocbf or ecbf") from error
+            raise RelativeDegreeError(
+                f"{error}. A cbf is for relative degree 1; use hocbf or ecbf"
+            ) from error
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> CBF:
@@ -60,10 +65,12 @@ class CBF(Condition):
 class HOCBF(Condition):
     """b_0 = h, b_j = L_f b_(j-1) + alpha_j(b_(j-1)), and b_r(x, u) >= 0.
 
-    The set that it keeps is the intersection of {b_j >= 0}, j < r, not C itself: a start in C alone is no guarantee.
+    The set that it keeps is the intersection of {b_j >= 0}, j < r, not C itself: a start in C alone
+    is no guarantee.
 
     Attributes:
-        p: class-K functions alpha_1..alpha_r, as many as the relative degree; a number is the rate of a linear one in 1/s.
+        p: class-K functions alpha_1..alpha_r, as many as the relative degree; a number is the rate
+            of a linear one in 1/s.
 
     Source: thesis Eq. (3.7), (3.10).
     """
@@ -97,8 +104,8 @@ class ECBF(Condition):
     It is the HOCBF whose rates are minus its poles, and keeps the same sets.
 
     Attributes:
-        k: gains k_0..k_(r-1). The polynomial s^r + k_(r-1) s^(r-1) + ... + k_0 needs real negative roots: stability
-            alone, as thesis Def. 3.1.5 prints it, lets h undershoot below 0.
+        k: gains k_0..k_(r-1). The polynomial s^r + k_(r-1) s^(r-1) + ... + k_0 needs real negative
+            roots: stability alone, as thesis Def. 3.1.5 prints it, lets h undershoot below 0.
         poles: these roots, in 1/s, if they are given in place of the gains.
 
     Raises:
@@ -120,7 +127,9 @@ class ECBF(Condition):
             poles = _real_negative_poles(self.poles)
             gains = gains_of_poles(poles)
             if self.k not in (None, gains):
-                raise ConfigurationError(f"ecbf takes gains or poles; k = {self.k} and poles = {poles} were given")
+                raise ConfigurationError(
+                    f"ecbf takes gains or poles; k = {self.k} and poles = {poles} were given"
+                )
             object.__setattr__(self, "poles", poles)
         object.__setattr__(self, "k", gains)
 
@@ -133,7 +142,10 @@ class ECBF(Condition):
         gains: tuple[float, ...] = self.k or ()
         degree = relative_degree(model, barrier.expression)
         if len(gains) != degree:
-            raise RelativeDegreeError(f"barrier {barrier.name} has relative degree {degree} and needs as many gains; {len(gains)} given")
+            raise RelativeDegreeError(
+                f"barrier {barrier.name} has relative degree {degree} and needs as many gains;"
+                f" {len(gains)} given"
+            )
         eta = derivatives(model, barrier.expression, degree, lie_derivative_f)
         offset = eta[-1] + sum(sp.Float(k, 17) * e for k, e in zip(gains, eta, strict=False))
         chain, _ = chain_of(model, barrier, self.chain_rates(degree), lie_derivative_f)
@@ -155,8 +167,8 @@ class ECBF(Condition):
 
 
 _WHY = (
-    "place real negative ones, one for each relative degree; with complex poles h would oscillate through 0, and with others it would "
-    "not come back to the safe set"
+    "place real negative ones, one for each relative degree; with complex poles h would oscillate"
+    " through 0, and with others it would not come back to the safe set"
 )
 
 
@@ -168,10 +180,14 @@ def gains_of_poles(poles: Sequence[float]) -> tuple[float, ...]:
 
 
 def _real_negative_poles(given: Any) -> tuple[float, ...]:
-    entries = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    entries = (
+        tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    )
     listing = shortened(", ".join(map(str, entries)) or "none")
     if not all(isinstance(pole, Number) and not isinstance(pole, bool) for pole in entries):
-        raise ConfigurationError(f"poles = {listing}; give numbers in 1/s, one for each relative degree")
+        raise ConfigurationError(
+            f"poles = {listing}; give numbers in 1/s, one for each relative degree"
+        )
     poles = [complex(pole) for pole in entries]
     if not poles or any(pole.imag or not -math.inf < pole.real < 0 for pole in poles):
         raise ConfigurationError(f"poles = {listing}: {_WHY}")
@@ -181,12 +197,22 @@ def _real_negative_poles(given: Any) -> tuple[float, ...]:
 def _real_negative_roots(gains: Sequence[float]) -> tuple[float, ...]:
     polynomial = sp.Poly([1, *(sp.Rational(repr(k)) for k in reversed(gains))], sp.Symbol("s"))
     try:
-        # A factor that is repeated exactly is solved once: the iteration does not converge at multiple roots.
-        roots = [root for factor, count in polynomial.sqf_list()[1] for root in factor.nroots(n=50, maxsteps=_STEPS) * count]
+        # A factor that is repeated exactly is solved once: the iteration does not converge at
+        # multiple roots.
+        roots = [
+            root
+            for factor, count in polynomial.sqf_list()[1]
+            for root in factor.nroots(n=50, maxsteps=_STEPS) * count
+        ]
     except NoConvergence as error:
-        raise ConfigurationError(f"the poles of k = {shown(gains)} cannot be computed; give poles in place of gains") from error
-    # Rounding of the gains splits a multiple pole into a ring about it: what oscillates so slowly is real.
+        raise ConfigurationError(
+            f"the poles of k = {shown(gains)} cannot be computed; give poles in place of gains"
+        ) from error
+    # Rounding of the gains splits a multiple pole into a ring about it: what oscillates so slowly
+    # is real.
     if any(sp.re(root) >= 0 or abs(sp.im(root)) > 1e-3 * abs(root) for root in roots):
         listing = ", ".join(str(sp.N(root, 4)) for root in roots)
-        raise ConfigurationError(f"k = {shown(gains)} has its poles at {shortened(listing)}: {_WHY}")
+        raise ConfigurationError(
+            f"k = {shown(gains)} has its poles at {shortened(listing)}: {_WHY}"
+        )
     return tuple(float(sp.re(root)) for root in roots)

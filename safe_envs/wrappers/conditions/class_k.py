@@ -19,7 +19,8 @@ _DIGITS = 150
 _NEAR = 1e-12
 
 _MOST_BITS = 20_000
-"""Of the arguments of exponentials and sines: exp(exp(1e4)) is computed at once, and the exponential of that never."""
+"""Of the arguments of exponentials and sines: exp(exp(1e4)) is computed at once, and the
+exponential of that never."""
 
 _SATURATED = 20
 """Bits of arguments beyond which tanh is 1, to all digits."""
@@ -41,7 +42,8 @@ def _tanh(argument: Any) -> Any:
 
 
 def _modulus(argument: Any) -> Any:
-    """The modulus of a real number. That of a complex one is real, but floats have no complex number on the way there."""
+    """The modulus of a real number. That of a complex one is real, but floats have no complex
+    number on the way there."""
     if isinstance(argument, mpmath.mpc):
         raise ValueError("the modulus of a number that is not real")
     return abs(argument)
@@ -61,7 +63,8 @@ class ClassK:
     Raises:
         ConfigurationError: it is no such function, as found on a grid of 600 points in [-1e4, 1e4].
 
-    Source: thesis Def. 2.1.7, with the whole line as its domain, since a state may be outside the safe set.
+    Source: thesis Def. 2.1.7, with the whole line as its domain, since a state may be outside the
+        safe set.
     """
 
     expression: Any
@@ -70,11 +73,18 @@ class ClassK:
         given = self.expression
         try:
             expression = parsed(given) if isinstance(given, str) else given
-            expression = expression.subs({s: S for s in expression.free_symbols if s.name == S.name})
+            expression = expression.subs(
+                {s: S for s in expression.free_symbols if s.name == S.name}
+            )
         except AttributeError:
-            raise ConfigurationError(f"class-K function {shown(given)} is no expression of s, like 2*s**3 or tanh(s)") from None
+            raise ConfigurationError(
+                f"class-K function {shown(given)} is no expression of s, like 2*s**3 or tanh(s)"
+            ) from None
         if expression.free_symbols != {S} or expression.has(sp.zoo, sp.nan, sp.oo):
-            raise ConfigurationError(f"class-K function {shortened(given)}: give a finite expression of s alone, like 2*s**3")
+            raise ConfigurationError(
+                f"class-K function {shortened(given)}: give a finite expression of s alone, like"
+                " 2*s**3"
+            )
         object.__setattr__(self, "expression", expression)
         # Before its values are computed: what can be read is small.
         if parsed(str(self)) != expression:
@@ -82,21 +92,30 @@ class ClassK:
             raise ConfigurationError(f"class-K function {texts}; write numbers as floats")
         _require_increasing(expression)
         if sp.diff(expression, S).has(sp.Derivative, sp.Subs):
-            raise ConfigurationError(f"class-K function {shortened(self)}: sympy cannot tell its slope; write it without that Abs")
+            raise ConfigurationError(
+                f"class-K function {shortened(self)}: sympy cannot tell its slope; write it without"
+                " that Abs"
+            )
 
     def __call__(self, value: sp.Expr) -> sp.Expr:
         """Return alpha(value)."""
         return self.expression.subs(S, value)
 
     def is_smooth(self, order: int) -> bool:
-        """Whether the derivatives up to an order are finite and continuous at 0, the one place where s |s| and the like are not."""
-        slopes = [sp.diff(self.expression, S, i).replace(sp.DiracDelta, lambda *_: sp.Integer(0)) for i in range(order + 1)]
+        """Whether the derivatives up to an order are finite and continuous at 0, the one place
+        where s |s| and the like are not."""
+        slopes = [
+            sp.diff(self.expression, S, i).replace(sp.DiracDelta, lambda *_: sp.Integer(0))
+            for i in range(order + 1)
+        ]
         if any(slope.has(sp.Derivative, sp.Subs) for slope in slopes):
             return False
         value = sp.lambdify(S, slopes, _MODULES)
         try:
             with mpmath.workdps(_DIGITS):
-                middle, below, above, wide = [value(mpmath.mpf(s)) for s in (0, -_NEAR, _NEAR, 1e6 * _NEAR)]
+                middle, below, above, wide = [
+                    value(mpmath.mpf(s)) for s in (0, -_NEAR, _NEAR, 1e6 * _NEAR)
+                ]
                 return all(
                     mpmath.isfinite(c) and abs(b - a) <= abs(w - c) + abs(c) / 2
                     for c, a, b, w in zip(middle, below, above, wide, strict=True)
@@ -122,13 +141,17 @@ def power(rate: float, exponent: float) -> ClassK:
 
     Args:
         rate: positive.
-        exponent: at least 1: below that the slope at 0 is infinite, and the closed loop need not have a solution.
+        exponent: at least 1: below that the slope at 0 is infinite, and the closed loop need not
+            have a solution.
 
     Raises:
         ConfigurationError: an argument is out of its range.
     """
     if not (finite_number("rate", rate) > 0 and finite_number("exponent", exponent) >= 1):
-        raise ConfigurationError(f"rate = {rate}, exponent = {exponent}; give a positive rate and an exponent of at least 1")
+        raise ConfigurationError(
+            f"rate = {rate}, exponent = {exponent}; give a positive rate and an exponent of at"
+            " least 1"
+        )
     if exponent == int(exponent):
         exponent = int(exponent)
     odd = isinstance(exponent, int) and exponent % 2 == 1
@@ -140,13 +163,19 @@ Rate = float | ClassK
 
 
 def rates(name: str, given: Any) -> tuple[Rate, ...]:
-    """Return class-K functions, the linear ones as positive floats in 1/s, or say which one is none.
+    """Return class-K functions, the linear ones as positive floats in 1/s, or say which one is
+    none.
 
     Raises:
-        ConfigurationError: there is none, or one is neither a positive number nor a class-K function.
+        ConfigurationError: there is none, or one is neither a positive number nor a class-K
+            function.
     """
-    entries = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
-    found = tuple(ClassK(r) if isinstance(r, str) or getattr(r, "free_symbols", None) else r for r in entries)
+    entries = (
+        tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    )
+    found = tuple(
+        ClassK(r) if isinstance(r, str) or getattr(r, "free_symbols", None) else r for r in entries
+    )
     numbers = [r for r in found if not isinstance(r, ClassK)]
     if numbers or not found:
         positive_rates(name, numbers)
@@ -159,10 +188,14 @@ def positive_rates(name: str, given: Any) -> tuple[float, ...]:
     Raises:
         ConfigurationError: there is none, or one is not a positive finite number.
     """
-    entries = tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    entries = (
+        tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
+    )
     try:
         # A text that is a number is one already.
-        values = () if any(isinstance(r, str) for r in entries) else tuple(float(r) for r in entries)
+        values = (
+            () if any(isinstance(r, str) for r in entries) else tuple(float(r) for r in entries)
+        )
     except (TypeError, ValueError, OverflowError):
         values = ()
     if not values or not all(0 < v < float("inf") for v in values):
@@ -183,14 +216,26 @@ def _require_increasing(alpha: sp.Expr) -> None:
     with mpmath.workdps(_DIGITS):
         try:
             at_zero = value(mpmath.mpf(0))
-            values = [value(mpmath.mpf(s)) for s in (*(-s for s in reversed(near + far)), 0, *near, *far)]
+            values = [
+                value(mpmath.mpf(s)) for s in (*(-s for s in reversed(near + far)), 0, *near, *far)
+            ]
         except (ArithmeticError, TypeError, ValueError) as error:
-            raise ConfigurationError(f"class-K function {name} has no value somewhere in [-1e4, 1e4]: {error}") from error
+            raise ConfigurationError(
+                f"class-K function {name} has no value somewhere in [-1e4, 1e4]: {error}"
+            ) from error
         if any(not isinstance(v, mpmath.mpf) or not mpmath.isfinite(v) for v in values):
-            raise ConfigurationError(f"class-K function {name} is not real and finite everywhere; for even powers write s*Abs(s)")
+            raise ConfigurationError(
+                f"class-K function {name} is not real and finite everywhere; for even powers write"
+                " s*Abs(s)"
+            )
         if at_zero != 0:
-            raise ConfigurationError(f"class-K function {name} is {mpmath.nstr(at_zero, 4)} at 0; it has to go through 0")
+            raise ConfigurationError(
+                f"class-K function {name} is {mpmath.nstr(at_zero, 4)} at 0; it has to go through 0"
+            )
         middle = slice(len(far), len(values) - len(far))
         rising = all(a < b for a, b in pairwise(values[middle]))
         if not rising or any(a > b for a, b in pairwise(values)):
-            raise ConfigurationError(f"class-K function {name} is not strictly increasing; for even powers write s*Abs(s)")
+            raise ConfigurationError(
+                f"class-K function {name} is not strictly increasing; for even powers write"
+                " s*Abs(s)"
+            )

@@ -1,4 +1,5 @@
-"""Class-K functions as text: arithmetic of s, read without running code and within bounds on time and memory."""
+"""Class-K functions as text: arithmetic of s, read without running code and within bounds on time
+and memory."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ S = sp.Symbol("s", real=True)
 """The argument of a class-K function."""
 
 _FUNCTIONS: dict[str, Any] = {
-    name: getattr(sp, name) for name in ("Abs", "asinh", "atan", "cos", "cosh", "exp", "log", "sin", "sinh", "sqrt", "tanh")
+    name: getattr(sp, name)
+    for name in ("Abs", "asinh", "atan", "cos", "cosh", "exp", "log", "sin", "sinh", "sqrt", "tanh")
 }
 _CONSTANTS: dict[str, Any] = {"s": S, "pi": sp.pi, "E": sp.E}
 _OPERATORS: dict[type[ast.AST], Any] = {
@@ -32,11 +34,13 @@ _LARGEST_EXPONENT = 100
 
 _MOST_CHARACTERS = 400
 _MOST_PARTS = 60
-"""Numbers, names and operations: the derivatives that a chain of four takes of a product of as many as fit need a second."""
+"""Numbers, names and operations: the derivatives that a chain of four takes of a product of as many
+as fit need a second."""
 
 _MOST_FUNCTIONS = 8
 _DEEPEST = 3
-"""Functions within functions. A fourth exponential of a number above 1 has no value that a computer can hold."""
+"""Functions within functions. A fourth exponential of a number above 1 has no value that a computer
+can hold."""
 
 _MOST_BITS = 1100
 """Of the numerator and the denominator of a fraction, as far as floats reach."""
@@ -45,26 +49,36 @@ _MOST_BITS = 1100
 def parsed(text: str) -> Any:
     """Evaluate arithmetic of s without Python's eval, which would run whatever stands in a spec.
 
-    Nothing is evaluated whose size is not known to be small before: sympy would compute 9**9**9 for days.
+    Nothing is evaluated whose size is not known to be small before: sympy would compute 9**9**9 for
+    days.
 
     Raises:
         ConfigurationError: it is no such arithmetic, or too long.
     """
     if len(text) > _MOST_CHARACTERS:
-        raise ConfigurationError(f"class-K function {shown(text)} has {len(text):,} characters; give at most {_MOST_CHARACTERS}")
+        raise ConfigurationError(
+            f"class-K function {shown(text)} has {len(text):,} characters; give at most"
+            f" {_MOST_CHARACTERS}"
+        )
     if not (text.isascii() and text.isprintable()):
-        raise ConfigurationError(f"class-K function {shown(text)} has characters beyond ASCII; write it like 2*s**3 or tanh(s)")
+        raise ConfigurationError(
+            f"class-K function {shown(text)} has characters beyond ASCII; write it like 2*s**3 or"
+            " tanh(s)"
+        )
     source = text.replace("^", "**").strip()
     try:
         tree = ast.parse(source, mode="eval").body
         _require_few_parts(tree)
         return _evaluated(tree, source)
     except (SyntaxError, RecursionError, MemoryError, TypeError, ZeroDivisionError) as error:
-        raise ConfigurationError(f"class-K function {shown(text)} is no expression of s, like 2*s**3 or tanh(s)") from error
+        raise ConfigurationError(
+            f"class-K function {shown(text)} is no expression of s, like 2*s**3 or tanh(s)"
+        ) from error
 
 
 def _require_few_parts(tree: ast.expr) -> None:
-    """Raise ConfigurationError for more than a person writes; without recursion, for the tree may be as deep as it is large."""
+    """Raise ConfigurationError for more than a person writes; without recursion, for the tree may
+    be as deep as it is large."""
     parts, functions, left = 0, 0, [(tree, 0)]
     while left:
         node, depth = left.pop()
@@ -72,8 +86,9 @@ def _require_few_parts(tree: ast.expr) -> None:
         parts, functions, depth = parts + 1, functions + is_call, depth + is_call
         if parts > _MOST_PARTS or functions > _MOST_FUNCTIONS or depth > _DEEPEST:
             raise ConfigurationError(
-                f"class-K function: it has more than {_MOST_PARTS} numbers, names and operations, more than {_MOST_FUNCTIONS} functions, "
-                f"or functions more than {_DEEPEST} deep within each other; give a simpler one, like 2*s**3 or tanh(s)"
+                f"class-K function: it has more than {_MOST_PARTS} numbers, names and operations,"
+                f" more than {_MOST_FUNCTIONS} functions, or functions more than {_DEEPEST} deep"
+                " within each other; give a simpler one, like 2*s**3 or tanh(s)"
             )
         # The name of a function is a part of its call.
         children = node.args if isinstance(node, ast.Call) else ast.iter_child_nodes(node)
@@ -92,40 +107,53 @@ def _combined(node: ast.expr, source: str) -> Any:
             return sp.sympify(_number(source[node.col_offset : node.end_col_offset]))
         case ast.BinOp(left, kind, right) if type(kind) in _OPERATORS:
             first, second = _evaluated(left, source), _evaluated(right, source)
-            if isinstance(kind, ast.Pow) and not (second.is_Number and abs(second) <= _LARGEST_EXPONENT):
+            if isinstance(kind, ast.Pow) and not (
+                second.is_Number and abs(second) <= _LARGEST_EXPONENT
+            ):
                 raise ConfigurationError(
-                    f"class-K function: the exponent {shortened(ast.unparse(right))} is no number up to {_LARGEST_EXPONENT}"
+                    f"class-K function: the exponent {shortened(ast.unparse(right))} is no number"
+                    f" up to {_LARGEST_EXPONENT}"
                 )
             return _OPERATORS[type(kind)](first, second)
         case ast.UnaryOp(kind, operand) if type(kind) in _OPERATORS:
             return _OPERATORS[type(kind)](_evaluated(operand, source))
         case ast.Call(ast.Name(name), [argument], []):
             if name not in _FUNCTIONS:
-                raise ConfigurationError(f"class-K function: unknown function {shown(name)}; {nearest(name, _FUNCTIONS)}")
+                raise ConfigurationError(
+                    f"class-K function: unknown function {shown(name)}; {nearest(name, _FUNCTIONS)}"
+                )
             return _FUNCTIONS[name](_evaluated(argument, source))
-    raise ConfigurationError(f"class-K function: {shown(ast.unparse(node))} is not allowed; write arithmetic of s, like 2*s**3 or tanh(s)")
+    raise ConfigurationError(
+        f"class-K function: {shown(ast.unparse(node))} is not allowed; write arithmetic of s, like"
+        " 2*s**3 or tanh(s)"
+    )
 
 
 def _number(text: str) -> int | float:
     try:
         return whole_or_real(text)
     except ValueError as error:
-        raise ConfigurationError(f"class-K function: {shown(text)} is no decimal number; write it with the digits 0 to 9") from error
+        raise ConfigurationError(
+            f"class-K function: {shown(text)} is no decimal number; write it with the digits 0 to 9"
+        ) from error
 
 
 def _small(expression: Any, node: ast.expr) -> Any:
-    """An expression, all numbers in which are known to be small: the next operation on it takes no time either.
+    """An expression, all numbers in which are known to be small: the next operation on it takes no
+    time either.
 
     Raises:
         ConfigurationError: one is not.
     """
     exponents = [power.exp for power in expression.atoms(sp.Pow)]
     numbers = expression.atoms(sp.Number)
-    fits = all(e.is_Number and abs(e) <= _LARGEST_EXPONENT for e in exponents) and all(map(_is_small, numbers))
+    fits = all(e.is_Number and abs(e) <= _LARGEST_EXPONENT for e in exponents) and all(
+        map(_is_small, numbers)
+    )
     if not fits or not (expression.free_symbols or _is_real(expression)):
         raise ConfigurationError(
-            f"class-K function: {shown(ast.unparse(node))} has a number that is not real, beyond floats or too long, or an exponent "
-            f"above {_LARGEST_EXPONENT}; give smaller ones"
+            f"class-K function: {shown(ast.unparse(node))} has a number that is not real, beyond"
+            f" floats or too long, or an exponent above {_LARGEST_EXPONENT}; give smaller ones"
         )
     return expression
 

@@ -1,4 +1,5 @@
-"""Reciprocal conditions, whose barrier function B grows without bound towards the edge: RCBF, SRCBF."""
+"""Reciprocal conditions, whose barrier function B grows without bound towards the edge: RCBF,
+SRCBF."""
 
 from __future__ import annotations
 
@@ -26,8 +27,9 @@ class _Reciprocal(Condition):
 
         A h >= (gamma/beta - beta''/2 |sigma' grad h|^2)/beta'
 
-    whose slack has the units of h per s. It means something where h > 0 only, by more than the rounding of h: beyond the edge the
-    inequality would turn round, so that there the row is A h alone.
+    whose slack has the units of h per s. It means something where h > 0 only, by more than the
+    rounding of h: beyond the edge the inequality would turn round, so that there the row is A h
+    alone.
     """
 
     gamma: float = 1.0
@@ -37,7 +39,9 @@ class _Reciprocal(Condition):
         super().__post_init__()
         object.__setattr__(self, "gamma", positive_rates("gamma", (self.gamma,))[0])
         if self.form not in _FORMS:
-            raise ConfigurationError(f"form = {shown(self.form)}; {nearest(str(self.form), _FORMS)}")
+            raise ConfigurationError(
+                f"form = {shown(self.form)}; {nearest(str(self.form), _FORMS)}"
+            )
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint.
@@ -49,14 +53,19 @@ class _Reciprocal(Condition):
         degree = relative_degree(model, h, self.derivative)
         if degree != 1:
             raise RelativeDegreeError(
-                f"barrier {barrier.name} has relative degree {degree}; {self.name} is for relative degree 1. Use hocbf, scbf or szcbf"
+                f"barrier {barrier.name} has relative degree {degree}; {self.name} is for relative"
+                " degree 1. Use hocbf, scbf or szcbf"
             )
         beta = _FORMS[self.form]
         slope = sp.diff(beta, _H)
         demand = sp.simplify(sp.Float(self.gamma, 17) / beta / slope)
         if self.stochastic:
-            demand -= sp.simplify(sp.diff(beta, _H, 2) / slope / 2) * quadratic_variation_rate(model, h)
-        return AffineConstraint.after(model, (h,), resolved(self.derivative(model, h), barrier), demand.subs(_H, h))
+            demand -= sp.simplify(sp.diff(beta, _H, 2) / slope / 2) * quadratic_variation_rate(
+                model, h
+            )
+        return AffineConstraint.after(
+            model, (h,), resolved(self.derivative(model, h), barrier), demand.subs(_H, h)
+        )
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> _Reciprocal:
@@ -68,7 +77,8 @@ class _Reciprocal(Condition):
 class RCBF(_Reciprocal):
     """L_f B + L_g B u <= gamma / B, for relative degree 1, without noise.
 
-    Outside C it has no meaning: the filter gives the action of the largest rate of h there, flagged as infeasible.
+    Outside C it has no meaning: the filter gives the action of the largest rate of h there, flagged
+    as infeasible.
 
     Attributes:
         gamma: weight > 0, in 1/s times the square of the unit of B.
@@ -84,8 +94,9 @@ class RCBF(_Reciprocal):
 class SRCBF(_Reciprocal):
     """A B <= gamma / B with the Ito generator A, for relative degree 1.
 
-    Under noise the second derivative of B asks for unbounded control towards the edge: a box breaks the condition there.
-    Outside C it has no meaning: the filter gives the action of the largest A h there, flagged as infeasible.
+    Under noise the second derivative of B asks for unbounded control towards the edge: a box breaks
+    the condition there. Outside C it has no meaning: the filter gives the action of the largest A h
+    there, flagged as infeasible.
 
     Attributes:
         gamma: weight > 0, in 1/s times the square of the unit of B.

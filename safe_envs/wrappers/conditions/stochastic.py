@@ -1,4 +1,5 @@
-"""Conditions that know the noise, with the Ito generator A in place of the Lie derivative: SCBF, SZCBF."""
+"""Conditions that know the noise, with the Ito generator A in place of the Lie derivative: SCBF,
+SZCBF."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ class SCBF(Condition):
 
     What it promises: `safe_envs.wrappers.verification.bounds`.
 
-    Source: thesis Def. 4.2.6, Prop. 4.2.8, Thm. 4.2.10. The print defines the relative degree by A^j h = 0; what is
+    Source: thesis Def. 4.2.6, Prop. 4.2.8, Thm. 4.2.10. The print defines the relative degree by
+        A^j h = 0; what is
     meant is that L_g A^(j-1) h = 0 below r.
     """
 
@@ -48,7 +50,8 @@ class SZCBF(Condition):
     Attributes:
         alphas: rates alpha_1..alpha_r in 1/s, as many as the relative degree.
 
-    Source: thesis Def. 4.2.4, Prop. 4.2.5 and, for higher degrees, Sec. 4.3.2, which prints h_2 = A h_1 + alpha_2 h:
+    Source: thesis Def. 4.2.4, Prop. 4.2.5 and, for higher degrees, Sec. 4.3.2, which prints h_2 = A
+        h_1 + alpha_2 h:
     with that even noise-free trajectories can leave the set.
     """
 

@@ -1,1 +1,2 @@
-"""Gymnasium wrappers: the safety filter, monitors of third-party envs, and the cost in the return of `step`."""
+"""Gymnasium wrappers: the safety filter, monitors of third-party envs, and the cost in the return
+of `step`."""

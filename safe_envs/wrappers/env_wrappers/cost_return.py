@@ -16,8 +16,8 @@ SixTuple = tuple[Any, Any, Any, Any, Any, dict[str, Any]]
 class CostReturnWrapper:
     """Gives a `step` of six values to an env of this project, scalar or vector, filtered or not.
 
-    It is no `gymnasium.Wrapper`, since Gymnasium's checkers and wrappers take five values: put it around everything else.
-    Every other attribute, such as `action_space`, is that of the env.
+    It is no `gymnasium.Wrapper`, since Gymnasium's checkers and wrappers take five values: put it
+    around everything else. Every other attribute, such as `action_space`, is that of the env.
 
     Args:
         env: whose `info` holds the `cost` of each step.
@@ -28,9 +28,14 @@ class CostReturnWrapper:
 
     def __init__(self, env: gym.Env[Any, Any] | gym.vector.VectorEnv[Any, Any, Any]) -> None:
         if not isinstance(env, gym.Env | gym.vector.VectorEnv):
-            raise ConfigurationError(f"env = {env!r}; give a Gymnasium env or vector env, such as gym.make('safe_envs/Quadrotor-v0')")
+            raise ConfigurationError(
+                f"env = {env!r}; give a Gymnasium env or vector env, such as"
+                " gym.make('safe_envs/Quadrotor-v0')"
+            )
         self.env = env
-        self._mode = env.metadata.get("autoreset_mode") if isinstance(env, gym.vector.VectorEnv) else None
+        self._mode = (
+            env.metadata.get("autoreset_mode") if isinstance(env, gym.vector.VectorEnv) else None
+        )
         self._ended = np.zeros(getattr(env, "num_envs", ()), dtype=bool)
 
     def __getattr__(self, name: str) -> Any:
@@ -39,7 +44,9 @@ class CostReturnWrapper:
             raise AttributeError(f"{type(self).__name__} has no attribute {name!r}")
         return getattr(self.env, name)
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Start an episode, as in Gymnasium."""
         anew = (options or {}).get("reset_mask", True)
         self._ended = self._ended & ~np.asarray(anew, dtype=bool)
@@ -49,25 +56,44 @@ class CostReturnWrapper:
         """Hold an action for one control period.
 
         Returns:
-            The observation, the reward, the cost of the state that was reached, whether the episode was terminated or
-            truncated, and the env's info with that cost once more as `cost_sum`. Over a vector env the first five are arrays
-            (num_envs, ...): a step that ends an episode in same-step autoreset has the cost of its last state, and one that
-            only starts an episode, in next-step autoreset, costs nothing.
+            The observation, the reward, the cost of the state that was reached, whether the episode
+            was terminated or truncated, and the env's info with that cost once more as `cost_sum`.
+            Over a vector env the first five are arrays (num_envs, ...): a step that ends an episode
+            in same-step autoreset has the cost of its last state, and one that only starts an
+            episode, in next-step autoreset, costs nothing.
 
         Raises:
             ConfigurationError: the env reports no cost.
         """
         observation, reward, terminated, truncated, info = self.env.step(action)
         if "cost" not in info:
-            raise ConfigurationError(f"info of {self.env} has no 'cost', but {', '.join(info) or 'nothing'}; use an env of this project")
+            raise ConfigurationError(
+                f"info of {self.env} has no 'cost', but {', '.join(info) or 'nothing'}; use an env"
+                " of this project"
+            )
         if self._mode is None:
-            return observation, reward, info["cost"], terminated, truncated, {**info, "cost_sum": info["cost"]}
+            return (
+                observation,
+                reward,
+                info["cost"],
+                terminated,
+                truncated,
+                {**info, "cost_sum": info["cost"]},
+            )
         cost = self._costs(info)
         self._ended = terminated | truncated
-        return observation, reward, cost, terminated, truncated, {**info, "cost_sum": cost, "_cost_sum": info["_cost"]}
+        return (
+            observation,
+            reward,
+            cost,
+            terminated,
+            truncated,
+            {**info, "cost_sum": cost, "_cost_sum": info["_cost"]},
+        )
 
     def _costs(self, info: dict[str, Any]) -> np.ndarray:
-        """The cost of the step of each env, shape (num_envs,), where the info may be that of a reset."""
+        """The cost of the step of each env, shape (num_envs,), where the info may be that of a
+        reset."""
         cost = info["cost"]
         if self._mode == AutoresetMode.SAME_STEP and "final_info" in info:
             last = info["final_info"]

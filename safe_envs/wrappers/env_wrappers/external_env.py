@@ -1,4 +1,5 @@
-"""How a filter sees an env that was not written for it: a model of it, what is safe, and where its state and its input are."""
+"""How a filter sees an env that was not written for it: a model of it, what is safe, and where its
+state and its input are."""
 
 from __future__ import annotations
 
@@ -41,7 +42,10 @@ class ActionMap(NamedTuple):
         """Input = offset + factor action; numbers, or one for each input."""
         f, o = np.asarray(factor, dtype=float), np.asarray(offset, dtype=float)
         if not (np.isfinite(f).all() and np.isfinite(o).all() and f.all()):
-            raise ConfigurationError(f"factor = {factor!r} and offset = {offset!r} of an action map; give finite numbers, and no factor 0")
+            raise ConfigurationError(
+                f"factor = {factor!r} and offset = {offset!r} of an action map; give finite"
+                " numbers, and no factor 0"
+            )
         return cls(lambda action: o + f * action, lambda u: (u - o) / f)
 
 
@@ -51,14 +55,18 @@ class FilterSpec:
 
     Attributes:
         model: of the env, continuous in time; nobody checks that the env obeys it.
-        barriers: h, safe where h >= 0: an expression of the model's states or a `Barrier`, or several of them.
-        state_fn: from the observation that the wrapper gets, (..., k) mostly, to states (..., n), over any leading axes: write
-            `observation[..., 0]`.
+        barriers: h, safe where h >= 0: an expression of the model's states or a `Barrier`, or
+            several of them.
+        state_fn: from the observation that the wrapper gets, (..., k) mostly, to states (..., n),
+            over any leading axes: write `observation[..., 0]`.
         action_map: between the env's actions and the model's inputs; None where they are the same.
-        filter: text of the filter where an evaluation names none, like "hocbf:p=2,8"; None for what suits the model.
+        filter: text of the filter where an evaluation names none, like "hocbf:p=2,8"; None for what
+            suits the model.
         dt: control period in s; None for the env's own attribute `dt`.
-        gains: rates that the conditions use unless told otherwise; ones by default. See `SafetyProblem`.
-        nominal: a controller to be kept safe, an expression of the model's states and parameters for each input; if any.
+        gains: rates that the conditions use unless told otherwise; ones by default. See
+            `SafetyProblem`.
+        nominal: a controller to be kept safe, an expression of the model's states and parameters
+            for each input; if any.
 
     Raises:
         RelativeDegreeError: no input reaches a barrier.
@@ -77,12 +85,22 @@ class FilterSpec:
 
     def __post_init__(self) -> None:
         if not isinstance(self.model, ControlAffineSDE):
-            raise ConfigurationError(f"model is {type(self.model).__name__}; give a ControlAffineSDE")
+            raise ConfigurationError(
+                f"model is {type(self.model).__name__}; give a ControlAffineSDE"
+            )
         if not callable(self.state_fn):
-            raise ConfigurationError(f"state_fn = {self.state_fn!r}; give a function of observations (..., k) that returns states")
+            raise ConfigurationError(
+                f"state_fn = {self.state_fn!r}; give a function of observations (..., k) that"
+                " returns states"
+            )
         pair = self.action_map
-        if pair is not None and not (isinstance(pair, tuple) and len(pair) == 2 and all(map(callable, pair))):
-            raise ConfigurationError(f"action_map = {pair!r}; give ActionMap(to_input, to_action), or ActionMap.scaled(factor)")
+        if pair is not None and not (
+            isinstance(pair, tuple) and len(pair) == 2 and all(map(callable, pair))
+        ):
+            raise ConfigurationError(
+                f"action_map = {pair!r}; give ActionMap(to_input, to_action), or"
+                " ActionMap.scaled(factor)"
+            )
         for barrier in self.named:
             degree_of(self.model, barrier.expression)
 
@@ -99,7 +117,9 @@ class FilterSpec:
                 raise ConfigurationError(f"unknown argument {name!r}; {nearest(name, names)}")
         missing = [name for name in ("model", "barriers", "state_fn") if name not in view]
         if missing:
-            raise ConfigurationError(f"a filter over an env that is not this project's needs {', '.join(missing)} too")
+            raise ConfigurationError(
+                f"a filter over an env that is not this project's needs {', '.join(missing)} too"
+            )
         return cls(**view)
 
     @classmethod
@@ -133,26 +153,40 @@ class FilterSpec:
         try:
             x = np.array(self.state_fn(observation), dtype=np.float64)
         except Exception as error:
-            raise InvalidInputError(f"state_fn failed at an observation: {type(error).__name__}: {error}") from error
+            raise InvalidInputError(
+                f"state_fn failed at an observation: {type(error).__name__}: {error}"
+            ) from error
         if x.shape != shape:
             raise InvalidInputError(
-                f"state_fn made {x.shape} of observations {np.shape(observation)}; the model needs {shape}. Write it for any leading axes, "
-                "like np.stack([observation[..., 0], observation[..., 1]], axis=-1)"
+                f"state_fn made {x.shape} of observations {np.shape(observation)}; the model needs"
+                f" {shape}. Write it for any leading axes, like np.stack([observation[..., 0],"
+                " observation[..., 1]], axis=-1)"
             )
         if not np.isfinite(x).all():
-            raise InvalidInputError(f"state_fn made {x.tolist()} of {observation!r}; a filter needs finite numbers")
+            raise InvalidInputError(
+                f"state_fn made {x.tolist()} of {observation!r}; a filter needs finite numbers"
+            )
         return x
 
     def inputs(self, actions: np.ndarray) -> np.ndarray:
         """The model's inputs (..., m) for the env's actions."""
-        return np.asarray(actions if self.action_map is None else self.action_map.to_input(actions), dtype=np.float64)
+        return np.asarray(
+            actions if self.action_map is None else self.action_map.to_input(actions),
+            dtype=np.float64,
+        )
 
     def actions(self, inputs: np.ndarray) -> np.ndarray:
         """The env's actions (..., m) for the model's inputs."""
-        return np.asarray(inputs if self.action_map is None else self.action_map.to_action(inputs), dtype=np.float64)
+        return np.asarray(
+            inputs if self.action_map is None else self.action_map.to_action(inputs),
+            dtype=np.float64,
+        )
 
-    def problem(self, env: Any, action_space: gym.Space[Any], name: str, steps: int | None) -> SafetyProblem:
-        """The model as a problem of its own, for all that needs one: conditions, the filter, an evaluation.
+    def problem(
+        self, env: Any, action_space: gym.Space[Any], name: str, steps: int | None
+    ) -> SafetyProblem:
+        """The model as a problem of its own, for all that needs one: conditions, the filter, an
+        evaluation.
 
         Args:
             env: where the attribute `dt` may be found.
@@ -161,8 +195,9 @@ class FilterSpec:
             steps: after which an episode is truncated, if it is.
 
         Raises:
-            ConfigurationError: the action space is no finite box of as many numbers as the model has inputs, the action map does
-                not take it to a box and back, or the control period is unknown.
+            ConfigurationError: the action space is no finite box of as many numbers as the model
+                has inputs, the action map does not take it to a box and back, or the control period
+                is unknown.
         """
         period = self._period(env, name)
         defaults = suitable(self.model, self.named)
@@ -174,7 +209,10 @@ class FilterSpec:
             model=model,
             barriers=self.named,
             states=tuple(Variable(s, -math.inf, math.inf) for s in model.states),
-            inputs=tuple(Variable(u, *ends) for u, ends in zip(model.inputs, self._box(action_space, name), strict=True)),
+            inputs=tuple(
+                Variable(u, *ends)
+                for u, ends in zip(model.inputs, self._box(action_space, name), strict=True)
+            ),
             reward=still,
             nominal=tuple(law_of(law, model) for law in laws),
             starts={"of the env": Start.at((0.0,) * model.n)},
@@ -186,14 +224,22 @@ class FilterSpec:
     def _period(self, env: Any, name: str) -> float:
         given = getattr(env, "dt", None) if self.dt is None else self.dt
         if given is None:
-            raise ConfigurationError(f"{name} has no attribute dt, so that its control period is unknown; give dt, in s")
+            raise ConfigurationError(
+                f"{name} has no attribute dt, so that its control period is unknown; give dt, in s"
+            )
         return finite_number("dt", given)
 
     def _box(self, space: gym.Space[Any], name: str) -> list[tuple[float, float]]:
         m = self.model.m
-        if not isinstance(space, gym.spaces.Box) or space.shape != (m,) or not space.is_bounded() or space.dtype.kind != "f":
+        if (
+            not isinstance(space, gym.spaces.Box)
+            or space.shape != (m,)
+            or not space.is_bounded()
+            or space.dtype.kind != "f"
+        ):
             raise ConfigurationError(
-                f"the action space of {name} is {space}; a filter of {m} inputs needs a bounded Box of floats of ({m},)"
+                f"the action space of {name} is {space}; a filter of {m} inputs needs a bounded Box"
+                f" of floats of ({m},)"
             )
         low, high = space.low.astype(np.float64), space.high.astype(np.float64)
         ends = self._mapped(np.stack([low, high]))
@@ -212,15 +258,18 @@ class FilterSpec:
         )
         if not fits or not width.all():
             raise ConfigurationError(
-                f"the action map does not take the action space {space} to a box of inputs and back: to_action is to undo to_input, and "
-                "each action is to move one input alone"
+                f"the action map does not take the action space {space} to a box of inputs and"
+                " back: to_action is to undo to_input, and each action is to move one input alone"
             )
         return list(zip(least.tolist(), most.tolist(), strict=True))
 
     def _mapped(self, actions: np.ndarray) -> np.ndarray:
         found = self.inputs(actions)
         if found.shape != actions.shape:
-            raise ConfigurationError(f"to_input of the action map made {found.shape} of actions {actions.shape}; it is to keep the shape")
+            raise ConfigurationError(
+                f"to_input of the action map made {found.shape} of actions {actions.shape}; it is"
+                " to keep the shape"
+            )
         return found
 
 

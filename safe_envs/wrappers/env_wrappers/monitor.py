@@ -1,4 +1,5 @@
-"""Safety of envs that know nothing of it: `info` as for this project's own, and their states and inputs for a filter."""
+"""Safety of envs that know nothing of it: `info` as for this project's own, and their states and
+inputs for a filter."""
 
 from __future__ import annotations
 
@@ -17,18 +18,24 @@ from safe_envs.rendering.viewer import Viewer
 from safe_envs.validators import real_array
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
 
-_CHANGE_SIGHT = (gym.ObservationWrapper, gym.wrappers.NormalizeObservation, gym.wrappers.FrameStackObservation)
+_CHANGE_SIGHT = (
+    gym.ObservationWrapper,
+    gym.wrappers.NormalizeObservation,
+    gym.wrappers.FrameStackObservation,
+)
 """Wrappers that change observations."""
 
 
 class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.RecordConstructorArgs):
-    """Adds cost, violation, barrier, h_min and episode_cost to `info`, by a model's barriers; actions go through unchanged.
+    """Adds cost, violation, barrier, h_min and episode_cost to `info`, by a model's barriers;
+    actions go through unchanged.
 
     Keys of the same names that the env reports itself are replaced.
 
     Args:
         env: any env with a box of actions.
-        spec: how its state is seen, and what is safe; or FILE.py:NAME of that, with which an env's own spec can be written as JSON.
+        spec: how its state is seen, and what is safe; or FILE.py:NAME of that, with which an env's
+            own spec can be written as JSON.
 
     Attributes:
         problem: the model as a problem.
@@ -48,7 +55,9 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         self._spec = spec
         self._barriers = barriers_of(spec, "floats")
         self._low, self._high, self._kind = ends_of(env.action_space)
-        self.viewer = Viewer(self.problem, "rgb_array", 1) if env.render_mode == "rgb_array" else None
+        self.viewer = (
+            Viewer(self.problem, "rgb_array", 1) if env.render_mode == "rgb_array" else None
+        )
         self._steps = 0
         self.executed: Sequence[float] = ()
         self._x: tuple[float, ...] | None = None
@@ -70,14 +79,19 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         """
         given = np.asarray(real_array("action", action), dtype=np.float64)
         if given.shape != self._low.shape or not np.isfinite(given).all():
-            raise InvalidInputError(f"action {given.tolist()}: the env takes finite numbers of shape {self._low.shape}")
+            raise InvalidInputError(
+                f"action {given.tolist()}: the env takes finite numbers of shape {self._low.shape}"
+            )
         return self._spec.inputs(np.clip(given, self._low, self._high)).tolist()
 
     def normalized_action(self, u: Sequence[float]) -> np.ndarray:
-        """Inverse of `physical_action`: the env's action for an input of the model, in the numbers of the action space."""
+        """Inverse of `physical_action`: the env's action for an input of the model, in the numbers
+        of the action space."""
         return np.clip(self._spec.actions(np.array(u)), self._low, self._high).astype(self._kind)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Start an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._h_min, self._episode_cost, self._steps = math.inf, 0.0, 0
@@ -101,7 +115,8 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         return self.step(self.normalized_action(u))
 
     def render(self) -> Any:
-        """The env's own picture, in the mode "rgb_array" with what the filter does and the barrier beside it.
+        """The env's own picture, in the mode "rgb_array" with what the filter does and the barrier
+        beside it.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.
@@ -122,20 +137,26 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         cost = 1.0 if violation else 0.0
         self._h_min = min(self._h_min, h)
         self._episode_cost += cost
-        return safety_info(violation, cost, np.array(barrier, dtype=np.float64), self._h_min, self._episode_cost)
+        return safety_info(
+            violation, cost, np.array(barrier, dtype=np.float64), self._h_min, self._episode_cost
+        )
 
 
 def doubt_layers(env: gym.Env[Any, Any]) -> None:
     """Warn of wrappers between a filter and its env that change what it sees or does."""
     layer = env
     while isinstance(layer, gym.Wrapper):
-        sees = isinstance(layer, _CHANGE_SIGHT) or layer.observation_space != layer.env.observation_space
+        sees = (
+            isinstance(layer, _CHANGE_SIGHT)
+            or layer.observation_space != layer.env.observation_space
+        )
         acts = isinstance(layer, gym.ActionWrapper) or layer.action_space != layer.env.action_space
         if sees or acts:
             part = "state_fn" if sees else "action_map"
             warnings.warn(
-                f"{type(layer).__name__} lies between the filter and the env and changes {'observations' if sees else 'actions'}: unless "
-                f"{part} undoes that, the filter keeps something else safe. Put wrappers around the filter",
+                f"{type(layer).__name__} lies between the filter and the env and changes"
+                f" {'observations' if sees else 'actions'}: unless {part} undoes that, the filter"
+                " keeps something else safe. Put wrappers around the filter",
                 SystemDefinitionWarning,
                 stacklevel=4,
             )
@@ -145,7 +166,9 @@ def doubt_layers(env: gym.Env[Any, Any]) -> None:
 def named_and_limited(env: Any) -> tuple[str, int | None]:
     """Name of an env, and the number of steps after which it is truncated."""
     spec = env.spec
-    return (type(env.unwrapped).__name__, None) if spec is None else (spec.id, spec.max_episode_steps)
+    return (
+        (type(env.unwrapped).__name__, None) if spec is None else (spec.id, spec.max_episode_steps)
+    )
 
 
 def ends_of(space: Any) -> tuple[np.ndarray, np.ndarray, Any]:
@@ -155,11 +178,15 @@ def ends_of(space: Any) -> tuple[np.ndarray, np.ndarray, Any]:
 
 def barriers_of(spec: FilterSpec, flavour: Flavour) -> Any:
     """The barriers of a spec, compiled."""
-    return compile_function(spec.model.states, [spec.model.numeric(b.expression) for b in spec.named], flavour)
+    return compile_function(
+        spec.model.states, [spec.model.numeric(b.expression) for b in spec.named], flavour
+    )
 
 
 def _undefined(name: str, x: Sequence[float]) -> NumericalError:
-    return NumericalError(f"a barrier over {name} has no finite value at the state {list(x)}; check it there")
+    return NumericalError(
+        f"a barrier over {name} has no finite value at the state {list(x)}; check it there"
+    )
 
 
 def barrier_table(barriers: Any, name: str, x: Components) -> np.ndarray:

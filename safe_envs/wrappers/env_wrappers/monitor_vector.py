@@ -16,14 +16,20 @@ from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.rendering.viewer import Viewer
 from safe_envs.validators import real_array
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
-from safe_envs.wrappers.env_wrappers.monitor import barrier_table, barriers_of, doubt_layers, ends_of, named_and_limited
+from safe_envs.wrappers.env_wrappers.monitor import (
+    barrier_table,
+    barriers_of,
+    doubt_layers,
+    ends_of,
+    named_and_limited,
+)
 
 
 class SafetyMonitorVector(gym.vector.VectorWrapper):
     """`SafetyMonitor` over a whole batch: arrays with the batch in front, and Gymnasium's masks.
 
-    A step that only resets an env (next-step autoreset) counts nothing but its start. With same-step autoreset the last step of an
-    episode is in `final_info`.
+    A step that only resets an env (next-step autoreset) counts nothing but its start. With
+    same-step autoreset the last step of an episode is in `final_info`.
 
     Args:
         env: any vector env with a box of actions, SyncVectorEnv and AsyncVectorEnv among them.
@@ -48,10 +54,17 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         try:
             self._mode = AutoresetMode(env.metadata.get("autoreset_mode"))
         except ValueError as error:
-            raise ConfigurationError(f"{env} does not say when it resets: its metadata has no autoreset_mode of Gymnasium") from error
+            raise ConfigurationError(
+                f"{env} does not say when it resets: its metadata has no autoreset_mode of"
+                " Gymnasium"
+            ) from error
         self._barriers = barriers_of(spec, "arrays")
         self._low, self._high, self._kind = ends_of(env.single_action_space)
-        self.viewer = Viewer(self.problem, "rgb_array", self.num_envs) if env.render_mode == "rgb_array" else None
+        self.viewer = (
+            Viewer(self.problem, "rgb_array", self.num_envs)
+            if env.render_mode == "rgb_array"
+            else None
+        )
         self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self.executed: Components = ()
         self._x: Components = ()
@@ -62,35 +75,51 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
     @property
     def components(self) -> Components:
-        """The states that the last observations show, an array (num_envs,) for each of the model's states."""
+        """The states that the last observations show, an array (num_envs,) for each of the model's
+        states."""
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
         return self._x
 
     def physical_action(self, actions: Any) -> Components:
-        """Components of the model's inputs for actions (num_envs, m); what lies beyond the action space is clipped.
+        """Components of the model's inputs for actions (num_envs, m); what lies beyond the action
+        space is clipped.
 
         Raises:
             InvalidInputError: the actions have another shape or are not finite.
         """
         given = np.asarray(real_array("array of actions", actions), dtype=np.float64)
         if given.shape != self.action_space.shape or not np.isfinite(given).all():
-            raise InvalidInputError(f"actions of shape {given.shape}: the envs take finite numbers of shape {self.action_space.shape}")
+            raise InvalidInputError(
+                f"actions of shape {given.shape}: the envs take finite numbers of shape"
+                f" {self.action_space.shape}"
+            )
         return _columns(self._spec.inputs(np.clip(given, self._low, self._high)))
 
     def normalized_action(self, u: Sequence[Any]) -> np.ndarray:
-        """Inverse of `physical_action`: the envs' actions for components of inputs, in the numbers of the action space."""
-        return np.clip(self._spec.actions(np.stack(u, axis=-1)), self._low, self._high).astype(self._kind)
+        """Inverse of `physical_action`: the envs' actions for components of inputs, in the numbers
+        of the action space."""
+        return np.clip(self._spec.actions(np.stack(u, axis=-1)), self._low, self._high).astype(
+            self._kind
+        )
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`."""
         # Gymnasium's own vector envs take the mask out of the mapping that they are given.
         anew = np.array((options or {}).get("reset_mask", self._everywhere), dtype=bool)
-        observation, info = self.env.reset(seed=seed, options=None if options is None else dict(options))
+        observation, info = self.env.reset(
+            seed=seed, options=None if options is None else dict(options)
+        )
         self._forget(anew)
         seen = self._seen(observation, anew)
         if self.viewer is not None:
-            self.viewer.restart(np.stack(self._x, axis=-1), self._steps * self.problem.dt, np.flatnonzero(anew).tolist())
+            self.viewer.restart(
+                np.stack(self._x, axis=-1),
+                self._steps * self.problem.dt,
+                np.flatnonzero(anew).tolist(),
+            )
         return observation, {**info, **with_masks(seen, anew)}
 
     def step(self, actions: Any) -> VectorStep:
@@ -108,30 +137,47 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         if self.viewer is not None:
             self._steps += ~anew
             times, begun = self._steps * self.problem.dt, np.flatnonzero(anew).tolist()
-            self.viewer.advance(np.stack(self._x, axis=-1), times, np.stack(self.executed, axis=-1), begun)
-        return observation, reward, terminated, truncated, {**info, **with_masks(shown, self._everywhere.copy())}
+            self.viewer.advance(
+                np.stack(self._x, axis=-1), times, np.stack(self.executed, axis=-1), begun
+            )
+        return (
+            observation,
+            reward,
+            terminated,
+            truncated,
+            {**info, **with_masks(shown, self._everywhere.copy())},
+        )
 
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
         """`step` for the components of the model's inputs."""
         return self.step(self.normalized_action(u))
 
     def render(self) -> Any:
-        """The envs' own pictures, in the mode "rgb_array" with what the filter does and the barrier beside each.
+        """The envs' own pictures, in the mode "rgb_array" with what the filter does and the barrier
+        beside each.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.
         """
         pictures: Any = self.env.render()
-        return pictures if self.viewer is None else self.viewer.frames([np.asarray(picture) for picture in pictures])
+        return (
+            pictures
+            if self.viewer is None
+            else self.viewer.frames([np.asarray(picture) for picture in pictures])
+        )
 
     def _of_same_step(self, observation: np.ndarray, ended: np.ndarray, info: Info) -> Info:
-        """What is shown after a step that restarted the envs that ended: their last step goes to `final_info`."""
+        """What is shown after a step that restarted the envs that ended: their last step goes to
+        `final_info`."""
         if not ended.any():
             return self._seen(observation, self._everywhere)
         last = np.array(observation)
         for i in np.flatnonzero(ended).tolist():
             last[i] = info["final_obs"][i]
-        info["final_info"] = {**info.get("final_info", {}), **with_masks(self._seen(last, self._everywhere), ended)}
+        info["final_info"] = {
+            **info.get("final_info", {}),
+            **with_masks(self._seen(last, self._everywhere), ended),
+        }
         self._forget(ended)
         return self._seen(observation, ended)
 
@@ -155,7 +201,8 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
 
 def _one_of(env: gym.vector.VectorEnv) -> Any:
-    """One of the envs of a batch where they are at hand, as in SyncVectorEnv; the batch itself elsewhere."""
+    """One of the envs of a batch where they are at hand, as in SyncVectorEnv; the batch itself
+    elsewhere."""
     envs = getattr(env.unwrapped, "envs", None)
     return envs[0].unwrapped if envs else env.unwrapped
 

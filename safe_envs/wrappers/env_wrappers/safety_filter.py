@@ -19,27 +19,34 @@ from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
 
-class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], gym.utils.RecordConstructorArgs):
+class SafetyFilterWrapper(
+    gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.ndarray], gym.utils.RecordConstructorArgs
+):
     """Replaces each action of a policy by the nearest one that a condition allows.
 
-    The wrapper takes and passes on actions in [-1, 1]; `info` gains the keys of `safe_envs.envs.info`, in physical units.
+    The wrapper takes and passes on actions in [-1, 1]; `info` gains the keys of
+    `safe_envs.envs.info`, in physical units.
 
-    Over an env of somebody else the filter is told what it needs by name, as the fields of `FilterSpec`; then actions are the env's
-    own, and `info` gains the keys of this project's envs too.
+    Over an env of somebody else the filter is told what it needs by name, as the fields of
+    `FilterSpec`; then actions are the env's own, and `info` gains the keys of this project's envs
+    too.
 
     Args:
         env: one of this project's envs, possibly wrapped; or any env with a box of actions.
-        condition: a `Condition` for every barrier, one for each, or their text, like "scbf", "hocbf:p=2,8" or
-            "hocbf:p=2,8+cbf:alpha=1"; without parameters it takes the env's.
+        condition: a `Condition` for every barrier, one for each, or their text, like "scbf",
+            "hocbf:p=2,8" or "hocbf:p=2,8+cbf:alpha=1"; without parameters it takes the env's.
         knowledge: "model" (what the designer believes) or "plant" (the true system).
-        objective: "nearest" to the policy's action; or "clf" for the joint program with the env's goal, in which the policy has
-            no say: `info["nominal_action"]` is what the goal alone asks for.
-        priorities: of the barriers where not all can be kept: weights of their squared slacks, ones by default.
-        **view: for an env of somebody else `model`, `barriers`, `state_fn`, and what else of `FilterSpec` is needed.
+        objective: "nearest" to the policy's action; or "clf" for the joint program with the env's
+            goal, in which the policy has no say: `info["nominal_action"]` is what the goal alone
+            asks for.
+        priorities: of the barriers where not all can be kept: weights of their squared slacks, ones
+            by default.
+        **view: for an env of somebody else `model`, `barriers`, `state_fn`, and what else of
+          `FilterSpec` is needed.
 
     Raises:
-        ConfigurationError: an argument is unknown or missing, or does not fit the env; or, at a step, a wrapper
-            between the filter and the env changed the action.
+        ConfigurationError: an argument is unknown or missing, or does not fit the env; or, at a
+            step, a wrapper between the filter and the env changed the action.
         InvalidInputError: `state_fn` does not make states of observations.
         RelativeDegreeError: the condition does not suit the env's barrier.
     """
@@ -57,9 +64,13 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
             require_foreign(env.unwrapped, SafeEnv, view, knowledge)
             env = SafetyMonitor(env, FilterSpec.of(view))
         inner = _readable(env)
-        text, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective, priorities)
+        text, self.safety_filter = build_filter(
+            inner.problem, condition, knowledge, objective, priorities
+        )
         # The monitor records the view: an env that is made again from its spec has one already.
-        gym.utils.RecordConstructorArgs.__init__(self, condition=text, knowledge=knowledge, objective=objective, priorities=priorities)
+        gym.utils.RecordConstructorArgs.__init__(
+            self, condition=text, knowledge=knowledge, objective=objective, priorities=priorities
+        )
         gym.Wrapper.__init__(self, env)
         self._inner: Any = inner
         if inner.viewer is not None:
@@ -69,7 +80,9 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         self._interventions = 0
         self._infeasible = 0
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Start an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._interventions = 0
@@ -86,8 +99,15 @@ class SafetyFilterWrapper(gym.Wrapper[np.ndarray, np.ndarray, np.ndarray, np.nda
         if self._directly:
             observation, reward, terminated, truncated, info = self._inner.step_physical(executed)
         else:
-            observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(executed))
-            if any([abs(u - v) > t for u, v, t in zip(executed, self._inner.executed, self._tolerance, strict=True)]):  # noqa: C419  (a list is faster here)
+            observation, reward, terminated, truncated, info = self.env.step(
+                self._inner.normalized_action(executed)
+            )
+            if any(
+                [  # noqa: C419
+                    abs(u - v) > t
+                    for u, v, t in zip(executed, self._inner.executed, self._tolerance, strict=True)
+                ]
+            ):
                 raise changed_action(self, executed, self._inner.executed)
         differs = active and executed != nominal
         self._interventions += differs
@@ -123,25 +143,41 @@ def unreadable(env: Any, vector: bool) -> ConfigurationError:
     """The error of a filter over an env whose state it cannot read."""
     if isinstance(env, gym.vector.VectorEnv) != vector:
         batched = isinstance(env, gym.vector.VectorEnv)
-        kinds = ("SafetyFilterVectorWrapper", "a vector env") if batched else ("SafetyFilterWrapper", "a single env")
+        kinds = (
+            ("SafetyFilterVectorWrapper", "a vector env")
+            if batched
+            else ("SafetyFilterWrapper", "a single env")
+        )
         return ConfigurationError(f"{env} is {kinds[1]}; put {kinds[0]} over it")
     if vector and any(isinstance(each.unwrapped, SafeEnv) for each in getattr(env, "envs", [])):
-        return ConfigurationError(f"{env} holds envs of this project one by one; make them by gym.make_vec, which is many times faster too")
+        return ConfigurationError(
+            f"{env} holds envs of this project one by one; make them by gym.make_vec, which is many"
+            " times faster too"
+        )
     return ConfigurationError(
-        f"{env} is not one of this project's envs, so that a filter cannot read its state; give model, barriers, state_fn: see FilterSpec"
+        f"{env} is not one of this project's envs, so that a filter cannot read its state; give"
+        " model, barriers, state_fn: see FilterSpec"
     )
 
 
 def require_foreign(env: object, ours: type[Any], view: Mapping[str, Any], knowledge: str) -> None:
-    """Raise ConfigurationError where a filter is told how to see an env of this project, or to know what nobody knows."""
+    """Raise ConfigurationError where a filter is told how to see an env of this project, or to know
+    what nobody knows."""
     if isinstance(env, ours):
-        raise ConfigurationError(f"{', '.join(view)}: only for envs of somebody else; {env} has a model and barriers of its own")
+        raise ConfigurationError(
+            f"{', '.join(view)}: only for envs of somebody else; {env} has a model and barriers of"
+            " its own"
+        )
     if knowledge != "model":
-        raise ConfigurationError(f"knowledge = {knowledge!r}: of an env of somebody else nothing is known but the model; use 'model'")
+        raise ConfigurationError(
+            f"knowledge = {knowledge!r}: of an env of somebody else nothing is known but the model;"
+            " use 'model'"
+        )
 
 
 def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv | SafetyMonitor) -> bool:
-    """Whether no wrapper between the filter and the env could change a step, so that its input need not be encoded."""
+    """Whether no wrapper between the filter and the env could change a step, so that its input need
+    not be encoded."""
     while isinstance(env, (OrderEnforcing, PassiveEnvChecker)):
         env = env.env
     return env is inner
@@ -152,11 +188,14 @@ def rounding(problem: SafetyProblem) -> list[float]:
     return [1e-6 * (high - low) for low, high in problem.box]
 
 
-def changed_action(wrapper: object, decided: Sequence[Any], executed: Sequence[Any]) -> ConfigurationError:
+def changed_action(
+    wrapper: object, decided: Sequence[Any], executed: Sequence[Any]
+) -> ConfigurationError:
     """The error of a wrapper below the filter that changed the action that the filter decided on."""
     return ConfigurationError(
-        f"a wrapper below the filter changed the safe action {decided} into {executed}: {wrapper}. Put wrappers that change "
-        "actions around the filter; several conditions go into one SafetyFilter"
+        f"a wrapper below the filter changed the safe action {decided} into {executed}: {wrapper}."
+        " Put wrappers that change actions around the filter; several conditions go into one"
+        " SafetyFilter"
     )
 
 

@@ -14,15 +14,23 @@ from safe_envs.envs.vector_env import SafeVectorEnv, VectorStep
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
-from safe_envs.wrappers.env_wrappers.safety_filter import build_filter, changed_action, require_foreign, rest_info, rounding, unreadable
+from safe_envs.wrappers.env_wrappers.safety_filter import (
+    build_filter,
+    changed_action,
+    require_foreign,
+    rest_info,
+    rounding,
+    unreadable,
+)
 from safe_envs.wrappers.safety_filter import Decision
 
 
 class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
-    """`SafetyFilterWrapper` for the whole batch at once; same arguments, same info with the batch in front.
+    """`SafetyFilterWrapper` for the whole batch at once; same arguments, same info with the batch
+    in front.
 
-    A step that only resets an env (next-step autoreset) ignores its action: there the filter reports what it reports
-    at reset, and counts nothing.
+    A step that only resets an env (next-step autoreset) ignores its action: there the filter
+    reports what it reports at reset, and counts nothing.
 
     Raises:
         ConfigurationError: an argument is unknown or missing, or does not fit the env.
@@ -43,7 +51,9 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             require_foreign(env.unwrapped, SafeVectorEnv, view, knowledge)
             env = SafetyMonitorVector(env, FilterSpec.of(view))
         inner = readable(env)
-        text, self.safety_filter = build_filter(inner.problem, condition, knowledge, objective, priorities)
+        text, self.safety_filter = build_filter(
+            inner.problem, condition, knowledge, objective, priorities
+        )
         super().__init__(env)
         self._inner: Any = inner
         if inner.viewer is not None:
@@ -55,43 +65,69 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         self._infeasible = np.zeros(self.num_envs, dtype=np.int64)
         self._ended = np.zeros(self.num_envs, dtype=bool)
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`."""
         observation, info = self.env.reset(seed=seed, options=options)
         present = info["_cost"]
         self._forget(present)
-        at_rest = {key: np.full((self.num_envs, *np.shape(value)), value) for key, value in self._rest.items()}
+        at_rest = {
+            key: np.full((self.num_envs, *np.shape(value)), value)
+            for key, value in self._rest.items()
+        }
         return observation, {**info, **with_masks(at_rest, present)}
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """That of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
-        counts = {"interventions": self._interventions.copy(), "infeasible": self._infeasible.copy()}
+        counts = {
+            "interventions": self._interventions.copy(),
+            "infeasible": self._infeasible.copy(),
+        }
         return {**self._inner.snapshot(), **counts}
 
-    def restore(self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None) -> None:
+    def restore(
+        self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None
+    ) -> None:
         """Put each episode where a snapshot of a filtered env has it; see `SafeVectorEnv.restore`."""
         self._inner.restore(snapshot, seed)
-        self._interventions, self._infeasible = (np.array(snapshot[name]) for name in ("interventions", "infeasible"))
+        self._interventions, self._infeasible = (
+            np.array(snapshot[name]) for name in ("interventions", "infeasible")
+        )
         self._ended = np.array(snapshot["ended"])
 
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
         proposed = self._inner.physical_action(actions)
         decision = self.safety_filter.decide_arrays(self._inner.components, proposed)
-        active = decision.active[0] if len(decision.active) == 1 else np.logical_or.reduce(decision.active)
+        active = (
+            decision.active[0]
+            if len(decision.active) == 1
+            else np.logical_or.reduce(decision.active)
+        )
         if self._inner.viewer is not None:
-            self._inner.viewer.announce(np.stack(decision.proposed, axis=-1), active, decision.feasible)
+            self._inner.viewer.announce(
+                np.stack(decision.proposed, axis=-1), active, decision.feasible
+            )
         if self.env is self._inner:
-            observation, reward, terminated, truncated, info = self._inner.step_physical(decision.action)
+            observation, reward, terminated, truncated, info = self._inner.step_physical(
+                decision.action
+            )
         else:
-            observation, reward, terminated, truncated, info = self.env.step(self._inner.normalized_action(decision.action))
-            for u, v, tolerance in zip(decision.action, self._inner.executed, self._tolerance, strict=True):
+            observation, reward, terminated, truncated, info = self.env.step(
+                self._inner.normalized_action(decision.action)
+            )
+            for u, v, tolerance in zip(
+                decision.action, self._inner.executed, self._tolerance, strict=True
+            ):
                 if not np.allclose(u, v, rtol=0.0, atol=tolerance):
                     raise changed_action(self, decision.action, self._inner.executed)
         added = self._decided(decision, active)
         ended = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
-            info["final_info"].update(with_masks({key: value.copy() for key, value in added.items()}, ended))
+            info["final_info"].update(
+                with_masks({key: value.copy() for key, value in added.items()}, ended)
+            )
             self._start_anew(added, ended)
         elif self._mode == AutoresetMode.NEXT_STEP:
             if np.count_nonzero(self._ended):
@@ -115,7 +151,9 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
             intervention=differs,
             filter_active=active,
             feasible=decision.feasible,
-            slack=decision.slack[0] if len(decision.slack) == 1 else np.maximum.reduce(decision.slack),
+            slack=(
+                decision.slack[0] if len(decision.slack) == 1 else np.maximum.reduce(decision.slack)
+            ),
             slacks=_beside(decision.slack),
             active_barrier=np.where(differs, decision.cause, -1),
             episode_interventions=self._interventions.copy(),
@@ -123,7 +161,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         )
 
     def _start_anew(self, added: Info, envs: np.ndarray) -> None:
-        """Put what is reported at reset in place of a decision, for the envs that were reset in this step."""
+        """Put what is reported at reset in place of a decision, for the envs that were reset in
+        this step."""
         self._forget(envs)
         for key, value in self._rest.items():
             # The env itself may hold the array of a single input.
@@ -143,7 +182,9 @@ def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
         ConfigurationError: there is none.
     """
     layer = env
-    while isinstance(layer, gym.vector.VectorWrapper) and not isinstance(layer, SafetyMonitorVector):
+    while isinstance(layer, gym.vector.VectorWrapper) and not isinstance(
+        layer, SafetyMonitorVector
+    ):
         layer = layer.env
     if not isinstance(layer, SafeVectorEnv | SafetyMonitorVector):
         raise unreadable(layer, vector=True)

@@ -1,4 +1,5 @@
-"""Learning what a model lacks: residuals of derivatives, the generator of unknown noise, or the whole system."""
+"""Learning what a model lacks: residuals of derivatives, the generator of unknown noise, or the
+whole system."""
 
 from __future__ import annotations
 
@@ -13,18 +14,28 @@ from safe_envs.wrappers.learning.base import LearnedModel, Progress, Record
 from safe_envs.wrappers.learning.checks import require_problem
 from safe_envs.wrappers.learning.models.files import DATA, LearnedFileError, load
 
-__all__ = ["METHODS", "LearnedFileError", "LearnedModel", "Progress", "Record", "learner_of", "load_learned"]
+__all__ = [
+    "METHODS",
+    "LearnedFileError",
+    "LearnedModel",
+    "Progress",
+    "Record",
+    "learner_of",
+    "load_learned",
+]
 
 METHODS = {
     "learned-hocbf": ("residual", "ResidualModel", "learn_residual"),
     "ddscbf": ("generator", "GeneratorModel", "learn_generator"),
     "bayesian": ("bayesian", "Posterior", "identify"),
 }
-"""Module, model and function of each method; imported when they are needed, since they are heavy."""
+"""Module, model and function of each method; imported when they are needed, since they are heavy.
+"""
 
 
 def learner_of(method: str) -> Callable[..., LearnedModel]:
-    """The function that learns a problem by a method: (problem, *, seed, progress, ...) -> LearnedModel.
+    """The function that learns a problem by a method: (problem, *, seed, progress, ...) ->
+    LearnedModel.
 
     Raises:
         LearnedFileError: the method is unknown.
@@ -32,7 +43,9 @@ def learner_of(method: str) -> Callable[..., LearnedModel]:
     return getattr(_module(method), METHODS[method][2])
 
 
-def load_learned(path: Path | str, problem: SafetyProblem, method: str | None = None) -> LearnedModel:
+def load_learned(
+    path: Path | str, problem: SafetyProblem, method: str | None = None
+) -> LearnedModel:
     """Read what was learned of a problem.
 
     Args:
@@ -41,17 +54,25 @@ def load_learned(path: Path | str, problem: SafetyProblem, method: str | None = 
         method: which it has to be of; None for any.
 
     Raises:
-        LearnedFileError: the path is empty, or the file is damaged, holds data, or is of another method or system.
+        LearnedFileError: the path is empty, or the file is damaged, holds data, or is of another
+            method or system.
     """
     if not str(path):
-        raise LearnedFileError("the path of a learned model is empty; name a file that `safe-envs identify` wrote")
+        raise LearnedFileError(
+            "the path of a learned model is empty; name a file that `safe-envs identify` wrote"
+        )
     require_problem(problem)
     content = load(Path(path))
     if content.kind == DATA:
-        raise LearnedFileError(f"{path} holds transitions (data), no model; `safe-envs identify --data {path}` learns from it")
+        raise LearnedFileError(
+            f"{path} holds transitions (data), no model; `safe-envs identify --data {path}` learns"
+            " from it"
+        )
     if method is not None and content.kind != method:
         raise LearnedFileError(f"{path} holds {content.kind}; {method} is needed here")
-    model: LearnedModel = getattr(_module(content.kind), METHODS[content.kind][1]).from_content(content, problem)
+    model: LearnedModel = getattr(_module(content.kind), METHODS[content.kind][1]).from_content(
+        content, problem
+    )
     object.__setattr__(model, "path", Path(path))  # the models are frozen
     return model
 

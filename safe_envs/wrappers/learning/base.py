@@ -13,7 +13,15 @@ import numpy as np
 
 from safe_envs.errors import require_whole, shortened
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.models.files import Content, LearnedFileError, Signature, checksum, require_finite, require_text, save
+from safe_envs.wrappers.learning.models.files import (
+    Content,
+    LearnedFileError,
+    Signature,
+    checksum,
+    require_finite,
+    require_text,
+    save,
+)
 
 Progress = Callable[[float], None]
 """Told which part of the work is done, from 0 to 1."""
@@ -55,7 +63,10 @@ class Record:
         for name in ("observed", "seconds"):
             found[name] = require_finite(found[name])
         found["errors"] = {name: require_finite(error) for name, error in found["errors"].items()}
-        found["settings"], found["warnings"] = dict(found["settings"]), tuple(map(require_text, found["warnings"]))
+        found["settings"], found["warnings"] = (
+            dict(found["settings"]),
+            tuple(map(require_text, found["warnings"])),
+        )
         return cls(**found)
 
 
@@ -84,7 +95,13 @@ class LearnedModel(ABC):
 
     @classmethod
     @abstractmethod
-    def restored(cls, problem: SafetyProblem, record: Record, details: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Self:
+    def restored(
+        cls,
+        problem: SafetyProblem,
+        record: Record,
+        details: Mapping[str, Any],
+        arrays: Mapping[str, np.ndarray],
+    ) -> Self:
         """Make the model again for a problem whose signature fits."""
 
     @classmethod
@@ -93,8 +110,11 @@ class LearnedModel(ABC):
         """Raise LearnedFileError where a model with a signature is of no use for a problem."""
 
     @abstractmethod
-    def compare(self, problem: SafetyProblem, x: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """(truth, estimate) of each learned function at states (B, n), by name, values (B,); the plant is the truth."""
+    def compare(
+        self, problem: SafetyProblem, x: np.ndarray
+    ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """(truth, estimate) of each learned function at states (B, n), by name, values (B,); the
+        plant is the truth."""
 
     def _saved(self) -> dict[str, Any]:
         record = asdict(self.record)
@@ -102,13 +122,15 @@ class LearnedModel(ABC):
 
     @cached_property
     def sha256(self) -> str:
-        """Checksum of the model with its record, but for how long it took: the same seed and data give the same."""
+        """Checksum of the model with its record, but for how long it took: the same seed and data
+        give the same."""
         saved = self._saved()
         del saved["record"]["seconds"]
         return checksum(self.method, self.signature, saved, self.arrays())
 
     def save(self, path: Path) -> None:
-        """Write the model as data, without pickle; see `safe_envs.wrappers.learning.models.files.save`."""
+        """Write the model as data, without pickle; see
+        `safe_envs.wrappers.learning.models.files.save`."""
         save(path, self.method, self.signature, self._saved(), self.arrays())
 
     @classmethod
@@ -126,7 +148,11 @@ class LearnedModel(ABC):
         except LearnedFileError:
             raise
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            raise LearnedFileError(f"the file of {content.kind} is incomplete or altered: {shortened(error)}. Learn again") from error
-        # What may differ from the problem, such as its noise, stays that of the data. The models are frozen.
+            raise LearnedFileError(
+                f"the file of {content.kind} is incomplete or altered: {shortened(error)}. Learn"
+                " again"
+            ) from error
+        # What may differ from the problem, such as its noise, stays that of the data. The models
+        # are frozen.
         object.__setattr__(model, "signature", content.signature)
         return model

@@ -1,4 +1,5 @@
-"""What every way of learning asks for before it begins: sizes that fit into memory, the right objects; and its randomness."""
+"""What every way of learning asks for before it begins: sizes that fit into memory, the right
+objects; and its randomness."""
 
 from __future__ import annotations
 
@@ -17,10 +18,11 @@ _BYTES = 8
 
 
 class Purpose(IntEnum):
-    """Second entries of the seeds of everything random in learning, so that no two uses of a seed share their randomness.
+    """Second entries of the seeds of everything random in learning, so that no two uses of a seed
+    share their randomness.
 
-    None is 0: NumPy takes [s, 0] for s, whose children are those of safe sets and episodes. The small numbers belong to
-    surveys, bounds and the states at which an identification is reported.
+    None is 0: NumPy takes [s, 0] for s, whose children are those of safe sets and episodes. The
+    small numbers belong to surveys, bounds and the states at which an identification is reported.
     """
 
     DATA = 1001
@@ -50,7 +52,10 @@ def require_room(numbers: float, what: str, remedy: str) -> None:
     """
     size = _BYTES * numbers
     if size > _MOST_BYTES:
-        raise ConfigurationError(f"{what} take {size / 1e9:.3g} GB; at most {_MOST_BYTES / 1e9:g} GB are allowed: lower {remedy}")
+        raise ConfigurationError(
+            f"{what} take {size / 1e9:.3g} GB; at most {_MOST_BYTES / 1e9:g} GB are allowed: lower"
+            f" {remedy}"
+        )
 
 
 def require_kind(name: str, value: Any, kind: type, source: str) -> None:
@@ -63,16 +68,21 @@ def require_kind(name: str, value: Any, kind: type, source: str) -> None:
         source: where such an object comes from.
     """
     if not isinstance(value, kind):
-        raise ConfigurationError(f"{name} = {reprlib.repr(value)}, a {type(value).__name__}; give a {kind.__name__}, as {source} makes it")
+        raise ConfigurationError(
+            f"{name} = {reprlib.repr(value)}, a {type(value).__name__}; give a {kind.__name__}, as"
+            f" {source} makes it"
+        )
 
 
 def require_degrees(problem: SafetyProblem, given: Any) -> None:
-    """Raise ValueError unless these are the relative degrees of a problem's barriers: what a file says is to be so before it is used."""
+    """Raise ValueError unless these are the relative degrees of a problem's barriers: what a file
+    says is to be so before it is used."""
     wanted = [relative_degree(problem.model, b.expression) for b in problem.barriers]
     if given != wanted:
         raise ValueError(f"the degrees {shown(given)}, where the barriers have {wanted}")
 
 
 def require_problem(problem: Any) -> None:
-    """Raise ConfigurationError where something else was given for a problem: the id of an env, or an env."""
+    """Raise ConfigurationError where something else was given for a problem: the id of an env, or
+    an env."""
     require_kind("problem", problem, SafetyProblem, "load_problem of safe_envs.registry")

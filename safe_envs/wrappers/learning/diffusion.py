@@ -1,4 +1,5 @@
-"""The covariance of the noise, learned once from one-step transitions: with a known drift, every generator follows from it."""
+"""The covariance of the noise, learned once from one-step transitions: with a known drift, every
+generator follows from it."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ _DEGREES = (0, 1, 2)
 _HELD_OUT = 0.2
 _FEWEST_STARTS = 5
 _SINGULAR = 1e-12
-"""Least eigenvalue of a constant covariance, as part of the largest one: what is below cannot be told from rounding."""
+"""Least eigenvalue of a constant covariance, as part of the largest one: what is below cannot be
+told from rounding."""
 
 _EXACT = 1e-12
 
@@ -48,8 +50,8 @@ class Entry:
 class LearnedDiffusion:
     """C(x) = sigma sigma', each entry a polynomial of degree 0 to 2 in the scaled states.
 
-    A regression knows no signs: where an entry of the diagonal is near 0 it may come out slightly negative. Generators only
-    contain C itself, so that nothing is made of that; but see `system`.
+    A regression knows no signs: where an entry of the diagonal is near 0 it may come out slightly
+    negative. Generators only contain C itself, so that nothing is made of that; but see `system`.
 
     Attributes:
         states: n symbols.
@@ -61,27 +63,38 @@ class LearnedDiffusion:
 
     @classmethod
     def learn(
-        cls, problem: SafetyProblem, data: Transitions, rate: np.ndarray, allowed: np.ndarray | float = 0.0
+        cls,
+        problem: SafetyProblem,
+        data: Transitions,
+        rate: np.ndarray,
+        allowed: np.ndarray | float = 0.0,
     ) -> tuple[LearnedDiffusion, dict[str, float]]:
-        """Regress the covariances at the points, by least squares, with the degree that the information criterion BIC prefers.
+        """Regress the covariances at the points, by least squares, with the degree that the
+        information criterion BIC prefers.
 
         Args:
             problem: over whose region the features are scaled.
-            data: transitions under any inputs; one from each point is enough where there are many points.
-            rate: f(x) + g(x) u at each point, or its mean over the steps, shape (P, n); see `safe_envs.wrappers.learning.estimators`.
-            allowed: residual of each state, shape (n,), that is no noise where data do not repeat; see `slack` there.
+            data: transitions under any inputs; one from each point is enough where there are many
+                points.
+            rate: f(x) + g(x) u at each point, or its mean over the steps, shape (P, n); see
+                `safe_envs.wrappers.learning.estimators`.
+            allowed: residual of each state, shape (n,), that is no noise where data do not repeat;
+                see `slack` there.
 
         Returns:
-            What was learned from all points; and by name, for each entry that is not zero, the root mean square error of a
-            regression on 80 % of the start states at the others, empty where there are less than five. It contains the error
-            of the covariances there, sqrt(2/(K - 1)) of a diagonal entry.
+            What was learned from all points; and by name, for each entry that is not zero, the root
+            mean square error of a regression on 80 % of the start states at the others, empty where
+            there are less than five. It contains the error of the covariances there, sqrt(2/(K -
+            1)) of a diagonal entry.
 
         Source: thesis Sec. 5.3 learns from the same data a term of a single barrier's generator.
         """
         found = covariances(data, rate)
         small = rounding(data, rate) + (allowed if data.repetitions == 1 else 0.0)
         noisy = found.diagonal(axis1=1, axis2=2).max(axis=0) > small**2 / data.dt.min()
-        pairs = [(i, j) for i in range(len(noisy)) for j in range(i, len(noisy)) if noisy[i] and noisy[j]]
+        pairs = [
+            (i, j) for i in range(len(noisy)) for j in range(i, len(noisy)) if noisy[i] and noisy[j]
+        ]
         designs = _designs(problem, data.x)
         fits = {(i, j): _fit(designs, found[:, i, j], may_vanish=i != j) for i, j in pairs}
         entries = tuple(Entry(i, j, *fit) for (i, j), fit in fits.items() if fit is not None)
@@ -92,15 +105,18 @@ class LearnedDiffusion:
         """C, n x n expressions of the states."""
         matrix = sp.zeros(len(self.states))
         for entry in self.entries:
-            matrix[entry.row, entry.column] = matrix[entry.column, entry.row] = entry.features.combined(entry.weights.tolist())
+            matrix[entry.row, entry.column] = matrix[entry.column, entry.row] = (
+                entry.features.combined(entry.weights.tolist())
+            )
         return sp.ImmutableMatrix(matrix)
 
     def system(self, model: ControlAffineSDE) -> ControlAffineSDE:
         """The model with a diffusion L for which L L' = C.
 
-        L is a Cholesky factor in symbols, whose roots cancel in L L': `ito_correction`, and with it every generator, sees the
-        polynomials themselves. To evaluate L is another matter: where the regressed C is not positive definite, its roots
-        have no real value. A constant C is projected to a positive semidefinite one first.
+        L is a Cholesky factor in symbols, whose roots cancel in L L': `ito_correction`, and with it
+        every generator, sees the polynomials themselves. To evaluate L is another matter: where the
+        regressed C is not positive definite, its roots have no real value. A constant C is
+        projected to a positive semidefinite one first.
 
         Args:
             model: with the same states; its own diffusion is ignored.
@@ -113,7 +129,13 @@ class LearnedDiffusion:
     def details(self) -> list[dict[str, Any]]:
         """All but the weights, for JSON."""
         return [
-            {"row": e.row, "column": e.column, "degree": e.features.degree, "region": e.features.region, "angles": e.features.angles}
+            {
+                "row": e.row,
+                "column": e.column,
+                "degree": e.features.degree,
+                "region": e.features.region,
+                "angles": e.features.angles,
+            }
             for e in self.entries
         ]
 
@@ -123,7 +145,10 @@ class LearnedDiffusion:
 
     @classmethod
     def restored(
-        cls, states: tuple[sp.Symbol, ...], details: Sequence[Mapping[str, Any]], arrays: Mapping[str, np.ndarray]
+        cls,
+        states: tuple[sp.Symbol, ...],
+        details: Sequence[Mapping[str, Any]],
+        arrays: Mapping[str, np.ndarray],
     ) -> LearnedDiffusion:
         """Make it again of what `details` and `to_arrays` gave.
 
@@ -144,9 +169,10 @@ class LearnedDiffusion:
 def covariances(data: Transitions, rate: np.ndarray) -> np.ndarray:
     """Estimates of sigma sigma' at each point, free of bias for Euler-Maruyama steps.
 
-    With repetitions they are the covariances of the sample, over dt: whatever the drift is, and however a step without noise
-    was integrated, is not taken for noise. A single successor leaves r r'/dt with the residual r = x' - x - (f + g u) dt, to
-    which an error e of the known drift adds e e' dt.
+    With repetitions they are the covariances of the sample, over dt: whatever the drift is, and
+    however a step without noise was integrated, is not taken for noise. A single successor leaves r
+    r'/dt with the residual r = x' - x - (f + g u) dt, to which an error e of the known drift adds e
+    e' dt.
 
     Args:
         data: transitions under any inputs.
@@ -169,13 +195,19 @@ def covariances(data: Transitions, rate: np.ndarray) -> np.ndarray:
 
 
 def _designs(problem: SafetyProblem, x: np.ndarray) -> list[tuple[Features, np.ndarray]]:
-    """The features of each degree at states (P, n), as far as there are two points for each feature."""
-    candidates = [Features.of(problem, degree) for degree in _DEGREES if Features.allowed(problem, degree)]
+    """The features of each degree at states (P, n), as far as there are two points for each
+    feature."""
+    candidates = [
+        Features.of(problem, degree) for degree in _DEGREES if Features.allowed(problem, degree)
+    ]
     return [(f, f.matrix(x)) for f in candidates if f.degree == 0 or 2 * f.count <= len(x)]
 
 
-def _fit(designs: Sequence[tuple[Features, np.ndarray]], values: np.ndarray, may_vanish: bool) -> tuple[Features, np.ndarray] | None:
-    """Features and weights of the regression of values (P,) with the least BIC; None for the zero function."""
+def _fit(
+    designs: Sequence[tuple[Features, np.ndarray]], values: np.ndarray, may_vanish: bool
+) -> tuple[Features, np.ndarray] | None:
+    """Features and weights of the regression of values (P,) with the least BIC; None for the zero
+    function."""
     # A fit without any residual would win over all others, by an infinite margin.
     floor = len(values) * (_EXACT * np.abs(values).max()) ** 2
 
@@ -191,7 +223,9 @@ def _fit(designs: Sequence[tuple[Features, np.ndarray]], values: np.ndarray, may
     return best
 
 
-def _held_out_errors(problem: SafetyProblem, data: Transitions, found: np.ndarray, entries: Sequence[Entry]) -> dict[str, float]:
+def _held_out_errors(
+    problem: SafetyProblem, data: Transitions, found: np.ndarray, entries: Sequence[Entry]
+) -> dict[str, float]:
     """See `LearnedDiffusion.learn`."""
     if len(np.unique(data.x, axis=0)) < _FEWEST_STARTS:
         return {}
@@ -199,15 +233,20 @@ def _held_out_errors(problem: SafetyProblem, data: Transitions, found: np.ndarra
     kept = ~held
     designs, errors = _designs(problem, data.x[kept]), {}
     for entry in entries:
-        fit = _fit(designs, found[kept, entry.row, entry.column], may_vanish=entry.row != entry.column)
+        fit = _fit(
+            designs, found[kept, entry.row, entry.column], may_vanish=entry.row != entry.column
+        )
         predicted = 0.0 if fit is None else fit[0].matrix(data.x[held]) @ fit[1]
         names = ", ".join(problem.states[i].symbol.name for i in (entry.row, entry.column))
-        errors[f"C({names})"] = float(np.sqrt(np.mean((predicted - found[held, entry.row, entry.column]) ** 2)))
+        errors[f"C({names})"] = float(
+            np.sqrt(np.mean((predicted - found[held, entry.row, entry.column]) ** 2))
+        )
     return errors
 
 
 def _projected(matrix: sp.ImmutableMatrix) -> sp.ImmutableMatrix:
-    """The positive semidefinite matrix of numbers that is nearest to a symmetric one, with all pivots positive where it is not 0."""
+    """The positive semidefinite matrix of numbers that is nearest to a symmetric one, with all
+    pivots positive where it is not 0."""
     numbers = np.array(matrix, dtype=float)
     live = np.flatnonzero(numbers.diagonal())
     values, vectors = np.linalg.eigh(numbers[np.ix_(live, live)])
@@ -227,7 +266,9 @@ def _cholesky(matrix: Any) -> sp.ImmutableMatrix:
             continue
         factor[j, j] = sp.sqrt(pivot)
         for i in range(j + 1, n):
-            factor[i, j] = (matrix[i, j] - sum(factor[i, k] * factor[j, k] for k in range(j))) / factor[j, j]
+            factor[i, j] = (
+                matrix[i, j] - sum(factor[i, k] * factor[j, k] for k in range(j))
+            ) / factor[j, j]
     return sp.ImmutableMatrix(factor)
 
 

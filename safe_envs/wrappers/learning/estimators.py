@@ -1,4 +1,5 @@
-"""Estimates of what the noise adds to the generator of a function, from one-step transitions; the drift is known."""
+"""Estimates of what the noise adds to the generator of a function, from one-step transitions; the
+drift is known."""
 
 from __future__ import annotations
 
@@ -26,13 +27,15 @@ Slopes = Callable[[Components], Components]
 """Its gradient, from n components (B,) to n of them; a number where one is constant."""
 
 _AT_ONCE = 1 << 15
-"""Successors that are looked at together, unless a point alone has more: few enough for the cache."""
+"""Successors that are looked at together, unless a point alone has more: few enough for the cache.
+"""
 
 _BULK = 4096
 """States at which a network is evaluated together: few enough for the cache."""
 
 _BLOCK = 64
-"""States in a matrix product: few enough for BLAS to stay on one thread, since threads that wait for each other take far longer."""
+"""States in a matrix product: few enough for BLAS to stay on one thread, since threads that wait
+for each other take far longer."""
 
 _SUSPECT = 1.5
 """Score of a drift, in standard errors, from which it does not fit the data."""
@@ -53,7 +56,8 @@ class Estimate:
 
     Attributes:
         values: in the units of b per s, shape (P,).
-        deviations: their standard errors, from the spread of the sample, shape (P,); None for a single successor a point.
+        deviations: their standard errors, from the spread of the sample, shape (P,); None for a
+            single successor a point.
     """
 
     values: np.ndarray
@@ -61,15 +65,17 @@ class Estimate:
 
 
 def rates(model: ControlAffineSDE, data: Transitions) -> np.ndarray:
-    """f(x) + g(x) u of a model at each point under its input, in units of the states per s, shape (P, n)."""
+    """f(x) + g(x) u of a model at each point under its input, in units of the states per s, shape
+    (P, n)."""
     return _rate_of(model, data)(data.x)
 
 
 def mean_rates(model: ControlAffineSDE, data: Transitions, rate: np.ndarray) -> np.ndarray:
     """Mean of f + g u of a model over each step, as the data were integrated, shape (P, n).
 
-    An Euler step takes the rate at its beginning, an exact one differs from that by an order of dt, and one of several Euler
-    steps is between them. Which it was is one number, told by least squares over all data; for noise it must not be taken.
+    An Euler step takes the rate at its beginning, an exact one differs from that by an order of dt,
+    and one of several Euler steps is between them. Which it was is one number, told by least
+    squares over all data; for noise it must not be taken.
 
     Args:
         model: that is known.
@@ -94,7 +100,10 @@ def mean_rates(model: ControlAffineSDE, data: Transitions, rate: np.ndarray) -> 
 def _rate_of(model: ControlAffineSDE, data: Transitions) -> Callable[[np.ndarray], np.ndarray]:
     """The function f + g u of a model, of states (P, n) under the inputs of the points."""
     rate = model.numeric(model.drift + model.input_matrix * sp.Matrix(model.inputs))
-    compiled, u = compile_function((*model.states, *model.inputs), tuple(rate), "arrays"), np.ascontiguousarray(data.u.T)
+    compiled, u = (
+        compile_function((*model.states, *model.inputs), tuple(rate), "arrays"),
+        np.ascontiguousarray(data.u.T),
+    )
     return lambda x: stacked(compiled(*np.ascontiguousarray(x.T), *u), len(x))
 
 
@@ -103,28 +112,39 @@ def by_parts(data: Transitions) -> Iterator[tuple[slice, list[np.ndarray]]]:
     points = max(1, _AT_ONCE // data.repetitions)
     for begin in range(0, data.points, points):
         part = slice(begin, begin + points)
-        yield part, [np.ascontiguousarray(component) for component in np.moveaxis(data.successors[part], 2, 0)]
+        yield (
+            part,
+            [
+                np.ascontiguousarray(component)
+                for component in np.moveaxis(data.successors[part], 2, 0)
+            ],
+        )
 
 
 def rounding(data: Transitions, rate: np.ndarray) -> np.ndarray:
-    """The largest residual of each state that may be a rounding error, shape (n,); arguments as for `drift_score`."""
+    """The largest residual of each state that may be a rounding error, shape (n,); arguments as for
+    `drift_score`."""
     return _ROUNDING * (np.abs(data.x) + np.abs(rate) * data.dt[:, None]).max(axis=0)
 
 
 def slack(data: Transitions, rate: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """The largest residual of each state that another way of integrating may make, shape (n,); arguments as for `drift_warnings`."""
+    """The largest residual of each state that another way of integrating may make, shape (n,);
+    arguments as for `drift_warnings`."""
     return _MATERIAL * (np.abs(mean - rate) * data.dt[:, None]).max(axis=0)
 
 
 def drift_score(data: Transitions, rate: np.ndarray, allowed: np.ndarray | float = 0.0) -> float:
-    """How far the mean steps are from a drift's, in standard errors: root mean square over points and states; 1 if it is right.
+    """How far the mean steps are from a drift's, in standard errors: root mean square over points
+    and states; 1 if it is right.
 
-    Steps without repetitions say nothing about it and score 1, and so do residuals within the rounding.
+    Steps without repetitions say nothing about it and score 1, and so do residuals within the
+    rounding.
 
     Args:
         data: transitions under any inputs.
         rate: f(x) + g(x) u at each point, or its mean over the steps, shape (P, n).
-        allowed: part of the mean residual of each state that does not count, shape (n,); see `slack`.
+        allowed: part of the mean residual of each state that does not count, shape (n,); see
+            `slack`.
     """
     expected, small = (data.x + rate * data.dt[:, None]).T, rounding(data, rate)
     ignored = np.broadcast_to(allowed, small.shape)
@@ -134,11 +154,18 @@ def drift_score(data: Transitions, rate: np.ndarray, allowed: np.ndarray | float
             residual = after - expected[i, part, None]
             mean = np.maximum(np.abs(residual.mean(axis=1)) - ignored[i], 0.0)
             square = np.einsum("pk,pk->p", residual, residual) / data.repetitions
-            np.divide(mean**2 * data.repetitions, square, out=scores[part, i], where=square > small[i] ** 2)
+            np.divide(
+                mean**2 * data.repetitions,
+                square,
+                out=scores[part, i],
+                where=square > small[i] ** 2,
+            )
     return float(np.sqrt(scores.mean()))
 
 
-def drift_warnings(data: Transitions, rate: np.ndarray, mean: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
+def drift_warnings(
+    data: Transitions, rate: np.ndarray, mean: np.ndarray, names: Sequence[str]
+) -> tuple[str, ...]:
     """What a user has to know where a drift does not fit the data.
 
     Args:
@@ -150,45 +177,62 @@ def drift_warnings(data: Transitions, rate: np.ndarray, mean: np.ndarray, names:
     score = drift_score(data, mean, slack(data, rate, mean))
     if score >= _SUSPECT:
         return (
-            f"the mean steps are {score:.1f} standard errors away from those of the model's f and g, where 1 is expected: the method takes "
-            "both for known, and what is learned of the noise contains their error. A wrong dt looks the same",
+            (
+                f"the mean steps are {score:.1f} standard errors away from those of the model's f"
+                " and g, where 1 is expected: the method takes both for known, and what is learned"
+                " of the noise contains their error. A wrong dt looks the same"
+            ),
         )
     return _factor_warnings(data, mean, names)
 
 
 def _factor_warnings(data: Transitions, mean: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
-    """The same where the score sees nothing: of a log without repetitions, by regression of the steps on those of the drift."""
+    """The same where the score sees nothing: of a log without repetitions, by regression of the
+    steps on those of the drift."""
     moved = mean * data.dt[:, None]
     product = (data.successors.mean(axis=1) - data.x - moved) * moved
-    size, total, spread = (moved**2).sum(axis=0), product.sum(axis=0), np.sqrt((product**2).sum(axis=0))
+    size, total, spread = (
+        (moved**2).sum(axis=0),
+        product.sum(axis=0),
+        np.sqrt((product**2).sum(axis=0)),
+    )
     excess = np.divide(total, size, out=np.zeros_like(size), where=size > 0)
     bad = (np.abs(total) > _SURE * spread) & (np.abs(excess) > _MATERIAL)
     if not bad.any():
         return ()
     factors = ", ".join(f"{name} {1.0 + excess[i]:.2g}" for i, name in enumerate(names) if bad[i])
     return (
-        f"the steps in the data are not those of the model's f and g over dt, but times: {factors}. A wrong dt, columns in another order "
-        "or a wrong model does this; the method takes all three for right, and what is learned of the noise contains their error",
+        (
+            "the steps in the data are not those of the model's f and g over dt, but times:"
+            f" {factors}. A wrong dt, columns in another order or a wrong model does this; the"
+            " method takes all three for right, and what is learned of the noise contains their"
+            " error"
+        ),
     )
 
 
 def region_warnings(problem: SafetyProblem, data: Transitions) -> tuple[str, ...]:
-    """Which states of the data are to a material part outside the region in which a problem is explored."""
+    """Which states of the data are to a material part outside the region in which a problem is
+    explored."""
     found = []
-    for variable, (low, high), column in zip(problem.states, problem.exploration.region, data.x.T, strict=True):
+    for variable, (low, high), column in zip(
+        problem.states, problem.exploration.region, data.x.T, strict=True
+    ):
         # Of an unbounded angle any turn will do.
         bounded = np.isfinite(variable.low) or np.isfinite(variable.high)
         share = np.mean((column < low) | (column > high))
         if bounded and share > _MATERIAL:
             found.append(
-                f"{share:.0%} of the data have {variable.symbol} outside the explored region, [{low:g}, {high:g}]: it is from "
-                f"{column.min():g} to {column.max():g}. Learn from data of the region, where what is learned will be used"
+                f"{share:.0%} of the data have {variable.symbol} outside the explored region,"
+                f" [{low:g}, {high:g}]: it is from {column.min():g} to {column.max():g}. Learn from"
+                " data of the region, where what is learned will be used"
             )
     return tuple(found)
 
 
 def in_bulk(network: Network, inputs: Sequence[np.ndarray]) -> np.ndarray:
-    """The first output of a tanh network at very many states, in single precision, which is much faster.
+    """The first output of a tanh network at very many states, in single precision, which is much
+    faster.
 
     Args:
         network: with tanh for its activation.
@@ -198,7 +242,10 @@ def in_bulk(network: Network, inputs: Sequence[np.ndarray]) -> np.ndarray:
         Shape (B,), to about 1e-6 of the output's scale.
     """
     found = np.empty(len(inputs[0]))
-    layers = [(w.T.astype(np.float32), b.astype(np.float32)) for w, b in zip(network.weights, network.biases, strict=True)]
+    layers = [
+        (w.T.astype(np.float32), b.astype(np.float32))
+        for w, b in zip(network.weights, network.biases, strict=True)
+    ]
     for begin in range(0, len(found), _BULK):
         part = np.stack([component[begin : begin + _BULK] for component in inputs], axis=1)
         z = np.zeros((-(-len(part) // _BLOCK), _BLOCK, len(inputs)), dtype=np.float32)
@@ -214,22 +261,33 @@ def in_bulk(network: Network, inputs: Sequence[np.ndarray]) -> np.ndarray:
 def require_estimator(name: str) -> None:
     """Raise ConfigurationError unless there is an estimator of this name."""
     if name not in get_args(Estimator):
-        raise ConfigurationError(f"estimator = {shown(name)}; allowed: {', '.join(get_args(Estimator))}")
+        raise ConfigurationError(
+            f"estimator = {shown(name)}; allowed: {', '.join(get_args(Estimator))}"
+        )
 
 
-def ito_part(data: Transitions, rate: np.ndarray, value: Values, slopes: Slopes, estimator: Estimator = "martingale") -> Estimate:
+def ito_part(
+    data: Transitions,
+    rate: np.ndarray,
+    value: Values,
+    slopes: Slopes,
+    estimator: Estimator = "martingale",
+) -> Estimate:
     """Estimate 1/2 tr(sigma sigma' b_xx) at each point, in one of three ways.
 
     With x_j the K successors of x, and xbar = x + (f + g u) dt:
 
-    - "printed": mean[b(x_j) - b(x)]/dt - grad b(x).(f + g u), whose bias of order dt, 1/2 (f + g u)' b_xx (f + g u) dt first of all,
-      is far larger than the signal for the thesis' pendulum, and whose standard deviation is |sigma' grad b|/sqrt(K dt).
+    - "printed": mean[b(x_j) - b(x)]/dt - grad b(x).(f + g u), whose bias of order dt, 1/2 (f + g
+      u)' b_xx (f + g u) dt first of all, is far larger than the signal for the thesis' pendulum,
+      and whose standard deviation is |sigma' grad b|/sqrt(K dt).
     - "centred": mean[b(x_j) - b(xbar)]/dt, without that bias, and with the same standard deviation.
-    - "martingale": mean[b(x_j) - b(xbar) - grad b(xbar).(x_j - xbar)]/dt, without the martingale that makes up that deviation.
-      What is left is sqrt(2/K) of the value itself, for a quadratic b and one channel of noise.
+    - "martingale": mean[b(x_j) - b(xbar) - grad b(xbar).(x_j - xbar)]/dt, without the martingale
+      that makes up that deviation. What is left is sqrt(2/K) of the value itself, for a quadratic b
+      and one channel of noise.
 
-    The last two refer to the data's own Euler-Maruyama step: then they are free of bias for a quadratic b. For a step that was
-    integrated finer, the printed one's bias comes back in the difference between its mean and xbar.
+    The last two refer to the data's own Euler-Maruyama step: then they are free of bias for a
+    quadratic b. For a step that was integrated finer, the printed one's bias comes back in the
+    difference between its mean and xbar.
 
     Args:
         data: transitions under any inputs.
@@ -241,7 +299,8 @@ def ito_part(data: Transitions, rate: np.ndarray, value: Values, slopes: Slopes,
     Raises:
         ConfigurationError: there is no such estimator.
 
-    Source: thesis Eq. (5.17), (5.18), whose sum runs from j = 0 where 1 is meant: one term more adds b/(K dt).
+    Source: thesis Eq. (5.17), (5.18), whose sum runs from j = 0 where 1 is meant: one term more
+        adds b/(K dt).
     """
     require_estimator(estimator)
     origin = data.x if estimator == "printed" else data.x + rate * data.dt[:, None]
@@ -251,7 +310,12 @@ def ito_part(data: Transitions, rate: np.ndarray, value: Values, slopes: Slopes,
     values, deviations = np.empty(data.points), np.empty(data.points)
     for part, successors in by_parts(data):
         shape = successors[0].shape
-        change = filled(value(tuple(c.reshape(-1) for c in successors)), (successors[0].size,)).reshape(shape) - level[part, None]
+        change = (
+            filled(value(tuple(c.reshape(-1) for c in successors)), (successors[0].size,)).reshape(
+                shape
+            )
+            - level[part, None]
+        )
         if estimator == "martingale":
             for component, start, slope in zip(successors, base, gradient.T, strict=True):
                 change -= (component - start[part, None]) * slope[part, None]

@@ -37,11 +37,12 @@ class Trained:
     """A network and how well it was trained.
 
     Attributes:
-        network: with the weights of the epoch of least validation loss; a constant for each target that is one.
+        network: with the weights of the epoch of least validation loss; a constant for each target
+            that is one.
         epochs: that were run; none where there are only constants.
         validation_loss: the least one: mean squared error of the standardised targets.
-        heldout: absolute errors (N_h, q) at rows that neither the training nor the choice of the epoch has seen, in the
-            units of the targets.
+        heldout: absolute errors (N_h, q) at rows that neither the training nor the choice of the
+            epoch has seen, in the units of the targets.
     """
 
     network: Network
@@ -63,10 +64,11 @@ def train(
     sizes: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> Trained:
-    """Fit a network: 70 % of the rows train it, 15 % choose the epoch, 15 % measure it. One thread, no global generator.
+    """Fit a network: 70 % of the rows train it, 15 % choose the epoch, 15 % measure it. One thread,
+    no global generator.
 
-    A target that is the same in all rows, up to rounding, is answered by this constant: of a barrier to which the noise adds
-    nothing, a network would learn its own error.
+    A target that is the same in all rows, up to rounding, is answered by this constant: of a
+    barrier to which the noise adds nothing, a network would learn its own error.
 
     Args:
         inputs: (N, p).
@@ -76,14 +78,17 @@ def train(
         epochs: at most; training stops when the validation loss has not fallen for 60 of them.
         batch: rows in a step.
         rate: of Adam.
-        seed: of the split, the first weights and the order of the rows; the same seed gives the same network.
-        sizes: (q,), against which the spread of each target is judged small (see `_standardisation`); its largest entry
-            by default.
+        seed: of the split, the first weights and the order of the rows; the same seed gives the
+            same network.
+        sizes: (q,), against which the spread of each target is judged small (see
+            `_standardisation`); its largest entry by default.
         progress: told after each epoch.
 
     Raises:
-        InvalidInputError: the arrays have other shapes, fewer than ten rows, or entries that are not finite or above 1e100.
-        ConfigurationError: a setting is out of its range, or the network would have more than ten million parameters.
+        InvalidInputError: the arrays have other shapes, fewer than ten rows, or entries that are
+            not finite or above 1e100.
+        ConfigurationError: a setting is out of its range, or the network would have more than ten
+            million parameters.
 
     Source: thesis Sec. 3.4.2, whose loss lacks the square and whose update has the wrong sign.
     """
@@ -102,13 +107,26 @@ def train(
     x, y = (inputs - ends[0]) / ends[1], (targets - ends[2]) / ends[3]
     constant = np.ptp(targets, axis=0) <= _ROUNDING * np.abs(targets).max(axis=0)
     with _single_thread():
-        layers, run, loss = _fit(x, y, parts, widths, activation, 0 if constant.all() else epochs, batch, rate, int(seed), progress)
+        layers, run, loss = _fit(
+            x,
+            y,
+            parts,
+            widths,
+            activation,
+            0 if constant.all() else epochs,
+            batch,
+            rate,
+            int(seed),
+            progress,
+        )
     # In the last layer, whose output the mean is added to.
     for numbers in layers[-1]:
         numbers[constant] = 0.0
     network = Network(tuple(w for w, _ in layers), tuple(b for _, b in layers), activation, *ends)
     predicted = np.stack(network.arrays(tuple(inputs[parts[2]].T)), axis=1)
-    return Trained(network, run, 0.0 if constant.all() else loss, np.abs(predicted - targets[parts[2]]))
+    return Trained(
+        network, run, 0.0 if constant.all() else loss, np.abs(predicted - targets[parts[2]])
+    )
 
 
 def hidden_widths(hidden: Any) -> tuple[int, ...]:
@@ -120,7 +138,10 @@ def hidden_widths(hidden: Any) -> tuple[int, ...]:
     try:
         widths = tuple(hidden)
     except TypeError as error:
-        raise ConfigurationError(f"hidden = {shown(hidden)}; give the width of each hidden layer, such as (100, 30) or (100,)") from error
+        raise ConfigurationError(
+            f"hidden = {shown(hidden)}; give the width of each hidden layer, such as (100, 30) or"
+            " (100,)"
+        ) from error
     for width in widths:
         require_whole("the width of a hidden layer", width, 1)
     return tuple(map(int, widths))
@@ -131,26 +152,38 @@ def _require_size(widths: Sequence[int]) -> None:
     parameters = sum((into + 1) * out for into, out in pairwise(widths))
     if parameters > _MOST_PARAMETERS:
         raise ConfigurationError(
-            f"hidden = {list(widths[1:-1])} makes a network of {parameters:.3g} parameters; at most {_MOST_PARAMETERS} are allowed: "
-            "give narrower hidden layers"
+            f"hidden = {list(widths[1:-1])} makes a network of {parameters:.3g} parameters; at most"
+            f" {_MOST_PARAMETERS} are allowed: give narrower hidden layers"
         )
 
 
 def _check_data(inputs: np.ndarray, targets: np.ndarray) -> None:
-    if inputs.ndim != 2 or targets.ndim != 2 or len(inputs) != len(targets) or not inputs.size or not targets.size:
-        raise InvalidInputError(f"inputs and targets have the shapes {inputs.shape} and {targets.shape}; give (N, p) and (N, q)")
+    if (
+        inputs.ndim != 2
+        or targets.ndim != 2
+        or len(inputs) != len(targets)
+        or not inputs.size
+        or not targets.size
+    ):
+        raise InvalidInputError(
+            f"inputs and targets have the shapes {inputs.shape} and {targets.shape}; give (N, p)"
+            " and (N, q)"
+        )
     if len(inputs) < LEAST_ROWS:
         raise InvalidInputError(f"{len(inputs)} rows to learn from; give at least {LEAST_ROWS}")
     if not all((np.abs(columns) <= _LARGEST).all() for columns in (inputs, targets)):
         raise InvalidInputError(f"inputs or targets are not finite, or larger than {_LARGEST:g}")
 
 
-def _standardisation(columns: np.ndarray, sizes: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def _standardisation(
+    columns: np.ndarray, sizes: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Mean and scale of each column (N, k).
 
-    A column that should be constant, such as Delta_2 of a Dubins vehicle, still varies by the rounding and truncation of its
-    labels, up to about 1e-5 of its size. Divided by its own deviation, that noise would weigh as much in the loss as a signal;
-    so the scale is at least 1e-4 of the size. The network can still follow such a column, to a fraction of that. There is no
+    A column that should be constant, such as Delta_2 of a Dubins vehicle, still varies by the
+    rounding and truncation of its labels, up to about 1e-5 of its size. Divided by its own
+    deviation, that noise would weigh as much in the loss as a signal; so the scale is at least 1e-4
+    of the size. The network can still follow such a column, to a fraction of that. There is no
     absolute floor: units may make a signal as small as they like.
     """
     least = 1e-4 * (np.abs(columns).max(axis=0) if sizes is None else sizes)
@@ -160,7 +193,8 @@ def _standardisation(columns: np.ndarray, sizes: np.ndarray | None = None) -> tu
 
 @contextmanager
 def _single_thread() -> Iterator[None]:
-    """Let torch use one thread: on small matrices more are slower, and the order of sums would hang on their number."""
+    """Let torch use one thread: on small matrices more are slower, and the order of sums would hang
+    on their number."""
     import torch
 
     threads = torch.get_num_threads()
@@ -183,13 +217,17 @@ def _fit(
     seed: int,
     progress: Progress | None,
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], int, float]:
-    """Train on standardised data; return (weights, bias) of each layer, the epochs that were run, and the validation loss."""
+    """Train on standardised data; return (weights, bias) of each layer, the epochs that were run,
+    and the validation loss."""
     import torch
 
     generator = torch.Generator().manual_seed(seed)
-    (x_fit, x_val), (y_fit, y_val) = ([torch.tensor(a[part], dtype=torch.float32) for part in parts[:2]] for a in (x, y))
+    (x_fit, x_val), (y_fit, y_val) = (
+        [torch.tensor(a[part], dtype=torch.float32) for part in parts[:2]] for a in (x, y)
+    )
     shapes = [shape for into, out in pairwise(widths) for shape in ((out, into), (out,))]
-    # All parameters in one tensor: Adam's cost is in the number of its calls, not in the size of what it updates.
+    # All parameters in one tensor: Adam's cost is in the number of its calls, not in the size of
+    # what it updates.
     flat = _first_parameters(shapes, generator).requires_grad_()
     optimizer = torch.optim.Adam([flat], lr=rate)
     loss_of = torch.nn.functional.mse_loss
@@ -197,7 +235,9 @@ def _fit(
     for epoch in range(1, epochs + 1):
         for rows in torch.randperm(len(x_fit), generator=generator).split(batch):
             optimizer.zero_grad()
-            loss_of(_forward(_unpacked(flat, shapes), x_fit[rows], activation), y_fit[rows]).backward()
+            loss_of(
+                _forward(_unpacked(flat, shapes), x_fit[rows], activation), y_fit[rows]
+            ).backward()
             optimizer.step()
         with torch.no_grad():
             loss = loss_of(_forward(_unpacked(flat, shapes), x_val, activation), y_val).item()
@@ -213,17 +253,26 @@ def _fit(
 
 
 def _first_parameters(shapes: Sequence[tuple[int, ...]], generator: Any) -> Any:
-    """Weights and biases of all layers in one tensor, each uniform within 1/sqrt(inputs of the layer)."""
+    """Weights and biases of all layers in one tensor, each uniform within 1/sqrt(inputs of the
+    layer)."""
     import torch
 
     bounds = [weights[1] ** -0.5 for weights in shapes[::2] for _ in range(2)]
     parts = zip(shapes, bounds, strict=True)
-    return torch.cat([torch.empty(math.prod(shape)).uniform_(-bound, bound, generator=generator) for shape, bound in parts])
+    return torch.cat(
+        [
+            torch.empty(math.prod(shape)).uniform_(-bound, bound, generator=generator)
+            for shape, bound in parts
+        ]
+    )
 
 
 def _unpacked(flat: Any, shapes: Sequence[tuple[int, ...]]) -> list[Any]:
     """Weights and bias of each layer in turn, as views of the tensor that holds them all."""
-    return [part.view(shape) for part, shape in zip(flat.split([math.prod(s) for s in shapes]), shapes, strict=True)]
+    return [
+        part.view(shape)
+        for part, shape in zip(flat.split([math.prod(s) for s in shapes]), shapes, strict=True)
+    ]
 
 
 def _forward(parameters: Sequence[Any], x: Any, activation: Activation) -> Any:

@@ -1,4 +1,5 @@
-"""What data cannot tell about a system: inputs that are not excited, features that cannot be told apart."""
+"""What data cannot tell about a system: inputs that are not excited, features that cannot be told
+apart."""
 
 from __future__ import annotations
 
@@ -36,7 +37,13 @@ class IdentifiabilityWarning(UserWarning):
 
 
 def weaknesses(
-    features: Features, inputs: Sequence[str], x: np.ndarray, u: np.ndarray, design: np.ndarray, learned: Gaussian, prior: float
+    features: Features,
+    inputs: Sequence[str],
+    x: np.ndarray,
+    u: np.ndarray,
+    design: np.ndarray,
+    learned: Gaussian,
+    prior: float,
 ) -> tuple[str, ...]:
     """What the data leave open, in words.
 
@@ -54,15 +61,24 @@ def weaknesses(
     terms = term_names(features, inputs)
     found = [*_steady(features, inputs, x, u)]
     if len(design) < len(terms):
-        found.append(f"{len(design)} different rows of data are too few for {len(terms)} weights; collect more, or lower the degree")
+        found.append(
+            f"{len(design)} different rows of data are too few for {len(terms)} weights; collect"
+            " more, or lower the degree"
+        )
     _, singular, right = np.linalg.svd(np.linalg.qr(design, mode="r"), full_matrices=True)
     rank = int((singular > _RANK * singular[0]).sum()) if singular[0] > 0 else 0
     if rank < len(terms):
-        found.append(f"the data cannot tell apart: {_confounded(terms, right[rank:])}; what is learned of these is the prior's choice")
+        found.append(
+            f"the data cannot tell apart: {_confounded(terms, right[rank:])}; what is learned of"
+            " these is the prior's choice"
+        )
     weak = _weak(terms, right[:rank], learned, prior)
     return (
         *found,
-        *(f"{state}: the noise drowns {names}; observe longer, or try larger inputs" for state, names in _by_state(features, weak)),
+        *(
+            f"{state}: the noise drowns {names}; observe longer, or try larger inputs"
+            for state, names in _by_state(features, weak)
+        ),
     )
 
 
@@ -72,15 +88,18 @@ def misfits(features: Features, misfit: np.ndarray, variation: np.ndarray) -> tu
     Args:
         features: of the regression.
         misfit: part of each state's rate that they miss, (n,).
-        variation: part by which the variance of its noise varies although it is taken for constant, (n,).
+        variation: part by which the variance of its noise varies although it is taken for constant,
+            (n,).
     """
     missed = [
-        f"{state}: features of degree {features.degree} miss {100 * part:.3g} % of its rate; give a higher degree"
+        f"{state}: features of degree {features.degree} miss {100 * part:.3g} % of its rate; give a"
+        " higher degree"
         for state, part in zip(features.states, misfit, strict=True)
         if part > _MATERIAL
     ]
     varied = [
-        f"{state}: the variance of its noise varies by {100 * part:.3g} % over the states; give a diffusion degree"
+        f"{state}: the variance of its noise varies by {100 * part:.3g} % over the states; give a"
+        " diffusion degree"
         for state, part in zip(features.states, variation, strict=True)
         if part > _MATERIAL
     ]
@@ -88,10 +107,16 @@ def misfits(features: Features, misfit: np.ndarray, variation: np.ndarray) -> tu
 
 
 def term_names(features: Features, inputs: Sequence[str]) -> tuple[str, ...]:
-    """Names of the D columns of the regression: monomials of the states, then these times each input."""
-    # Whatever the ranges are, the order of the monomials is the same: on [-1, 1] their names are short.
-    plain = Features(features.states, ((-1.0, 1.0),) * len(features.states), features.degree, features.angles)
-    names = [str(e.as_coeff_Mul()[1]).replace("**", "^").replace("*", " ") for e in plain.expressions]
+    """Names of the D columns of the regression: monomials of the states, then these times each
+    input."""
+    # Whatever the ranges are, the order of the monomials is the same: on [-1, 1] their names are
+    # short.
+    plain = Features(
+        features.states, ((-1.0, 1.0),) * len(features.states), features.degree, features.angles
+    )
+    names = [
+        str(e.as_coeff_Mul()[1]).replace("**", "^").replace("*", " ") for e in plain.expressions
+    ]
     return (*names, *(u if name == "1" else f"{u} {name}" for u in inputs for name in names))
 
 
@@ -99,28 +124,39 @@ def _steady(features: Features, inputs: Sequence[str], x: np.ndarray, u: np.ndar
     found = []
     for state, (low, high), values in zip(features.states, features.region, x.T, strict=True):
         if np.ptp(values) <= _STILL * (high - low):
-            found.append(f"the state {state} is always {values[0]:g}: how anything depends on it cannot be learned")
+            found.append(
+                f"the state {state} is always {values[0]:g}: how anything depends on it cannot be"
+                " learned"
+            )
     for name, values in zip(inputs, u.T, strict=True):
         if np.ptp(values) <= _STEADY * abs(values).max():
             found.append(
-                f"the input {name} stays within [{values.min() + 0.0:g}, {values.max() + 0.0:g}]: its effect cannot be told from the "
-                "drift; try values of both signs"
+                f"the input {name} stays within [{values.min() + 0.0:g}, {values.max() + 0.0:g}]:"
+                " its effect cannot be told from the drift; try values of both signs"
             )
     return found
 
 
 def _confounded(terms: Sequence[str], null: np.ndarray) -> str:
-    """The groups of terms that mix in the null space with the orthonormal basis `null` (d, D); whatever the basis is."""
+    """The groups of terms that mix in the null space with the orthonormal basis `null` (d, D);
+    whatever the basis is."""
     projector = null.T @ null
     involved = np.flatnonzero(projector.diagonal() > _PART)
-    count, group = connected_components(abs(projector[np.ix_(involved, involved)]) > _PART, directed=False)
+    count, group = connected_components(
+        abs(projector[np.ix_(involved, involved)]) > _PART, directed=False
+    )
     members: list[list[str]] = [[terms[int(k)] for k in involved[group == g]] for g in range(count)]
-    texts = [" and ".join(_shortened(m)) if len(m) > 1 else f"{m[0]} (never excited)" for m in members]
+    texts = [
+        " and ".join(_shortened(m)) if len(m) > 1 else f"{m[0]} (never excited)" for m in members
+    ]
     return "; ".join(_shortened(texts))
 
 
-def _weak(terms: Sequence[str], seen: np.ndarray, learned: Gaussian, prior: float) -> list[tuple[str, ...]]:
-    """For each output the terms in those directions that the data show, but hardly; `seen` (r, D) is a basis."""
+def _weak(
+    terms: Sequence[str], seen: np.ndarray, learned: Gaussian, prior: float
+) -> list[tuple[str, ...]]:
+    """For each output the terms in those directions that the data show, but hardly; `seen` (r, D)
+    is a basis."""
     values, vectors = np.linalg.eigh(seen @ learned.covariance @ seen.T)
     found = []
     for sizes, directions in zip(values, vectors, strict=True):

@@ -1,4 +1,5 @@
-"""What Bayesian identification knows of a control-affine system: distributions of its drift, input matrix and noise."""
+"""What Bayesian identification knows of a control-affine system: distributions of its drift, input
+matrix and noise."""
 
 from __future__ import annotations
 
@@ -17,7 +18,13 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.files import LARGEST, LearnedFileError, Signature, array_of, require_finite
+from safe_envs.wrappers.learning.models.files import (
+    LARGEST,
+    LearnedFileError,
+    Signature,
+    array_of,
+    require_finite,
+)
 from safe_envs.wrappers.learning.regression import Gaussian, sigma_map, sigma_samples
 
 _SIGNIFICANT = 0.999
@@ -29,15 +36,18 @@ _ROUNDING = 1e-9
 """Of the entries of a matrix of correlations."""
 
 _ROUNDED = 1e-3
-"""Part of its mean within which a regressed variance is rounded off towards 0, so that it stays positive and smooth."""
+"""Part of its mean within which a regressed variance is rounded off towards 0, so that it stays
+positive and smooth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Diffusion:
-    """What is known of the noise: a level for each state, or a variance that varies, and correlations.
+    """What is known of the noise: a level for each state, or a variance that varies, and
+    correlations.
 
     Attributes:
-        squares: S of each state, the sum of xi^2/dt over the residual increments xi, (n,); 0 for a state without noise.
+        squares: S of each state, the sum of xi^2/dt over the residual increments xi, (n,); 0 for a
+            state without noise.
         count: N, degrees of freedom of each S.
         correlation: of the noise of the states, (n, n).
         alpha: shape of the prior of sigma.
@@ -56,21 +66,29 @@ class Diffusion:
 
     @property
     def sigma(self) -> np.ndarray:
-        """The most probable constant levels, (n,). A state without any scatter has none, where the prior would say beta/N."""
-        levels = sigma_map(self.squares, np.full(len(self.squares), self.count), self.alpha, self.beta)
+        """The most probable constant levels, (n,). A state without any scatter has none, where the
+        prior would say beta/N."""
+        levels = sigma_map(
+            self.squares, np.full(len(self.squares), self.count), self.alpha, self.beta
+        )
         return np.where(self.squares > 0, levels, 0.0)
 
     def sigma_intervals(self, delta: float) -> np.ndarray:
-        """Intervals that hold all sigma_i of constant, independent noise but for a probability delta, shape (n, 2).
+        """Intervals that hold all sigma_i of constant, independent noise but for a probability
+        delta, shape (n, 2).
 
-        They are those of S/sigma^2 ~ chi^2_N: a prior of sigma, whose scale is a guess, would move them off the truth.
+        They are those of S/sigma^2 ~ chi^2_N: a prior of sigma, whose scale is a guess, would move
+        them off the truth.
 
         Raises:
             ConfigurationError: the noise varies with the state, or is correlated.
         """
-        if self.features is not None or not np.array_equal(self.correlation, np.eye(len(self.squares))):
+        if self.features is not None or not np.array_equal(
+            self.correlation, np.eye(len(self.squares))
+        ):
             raise ConfigurationError(
-                "intervals of sigma are known for constant noise of independent states only; ask for confidence instead"
+                "intervals of sigma are known for constant noise of independent states only; ask"
+                " for confidence instead"
             )
         tail = 0.5 * delta / len(self.squares)
         levels = np.array([tail, 1.0 - tail])
@@ -90,13 +108,23 @@ class Diffusion:
             levels = [sp.Float(s, 17) if s else sp.Integer(0) for s in self._levels(rng).tolist()]
         else:
             weights = self.variance.mean if rng is None else self.variance.sample(rng)
-            levels = [self._level(p, r) for p, r in zip(map(self.features.combined, weights), self.squares / self.count, strict=True)]
+            levels = [
+                self._level(p, r)
+                for p, r in zip(
+                    map(self.features.combined, weights), self.squares / self.count, strict=True
+                )
+            ]
         return sp.ImmutableMatrix(sp.diag(*levels) * _root(self.correlation))
 
     def _levels(self, rng: np.random.Generator | None) -> np.ndarray:
         if rng is None:
             return self.sigma
-        return np.array([sigma_samples(s, self.count, self.alpha, self.beta, 1, rng)[0] if s > 0 else 0.0 for s in self.squares])
+        return np.array(
+            [
+                sigma_samples(s, self.count, self.alpha, self.beta, 1, rng)[0] if s > 0 else 0.0
+                for s in self.squares
+            ]
+        )
 
     def _level(self, p: sp.Expr, constant: float) -> sp.Expr:
         if not constant:
@@ -109,8 +137,9 @@ class Diffusion:
 class Posterior(LearnedModel):
     """What Bayesian identification knows of f, g and sigma.
 
-    f_i = Phi w_i0 and g_ij = s_j Phi w_ij, with the features Phi and Gaussian weights (w_i0, .., w_im), drawn independently from
-    state to state. Where the noise of the states is correlated, the weights are as well: see `BayesianSCBF`.
+    f_i = Phi w_i0 and g_ij = s_j Phi w_ij, with the features Phi and Gaussian weights (w_i0, ..,
+    w_im), drawn independently from state to state. Where the noise of the states is correlated, the
+    weights are as well: see `BayesianSCBF`.
 
     Attributes:
         signature: of which system.
@@ -122,10 +151,13 @@ class Posterior(LearnedModel):
         covariance: of the weights, (n, D, D).
         diffusion: the noise.
         dt: mean length of the steps in the data, in s.
-        misfit: part of each state's rate that the features miss beyond the noise, (n,); 0 where that may be chance.
-        variation: part by which the variance of its noise varies although it was taken for constant, (n,), likewise.
+        misfit: part of each state's rate that the features miss beyond the noise, (n,); 0 where
+            that may be chance.
+        variation: part by which the variance of its noise varies although it was taken for
+            constant, (n,), likewise.
 
-    Source: thesis Sec. 6.2, with f and g in one regression on both inputs instead of the pairs of Eq. (6.5): the same posterior,
+    Source: thesis Sec. 6.2, with f and g in one regression on both inputs instead of the pairs of
+        Eq. (6.5): the same posterior,
     with the right variances.
     """
 
@@ -144,9 +176,11 @@ class Posterior(LearnedModel):
 
     @cached_property
     def pruned(self) -> np.ndarray:
-        """Whether g_ij is taken for 0, (n, m): it does not differ from 0, or only as the length of the steps makes it.
+        """Whether g_ij is taken for 0, (n, m): it does not differ from 0, or only as the length of
+        the steps makes it.
 
-        Such entries would have tiny values, and with them give a relative degree to barriers that the input does not reach.
+        Such entries would have tiny values, and with them give a relative degree to barriers that
+        the input does not reach.
         """
         return self._insignificant() | self._leaked()
 
@@ -162,24 +196,35 @@ class Posterior(LearnedModel):
         return small
 
     def _leaked(self) -> np.ndarray:
-        """Whether g_ij is no larger than twice dt/2 (Df g_j + Dg_j f)_i, by which a step of dt mixes it with the others.
+        """Whether g_ij is no larger than twice dt/2 (Df g_j + Dg_j f)_i, by which a step of dt
+        mixes it with the others.
 
-        A plant that is integrated finer than dt shows that much: to a position the input comes within a step.
+        A plant that is integrated finer than dt shows that much: to a position the input comes
+        within a step.
         """
         n, parts, _, count = self._blocks
         low, high = np.array(self.features.region).T
         x = np.random.default_rng(0).uniform(low, high, (_POINTS, n))
         reach = np.diag(_SLOPE * (high - low))
-        slopes = np.stack([(self.features.matrix(x + h) - self.features.matrix(x - h)) / (2.0 * h.sum()) for h in reach], axis=-1)
+        slopes = np.stack(
+            [
+                (self.features.matrix(x + h) - self.features.matrix(x - h)) / (2.0 * h.sum())
+                for h in reach
+            ],
+            axis=-1,
+        )
         weights = self.mean.reshape(n, parts, count)
         values = np.einsum("bk,ipk->bip", self.features.matrix(x), weights)
         jacobians = np.einsum("bkj,ipk->bipj", slopes, weights, optimize=True)
-        mixed = jacobians[:, :, 0] @ values[:, :, 1:] + np.einsum("bipj,bj->bip", jacobians[:, :, 1:], values[:, :, 0])
+        mixed = jacobians[:, :, 0] @ values[:, :, 1:] + np.einsum(
+            "bipj,bj->bip", jacobians[:, :, 1:], values[:, :, 0]
+        )
         return (values[:, :, 1:] ** 2).mean(axis=0) <= self.dt**2 * (mixed**2).mean(axis=0)
 
     @cached_property
     def weights(self) -> Gaussian:
-        """The weights of `system`: their distribution, given that those of the pruned entries are 0."""
+        """The weights of `system`: their distribution, given that those of the pruned entries are
+        0."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
         for i, row in enumerate(self.pruned):
             zero = np.flatnonzero(np.repeat([False, *row], self.features.count))
@@ -206,15 +251,22 @@ class Posterior(LearnedModel):
 
     def _system(self, weights: np.ndarray, diffusion: sp.ImmutableMatrix) -> ControlAffineSDE:
         n, m, count = len(self.mean), len(self.inputs), self.features.count
-        scaled = (weights.reshape(n, 1 + m, count) * np.array([1.0, *self.input_scale])[:, None]).tolist()
-        entries = [[self.features.combined(w) if any(w) else sp.Integer(0) for w in row] for row in scaled]
+        scaled = (
+            weights.reshape(n, 1 + m, count) * np.array([1.0, *self.input_scale])[:, None]
+        ).tolist()
+        entries = [
+            [self.features.combined(w) if any(w) else sp.Integer(0) for w in row] for row in scaled
+        ]
         drift, rows = [row[0] for row in entries], [row[1:] for row in entries]
         return ControlAffineSDE(self.features.states, self.inputs, drift, rows, diffusion)
 
     def drift_variance(self, x: np.ndarray) -> np.ndarray:
-        """Covariances of (f_i, g_i1, .., g_im) at states (B, n), shape (B, n, 1 + m, 1 + m); also of what is pruned."""
+        """Covariances of (f_i, g_i1, .., g_im) at states (B, n), shape (B, n, 1 + m, 1 + m); also
+        of what is pruned."""
         phi = self.features.matrix(x)
-        return np.einsum("bipqk,bk->bipq", (phi @ self._stretched).reshape(len(x), *self._blocks), phi)
+        return np.einsum(
+            "bipqk,bk->bipq", (phi @ self._stretched).reshape(len(x), *self._blocks), phi
+        )
 
     @cached_property
     def _blocks(self) -> tuple[int, int, int, int]:
@@ -223,7 +275,8 @@ class Posterior(LearnedModel):
 
     @cached_property
     def _split_covariance(self) -> np.ndarray:
-        """The covariance of the weights with the scales of the inputs in it, axes (n, 1 + m, 1 + m, M, M)."""
+        """The covariance of the weights with the scales of the inputs in it, axes (n, 1 + m, 1 + m,
+        M, M)."""
         n, parts, _, count = self._blocks
         scale = np.array([1.0, *self.input_scale])
         split = self.covariance.reshape(n, parts, count, parts, count).transpose(0, 1, 3, 2, 4)
@@ -232,32 +285,55 @@ class Posterior(LearnedModel):
     @cached_property
     def _stretched(self) -> np.ndarray:
         """The same as one matrix (M, n (1 + m)^2 M), so that a batch costs one product of matrices."""
-        return np.ascontiguousarray(np.moveaxis(self._split_covariance, 3, 0).reshape(self.features.count, -1))
+        return np.ascontiguousarray(
+            np.moveaxis(self._split_covariance, 3, 0).reshape(self.features.count, -1)
+        )
 
     @property
     def variance_expressions(self) -> tuple[sp.ImmutableMatrix, ...]:
-        """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m) of expressions, multiplied out."""
+        """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m) of expressions,
+        multiplied out."""
         first, second = np.triu_indices(self.features.count)
         phi = self.features.expressions
-        products = [sp.expand(phi[k] * phi[j]).as_coefficients_dict() for k, j in zip(first, second, strict=True)]
+        products = [
+            sp.expand(phi[k] * phi[j]).as_coefficients_dict()
+            for k, j in zip(first, second, strict=True)
+        ]
         monomials = list(dict.fromkeys(monomial for product in products for monomial in product))
         # By numbers, not by symbols, of which there are many more.
-        shares = np.array([[float(product.get(monomial, 0)) for monomial in monomials] for product in products])
+        shares = np.array(
+            [[float(product.get(monomial, 0)) for monomial in monomials] for product in products]
+        )
         twice = np.where(first == second, 0.5, 1.0)
 
         def entry(block: np.ndarray) -> sp.Expr:
             weights = ((block + block.T)[first, second] * twice) @ shares
-            return sp.Add(*[sp.Float(w, 17) * monomial for w, monomial in zip(weights.tolist(), monomials, strict=True) if w])
+            return sp.Add(
+                *[
+                    sp.Float(w, 17) * monomial
+                    for w, monomial in zip(weights.tolist(), monomials, strict=True)
+                    if w
+                ]
+            )
 
-        return tuple(sp.ImmutableMatrix([[entry(block) for block in row] for row in state]) for state in self._split_covariance)
+        return tuple(
+            sp.ImmutableMatrix([[entry(block) for block in row] for row in state])
+            for state in self._split_covariance
+        )
 
     def arrays(self) -> dict[str, np.ndarray]:
         """See `LearnedModel.arrays`."""
         noise = self.diffusion
-        named = {name: getattr(self, name) for name in ("input_scale", "mean", "covariance", "misfit", "variation")}
+        named = {
+            name: getattr(self, name)
+            for name in ("input_scale", "mean", "covariance", "misfit", "variation")
+        }
         named |= {"squares": noise.squares, "correlation": noise.correlation}
         if noise.variance is not None:
-            named |= {"variance_mean": noise.variance.mean, "variance_covariance": noise.variance.covariance}
+            named |= {
+                "variance_mean": noise.variance.mean,
+                "variance_covariance": noise.variance.covariance,
+            }
         return named
 
     def details(self) -> dict[str, Any]:
@@ -275,11 +351,19 @@ class Posterior(LearnedModel):
         }
 
     @classmethod
-    def restored(cls, problem: SafetyProblem, record: Record, details: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Self:
+    def restored(
+        cls,
+        problem: SafetyProblem,
+        record: Record,
+        details: Mapping[str, Any],
+        arrays: Mapping[str, np.ndarray],
+    ) -> Self:
         """See `LearnedModel.restored`. The region is the one in which was learned."""
 
         def features(degree: int) -> Features:
-            return Features.from_json(problem.plant.states, details["region"], degree, details["angles"])
+            return Features.from_json(
+                problem.plant.states, details["region"], degree, details["angles"]
+            )
 
         def numbers(name: str, *shape: int) -> np.ndarray:
             return array_of(arrays, name, shape)
@@ -293,7 +377,10 @@ class Posterior(LearnedModel):
             **{name: require_finite(details[name]) for name in ("count", "alpha", "beta")},
             features=varying,
             variance=varying
-            and Gaussian(numbers("variance_mean", n, varying.count), numbers("variance_covariance", n, varying.count, varying.count)),
+            and Gaussian(
+                numbers("variance_mean", n, varying.count),
+                numbers("variance_covariance", n, varying.count, varying.count),
+            ),
         )
         _require_noise(noise)
         weights = numbers("mean", n, count), numbers("covariance", n, count, count)
@@ -301,15 +388,20 @@ class Posterior(LearnedModel):
         if not (0 < dt <= LARGEST and (scale > 0).all()):
             raise ValueError("a step or the scale of an input is not positive, or too large")
         rest = dt, numbers("misfit", n), numbers("variation", n)
-        return cls(Signature.of(problem), record, phi, problem.plant.inputs, scale, *weights, noise, *rest)
+        return cls(
+            Signature.of(problem), record, phi, problem.plant.inputs, scale, *weights, noise, *rest
+        )
 
     @classmethod
     def check(cls, signature: Signature, problem: SafetyProblem) -> None:
         """See `LearnedModel.check`. Barriers, model and control period may differ."""
         signature.require(problem)
 
-    def compare(self, problem: SafetyProblem, x: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """See `LearnedModel.compare`: f_i and g_ij in the units of the states per s, and the entries of sigma sigma'."""
+    def compare(
+        self, problem: SafetyProblem, x: np.ndarray
+    ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """See `LearnedModel.compare`: f_i and g_ij in the units of the states per s, and the
+        entries of sigma sigma'."""
         truth, estimate = _entries(problem.plant, x), _entries(self.system, x)
         return {name: (truth[name], estimate[name]) for name in truth}
 
@@ -319,25 +411,48 @@ def _solved(covariance: np.ndarray, right: np.ndarray) -> np.ndarray:
     try:
         return np.linalg.solve(covariance, right)
     except np.linalg.LinAlgError as error:
-        raise LearnedFileError("the covariance of the weights is singular: the file was altered. Learn again") from error
+        raise LearnedFileError(
+            "the covariance of the weights is singular: the file was altered. Learn again"
+        ) from error
 
 
 def _require_noise(noise: Diffusion) -> None:
     """Raise ValueError where noise has a variance, a correlation or a prior that there is not."""
     correlation = noise.correlation
-    fits = (noise.squares >= 0).all() and 0 < noise.count <= LARGEST and max(noise.alpha, noise.beta) <= LARGEST
+    fits = (
+        (noise.squares >= 0).all()
+        and 0 < noise.count <= LARGEST
+        and max(noise.alpha, noise.beta) <= LARGEST
+    )
     fits = fits and min(noise.alpha, noise.beta) >= 0
-    if not (fits and np.allclose(correlation, correlation.T, atol=_ROUNDING) and (abs(correlation) <= 1.0 + _ROUNDING).all()):
-        raise ValueError("the noise has a negative variance, a correlation above 1, or no degrees of freedom")
+    if not (
+        fits
+        and np.allclose(correlation, correlation.T, atol=_ROUNDING)
+        and (abs(correlation) <= 1.0 + _ROUNDING).all()
+    ):
+        raise ValueError(
+            "the noise has a negative variance, a correlation above 1, or no degrees of freedom"
+        )
 
 
 def _entries(system: ControlAffineSDE, x: np.ndarray) -> dict[str, np.ndarray]:
     """Values of f, g and the upper half of sigma sigma' at states (B, n), by name."""
     covariance = system.diffusion * system.diffusion.T
     named = {f"f[{s}]": system.drift[i] for i, s in enumerate(system.states)}
-    named |= {f"g[{s}, {u}]": system.input_matrix[i, j] for i, s in enumerate(system.states) for j, u in enumerate(system.inputs)}
-    named |= {f"covariance[{s}, {t}]": covariance[i, j] for i, s in enumerate(system.states) for j, t in enumerate(system.states) if i <= j}
-    compiled = compile_function(system.states, [system.numeric(e) for e in named.values()], "arrays")
+    named |= {
+        f"g[{s}, {u}]": system.input_matrix[i, j]
+        for i, s in enumerate(system.states)
+        for j, u in enumerate(system.inputs)
+    }
+    named |= {
+        f"covariance[{s}, {t}]": covariance[i, j]
+        for i, s in enumerate(system.states)
+        for j, t in enumerate(system.states)
+        if i <= j
+    }
+    compiled = compile_function(
+        system.states, [system.numeric(e) for e in named.values()], "arrays"
+    )
     return dict(zip(named, stacked(compiled(*np.ascontiguousarray(x.T)), len(x)).T, strict=True))
 
 
@@ -345,4 +460,6 @@ def _root(correlation: np.ndarray) -> sp.Matrix:
     """The symmetric square root of a correlation matrix, which may be singular."""
     values, vectors = np.linalg.eigh(correlation)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return sp.Matrix([[sp.Float(v, 17) if v else sp.Integer(0) for v in row] for row in root.tolist()])
+    return sp.Matrix(
+        [[sp.Float(v, 17) if v else sp.Integer(0) for v in row] for row in root.tolist()]
+    )

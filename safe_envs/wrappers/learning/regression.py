@@ -1,4 +1,5 @@
-"""Bayesian linear regression: the rows of one-step data, the posterior of weights, and that of a noise level."""
+"""Bayesian linear regression: the rows of one-step data, the posterior of weights, and that of a
+noise level."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ class Rows:
         count: number of transitions in each row, (G,).
         rate: mean of (x' - x)/dt, (G, n).
         group: row of each of the R transitions, (R,).
-        deviation: of each transition from its row's mean, times sqrt(dt), (R, n): noise of variance (sigma sigma')_ii.
+        deviation: of each transition from its row's mean, times sqrt(dt), (R, n): noise of variance
+            (sigma sigma')_ii.
     """
 
     x: np.ndarray
@@ -43,7 +45,9 @@ class Rows:
     def of(cls, data: Transitions) -> Rows:
         """Group data: a log in which rows repeat gives what a collector with repetitions gives."""
         n, m = data.x.shape[1], data.u.shape[1]
-        unique, inverse = np.unique(np.column_stack((data.x, data.u, data.dt)), axis=0, return_inverse=True)
+        unique, inverse = np.unique(
+            np.column_stack((data.x, data.u, data.dt)), axis=0, return_inverse=True
+        )
         group = np.repeat(inverse.ravel(), data.repetitions)
         rates = ((data.successors - data.x[:, None]) / data.dt[:, None, None]).reshape(-1, n)
         count, dt = np.bincount(group), unique[:, -1]
@@ -53,7 +57,8 @@ class Rows:
 
     @property
     def repeated(self) -> bool:
-        """Whether rows repeat often enough that their scatter tells most about the noise, whatever the drift is."""
+        """Whether rows repeat often enough that their scatter tells most about the noise, whatever
+        the drift is."""
         return 2 * (len(self.group) - len(self.count)) >= len(self.group)
 
     def design(self, features: Features, input_scale: np.ndarray) -> np.ndarray:
@@ -87,39 +92,62 @@ class Gaussian:
         return self.mean + np.einsum("ide,ie->id", vectors, draws)
 
 
-def posterior(design: np.ndarray, y: np.ndarray, variance: np.ndarray, prior: np.ndarray | float) -> Gaussian:
-    """Distribution of the weights of y = design w + noise under the prior N(0, prior_i I), for every output i.
+def posterior(
+    design: np.ndarray, y: np.ndarray, variance: np.ndarray, prior: np.ndarray | float
+) -> Gaussian:
+    """Distribution of the weights of y = design w + noise under the prior N(0, prior_i I), for
+    every output i.
 
-    The whitened rows are reduced by QR and an SVD, not by their Gram matrix: directions that the data do not show keep the
-    prior, even where an output is nearly free of noise.
+    The whitened rows are reduced by QR and an SVD, not by their Gram matrix: directions that the
+    data do not show keep the prior, even where an output is nearly free of noise.
 
     Args:
         design: (P, D).
         y: (P, n).
-        variance: of the noise, (n,) or (P, n), positive, in units of y squared. Outputs whose variances differ by a factor
-            only share the decomposition.
+        variance: of the noise, (n,) or (P, n), positive, in units of y squared. Outputs whose
+            variances differ by a factor only share the decomposition.
         prior: variance of each weight, positive, one for all outputs or (n,).
 
     Raises:
         ConfigurationError: a variance is not positive and finite.
 
-    Source: thesis Eq. (6.7), where the noise variance is printed as sigma^2/K for data that are divided by dt: the callers
+    Source: thesis Eq. (6.7), where the noise variance is printed as sigma^2/K for data that are
+        divided by dt: the callers
     here pass sigma^2/(K dt).
     """
-    spread, believed = np.broadcast_to(np.asarray(variance, dtype=float), y.shape), np.broadcast_to(prior, y.shape[1:])
-    if not (np.isfinite(spread).all() and (spread > 0).all() and np.isfinite(believed).all() and (believed > 0).all()):
-        raise ConfigurationError(f"the variances of the noise and of the prior ({prior!r}) must be positive and finite")
+    spread, believed = (
+        np.broadcast_to(np.asarray(variance, dtype=float), y.shape),
+        np.broadcast_to(prior, y.shape[1:]),
+    )
+    if not (
+        np.isfinite(spread).all()
+        and (spread > 0).all()
+        and np.isfinite(believed).all()
+        and (believed > 0).all()
+    ):
+        raise ConfigurationError(
+            f"the variances of the noise and of the prior ({prior!r}) must be positive and finite"
+        )
     ratio = spread / spread[:, :1]
     if (np.ptp(ratio, axis=0) <= _SAME_SHAPE * ratio[0]).all():
         return _shared(design, y, spread[:, 0], ratio[0], believed)
-    parts = [_shared(design, y[:, [i]], spread[:, i], np.ones(1), believed[[i]]) for i in range(y.shape[1])]
-    return Gaussian(np.concatenate([p.mean for p in parts]), np.concatenate([p.covariance for p in parts]))
+    parts = [
+        _shared(design, y[:, [i]], spread[:, i], np.ones(1), believed[[i]])
+        for i in range(y.shape[1])
+    ]
+    return Gaussian(
+        np.concatenate([p.mean for p in parts]), np.concatenate([p.covariance for p in parts])
+    )
 
 
-def _shared(design: np.ndarray, y: np.ndarray, variance: np.ndarray, ratio: np.ndarray, prior: np.ndarray) -> Gaussian:
+def _shared(
+    design: np.ndarray, y: np.ndarray, variance: np.ndarray, ratio: np.ndarray, prior: np.ndarray
+) -> Gaussian:
     """The same where the noise of output i has the variance `variance` (P,) times `ratio` (n,)."""
     count = design.shape[1]
-    reduced = np.asarray(np.linalg.qr(np.hstack((design, y)) / np.sqrt(variance)[:, None], mode="r"))
+    reduced = np.asarray(
+        np.linalg.qr(np.hstack((design, y)) / np.sqrt(variance)[:, None], mode="r")
+    )
     left, singular, right = np.linalg.svd(reduced[:, :count], full_matrices=True)
     size = np.zeros(count)
     size[: len(singular)] = singular
@@ -130,7 +158,9 @@ def _shared(design: np.ndarray, y: np.ndarray, variance: np.ndarray, ratio: np.n
     return Gaussian(mean, np.einsum("ki,nk,kj->nij", right, 1.0 / precision, right, optimize=True))
 
 
-def sigma_map(squares: np.ndarray, counts: np.ndarray, alpha: float = 1.0, beta: float = 1.0) -> np.ndarray:
+def sigma_map(
+    squares: np.ndarray, counts: np.ndarray, alpha: float = 1.0, beta: float = 1.0
+) -> np.ndarray:
     """The most probable noise level after N increments, where the prior of sigma is inverse-gamma.
 
     sigma = [beta + sqrt(beta^2 + 4 (N + alpha + 1) S)]/(2 (N + alpha + 1)).
@@ -144,7 +174,8 @@ def sigma_map(squares: np.ndarray, counts: np.ndarray, alpha: float = 1.0, beta:
     Raises:
         ConfigurationError: alpha or beta is negative.
 
-    Source: thesis Eq. (6.11), whose solution the print calls intractable; it prints the likelihood N(0, sigma^2), without dt,
+    Source: thesis Eq. (6.11), whose solution the print calls intractable; it prints the likelihood
+        N(0, sigma^2), without dt,
     with N - 1 factors.
     """
     _require_prior(alpha, beta)
@@ -152,8 +183,11 @@ def sigma_map(squares: np.ndarray, counts: np.ndarray, alpha: float = 1.0, beta:
     return (beta + np.sqrt(beta**2 + 4.0 * total * np.asarray(squares))) / (2.0 * total)
 
 
-def sigma_quantile(levels: np.ndarray, squares: float, count: float, alpha: float = 1.0, beta: float = 1.0) -> np.ndarray:
-    """Quantiles of the posterior of sigma, p(sigma) ~ sigma^-(N + alpha + 1) exp(-S/(2 sigma^2) - beta/sigma).
+def sigma_quantile(
+    levels: np.ndarray, squares: float, count: float, alpha: float = 1.0, beta: float = 1.0
+) -> np.ndarray:
+    """Quantiles of the posterior of sigma, p(sigma) ~ sigma^-(N + alpha + 1) exp(-S/(2 sigma^2) -
+    beta/sigma).
 
     The density of log sigma is log-concave; it is tabulated around its mode.
 
@@ -175,21 +209,29 @@ def sigma_quantile(levels: np.ndarray, squares: float, count: float, alpha: floa
     _require_prior(alpha, beta)
     power = count + alpha
     if not (squares >= 0 and power > 0 and squares + beta > 0):
-        raise ConfigurationError(f"no distribution of sigma for S = {squares}, N = {count}, alpha = {alpha}, beta = {beta}")
-    # In d = log sigma - mode: -power d - S s^2 (exp(-2 d) - 1)/2 - beta s (exp(-d) - 1), with s = 1/sigma at the mode.
+        raise ConfigurationError(
+            f"no distribution of sigma for S = {squares}, N = {count}, alpha = {alpha}, beta ="
+            f" {beta}"
+        )
+    # In d = log sigma - mode: -power d - S s^2 (exp(-2 d) - 1)/2 - beta s (exp(-d) - 1), with s =
+    # 1/sigma at the mode.
     inverse = 2.0 * power / (beta + np.sqrt(beta**2 + 4.0 * power * squares))
     quadratic, linear = squares * inverse**2, beta * inverse
     bend = 2.0 * quadratic + linear
-    # To the left it falls faster than its parabola; to the right the curvature is at least exp(-2) of that up to d = 1, and
-    # from there on the slope tends to -power.
+    # To the left it falls faster than its parabola; to the right the curvature is at least exp(-2)
+    # of that up to d = 1, and from there on the slope tends to -power.
     right = np.sqrt(2.0 * np.e**2 * _DROP / bend)
-    d = np.linspace(-np.sqrt(2.0 * _DROP / bend), right if right < 1.0 else 1.0 + _DROP / power, _GRID)
+    d = np.linspace(
+        -np.sqrt(2.0 * _DROP / bend), right if right < 1.0 else 1.0 + _DROP / power, _GRID
+    )
     density = np.exp(-power * d - 0.5 * quadratic * np.expm1(-2.0 * d) - linear * np.expm1(-d))
     below = cumulative_trapezoid(density, d, initial=0.0)
     return np.exp(np.interp(levels, below / below[-1], d)) / inverse
 
 
-def sigma_samples(squares: float, count: float, alpha: float, beta: float, size: int, rng: np.random.Generator) -> np.ndarray:
+def sigma_samples(
+    squares: float, count: float, alpha: float, beta: float, size: int, rng: np.random.Generator
+) -> np.ndarray:
     """Draws (size,) from the posterior of sigma; see `sigma_quantile` for the rest.
 
     Source: thesis Sec. 6.3.1, Fig. 6.2.
@@ -199,4 +241,6 @@ def sigma_samples(squares: float, count: float, alpha: float, beta: float, size:
 
 def _require_prior(alpha: float, beta: float) -> None:
     if not (np.isfinite(alpha) and np.isfinite(beta) and alpha >= 0 and beta >= 0):
-        raise ConfigurationError(f"alpha = {alpha!r} and beta = {beta!r}; the prior of sigma needs both from 0")
+        raise ConfigurationError(
+            f"alpha = {alpha!r} and beta = {beta!r}; the prior of sigma needs both from 0"
+        )

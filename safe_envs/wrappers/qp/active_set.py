@@ -1,13 +1,15 @@
-"""One state, any number of rows and inputs: the nearest of the actions that violate the rows least, to rounding.
+"""One state, any number of rows and inputs: the nearest of the actions that violate the rows least,
+to rounding.
 
-Two steps. The least sum of squared slacks comes from bounded least squares; where it is zero, the rows can be met. The slacks
-are the same at all its minimisers, so that these are the actions inside the box which violate no row by more. Among them the
-nearest one to the proposal is found by a primal active-set method, which begins at the one at hand and never leaves them
-(Nocedal and Wright, Numerical Optimization, Sec. 16.5). Distances are those of y = sqrt(w) u, where the objective is |y - y_v|^2
-and rows have unit length.
+Two steps. The least sum of squared slacks comes from bounded least squares; where it is zero, the
+rows can be met. The slacks are the same at all its minimisers, so that these are the actions inside
+the box which violate no row by more. Among them the nearest one to the proposal is found by a
+primal active-set method, which begins at the one at hand and never leaves them (Nocedal and Wright,
+Numerical Optimization, Sec. 16.5). Distances are those of y = sqrt(w) u, where the objective is |y
+- y_v|^2 and rows have unit length.
 
-Rounding counts: with rows or inputs whose sizes differ by more than about a million, the action may be somewhat worse than the best.
-It stays in the box, and is flagged where a row is missed.
+Rounding counts: with rows or inputs whose sizes differ by more than about a million, the action may
+be somewhat worse than the best. It stays in the box, and is flagged where a row is missed.
 """
 
 from __future__ import annotations
@@ -32,13 +34,21 @@ _LOST = 4.0
 """How many tolerances of a row the way to the nearest action may cost."""
 
 _CORRECTIONS = 2
-"""How often the rows that hold the action are evaluated there: the first time takes back the rounding of the way to it."""
+"""How often the rows that hold the action are evaluated there: the first time takes back the
+rounding of the way to it."""
 
 
 def project(
-    a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray, priority: np.ndarray
+    a: np.ndarray,
+    b: np.ndarray,
+    v: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    w: np.ndarray,
+    priority: np.ndarray,
 ) -> np.ndarray:
-    """Return the nearest action (m,) of those that violate the rows least; NaN where the numbers are too large to say.
+    """Return the nearest action (m,) of those that violate the rows least; NaN where the numbers
+    are too large to say.
 
     Args:
         a: rows, shape (k, m).
@@ -50,19 +60,34 @@ def project(
         priority: positive weights of the squared slacks, shape (k,).
     """
     u = np.clip(v, low, high)
-    # An input on which no row depends keeps its proposal, and a row that depends on no input has no say.
+    # An input on which no row depends keeps its proposal, and a row that depends on no input has no
+    # say.
     rows, inputs = (a != 0.0).any(axis=1), (a != 0.0).any(axis=0)
     if not rows.any():
         return u
     try:
-        u[inputs] = _project(a[np.ix_(rows, inputs)], b[rows], v[inputs], low[inputs], high[inputs], w[inputs], priority[rows])
+        u[inputs] = _project(
+            a[np.ix_(rows, inputs)],
+            b[rows],
+            v[inputs],
+            low[inputs],
+            high[inputs],
+            w[inputs],
+            priority[rows],
+        )
     except np.linalg.LinAlgError:
         u[inputs] = np.nan
     return u
 
 
 def _project(
-    a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray, priority: np.ndarray
+    a: np.ndarray,
+    b: np.ndarray,
+    v: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    w: np.ndarray,
+    priority: np.ndarray,
 ) -> np.ndarray:
     start = least_violating(a, b, low, high, priority, np.clip(v, low, high))
     margin = a @ start + b
@@ -71,20 +96,30 @@ def _project(
     normals = a / unit[:, None] / roots
     lengths = np.linalg.norm(normals, axis=1)
     normals, unit = normals / lengths[:, None], unit * lengths
-    held = _nearest(normals, np.maximum(margin + slack, 0.0) / unit, (v - start) * roots, (low - start) * roots, (high - start) * roots)
+    held = _nearest(
+        normals,
+        np.maximum(margin + slack, 0.0) / unit,
+        (v - start) * roots,
+        (low - start) * roots,
+        (high - start) * roots,
+    )
     u = np.where(held.low, low, np.where(held.high, high, start + held.step / roots))
     free, binding = ~(held.low | held.high), held.rows
     for _ in range(_CORRECTIONS):
         excess = (a @ u + b + slack)[binding] / unit[binding]
         u[free] -= np.linalg.lstsq(normals[np.ix_(binding, free)], excess)[0] / roots[free]
     u = np.clip(u, low, high)
-    # Where rows or inputs differ by many orders of magnitude, rounding may lead astray: then the least-violating action itself is safer.
+    # Where rows or inputs differ by many orders of magnitude, rounding may lead astray: then the
+    # least-violating action itself is safer.
     worse = np.maximum(-(a @ u + b), 0.0) - np.maximum(-margin, 0.0)
-    return u if (worse <= _LOST * (tolerances(a.T, b, u) + tolerances(a.T, b, start))).all() else start
+    return (
+        u if (worse <= _LOST * (tolerances(a.T, b, u) + tolerances(a.T, b, start))).all() else start
+    )
 
 
 class _Held(NamedTuple):
-    """Where a step (m,) ends, the rows (k,) that hold it as equations, and the inputs (m,) at their bounds."""
+    """Where a step (m,) ends, the rows (k,) that hold it as equations, and the inputs (m,) at their
+    bounds."""
 
     step: np.ndarray
     rows: np.ndarray
@@ -92,11 +127,14 @@ class _Held(NamedTuple):
     high: np.ndarray
 
 
-def _nearest(normals: np.ndarray, spare: np.ndarray, way: np.ndarray, low: np.ndarray, high: np.ndarray) -> _Held:
-    """The step nearest to the way to the proposal, with normals . step + spare >= 0 and low <= step <= high; 0 is one.
+def _nearest(
+    normals: np.ndarray, spare: np.ndarray, way: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> _Held:
+    """The step nearest to the way to the proposal, with normals . step + spare >= 0 and low <= step
+    <= high; 0 is one.
 
-    Where no step leads nearer, the rest of the way is a sum of the normals of what holds the step. What has the wrong sign in
-    it is let go.
+    Where no step leads nearer, the rest of the way is a sum of the normals of what holds the step.
+    What has the wrong sign in it is let go.
     """
     k, m = normals.shape
     step, rows, at = np.zeros(m), np.zeros(k, dtype=bool), np.zeros(m)
@@ -113,7 +151,12 @@ def _nearest(normals: np.ndarray, spare: np.ndarray, way: np.ndarray, low: np.nd
             ends = np.where(move > 0.0, high, low)
             to_ends = np.divide(ends - step, move, out=np.full(m, np.inf), where=move != 0.0)
             change, left = normals @ move, normals @ step + spare
-            to_rows = np.divide(np.maximum(left, 0.0), -change, out=np.full(k, np.inf), where=~rows & (change < -_PARALLEL * size))
+            to_rows = np.divide(
+                np.maximum(left, 0.0),
+                -change,
+                out=np.full(k, np.inf),
+                where=~rows & (change < -_PARALLEL * size),
+            )
             length = min(to_ends.min(), to_rows.min(initial=np.inf), 1.0)
             stops = to_ends <= length
             step = np.where(stops, ends, np.clip(step + length * move, low, high))

@@ -1,9 +1,11 @@
-"""The least sum of squared slacks of one state, for any number of inputs: bounded-variable least squares.
+"""The least sum of squared slacks of one state, for any number of inputs: bounded-variable least
+squares.
 
-With p the positive and s the negative part of a row's margin, min |a u + b - p|^2 over u in the box and p >= 0 leaves s as the
-residual. The active-set method of Stark and Parker (1995) solves that: rows with p = 0 take part in a least-squares problem,
-those with p > 0 do not, and a step ends where an input meets its bound or a row without a part its zero. SciPy's version stops
-where a step is too short to change the sum, and so too early where several bounds meet in a point.
+With p the positive and s the negative part of a row's margin, min |a u + b - p|^2 over u in the box
+and p >= 0 leaves s as the residual. The active-set method of Stark and Parker (1995) solves that:
+rows with p = 0 take part in a least-squares problem, those with p > 0 do not, and a step ends where
+an input meets its bound or a row without a part its zero. SciPy's version stops where a step is too
+short to change the sum, and so too early where several bounds meet in a point.
 """
 
 from __future__ import annotations
@@ -17,7 +19,14 @@ _NOTHING = 1e-12
 """Part of the forces on an input that is rounding."""
 
 
-def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, priority: np.ndarray, start: np.ndarray) -> np.ndarray:
+def least_violating(
+    a: np.ndarray,
+    b: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    priority: np.ndarray,
+    start: np.ndarray,
+) -> np.ndarray:
     """Return an action of least sum_i priority_i slack_i^2.
 
     Args:
@@ -34,7 +43,8 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
     margin = a @ u + b
     k, m = a.shape
     missed, held = margin < 0.0, np.zeros(m, dtype=bool)
-    # What was let go last, rows first and then inputs; and what came back at once, because the force on it was rounding.
+    # What was let go last, rows first and then inputs; and what came back at once, because the
+    # force on it was rounding.
     freed, barred = -1, np.zeros(k + m, dtype=bool)
     for _ in range(_STEPS * (k + m)):
         step = np.zeros(len(u))
@@ -42,7 +52,12 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
         ends = np.where(step > 0.0, high, low)
         change = a @ step
         to_ends = np.divide(ends - u, step, out=np.full(len(u), np.inf), where=step != 0.0)
-        to_rows = np.divide(np.maximum(margin, 0.0), -change, out=np.full(len(b), np.inf), where=~missed & (change < 0.0))
+        to_rows = np.divide(
+            np.maximum(margin, 0.0),
+            -change,
+            out=np.full(len(b), np.inf),
+            where=~missed & (change < 0.0),
+        )
         length = min(to_ends.min(), to_rows.min(), 1.0)
         stops = to_ends <= length
         u = np.where(stops, ends, np.clip(u + length * step, low, high))
@@ -68,7 +83,10 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
             held[freed - k] = False
         else:
             break
-    # The margins are those of a long way; a last step along the same rows takes back its rounding, or leads astray.
+    # The margins are those of a long way; a last step along the same rows takes back its rounding,
+    # or leads astray.
     last = u.copy()
     last[~held] += np.linalg.lstsq(a[np.ix_(missed, ~held)], -margin[missed])[0]
-    return min(u, np.clip(last, low, high), key=lambda q: float((np.minimum(a @ q + b, 0.0) ** 2).sum()))
+    return min(
+        u, np.clip(last, low, high), key=lambda q: float((np.minimum(a @ q + b, 0.0) ** 2).sum())
+    )

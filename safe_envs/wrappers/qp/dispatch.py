@@ -2,10 +2,12 @@
 
     min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a_i . u + b_i >= 0,   low <= u <= high
 
-Where the rows cannot be met together, the answer is the least-violating action, flagged: it minimises sum_i priority_i
-slack_i^2 with slack_i = max(0, -(a_i . u + b_i)), and among the minimisers it is the one nearest to v. One row, one input and
-two inputs have exact methods of their own, and so has a single row that binds; the rest goes to ProxQP, which is imported on
-first use. Rows can be met where the action that is returned meets them by the tolerance of `safe_envs.wrappers.qp.rows`.
+Where the rows cannot be met together, the answer is the least-violating action, flagged: it
+minimises sum_i priority_i slack_i^2 with slack_i = max(0, -(a_i . u + b_i)), and among the
+minimisers it is the one nearest to v. One row, one input and two inputs have exact methods of their
+own, and so has a single row that binds; the rest goes to ProxQP, which is imported on first use.
+Rows can be met where the action that is returned meets them by the tolerance of
+`safe_envs.wrappers.qp.rows`.
 """
 
 from __future__ import annotations
@@ -40,8 +42,8 @@ def project_floats(
         priority: k positive weights of the squared slacks.
 
     Returns:
-        Inputs (m), margins a_i . u + b_i (k), rows that bind or cannot be met (k; none where the clipped proposal meets them
-        all), and whether all rows can be met.
+        Inputs (m), margins a_i . u + b_i (k), rows that bind or cannot be met (k; none where the
+        clipped proposal meets them all), and whether all rows can be met.
     """
     if len(b) == 1:
         u, margin, active, feasible = one_row.project_floats(a[0], b[0], v, low, high, w)
@@ -49,7 +51,9 @@ def project_floats(
     if len(v) == 2:
         return plane.project_floats(a, b, v, low, high, w, priority)
     if len(v) == 1:
-        u, margin, active, feasible = interval.project_floats([ai for (ai,) in a], b, v[0], low[0], high[0], priority)
+        u, margin, active, feasible = interval.project_floats(
+            [ai for (ai,) in a], b, v[0], low[0], high[0], priority
+        )
         return [u], margin, active, feasible
     *parts, feasible = project_arrays(a, b, [np.array([c]) for c in v], low, high, w, priority)
     inputs, margins, binding = [[entry.item() for entry in part] for part in parts]
@@ -84,7 +88,9 @@ def project_arrays(
         u, margin, active, feasible = one_row.project_arrays(a[0], b[0], v, low, high, w)
         return u, [margin], [active], feasible
     if len(v) == 1:
-        u, margin, active, feasible = interval.project_arrays([ai for (ai,) in a], b, v[0], low[0], high[0], priority)
+        u, margin, active, feasible = interval.project_arrays(
+            [ai for (ai,) in a], b, v[0], low[0], high[0], priority
+        )
         return [u], list(margin), list(active), feasible
     if len(v) == 2:
         u, margin, active, feasible = plane_batch.project_arrays(a, b, v, low, high, w, priority)
@@ -108,7 +114,9 @@ def _solver(
     flat = np.array([(row == 0.0).all(axis=0) for row in rows])
     unmet = flat & (offsets < 0.0)
     solvable = np.where(unmet, 0.0, offsets)
-    (u, margin, active, feasible), left = single_active_row.project_arrays(rows, solvable, proposed, lower, upper, w)
+    (u, margin, active, feasible), left = single_active_row.project_arrays(
+        rows, solvable, proposed, lower, upper, w
+    )
     if left.size:
         # Imported here, since few filters need a solver.
         from safe_envs.wrappers.qp import proxqp
@@ -128,4 +136,9 @@ def _solver(
         for whole, part in zip((u, margin, active), found[:3], strict=True):
             whole[:, left] = part.T
         feasible[left] = found.feasible
-    return list(u), list(np.where(unmet, offsets, margin)), list(np.where(flat, unmet, active)), feasible & ~unmet.any(axis=0)
+    return (
+        list(u),
+        list(np.where(unmet, offsets, margin)),
+        list(np.where(flat, unmet, active)),
+        feasible & ~unmet.any(axis=0),
+    )

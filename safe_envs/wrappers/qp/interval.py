@@ -1,9 +1,11 @@
-"""Several rows and one input: the rows and the box meet in an interval, into which the proposal is clipped.
+"""Several rows and one input: the rows and the box meet in an interval, into which the proposal is
+clipped.
 
     min 1/2 (u - v)^2   subject to   a_i u + b_i >= 0,   low <= u <= high
 
-Where the interval is empty, the sum of squared slacks has a single minimiser in the box, found from its derivative, which
-is piecewise linear with a kink at the root of each row. A row with a_i = 0 has no say in the input.
+Where the interval is empty, the sum of squared slacks has a single minimiser in the box, found from
+its derivative, which is piecewise linear with a kink at the root of each row. A row with a_i = 0
+has no say in the input.
 """
 
 from __future__ import annotations
@@ -17,7 +19,12 @@ from safe_envs.wrappers.qp.rows import ROUNDING, stack, tolerance, tolerances, t
 
 
 def project_floats(
-    a: Sequence[float], b: Sequence[float], v: float, low: float, high: float, priority: Sequence[float]
+    a: Sequence[float],
+    b: Sequence[float],
+    v: float,
+    low: float,
+    high: float,
+    priority: Sequence[float],
 ) -> tuple[float, list[float], list[bool], bool]:
     """Project the input of one state; see `project_arrays`."""
     u = low if v < low else high if v > high else v
@@ -40,14 +47,24 @@ def project_floats(
         return _one_of_batch(a, b, v, low, high, priority)
     u = lo if v < lo else hi if v > hi else v
     margin = [ai * u + bi for ai, bi in zip(a, b, strict=True)]
-    if min(margin) < 0.0 and any(g < -tolerance((ai,), bi, (u,)) for ai, bi, g in zip(a, b, margin, strict=True) if g < 0.0):
+    if min(margin) < 0.0 and any(
+        g < -tolerance((ai,), bi, (u,)) for ai, bi, g in zip(a, b, margin, strict=True) if g < 0.0
+    ):
         return _one_of_batch(a, b, v, low, high, priority)
-    active = [g <= 0.0 or g <= ROUNDING * abs(ai * u) + ROUNDING * abs(bi) for ai, bi, g in zip(a, b, margin, strict=True)]
+    active = [
+        g <= 0.0 or g <= ROUNDING * abs(ai * u) + ROUNDING * abs(bi)
+        for ai, bi, g in zip(a, b, margin, strict=True)
+    ]
     return u, margin, active, True
 
 
 def _one_of_batch(
-    a: Sequence[float], b: Sequence[float], v: float, low: float, high: float, priority: Sequence[float]
+    a: Sequence[float],
+    b: Sequence[float],
+    v: float,
+    low: float,
+    high: float,
+    priority: Sequence[float],
 ) -> tuple[float, list[float], list[bool], bool]:
     u, margin, active, feasible = project_arrays(a, b, np.array([v]), low, high, priority)
     return u.item(), margin[:, 0].tolist(), active[:, 0].tolist(), feasible.item()
@@ -55,7 +72,12 @@ def _one_of_batch(
 
 @np.errstate(all="ignore")
 def project_arrays(
-    a: Sequence[Any], b: Sequence[Any], v: np.ndarray, low: Any, high: Any, priority: Sequence[float]
+    a: Sequence[Any],
+    b: Sequence[Any],
+    v: np.ndarray,
+    low: Any,
+    high: Any,
+    priority: Sequence[float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Project the input of each of B states.
 
@@ -68,7 +90,8 @@ def project_arrays(
         priority: k positive weights of the squared slacks.
 
     Returns:
-        Inputs (B,), margins (k, B), rows that bind or cannot be met (k, B), and whether all rows can be met (B,).
+        Inputs (B,), margins (k, B), rows that bind or cannot be met (k, B), and whether all rows
+        can be met (B,).
     """
     size = len(v)
     slope, offset = stack(a, size), stack(b, size)
@@ -79,12 +102,19 @@ def project_arrays(
     if acting.size:
         box = [np.broadcast_to(end, size)[acting] for end in (low, high)]
         slope, offset = slope[:, acting], offset[:, acting]
-        u[acting], margin[:, acting], active[:, acting], feasible[acting] = _project(slope, offset, v[acting], box[0], box[1], priority)
+        u[acting], margin[:, acting], active[:, acting], feasible[acting] = _project(
+            slope, offset, v[acting], box[0], box[1], priority
+        )
     return u, margin, active, feasible
 
 
 def _project(
-    a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, priority: Sequence[float]
+    a: np.ndarray,
+    b: np.ndarray,
+    v: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    priority: Sequence[float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What `project_arrays` returns, for states that violate a row."""
     root = -b / a
@@ -104,8 +134,15 @@ def _project(
     return u, margin, margin <= allowed, ~missed.any(axis=0)
 
 
-def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, priority: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Where sum_i priority_i max(0, -(a_i u + b_i))^2 is least in a box that meets no point of all sloping rows.
+def least_violating(
+    a: np.ndarray,
+    b: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    priority: Sequence[float] | np.ndarray,
+) -> np.ndarray:
+    """Where sum_i priority_i max(0, -(a_i u + b_i))^2 is least in a box that meets no point of all
+    sloping rows.
 
     Args:
         a: coefficients, shape (k, B).
@@ -122,7 +159,8 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
     a, b = a * units / size, b * units / size  # so that squares neither overflow nor vanish
     points = np.concatenate([np.minimum(np.maximum(-b / a, low), high), [low, high]])
     derivative = total(a[:, None] * np.minimum(a[:, None] * points + b[:, None], 0.0))
-    # The minimiser lies between the last kink before which the sum falls and the first one after which it rises.
+    # The minimiser lies between the last kink before which the sum falls and the first one after
+    # which it rises.
     left = np.where(derivative <= 0.0, points, low).max(axis=0)
     right = np.where(derivative >= 0.0, points, high).min(axis=0)
     missed = a * (0.5 * (left + right)) + b < 0.0

@@ -1,12 +1,15 @@
-"""Rows that no action of a planar box meets: the least sum of squared slacks, for a batch of states.
+"""Rows that no action of a planar box meets: the least sum of squared slacks, for a batch of
+states.
 
-The sum is convex and piecewise quadratic. A Newton step goes to the minimiser, over the box, of the quadratic that the rows
-violated now define; the sum is then minimised along the step. Near the minimiser the violated rows no longer change and the
-step is exact. A state is done when the forces of the rows, slack times coefficient, balance with those of the box.
+The sum is convex and piecewise quadratic. A Newton step goes to the minimiser, over the box, of the
+quadratic that the rows violated now define; the sum is then minimised along the step. Near the
+minimiser the violated rows no longer change and the step is exact. A state is done when the forces
+of the rows, slack times coefficient, balance with those of the box.
 
-Rows count in their own units, so that one may be 1e9 times as steep as another: its slack at the minimiser is then below the
-rounding of its margin, and it acts as a wall. What the other rows ask for along the wall must not drown in its rounding.
-Hence the frame of a step is that of the steepest row, and a force is known as an interval, judged along the walls.
+Rows count in their own units, so that one may be 1e9 times as steep as another: its slack at the
+minimiser is then below the rounding of its margin, and it acts as a wall. What the other rows ask
+for along the wall must not drown in its rounding. Hence the frame of a step is that of the steepest
+row, and a force is known as an interval, judged along the walls.
 """
 
 from __future__ import annotations
@@ -20,11 +23,13 @@ from safe_envs.wrappers.qp.rows import ROUNDING, total
 
 _STEPS = 20
 _FAR = 1e150
-"""A line further off than this meets no box. How far does not matter, and its square would overflow."""
+"""A line further off than this meets no box. How far does not matter, and its square would
+overflow."""
 
 
 class _Rows(NamedTuple):
-    """Rows x u_1 + y u_2 + r in units of the steepest, shapes (k, B), a box and inputs, shapes (2, B)."""
+    """Rows x u_1 + y u_2 + r in units of the steepest, shapes (k, B), a box and inputs, shapes (2,
+    B)."""
 
     x: np.ndarray
     y: np.ndarray
@@ -37,7 +42,14 @@ class _Rows(NamedTuple):
         return _Rows(*[part[:, states] for part in self])
 
 
-def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, priority: np.ndarray, start: np.ndarray) -> np.ndarray:
+def least_violating(
+    a: np.ndarray,
+    b: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    priority: np.ndarray,
+    start: np.ndarray,
+) -> np.ndarray:
     """Minimise sum_i priority_i max(0, -(a_i . u + b_i))^2 over a box of two inputs.
 
     Args:
@@ -55,7 +67,14 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
     size = (units * np.abs(a)).max(axis=(0, 1))
     size = np.where(size > 0.0, size, 1.0)  # so that squares neither overflow nor vanish
     u, left = start.copy(), np.arange(start.shape[1])
-    rows = _Rows(a[0] * units / size, a[1] * units / size, np.clip(b * units / size, -_FAR, _FAR), low, high, u)
+    rows = _Rows(
+        a[0] * units / size,
+        a[1] * units / size,
+        np.clip(b * units / size, -_FAR, _FAR),
+        low,
+        high,
+        u,
+    )
     for _ in range(_STEPS):
         margin, error = _margin(rows)
         # The smallest and the largest slack of each row that rounding allows.
@@ -64,17 +83,25 @@ def least_violating(a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndar
         if not moving.size:
             return u
         left, rows = left[moving], rows.take(moving)
-        u[:, left] = _newton(rows, margin[:, moving], error[:, moving], least[:, moving], most[:, moving])
+        u[:, left] = _newton(
+            rows, margin[:, moving], error[:, moving], least[:, moving], most[:, moving]
+        )
         rows = rows._replace(u=u[:, left])
     for i in left.tolist():
-        fit = bounded_least_squares.least_violating(a[:, :, i].T, b[:, i], low[:, i], high[:, i], priority, start[:, i])
-        missed = [np.linalg.norm(units[:, 0] * np.minimum(a[:, :, i].T @ end + b[:, i], 0.0)) for end in (u[:, i], fit)]
+        fit = bounded_least_squares.least_violating(
+            a[:, :, i].T, b[:, i], low[:, i], high[:, i], priority, start[:, i]
+        )
+        missed = [
+            np.linalg.norm(units[:, 0] * np.minimum(a[:, :, i].T @ end + b[:, i], 0.0))
+            for end in (u[:, i], fit)
+        ]
         u[:, i] = u[:, i] if missed[0] <= missed[1] else fit
     return u
 
 
 def is_unique(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Whether the rows violated at minimisers u (2, B) cross, so that no other action has the same slacks (B,)."""
+    """Whether the rows violated at minimisers u (2, B) cross, so that no other action has the same
+    slacks (B,)."""
     first, second = a[0] * u[0], a[1] * u[1]
     violated = first + second + b < -ROUNDING * (np.abs(first) + np.abs(second) + np.abs(b))
     _, _, along = _frame(np.where(violated, a[0], 0.0), np.where(violated, a[1], 0.0))
@@ -88,9 +115,13 @@ def _margin(rows: _Rows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _balanced(rows: _Rows, least: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Whether the forces cancel (B,): along both inputs, and along each row, which itself has no part in that."""
+    """Whether the forces cancel (B,): along both inputs, and along each row, which itself has no
+    part in that."""
     nothing = np.zeros_like(rows.u[:1])
-    along = np.concatenate([nothing + 1.0, nothing, -rows.y]), np.concatenate([nothing, nothing + 1.0, rows.x])
+    along = (
+        np.concatenate([nothing + 1.0, nothing, -rows.y]),
+        np.concatenate([nothing, nothing + 1.0, rows.x]),
+    )
     first, second = along[0] * rows.x[:, None], along[1] * rows.y[:, None]
     share, error = first + second, ROUNDING * (np.abs(first) + np.abs(second))
     ends = share * least[:, None], share * most[:, None]
@@ -98,12 +129,24 @@ def _balanced(rows: _Rows, least: np.ndarray, most: np.ndarray) -> np.ndarray:
     down, up = total(np.minimum(*ends) - error), total(np.maximum(*ends) + error)
     for j in (0, 1):
         # A face of the box pushes inwards, as strongly as it takes.
-        down = np.where((rows.u[j] <= rows.low[j]) & (along[j] < 0.0) | (rows.u[j] >= rows.high[j]) & (along[j] > 0.0), -np.inf, down)
-        up = np.where((rows.u[j] <= rows.low[j]) & (along[j] > 0.0) | (rows.u[j] >= rows.high[j]) & (along[j] < 0.0), np.inf, up)
+        down = np.where(
+            (rows.u[j] <= rows.low[j]) & (along[j] < 0.0)
+            | (rows.u[j] >= rows.high[j]) & (along[j] > 0.0),
+            -np.inf,
+            down,
+        )
+        up = np.where(
+            (rows.u[j] <= rows.low[j]) & (along[j] > 0.0)
+            | (rows.u[j] >= rows.high[j]) & (along[j] < 0.0),
+            np.inf,
+            up,
+        )
     return np.all((down <= 0.0) & (up >= 0.0), axis=0)
 
 
-def _newton(rows: _Rows, margin: np.ndarray, error: np.ndarray, least: np.ndarray, most: np.ndarray) -> np.ndarray:
+def _newton(
+    rows: _Rows, margin: np.ndarray, error: np.ndarray, least: np.ndarray, most: np.ndarray
+) -> np.ndarray:
     part = least > 0.0
     while True:
         x, y, r, doubt = [np.where(part, entry, 0.0) for entry in (rows.x, rows.y, margin, error)]
@@ -117,11 +160,14 @@ def _newton(rows: _Rows, margin: np.ndarray, error: np.ndarray, least: np.ndarra
         part |= hit
     nothing = np.zeros(goal.shape[1])
     length = interval.least_violating(change, margin, nothing, nothing + 1.0, np.ones(len(margin)))
-    return np.where(length == 1.0, goal, np.minimum(np.maximum(rows.u + length * step, rows.low), rows.high))
+    return np.where(
+        length == 1.0, goal, np.minimum(np.maximum(rows.u + length * step, rows.low), rows.high)
+    )
 
 
 def _least_squares(rows: _Rows, error: np.ndarray) -> np.ndarray:
-    """Where |x d_1 + y d_2 + r|^2, r being known up to an error, is least with u + d in the box: inside, or else on an edge."""
+    """Where |x d_1 + y d_2 + r|^2, r being known up to an error, is least with u + d in the box:
+    inside, or else on an edge."""
     goal = rows.u + _unbounded(rows)
     outside = np.flatnonzero(~((goal >= rows.low) & (goal <= rows.high)).all(axis=0))
     if outside.size:
@@ -129,17 +175,25 @@ def _least_squares(rows: _Rows, error: np.ndarray) -> np.ndarray:
     return goal
 
 
-def _frame(x: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-    """The steepest row (2, B), and each row's components across and along it, these zero where the rows are parallel."""
+def _frame(
+    x: np.ndarray, y: np.ndarray
+) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
+    """The steepest row (2, B), and each row's components across and along it, these zero where the
+    rows are parallel."""
     steepest = np.maximum(np.abs(x), np.abs(y)).argmax(axis=0)[None]
     n1, n2 = [np.take_along_axis(part, steepest, axis=0)[0] for part in (x, y)]
     first, second = y * n1, x * n2
     along = first - second
-    return (n1, n2), x * n1 + y * n2, np.where(np.abs(along) > ROUNDING * (np.abs(first) + np.abs(second)), along, 0.0)
+    return (
+        (n1, n2),
+        x * n1 + y * n2,
+        np.where(np.abs(along) > ROUNDING * (np.abs(first) + np.abs(second)), along, 0.0),
+    )
 
 
 def _unbounded(rows: _Rows) -> np.ndarray:
-    """The least-squares step (2, B), by Gram-Schmidt in the frame of the steepest row; across it alone where all are parallel."""
+    """The least-squares step (2, B), by Gram-Schmidt in the frame of the steepest row; across it
+    alone where all are parallel."""
     (n1, n2), across, along = _frame(rows.x, rows.y)
     square = total(across * across)
     square = np.where(square > 0.0, square, 1.0)
@@ -153,13 +207,20 @@ def _unbounded(rows: _Rows) -> np.ndarray:
 
 
 def _best_edge(rows: _Rows, error: np.ndarray) -> np.ndarray:
-    """The point of the four edges whose multiplier has the right sign; if several do up to rounding, the least sum and the nearest."""
+    """The point of the four edges whose multiplier has the right sign; if several do up to
+    rounding, the least sum and the nearest."""
     u, low, high = rows.u, rows.low, rows.high
-    best, least_wrong, least_sum = u.copy(), np.full(u.shape[1], np.inf), np.full(u.shape[1], np.inf)
+    best, least_wrong, least_sum = (
+        u.copy(),
+        np.full(u.shape[1], np.inf),
+        np.full(u.shape[1], np.inf),
+    )
     nearer = u - low <= high - u
     for j, near in ((0, True), (1, True), (0, False), (1, False)):
         fixed, moving = (rows.x, rows.y) if j == 0 else (rows.y, rows.x)
-        end, sign = np.where(nearer[j] == near, (low[j], -np.ones_like(low[j])), (high[j], np.ones_like(low[j])))
+        end, sign = np.where(
+            nearer[j] == near, (low[j], -np.ones_like(low[j])), (high[j], np.ones_like(low[j]))
+        )
         shift = fixed * (end - u[j])
         square = total(moving * moving)
         step = np.where(square > 0.0, -total(moving * (rows.r + shift)) / square, 0.0)
@@ -168,9 +229,14 @@ def _best_edge(rows: _Rows, error: np.ndarray) -> np.ndarray:
         margin = rows.r + shift + turn
         doubt = error + ROUNDING * (np.abs(shift) + np.abs(turn))
         force = sign * total(fixed * margin)
-        wrong = np.where(force > total(np.abs(fixed) * doubt), force, 0.0) / np.sqrt(total(fixed * fixed))
+        wrong = np.where(force > total(np.abs(fixed) * doubt), force, 0.0) / np.sqrt(
+            total(fixed * fixed)
+        )
         missed = total(np.where(np.abs(margin) > doubt, margin * margin, 0.0))
         better = (wrong < least_wrong) | (wrong == least_wrong) & (missed < least_sum)
-        least_wrong, least_sum = np.where(better, wrong, least_wrong), np.where(better, missed, least_sum)
+        least_wrong, least_sum = (
+            np.where(better, wrong, least_wrong),
+            np.where(better, missed, least_sum),
+        )
         best[j], best[1 - j] = np.where(better, end, best[j]), np.where(better, along, best[1 - j])
     return best

@@ -2,12 +2,14 @@
 
     min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a . u + b >= 0,   low <= u <= high
 
-The minimiser is u(l) = clip(v + l a / w) for the smallest multiplier l >= 0 at which phi(l) = a . u(l) + b reaches 0.
-phi is nondecreasing and piecewise linear, with a kink wherever a component enters or leaves its interval. If phi stays
-negative, no action meets the row; u(infinity), which maximises a . u + b over the box, violates it least.
+The minimiser is u(l) = clip(v + l a / w) for the smallest multiplier l >= 0 at which phi(l) = a .
+u(l) + b reaches 0. phi is nondecreasing and piecewise linear, with a kink wherever a component
+enters or leaves its interval. If phi stays negative, no action meets the row; u(infinity), which
+maximises a . u + b over the box, violates it least.
 
-A component whose proposal lies beyond its near bound stays there until l enters, and is measured from there: a proposal of 1e16
-does not drown it. What rounding leaves of the miss at the result is divided among the components that are free.
+A component whose proposal lies beyond its near bound stays there until l enters, and is measured
+from there: a proposal of 1e16 does not drown it. What rounding leaves of the miss at the result is
+divided among the components that are free.
 """
 
 from __future__ import annotations
@@ -21,19 +23,26 @@ import numpy as np
 from safe_envs.wrappers.qp.rows import ROUNDING, tolerance, tolerances
 
 _EXCESS = 1e3
-"""A row that holds with so many times its rounding to spare is not on the nearest action: the rounding of the way there was larger.
-Then, and where that makes it miss, a state of a batch is solved by itself."""
+"""A row that holds with so many times its rounding to spare is not on the nearest action: the
+rounding of the way there was larger. Then, and where that makes it miss, a state of a batch is
+solved by itself."""
 _CORRECTIONS = 3
 """How often the rounding of a long way is taken back: each time it shrinks by a factor of 1e16."""
 
 
 def project_floats(
-    a: Sequence[float], b: float, u: Sequence[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
+    a: Sequence[float],
+    b: float,
+    u: Sequence[float],
+    low: Sequence[float],
+    high: Sequence[float],
+    w: Sequence[float],
 ) -> tuple[list[float], float, bool, bool]:
     """Project the input u of one state.
 
     Returns:
-        The minimiser (m floats), its margin a . u + b, whether the row had to act, and whether it can be met.
+        The minimiser (m floats), its margin a . u + b, whether the row had to act, and whether it
+        can be met.
     """
     if len(u) == 1:
         return _project_scalar(a[0], b, u[0], low[0], high[0])
@@ -45,17 +54,30 @@ def project_floats(
     u, ways = _follow_multiplier(a, b, v, low, high, w)
     margin, allowed = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]), tolerance(a, b, u)
     for _ in range(_CORRECTIONS):
-        slope = 0.0 if -allowed <= margin <= allowed else sum([aj * way for aj, way in zip(a, ways, strict=True)])
+        slope = (
+            0.0
+            if -allowed <= margin <= allowed
+            else sum([aj * way for aj, way in zip(a, ways, strict=True)])
+        )
         if not slope > 0.0:
             break
         step = margin / slope
-        u = [min(max(uj - step * way, lo), hi) if way else uj for uj, way, lo, hi in zip(u, ways, low, high, strict=True)]
-        margin, allowed = b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]), tolerance(a, b, u)
+        u = [
+            min(max(uj - step * way, lo), hi) if way else uj
+            for uj, way, lo, hi in zip(u, ways, low, high, strict=True)
+        ]
+        margin, allowed = (
+            b + sum([aj * uj for aj, uj in zip(a, u, strict=True)]),
+            tolerance(a, b, u),
+        )
     return u, margin, True, margin >= -allowed
 
 
-def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tuple[list[float], float, bool, bool]:
-    """A single input: the root of the row, if the box holds it, and the end of the box next to it if not."""
+def _project_scalar(
+    a: float, b: float, v: float, low: float, high: float
+) -> tuple[list[float], float, bool, bool]:
+    """A single input: the root of the row, if the box holds it, and the end of the box next to it
+    if not."""
     u = low if v < low else high if v > high else v
     margin = a * u + b
     if margin >= 0.0:
@@ -70,7 +92,12 @@ def _project_scalar(a: float, b: float, v: float, low: float, high: float) -> tu
 
 
 def _follow_multiplier(
-    a: Sequence[float], b: float, v: Sequence[float], low: Sequence[float], high: Sequence[float], w: Sequence[float]
+    a: Sequence[float],
+    b: float,
+    v: Sequence[float],
+    low: Sequence[float],
+    high: Sequence[float],
+    w: Sequence[float],
 ) -> tuple[list[float], list[float]]:
     """The minimiser, and the way of each component along a / w, 0 for those that are not free."""
     size = max([abs(aj) for aj in a]) or 1.0
@@ -85,25 +112,42 @@ def _follow_multiplier(
     parts = list(zip(start, far, d, enter, leave, strict=True))
 
     def inputs(multiplier: float) -> list[float]:
-        return [s if multiplier <= e else f if multiplier >= x else s + (multiplier - e) * dj for s, f, dj, e, x in parts]
+        return [
+            s if multiplier <= e else f if multiplier >= x else s + (multiplier - e) * dj
+            for s, f, dj, e, x in parts
+        ]
 
     kink, phi = max(
-        [(k, p) for k in (0.0, *enter, *leave) if (p := b + sum([aj * uj for aj, uj in zip(a, inputs(k), strict=True)])) < 0.0],
+        [
+            (k, p)
+            for k in (0.0, *enter, *leave)
+            if (p := b + sum([aj * uj for aj, uj in zip(a, inputs(k), strict=True)])) < 0.0
+        ],
         default=(0.0, -0.0),
     )
-    # Where a component is so far off that it enters and leaves at the same multiplier, up to rounding, it is free there.
+    # Where a component is so far off that it enters and leaves at the same multiplier, up to
+    # rounding, it is free there.
     ways = [dj if s != f and (e <= kink < x or e == kink == x) else 0.0 for s, f, dj, e, x in parts]
     slope = sum([aj * way for aj, way in zip(a, ways, strict=True)])
     if not slope > 0.0:
         return far, ways
     step = phi / slope
-    return [min(max(uj - step * way, lo), hi) if way else uj for uj, way, lo, hi in zip(inputs(kink), ways, low, high, strict=True)], ways
+    return [
+        min(max(uj - step * way, lo), hi) if way else uj
+        for uj, way, lo, hi in zip(inputs(kink), ways, low, high, strict=True)
+    ], ways
 
 
 def project_arrays(
-    a: Sequence[Any], b: Any, v: Sequence[np.ndarray], low: Sequence[Any], high: Sequence[Any], w: Sequence[Any]
+    a: Sequence[Any],
+    b: Any,
+    v: Sequence[np.ndarray],
+    low: Sequence[Any],
+    high: Sequence[Any],
+    w: Sequence[Any],
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
-    """Project the inputs of a batch of B states. A flat row divides by zero: the caller silences that warning.
+    """Project the inputs of a batch of B states. A flat row divides by zero: the caller silences
+    that warning.
 
     Args:
         a: m entries of the row, each a float or an array (B,).
@@ -130,7 +174,10 @@ def project_arrays(
     feasible = margin >= -allowed
     wrong = states[(~feasible[states] & movable) | (margin[states] > _EXCESS * allowed[states])]
     if wrong.size:
-        problems = [np.array([np.broadcast_to(cj, active.shape)[wrong] for cj in c]).T.tolist() for c in (a, (b,), v, low, high, w)]
+        problems = [
+            np.array([np.broadcast_to(cj, active.shape)[wrong] for cj in c]).T.tolist()
+            for c in (a, (b,), v, low, high, w)
+        ]
         for i, aj, (bi,), *rest in zip(wrong.tolist(), *problems, strict=True):
             found, margin[i], _, feasible[i] = project_floats(aj, bi, *rest)
             for uj, component in zip(u, found, strict=True):
@@ -138,7 +185,9 @@ def project_arrays(
     return u, margin, active, feasible
 
 
-def _project_scalars(a: Any, b: Any, v: np.ndarray, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _project_scalars(
+    a: Any, b: Any, v: np.ndarray, low: Any, high: Any
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     u = np.minimum(np.maximum(v, low), high)
     margin = a * u + b
     active = margin < 0.0
@@ -178,16 +227,25 @@ def _follow_multipliers(
     Components are in front: shape (m, R), kinks in a third axis (m, R, 2m + 1).
     """
     batch = u[0].shape
-    ar, vr, lo, hi, wr = [np.array([np.broadcast_to(cj, batch)[rows] for cj in c]) for c in (a, v, low, high, w)]
+    ar, vr, lo, hi, wr = [
+        np.array([np.broadcast_to(cj, batch)[rows] for cj in c]) for c in (a, v, low, high, w)
+    ]
     size = np.abs(ar).max(axis=0)
     size[size == 0.0] = 1.0
-    ar, br = ar / size, np.broadcast_to(b, batch)[rows] / size  # so that products neither overflow nor vanish
+    ar, br = (
+        ar / size,
+        np.broadcast_to(b, batch)[rows] / size,
+    )  # so that products neither overflow nor vanish
     d = ar / wr
     near, far = np.where(d > 0.0, lo, hi), np.where(d > 0.0, hi, lo)
     free = d != 0.0
     # Finite, for an input without a say stays where it is.
-    enter = np.clip(np.divide(near - vr, d, out=np.zeros_like(d), where=free), 0.0, sys.float_info.max)
-    leave = np.clip(np.divide(far - vr, d, out=np.zeros_like(d), where=free), 0.0, sys.float_info.max)
+    enter = np.clip(
+        np.divide(near - vr, d, out=np.zeros_like(d), where=free), 0.0, sys.float_info.max
+    )
+    leave = np.clip(
+        np.divide(far - vr, d, out=np.zeros_like(d), where=free), 0.0, sys.float_info.max
+    )
     kinks = np.concatenate([np.zeros((1, rows.size)), enter, leave]).T
     at_kinks = np.clip(vr[:, :, None] + kinks * d[:, :, None], lo[:, :, None], hi[:, :, None])
     phi = (ar[:, :, None] * at_kinks).sum(axis=0) + br[:, None]

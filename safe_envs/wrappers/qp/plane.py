@@ -1,14 +1,17 @@
-"""Several rows and two inputs, one state in plain floats: exact, row by row, in a time that the solvers need to start.
+"""Several rows and two inputs, one state in plain floats: exact, row by row, in a time that the
+solvers need to start.
 
     min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a_i . u + b_i >= 0,   low <= u <= high
 
-Seidel's incremental scheme. The proposal clipped into the box is the minimiser without rows. Where it violates the next row,
-the new minimiser lies on that row's line: the box and the rows before leave an interval of the line, and the point of the
-line nearest to v is clipped into it. An empty interval means that no action meets the rows.
+Seidel's incremental scheme. The proposal clipped into the box is the minimiser without rows. Where
+it violates the next row, the new minimiser lies on that row's line: the box and the rows before
+leave an interval of the line, and the point of the line nearest to v is clipped into it. An empty
+interval means that no action meets the rows.
 
-A line is written u_p = alpha + beta u_f. The free input f is the one that adds less to the row, given how far each input can
-go: to the end of its box, or as far in the metric of the objective as the line is away, since a box may be endless. So neither
-term is much larger than u_p, and rounding stays small. Every test compares a sum with its own terms: rows may have any size.
+A line is written u_p = alpha + beta u_f. The free input f is the one that adds less to the row,
+given how far each input can go: to the end of its box, or as far in the metric of the objective as
+the line is away, since a box may be endless. So neither term is much larger than u_p, and rounding
+stays small. Every test compares a sum with its own terms: rows may have any size.
 """
 
 from __future__ import annotations
@@ -22,7 +25,8 @@ from safe_envs.wrappers.qp import plane_batch
 from safe_envs.wrappers.qp.rows import ROUNDING, tolerance
 
 Row = tuple[float, float, float]
-"""(a_1, a_2, b) of a row a . u + b >= 0; on a line, the second and first input are the pivot and the free one."""
+"""(a_1, a_2, b) of a row a . u + b >= 0; on a line, the second and first input are the pivot and
+the free one."""
 
 
 def project_floats(
@@ -34,7 +38,8 @@ def project_floats(
     w: Sequence[float],
     priority: Sequence[float],
 ) -> tuple[list[float], list[float], list[bool], bool]:
-    """Project the input of one state: inputs (2), margins and binding rows (k), whether the rows can be met together."""
+    """Project the input of one state: inputs (2), margins and binding rows (k), whether the rows
+    can be met together."""
     (v1, v2), (l1, l2), (h1, h2) = v, low, high
     c1 = l1 if v1 < l1 else h1 if v1 > h1 else v1
     c2 = l2 if v2 < l2 else h2 if v2 > h2 else v2
@@ -54,24 +59,53 @@ def project_floats(
         if abs(a1) * min(e1, reach / r1) >= abs(a2) * min(e2, reach / r2):
             u = _onto_line(rows[i], rows[:i], v1, v2, l1, h1, l2, h2, w[0], w[1])
         else:
-            found = _onto_line((a2, a1, bi), [(q2, q1, q0) for q1, q2, q0 in rows[:i]], v2, v1, l2, h2, l1, h1, w[1], w[0])
+            found = _onto_line(
+                (a2, a1, bi),
+                [(q2, q1, q0) for q1, q2, q0 in rows[:i]],
+                v2,
+                v1,
+                l2,
+                h2,
+                l1,
+                h1,
+                w[1],
+                w[0],
+            )
             u = found and (found[1], found[0])
         if u is None:
             return _one_of_batch(a, b, v, low, high, w, priority)
         u1, u2 = u
     margin = [a1 * u1 + a2 * u2 + bi for a1, a2, bi in rows]
-    if not all([g >= 0.0 or g >= -tolerance((a1, a2), bi, u) for (a1, a2, bi), g in zip(rows, margin, strict=True)]):  # noqa: C419
+    if not all(
+        [  # noqa: C419
+            g >= 0.0 or g >= -tolerance((a1, a2), bi, u)
+            for (a1, a2, bi), g in zip(rows, margin, strict=True)
+        ]
+    ):
         return _one_of_batch(a, b, v, low, high, w, priority)
     reach = r1 * abs(u1) + r2 * abs(u2)
     s1, s2 = min(e1, reach / r1), min(e2, reach / r2)
-    active = [g <= 0.0 or g <= ROUNDING * (abs(bi) + abs(a1) * s1 + abs(a2) * s2) for (a1, a2, bi), g in zip(rows, margin, strict=True)]
+    active = [
+        g <= 0.0 or g <= ROUNDING * (abs(bi) + abs(a1) * s1 + abs(a2) * s2)
+        for (a1, a2, bi), g in zip(rows, margin, strict=True)
+    ]
     return [u1, u2], margin, active, True
 
 
 def _onto_line(
-    line: Row, before: list[Row], vp: float, vf: float, lp: float, hp: float, lf: float, hf: float, wp: float, wf: float
+    line: Row,
+    before: list[Row],
+    vp: float,
+    vf: float,
+    lp: float,
+    hp: float,
+    lf: float,
+    hf: float,
+    wp: float,
+    wf: float,
 ) -> tuple[float, float] | None:
-    """The minimiser (pivot, free) on a line within the box and the rows before; None where there is none."""
+    """The minimiser (pivot, free) on a line within the box and the rows before; None where there is
+    none."""
     ap, af, b = line
     if ap == 0.0:
         return None
@@ -102,7 +136,9 @@ def _onto_line(
     return (lp if pivot < lp else hp if pivot > hp else pivot), free
 
 
-def _meeting_point(before: list[Row], alpha: float, beta: float, lo: float, hi: float, aim: float) -> float | None:
+def _meeting_point(
+    before: list[Row], alpha: float, beta: float, lo: float, hi: float, aim: float
+) -> float | None:
     """The free input where the rows leave an interval once each of them may miss by its rounding."""
     for rp, rf, rb in before:
         slope, offset = rf + rp * beta, rb + rp * alpha
@@ -111,7 +147,8 @@ def _meeting_point(before: list[Row], alpha: float, beta: float, lo: float, hi: 
             end = -(offset + ROUNDING * terms) / slope
             lo, hi = (max(lo, end), hi) if slope > 0.0 else (lo, min(hi, end))
     free = min(max(aim, lo), hi)
-    # The ends may lie so far off that their rounding is large: what counts is the rounding of the rows at the point itself.
+    # The ends may lie so far off that their rounding is large: what counts is the rounding of the
+    # rows at the point itself.
     for rp, rf, rb in before:
         terms = abs(rb) + abs(rp * alpha) + (abs(rf) + abs(rp * beta)) * abs(free)
         if not (rf + rp * beta) * free + (rb + rp * alpha) >= -2.0 * ROUNDING * terms:
@@ -128,5 +165,7 @@ def _one_of_batch(
     w: Sequence[float],
     priority: Sequence[float],
 ) -> tuple[list[float], list[float], list[bool], bool]:
-    u, margin, active, feasible = plane_batch.project_arrays(a, b, [np.array([c]) for c in v], low, high, w, priority)
+    u, margin, active, feasible = plane_batch.project_arrays(
+        a, b, [np.array([c]) for c in v], low, high, w, priority
+    )
     return u[:, 0].tolist(), margin[:, 0].tolist(), active[:, 0].tolist(), feasible.item()

@@ -1,7 +1,9 @@
-"""Several rows and two inputs, a batch of states at once: `safe_envs.wrappers.qp.plane` with masks in place of branches.
+"""Several rows and two inputs, a batch of states at once: `safe_envs.wrappers.qp.plane` with masks
+in place of branches.
 
-The states that violate the row in turn are gathered and moved onto its line, so that the number of NumPy calls grows with the
-number of rows and not with the batch. Every number comes from the same operations in the same order as for one state.
+The states that violate the row in turn are gathered and moved onto its line, so that the number of
+NumPy calls grows with the number of rows and not with the batch. Every number comes from the same
+operations in the same order as for one state.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ class Plane(NamedTuple):
         return self.a[0] * u[0] + self.a[1] * u[1] + self.b
 
     def scale(self, u: np.ndarray, away: np.ndarray | float = 0.0) -> np.ndarray:
-        """How far each input can go (2, B): to the end of its box, or as far as u and `away` in the metric of the objective."""
+        """How far each input can go (2, B): to the end of its box, or as far as u and `away` in the
+        metric of the objective."""
         root = np.sqrt(self.w)
         reach = root[0] * np.abs(u[0]) + root[1] * np.abs(u[1]) + away
         return np.minimum(np.maximum(-self.low, self.high), reach / root)
@@ -59,7 +62,9 @@ class Plane(NamedTuple):
     def binds(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
         """Whether a row's margin exceeds zero by no more than rounding."""
         s1, s2 = self.scale(u)
-        return (margin <= 0.0) | (margin <= ROUNDING * (np.abs(self.b) + np.abs(self.a[0]) * s1 + np.abs(self.a[1]) * s2))
+        return (margin <= 0.0) | (
+            margin <= ROUNDING * (np.abs(self.b) + np.abs(self.a[0]) * s1 + np.abs(self.a[1]) * s2)
+        )
 
 
 @np.errstate(all="ignore")
@@ -75,7 +80,8 @@ def project_arrays(
     """Project the inputs of B states.
 
     Returns:
-        Inputs (2, B), margins (k, B), rows that bind or cannot be met (k, B), and whether all rows can be met (B,).
+        Inputs (2, B), margins (k, B), rows that bind or cannot be met (k, B), and whether all rows
+        can be met (B,).
     """
     size = len(v[0])
     a_of_input = np.array([stack([row[j] for row in a], size) for j in (0, 1)])
@@ -101,7 +107,8 @@ def project_arrays(
 
 
 def _nearest_of_least_violating(plane: Plane, priority: np.ndarray) -> np.ndarray:
-    """Of the actions with the least sum of squared slacks, which all have the same slacks, the one nearest to v."""
+    """Of the actions with the least sum of squared slacks, which all have the same slacks, the one
+    nearest to v."""
     u = least_violating(plane.a, plane.b, plane.low, plane.high, priority, plane.clip(plane.v))
     several = np.flatnonzero(~is_unique(plane.a, plane.b, u))
     if several.size:
@@ -121,7 +128,9 @@ def _nearest(plane: Plane) -> tuple[np.ndarray, np.ndarray]:
     for i, (a1, a2, b) in enumerate(zip(*plane.a, plane.b, strict=True)):
         first, second = a1 * u[0], a2 * u[1]
         miss = first + second + b
-        states = np.flatnonzero((miss < -ROUNDING * (np.abs(first) + np.abs(second) + np.abs(b))) & met)
+        states = np.flatnonzero(
+            (miss < -ROUNDING * (np.abs(first) + np.abs(second) + np.abs(b))) & met
+        )
         if states.size:
             part = plane.take(states)
             part = part._replace(a=part.a[:, : i + 1], b=part.b[: i + 1])
@@ -130,20 +139,26 @@ def _nearest(plane: Plane) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _onto_line(plane: Plane, u: np.ndarray, miss: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Minimisers (2, B) on the line of the last row, which u violates, and whether the rows before and the box leave any (B,)."""
+    """Minimisers (2, B) on the line of the last row, which u violates, and whether the rows before
+    and the box leave any (B,)."""
     first, second = np.abs(plane.a[:, -1])
     root = np.sqrt(plane.w)
     steepness = first / root[0] + second / root[1]
     s1, s2 = plane.scale(u, -np.where(steepness > 0.0, miss / steepness, miss))
     steep = first * s1 >= second * s2
     (rp, rf), (vp, vf), (lp, lf), (hp, hf), (wp, wf) = [
-        (np.where(steep, *pair), np.where(steep, *pair[::-1])) for pair in (plane.a, plane.v, plane.low, plane.high, plane.w)
+        (np.where(steep, *pair), np.where(steep, *pair[::-1]))
+        for pair in (plane.a, plane.v, plane.low, plane.high, plane.w)
     ]
     alpha, beta = -plane.b[-1] / rp[-1], -rf[-1] / rp[-1]
     box = np.ones((2, len(alpha)))
     box[1] = -1.0
     before = _OnLine.of(
-        np.concatenate([rp[:-1], box]), np.concatenate([rf[:-1], 0.0 * box]), np.concatenate([plane.b[:-1], [-lp, hp]]), alpha, beta
+        np.concatenate([rp[:-1], box]),
+        np.concatenate([rf[:-1], 0.0 * box]),
+        np.concatenate([plane.b[:-1], [-lp, hp]]),
+        alpha,
+        beta,
     )
     aim = vf + wp * beta * (vp - alpha - beta * vf) / (wf + wp * beta * beta)
     lo, hi = before.interval(lf, hf, 0.0)
@@ -160,7 +175,8 @@ def _onto_line(plane: Plane, u: np.ndarray, miss: np.ndarray) -> tuple[np.ndarra
 
 
 class _OnLine(NamedTuple):
-    """Rows slope * u_f + offset >= 0 along a line, shapes (k, B), with the sizes of the terms that they were summed from."""
+    """Rows slope * u_f + offset >= 0 along a line, shapes (k, B), with the sizes of the terms that
+    they were summed from."""
 
     slope: np.ndarray
     offset: np.ndarray
@@ -169,25 +185,35 @@ class _OnLine(NamedTuple):
     parallel: np.ndarray
 
     @classmethod
-    def of(cls, rp: np.ndarray, rf: np.ndarray, rb: np.ndarray, alpha: np.ndarray, beta: np.ndarray) -> _OnLine:
+    def of(
+        cls, rp: np.ndarray, rf: np.ndarray, rb: np.ndarray, alpha: np.ndarray, beta: np.ndarray
+    ) -> _OnLine:
         turn, shift = rp * beta, rp * alpha
         slope = rf + turn
         parallel = np.abs(slope) <= ROUNDING * np.abs(rf)
-        return cls(slope, rb + shift, np.abs(rf) + np.abs(turn), np.abs(rb) + np.abs(shift), parallel)
+        return cls(
+            slope, rb + shift, np.abs(rf) + np.abs(turn), np.abs(rb) + np.abs(shift), parallel
+        )
 
     @property
     def crosses(self) -> np.ndarray:
         """Whether no row lies parallel to the line on its wrong side (B,)."""
         return np.all(~self.parallel | (self.offset >= -ROUNDING * self.offset_terms), axis=0)
 
-    def interval(self, lo: np.ndarray, hi: np.ndarray, relative: float) -> tuple[np.ndarray, np.ndarray]:
+    def interval(
+        self, lo: np.ndarray, hi: np.ndarray, relative: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """What the rows leave of [lo, hi] when each may miss by a part of its terms."""
         offset = self.offset
         if relative:
-            offset = offset + relative * (self.offset_terms + self.slope_terms * np.abs(offset / self.slope))
+            offset = offset + relative * (
+                self.offset_terms + self.slope_terms * np.abs(offset / self.slope)
+            )
         end = -offset / self.slope
         lo = np.maximum(lo, np.where((self.slope > 0.0) & ~self.parallel, end, -np.inf).max(axis=0))
-        return lo, np.minimum(hi, np.where((self.slope < 0.0) & ~self.parallel, end, np.inf).min(axis=0))
+        return lo, np.minimum(
+            hi, np.where((self.slope < 0.0) & ~self.parallel, end, np.inf).min(axis=0)
+        )
 
     def holds(self, free: np.ndarray) -> np.ndarray:
         """Whether every row is met up to rounding where the free input is as given (B,)."""

@@ -1,10 +1,12 @@
 """Several constraint rows and a box: ProxQP for the batch, each answer checked and made precise.
 
-ProxQP's defaults return feasible points that are not the minimisers, and an infeasible problem ends at the iteration
-limit. So the settings ask for the duality gap and cap the iterations. Of its answer only the rows and bounds that hold it are
-taken: the minimiser is the point of these equations nearest to the proposal, if it meets all rows, and if what holds it presses
-in the right direction. So its precision is that of these equations, not that of the solver. States without such a certificate, among them
-all with contradicting rows, go to `safe_envs.wrappers.qp.active_set` one by one.
+ProxQP's defaults return feasible points that are not the minimisers, and an infeasible problem ends
+at the iteration limit. So the settings ask for the duality gap and cap the iterations. Of its
+answer only the rows and bounds that hold it are taken: the minimiser is the point of these
+equations nearest to the proposal, if it meets all rows, and if what holds it presses in the right
+direction. So its precision is that of these equations, not that of the solver. States without such
+a certificate, among them all with contradicting rows, go to `safe_envs.wrappers.qp.active_set` one
+by one.
 """
 
 from __future__ import annotations
@@ -12,24 +14,33 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from proxsuite import proxqp  # pyright: ignore[reportMissingImports]  (it lives in a prefix of its own)
+
+# It lives in a prefix of its own.
+from proxsuite import proxqp  # pyright: ignore[reportMissingImports]
 
 from safe_envs.wrappers.qp import active_set
 from safe_envs.wrappers.qp.rows import ROUNDING, tolerances, total
 
-_PRECISION = {"eps_abs": 1e-9, "eps_rel": 0.0, "check_duality_gap": True, "eps_duality_gap_abs": 1e-9}
+_PRECISION = {
+    "eps_abs": 1e-9,
+    "eps_rel": 0.0,
+    "check_duality_gap": True,
+    "eps_duality_gap_abs": 1e-9,
+}
 _SETTINGS = {**_PRECISION, "eps_primal_inf": 1e-14, "max_iter": 200, "max_iter_in": 50}
 _INFINITY = 1e20
 _PRESSES = 1e-7
 """The row or bound of a multiplier binds from this share of the largest."""
 _WIDE = 1e3
-"""A box that reaches this many times further than the violated rows is too wide to be a unit of length."""
+"""A box that reaches this many times further than the violated rows is too wide to be a unit of
+length."""
 _REACH = 10.0
 """The unit then, in ways to the violated rows."""
 
 
 class Projection(NamedTuple):
-    """Arrays over a batch of B states: inputs (B, m), margins and binding rows (B, k), whether all can be met (B,)."""
+    """Arrays over a batch of B states: inputs (B, m), margins and binding rows (B, k), whether all
+    can be met (B,)."""
 
     u: np.ndarray
     margin: np.ndarray
@@ -38,7 +49,13 @@ class Projection(NamedTuple):
 
 
 def project(
-    a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray, priority: np.ndarray
+    a: np.ndarray,
+    b: np.ndarray,
+    v: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    w: np.ndarray,
+    priority: np.ndarray,
 ) -> Projection:
     """Project proposed inputs, which violate a row, onto k rows a u + b >= 0 and a box.
 
@@ -84,7 +101,8 @@ class _Problem(NamedTuple):
         return tolerances(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
 
     def contradictory(self) -> np.ndarray:
-        """Where a row, or two rows of unit length together, miss by more than rounding at every input in the box (B,).
+        """Where a row, or two rows of unit length together, miss by more than rounding at every
+        input in the box (B,).
 
         It finds opposite rows, not every set of rows that cannot be met.
         """
@@ -93,7 +111,9 @@ class _Problem(NamedTuple):
             lengths = np.where(lengths > np.finfo(float).tiny, lengths, 1.0)
             a, b = self.a / lengths[:, :, None], self.b / lengths
             low, high = self.low[:, None, :], self.high[:, None, :]
-            allowed = tolerances(np.moveaxis(a, 2, 0), b, np.moveaxis(np.maximum(np.abs(low), np.abs(high)), 2, 0))
+            allowed = tolerances(
+                np.moveaxis(a, 2, 0), b, np.moveaxis(np.maximum(np.abs(low), np.abs(high)), 2, 0)
+            )
             first, second = np.triu_indices(a.shape[1])
             sums = a[:, first] + a[:, second]
             most = b[:, first] + b[:, second] + np.maximum(sums * low, sums * high).sum(axis=2)
@@ -102,16 +122,19 @@ class _Problem(NamedTuple):
     def tidied(self, u: np.ndarray) -> np.ndarray:
         """The inputs without the rounding that other inputs brought in.
 
-        An input on which no row depends keeps its proposal. One that is nothing but rounding of the way from the proposal is 0,
-        for a row of this input alone may ask for that.
+        An input on which no row depends keeps its proposal. One that is nothing but rounding of the
+        way from the proposal is 0, for a row of this input alone may ask for that.
         """
         roots, start = np.sqrt(self.w), np.clip(self.v, self.low, self.high)
         way = (np.abs(u - self.v) * roots).max(axis=1, keepdims=True)
         u = np.where(np.abs(u) <= ROUNDING * way / roots, np.clip(0.0, self.low, self.high), u)
         return np.where((self.a == 0.0).all(axis=1), start, u)
 
-    def certified(self, rows: np.ndarray, below: np.ndarray, above: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The minimisers (B, m) that some rows (B, k) and bounds (B, m) hold, and where they are those of the whole problem (B,)."""
+    def certified(
+        self, rows: np.ndarray, below: np.ndarray, above: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The minimisers (B, m) that some rows (B, k) and bounds (B, m) hold, and where they are
+        those of the whole problem (B,)."""
         roots, held = np.sqrt(self.w), below | above
         normals = self.a / roots[:, None, :]
         lengths = np.abs(normals).max(axis=2)
@@ -130,19 +153,25 @@ class _Problem(NamedTuple):
         rest = way - _dot(np.swapaxes(normals, 1, 2), np.where(rows, pressures, 0.0))
         rest = np.where(below, np.minimum(rest, 0.0), np.where(above, np.maximum(rest, 0.0), rest))
         nothing = ROUNDING * np.abs(way).max(axis=1)
-        pressed = (np.abs(rest).max(axis=1) <= nothing) & (pressures >= -nothing[:, None]).all(axis=1)
+        pressed = (np.abs(rest).max(axis=1) <= nothing) & (pressures >= -nothing[:, None]).all(
+            axis=1
+        )
         margin, allowed = self.margin(u), self.tolerance(u)
         met = (margin >= -allowed) & (~rows | (margin <= allowed))
         return u, usable & pressed & met.all(axis=1)
 
 
 def _dot(a: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Products (B, k) of rows (B, k, m) and inputs (B, m), summed in an order that does not depend on the batch."""
+    """Products (B, k) of rows (B, k, m) and inputs (B, m), summed in an order that does not depend
+    on the batch."""
     return total(np.moveaxis(a * u[:, None, :], 2, 0))
 
 
-def _units(a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Origin and unit of each input (B, m): those of the box, or of the way to the violated rows where the box is too wide."""
+def _units(
+    a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Origin and unit of each input (B, m): those of the box, or of the way to the violated rows
+    where the box is too wide."""
     inside = np.clip(v, low, high)
     missed = np.maximum(-(_dot(a, inside) + b), 0.0)
     steepness = np.sqrt((a**2 / w[:, None, :]).sum(axis=2))
@@ -171,7 +200,9 @@ class _Scaled(NamedTuple):
         offsets = b + _dot(a, center)
         lengths = np.linalg.norm(rows, axis=2)
         # A flat row says nothing of the input: its offset alone decides, in its own units.
-        lengths = np.where(lengths > np.finfo(float).tiny, lengths, np.maximum(np.abs(offsets), 1.0))
+        lengths = np.where(
+            lengths > np.finfo(float).tiny, lengths, np.maximum(np.abs(offsets), 1.0)
+        )
         curvature = w * half**2
         return cls(
             rows / lengths[:, :, None],
@@ -189,10 +220,13 @@ class _Scaled(NamedTuple):
 
 
 def _solve(scaled: _Scaled) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rows (B, k) and the lower and upper bounds (B, m) that hold the minimisers, according to ProxQP."""
+    """The rows (B, k) and the lower and upper bounds (B, m) that hold the minimisers, according to
+    ProxQP."""
     count, k, m = scaled.rows.shape
     # The solver does not come back from numbers that are not finite.
-    solvable = np.flatnonzero(np.all([np.isfinite(part).reshape(count, -1).all(axis=1) for part in scaled], axis=0)).tolist()
+    solvable = np.flatnonzero(
+        np.all([np.isfinite(part).reshape(count, -1).all(axis=1) for part in scaled], axis=0)
+    ).tolist()
     batch = proxqp.dense.BatchQP(len(solvable))
     for i in solvable:
         qp = batch.init_qp_in_place(m, 0, k + m)
@@ -200,7 +234,14 @@ def _solve(scaled: _Scaled) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             setattr(qp.settings, name, value)
         rows = np.vstack([scaled.rows[i], np.eye(m)])
         lower = np.concatenate([-scaled.offsets[i], scaled.low[i]])
-        qp.init(*scaled.objective(i), None, None, rows, lower, np.concatenate([np.full(k, _INFINITY), scaled.high[i]]))
+        qp.init(
+            *scaled.objective(i),
+            None,
+            None,
+            rows,
+            lower,
+            np.concatenate([np.full(k, _INFINITY), scaled.high[i]]),
+        )
     proxqp.dense.solve_in_parallel(batch, 1)
     pressures = np.zeros((count, k + m))
     for place, i in enumerate(solvable):

@@ -1,14 +1,16 @@
-"""What the solvers share: rows of a batch as one array, and the one tolerance with which a row counts as met.
+"""What the solvers share: rows of a batch as one array, and the one tolerance with which a row
+counts as met.
 
 A row a . u + b >= 0 is met by an input u if
 
     a . u + b >= -ROUNDING (|b| + sum_j |a_j u_j|)
 
-A sum of n floating-point products differs from the exact one by at most n eps times the sum of their sizes; ROUNDING leaves
-room for the coefficients, which were rounded themselves. The sizes are those of the terms at u, so that neither the unit of a
-row nor that of an input matters.
+A sum of n floating-point products differs from the exact one by at most n eps times the sum of
+their sizes; ROUNDING leaves room for the coefficients, which were rounded themselves. The sizes are
+those of the terms at u, so that neither the unit of a row nor that of an input matters.
 
-Every solver, for one state and for a batch, says `feasible` where the action that it returns meets all rows in this sense.
+Every solver, for one state and for a batch, says `feasible` where the action that it returns meets
+all rows in this sense.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ def stack(entries: Sequence[Any], size: int) -> np.ndarray:
 
 
 def total(parts: np.ndarray) -> np.ndarray:
-    """Sum over the first axis, in an order that does not depend on the size of the batch, as NumPy's own does."""
+    """Sum over the first axis, in an order that does not depend on the size of the batch, as
+    NumPy's own does."""
     result = parts[0].copy()
     for part in parts[1:]:
         result += part

@@ -1,11 +1,14 @@
-"""Rows with an uncertainty that depends on the single input: each is met on an interval, into which the proposal is clipped.
+"""Rows with an uncertainty that depends on the single input: each is met on an interval, into which
+the proposal is clipped.
 
-    min 1/2 (u - v)^2   subject to   a_i u + b_i - sqrt(q_i0 + 2 q_i1 u + q_i2 u^2) >= 0,   low <= u <= high
+    min 1/2 (u - v)^2   subject to   a_i u + b_i - sqrt(q_i0 + 2 q_i1 u + q_i2 u^2) >= 0,   low <= u
+    <= high
 
-The left-hand side c_i is concave, so that the rows and the box meet in an interval. Its ends are roots of
-(a^2 - q_2) u^2 + 2 (a b - q_1) u + b^2 - q_0 with a u + b >= 0. Where it is empty, a single row is missed least at the maximiser
-of c_1; for several rows the sum of squared slacks is convex, and its minimisers are found by bisection of its derivative between
-the inputs at which each row alone is missed least.
+The left-hand side c_i is concave, so that the rows and the box meet in an interval. Its ends are
+roots of (a^2 - q_2) u^2 + 2 (a b - q_1) u + b^2 - q_0 with a u + b >= 0. Where it is empty, a
+single row is missed least at the maximiser of c_1; for several rows the sum of squared slacks is
+convex, and its minimisers are found by bisection of its derivative between the inputs at which each
+row alone is missed least.
 """
 
 from __future__ import annotations
@@ -25,7 +28,13 @@ Quadratic = Sequence[Any]
 
 
 def project_floats(
-    a: Sequence[float], b: Sequence[float], q: Sequence[Quadratic], v: float, low: float, high: float, priority: Sequence[float]
+    a: Sequence[float],
+    b: Sequence[float],
+    q: Sequence[Quadratic],
+    v: float,
+    low: float,
+    high: float,
+    priority: Sequence[float],
 ) -> tuple[float, list[float], list[bool], bool]:
     """Project the input of one state; see `project_arrays`."""
     u = low if v < low else high if v > high else v
@@ -49,7 +58,12 @@ def project_floats(
     margin, allowed = [_margin(*row, u) for row in rows], [_tolerance(*row, u) for row in rows]
     # An end may be rounded by more than the margin that is nothing but rounding.
     active = [g <= t or u in ends for g, t, ends in zip(margin, allowed, intervals, strict=True)]
-    return u, margin, active, all([g >= -t for g, t in zip(margin, allowed, strict=True)])  # noqa: C419  (a list is faster here)
+    return (
+        u,
+        margin,
+        active,
+        all([g >= -t for g, t in zip(margin, allowed, strict=True)]),  # noqa: C419
+    )
 
 
 def _in_unit(a: float, b: float, q: Quadratic) -> tuple[float, float, Quadratic]:
@@ -58,7 +72,13 @@ def _in_unit(a: float, b: float, q: Quadratic) -> tuple[float, float, Quadratic]
     return a / unit, b / unit, [entry / unit / unit for entry in q]
 
 
-def _nearest(row: tuple[float, float, Quadratic], interval: tuple[float, float], v: float, low: float, high: float) -> float:
+def _nearest(
+    row: tuple[float, float, Quadratic],
+    interval: tuple[float, float],
+    v: float,
+    low: float,
+    high: float,
+) -> float:
     """Of the inputs in the box at which a row is missed least the nearest to v."""
     start, end = interval
     u = _maximiser(row[0], row[2], v, low, high) if start == math.inf else max(min(v, end), start)
@@ -66,7 +86,8 @@ def _nearest(row: tuple[float, float, Quadratic], interval: tuple[float, float],
 
 
 def _maximiser(a: float, q: Quadratic, v: float, low: float, high: float) -> float:
-    """Where c is largest: with w = u + q_1/q_2 and s the least sqrt(q/q_2), a = sqrt(q_2) w/sqrt(w^2 + s^2) there, or at an end."""
+    """Where c is largest: with w = u + q_1/q_2 and s the least sqrt(q/q_2), a = sqrt(q_2)
+    w/sqrt(w^2 + s^2) there, or at an end."""
     q0, q1, q2 = q
     end = high if a > 0.0 else low
     if q2 == 0.0:
@@ -85,7 +106,8 @@ def _margin(a: float, b: float, q: Quadratic, u: float) -> float:
 
 
 def _tolerance(a: float, b: float, q: Quadratic, u: float) -> float:
-    """As `safe_envs.wrappers.qp.rows.tolerance`, and what the rounding of the form makes of its root."""
+    """As `safe_envs.wrappers.qp.rows.tolerance`, and what the rounding of the form makes of its
+    root."""
     linear, terms = 2.0 * q[1] * u, q[2] * u * u
     form, terms = max(q[0] + linear + terms, 0.0), ROUNDING * (abs(q[0]) + abs(linear) + terms)
     return ROUNDING * abs(b) + ROUNDING * abs(a * u) + math.sqrt(form + terms) - math.sqrt(form)
@@ -120,7 +142,13 @@ def _interval(a: float, b: float, q: Quadratic) -> tuple[float, float]:
 
 @np.errstate(all="ignore")
 def project_arrays(
-    a: Sequence[Any], b: Sequence[Any], q: Sequence[Quadratic], v: np.ndarray, low: Any, high: Any, priority: Sequence[float]
+    a: Sequence[Any],
+    b: Sequence[Any],
+    q: Sequence[Quadratic],
+    v: np.ndarray,
+    low: Any,
+    high: Any,
+    priority: Sequence[float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Project the input of each of B states.
 
@@ -134,7 +162,8 @@ def project_arrays(
         priority: k positive weights of the squared slacks.
 
     Returns:
-        Inputs (B,), margins c_i (k, B), rows that bind or cannot be met (k, B), and whether all rows can be met (B,).
+        Inputs (B,), margins c_i (k, B), rows that bind or cannot be met (k, B), and whether all
+        rows can be met (B,).
     """
     size = len(v)
     slope, offset = stack(a, size), stack(b, size)
@@ -144,7 +173,12 @@ def project_arrays(
     active, feasible = np.zeros(margin.shape, dtype=bool), np.ones(size, dtype=bool)
     acting = np.flatnonzero(~(margin >= 0.0).all(axis=0))
     if acting.size:
-        slope, offset, form, wish = slope[:, acting], offset[:, acting], form[:, :, acting], v[acting]
+        slope, offset, form, wish = (
+            slope[:, acting],
+            offset[:, acting],
+            form[:, :, acting],
+            v[acting],
+        )
         in_unit = _all_in_unit(slope, offset, form)
         starts, ends = _intervals(*in_unit)
         lo, hi = np.maximum(starts.max(axis=0), low), np.minimum(ends.min(axis=0), high)
@@ -152,10 +186,17 @@ def project_arrays(
         found = np.maximum(np.minimum(np.maximum(wish, lo), hi), low)
         apart = np.flatnonzero(~met)
         if apart.size:
-            row, interval = tuple(part[..., apart] for part in in_unit), (starts[:, apart], ends[:, apart])
+            row, interval = (
+                tuple(part[..., apart] for part in in_unit),
+                (starts[:, apart], ends[:, apart]),
+            )
             nearest = _all_nearest(row, interval, wish[apart], low, high)
             lost = slope[:, apart], offset[:, apart], form[:, :, apart]
-            found[apart] = nearest[0] if len(slope) == 1 else _least_violating(*lost, nearest, wish[apart], priority)
+            found[apart] = (
+                nearest[0]
+                if len(slope) == 1
+                else _least_violating(*lost, nearest, wish[apart], priority)
+            )
         u[acting] = found
         margin[:, acting] = reached = _margins(slope, offset, form, found)
         allowed = _tolerances(slope, offset, form, found)
@@ -171,13 +212,20 @@ def _margins(a: np.ndarray, b: np.ndarray, q: np.ndarray, u: np.ndarray) -> np.n
 def _tolerances(a: np.ndarray, b: np.ndarray, q: np.ndarray, u: np.ndarray) -> np.ndarray:
     """`_tolerance` for arrays (k, B), with the same formulas."""
     linear, terms = 2.0 * q[1] * u, q[2] * u * u
-    form, terms = np.maximum(q[0] + linear + terms, 0.0), ROUNDING * (np.abs(q[0]) + np.abs(linear) + terms)
+    form, terms = (
+        np.maximum(q[0] + linear + terms, 0.0),
+        ROUNDING * (np.abs(q[0]) + np.abs(linear) + terms),
+    )
     return ROUNDING * np.abs(b) + ROUNDING * np.abs(a * u) + np.sqrt(form + terms) - np.sqrt(form)
 
 
-def _all_in_unit(a: np.ndarray, b: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _all_in_unit(
+    a: np.ndarray, b: np.ndarray, q: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`_in_unit` for arrays (k, B), with the same formulas."""
-    unit = np.maximum(np.maximum(abs(a), abs(b)), np.maximum(np.sqrt(abs(q[0])), np.sqrt(abs(q[2]))))
+    unit = np.maximum(
+        np.maximum(abs(a), abs(b)), np.maximum(np.sqrt(abs(q[0])), np.sqrt(abs(q[2])))
+    )
     unit = np.where(unit == 0.0, 1.0, unit)
     return a / unit, b / unit, q / unit / unit
 
@@ -195,19 +243,37 @@ def _intervals(a: np.ndarray, b: np.ndarray, q: np.ndarray) -> tuple[np.ndarray,
     level, flat = linear & (a == 0.0), leading == 0.0
     end = np.where(linear, least / a, -last / (2.0 * middle))
     ray = linear | flat
-    start = np.select([level, ray & rising, ray, leading < 0.0, rising], [-np.inf, end, -np.inf, first, second], -np.inf)
-    stop = np.select([level, ray & rising, ray, leading < 0.0, rising], [np.inf, np.inf, end, second, np.inf], first)
+    start = np.select(
+        [level, ray & rising, ray, leading < 0.0, rising],
+        [-np.inf, end, -np.inf, first, second],
+        -np.inf,
+    )
+    stop = np.select(
+        [level, ray & rising, ray, leading < 0.0, rising],
+        [np.inf, np.inf, end, second, np.inf],
+        first,
+    )
     between = (discriminant >= 0.0) & (b - a * middle / leading >= 0.0)
-    met = np.select([level, linear, flat, leading < 0.0], [least <= 0.0, True, middle * a > 0.0, between], True)
+    met = np.select(
+        [level, linear, flat, leading < 0.0], [least <= 0.0, True, middle * a > 0.0, between], True
+    )
     return np.where(met, start, np.inf), np.where(met, stop, np.inf)
 
 
 def _all_nearest(
-    row: tuple[np.ndarray, ...], interval: tuple[np.ndarray, np.ndarray], v: np.ndarray, low: float, high: float
+    row: tuple[np.ndarray, ...],
+    interval: tuple[np.ndarray, np.ndarray],
+    v: np.ndarray,
+    low: float,
+    high: float,
 ) -> np.ndarray:
     """`_nearest` for arrays (k, B), with the same formulas."""
     start, end = interval
-    u = np.where(start == np.inf, _maximisers(row[0], row[2], v, low, high), np.maximum(np.minimum(v, end), start))
+    u = np.where(
+        start == np.inf,
+        _maximisers(row[0], row[2], v, low, high),
+        np.maximum(np.minimum(v, end), start),
+    )
     return np.minimum(np.maximum(u, low), high)
 
 
@@ -218,13 +284,21 @@ def _maximisers(a: np.ndarray, q: np.ndarray, v: np.ndarray, low: float, high: f
     inside = kink + t * np.sqrt(np.maximum(q0 - q1 * q1 / q2, 0.0) / q2) / np.sqrt(1.0 - t * t)
     still = np.where(a > 0.0, np.maximum(v, kink), np.minimum(v, kink))
     end, level = np.where(a > 0.0, high, low), (t * t == 1.0) & (q0 * q2 <= q1 * q1)
-    return np.select([q2 == 0.0, t * t < 1.0, level], [np.where(a == 0.0, v, end), inside, still], end)
+    return np.select(
+        [q2 == 0.0, t * t < 1.0, level], [np.where(a == 0.0, v, end), inside, still], end
+    )
 
 
 def _least_violating(
-    a: np.ndarray, b: np.ndarray, q: np.ndarray, nearest: np.ndarray, v: np.ndarray, priority: Sequence[float]
+    a: np.ndarray,
+    b: np.ndarray,
+    q: np.ndarray,
+    nearest: np.ndarray,
+    v: np.ndarray,
+    priority: Sequence[float],
 ) -> np.ndarray:
-    """Of the minimisers of the sum of squared slacks the nearest to v, which lies between the nearest ones of each row."""
+    """Of the minimisers of the sum of squared slacks the nearest to v, which lies between the
+    nearest ones of each row."""
     weights = np.asarray(priority)[:, None]
 
     def derivative(u: np.ndarray) -> np.ndarray:
@@ -243,11 +317,15 @@ def _least_violating(
     return np.minimum(np.maximum(v, ends[0]), ends[1])
 
 
-def majorant(q: Sequence[Sequence[Any]], low: Sequence[Any], high: Sequence[Any]) -> tuple[list[Any], Any]:
-    """A plane c_0 + c . u above sqrt([1, u]' Q [1, u]) on a box of m inputs, so that a row less the plane is on the safe side.
+def majorant(
+    q: Sequence[Sequence[Any]], low: Sequence[Any], high: Sequence[Any]
+) -> tuple[list[Any], Any]:
+    """A plane c_0 + c . u above sqrt([1, u]' Q [1, u]) on a box of m inputs, so that a row less the
+    plane is on the safe side.
 
-    Its slopes are the mean differences between the faces of the box, and c_0 is as small as the corners allow: the root is
-    convex, so that it is below the plane everywhere if it is at the corners.
+    Its slopes are the mean differences between the faces of the box, and c_0 is as small as the
+    corners allow: the root is convex, so that it is below the plane everywhere if it is at the
+    corners.
 
     Args:
         q: symmetric Q, (1 + m) x (1 + m), floats or arrays (B,).
@@ -265,6 +343,12 @@ def majorant(q: Sequence[Sequence[Any]], low: Sequence[Any], high: Sequence[Any]
         square: Any = sum([q[i][j] * (w[i] * w[j]) for i in range(m + 1) for j in range(m + 1)])
         roots.append(np.sqrt(np.maximum(square, 0.0)))
     half = 2.0 ** (m - 1)
-    slopes = [sum([r if k >> j & 1 else -r for k, r in enumerate(roots)]) / (half * (high[j] - low[j])) for j in range(m)]
-    above = [r - sum([c * e for c, e in zip(slopes, corner, strict=True)]) for r, corner in zip(roots, corners, strict=True)]
+    slopes = [
+        sum([r if k >> j & 1 else -r for k, r in enumerate(roots)]) / (half * (high[j] - low[j]))
+        for j in range(m)
+    ]
+    above = [
+        r - sum([c * e for c, e in zip(slopes, corner, strict=True)])
+        for r, corner in zip(roots, corners, strict=True)
+    ]
     return slopes, np.maximum.reduce(above)

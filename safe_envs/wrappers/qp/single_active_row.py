@@ -1,7 +1,8 @@
-"""Several rows of which a single one binds: its own closed form, where the other rows allow what that gives.
+"""Several rows of which a single one binds: its own closed form, where the other rows allow what
+that gives.
 
-The minimiser under one row alone is that under all rows, if it meets them: so exact, and many times faster than a solver,
-in most states of most filters.
+The minimiser under one row alone is that under all rows, if it meets them: so exact, and many times
+faster than a solver, in most states of most filters.
 """
 
 from __future__ import annotations
@@ -18,7 +19,12 @@ Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def project_arrays(
-    a: Sequence[np.ndarray], b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: Sequence[Any]
+    a: Sequence[np.ndarray],
+    b: np.ndarray,
+    v: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    w: Sequence[Any],
 ) -> tuple[Answer, np.ndarray]:
     """Project the proposed inputs of the states in which at most one row binds.
 
@@ -31,11 +37,15 @@ def project_arrays(
         w: m positive weights, each a float or an array (B,).
 
     Returns:
-        Inputs (m, B), margins and binding rows (k, B) and feasibility (B,), as far as solved; and the states (indices) that
-        are left for a solver.
+        Inputs (m, B), margins and binding rows (k, B) and feasibility (B,), as far as solved; and
+        the states (indices) that are left for a solver.
     """
     u = np.minimum(np.maximum(v, low), high)
-    margin, active, feasible = np.array([total(r * u) for r in a]) + b, np.zeros(b.shape, dtype=bool), np.ones(b.shape[1], dtype=bool)
+    margin, active, feasible = (
+        np.array([total(r * u) for r in a]) + b,
+        np.zeros(b.shape, dtype=bool),
+        np.ones(b.shape[1], dtype=bool),
+    )
     missed = margin < 0.0
     left = np.flatnonzero(missed.any(axis=0))
     weights = stack(w, b.shape[1])
@@ -44,13 +54,20 @@ def project_arrays(
         if not tried.size:
             continue
         found, _, _, met = project_onto_row(
-            list(row[:, tried]), b[i, tried], list(v[:, tried]), list(low[:, tried]), list(high[:, tried]), list(weights[:, tried])
+            list(row[:, tried]),
+            b[i, tried],
+            list(v[:, tried]),
+            list(low[:, tried]),
+            list(high[:, tried]),
+            list(weights[:, tried]),
         )
         at = np.array(found)
         products = [r[:, tried] * at for r in a]
         reached = np.array([total(p) for p in products]) + b[:, tried]
         # As `tolerances`, from the same products.
-        rounding = ROUNDING * np.abs(b[:, tried]) + np.array([total(ROUNDING * np.abs(p)) for p in products])
+        rounding = ROUNDING * np.abs(b[:, tried]) + np.array(
+            [total(ROUNDING * np.abs(p)) for p in products]
+        )
         allowed = met & (reached >= -rounding).all(axis=0)
         solved = tried[allowed]
         u[:, solved] = at[:, allowed]

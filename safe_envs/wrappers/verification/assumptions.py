@@ -1,4 +1,5 @@
-"""What speaks against the bounds of conditions, in words: no bound at all, a hypothesis that fails, or one that is not established."""
+"""What speaks against the bounds of conditions, in words: no bound at all, a hypothesis that fails,
+or one that is not established."""
 
 from __future__ import annotations
 
@@ -17,7 +18,9 @@ def no_bound(formulas: Formulas) -> str:
     for condition, stage in zip(formulas.conditions, formulas.stages, strict=True):
         if not condition.stochastic:
             return f"{condition.name} ignores the noise"
-        if condition.chain_rates(stage.stop - stage.start) is None and not isinstance(condition, SRCBF):
+        if condition.chain_rates(stage.stop - stage.start) is None and not isinstance(
+            condition, SRCBF
+        ):
             return f"{condition.name} has no chain of rates, as the bounds need under noise"
     if not formulas.certain and any(isinstance(c, SRCBF) for c in formulas.conditions):
         return "the barriers have conditions of different kinds"
@@ -25,8 +28,11 @@ def no_bound(formulas: Formulas) -> str:
 
 
 def _kinked(formulas: Formulas) -> str:
-    """Which function of a chain has a kink, where the noise adds a local time that the generator does not see."""
-    for barrier, row in zip(formulas.problem.barriers, formulas.safety_filter.constraints, strict=True):
+    """Which function of a chain has a kink, where the noise adds a local time that the generator
+    does not see."""
+    for barrier, row in zip(
+        formulas.problem.barriers, formulas.safety_filter.constraints, strict=True
+    ):
         for j, function in enumerate(row.chain):
             if has_kinks(function):
                 what = barrier.name if j == 0 else f"b_{j} of {barrier.name}"
@@ -37,7 +43,11 @@ def _kinked(formulas: Formulas) -> str:
 def mismatch(formulas: Formulas) -> str:
     """In what the system that the conditions know differs from the plant, or ""."""
     plant, known = formulas.problem.plant, formulas.system
-    parts = [n for n in ("drift", "input_matrix", "diffusion") if plant.numeric(getattr(plant, n)) != known.numeric(getattr(known, n))]
+    parts = [
+        n
+        for n in ("drift", "input_matrix", "diffusion")
+        if plant.numeric(getattr(plant, n)) != known.numeric(getattr(known, n))
+    ]
     names = [p.name for p, value in plant.parameters.items() if known.parameters.get(p) != value]
     return f"the model differs from the plant in {', '.join(names or parts)}" if parts else ""
 
@@ -62,7 +72,10 @@ def _undefined(survey: SafeSetAnalysis) -> str:
     if not len(survey.undefined):
         return ""
     states = zip(survey.formulas.problem.states, survey.undefined[0].tolist(), strict=True)
-    return f"the condition has no finite value at {', '.join(f'{s.symbol} = {value:.3g}' for s, value in states)}"
+    return (
+        "the condition has no finite value at"
+        f" {', '.join(f'{s.symbol} = {value:.3g}' for s, value in states)}"
+    )
 
 
 def amount(shortfall: float) -> str:
@@ -72,5 +85,7 @@ def amount(shortfall: float) -> str:
 
 def unbounded(survey: SafeSetAnalysis) -> str:
     """Which supremum is infinite, where one matters; or ""."""
-    growing = np.flatnonzero(np.isinf(survey.suprema)) if not survey.formulas.certain else np.empty(0)
+    growing = (
+        np.flatnonzero(np.isinf(survey.suprema)) if not survey.formulas.certain else np.empty(0)
+    )
     return survey.infinite(int(growing[0])) if growing.size else ""

@@ -1,22 +1,25 @@
-"""Lower bounds on the probability of staying safe, as functions of numbers: each with its hypotheses.
+"""Lower bounds on the probability of staying safe, as functions of numbers: each with its
+hypotheses.
 
-All of them are of continuous time, with the condition met at every instant: an input that is held for a control period
-meets it at its beginning only. They rest on one inequality. Let G be the set where b_0, ..., b_(r-1) are positive, cut to the
-inside of the workspace where leaving that ends an episode. Let b be twice continuously differentiable in G, continuous on its
-closure and at most c. Let X be stopped when it leaves G, at the time tau, and let A b >= -a b - m up to then, with a, m >= 0. Then
+All of them are of continuous time, with the condition met at every instant: an input that is held
+for a control period meets it at its beginning only. They rest on one inequality. Let G be the set
+where b_0, ..., b_(r-1) are positive, cut to the inside of the workspace where leaving that ends an
+episode. Let b be twice continuously differentiable in G, continuous on its closure and at most c.
+Let X be stopped when it leaves G, at the time tau, and let A b >= -a b - m up to then, with a, m >=
+0. Then
 
     e^(a t) b(X_t) + m (e^(a t) - 1)/a     (m t in place of the last term where a = 0)
 
-is a submartingale up to tau, so that b(x_0) is at most its expectation at min(tau, T), which is at most
-e^(a T) c P(b is not 0 at min(tau, T)) + m (e^(a T) - 1)/a. That gives `stage_bound`. All others follow from it. An episode that
-has left the workspace before is at an end, and safe until then: so c and m are taken over G alone. For that a >= 0 is needed,
-since tau may come before T.
+is a submartingale up to tau, so that b(x_0) is at most its expectation at min(tau, T), which is at
+most e^(a T) c P(b is not 0 at min(tau, T)) + m (e^(a T) - 1)/a. That gives `stage_bound`. All
+others follow from it. An episode that has left the workspace before is at an end, and safe until
+then: so c and m are taken over G alone. For that a >= 0 is needed, since tau may come before T.
 
-These are theorems about the numbers they are given. A bound with c and m from a search is an estimate: a larger c or m that the
-search missed would make it smaller.
+These are theorems about the numbers they are given. A bound with c and m from a search is an
+estimate: a larger c or m that the search missed would make it smaller.
 
-Every function broadcasts over arrays of starts, and returns values in [0, 1]. A value of 0 promises nothing, and so does an
-infinite c.
+Every function broadcasts over arrays of starts, and returns values in [0, 1]. A value of 0 promises
+nothing, and so does an infinite c.
 """
 
 from __future__ import annotations
@@ -30,10 +33,14 @@ from numpy.typing import ArrayLike
 _FOREVER = math.inf
 
 
-def stage_bound(b: ArrayLike, c: ArrayLike, horizon: float = _FOREVER, rate: float = 0.0, shortfall: float = 0.0) -> np.ndarray:
-    """[b e^(-a T) - m (1 - e^(-a T))/a]/c: how likely b is not what X leaves the set by, up to the horizon.
+def stage_bound(
+    b: ArrayLike, c: ArrayLike, horizon: float = _FOREVER, rate: float = 0.0, shortfall: float = 0.0
+) -> np.ndarray:
+    """[b e^(-a T) - m (1 - e^(-a T))/a]/c: how likely b is not what X leaves the set by, up to the
+    horizon.
 
-    Hypotheses: A b >= -a b - m wherever X is before it leaves the set; b is positive at the start; b <= c there.
+    Hypotheses: A b >= -a b - m wherever X is before it leaves the set; b is positive at the start;
+        b <= c there.
 
     Args:
         b: value at the start.
@@ -57,7 +64,8 @@ def stage_bound(b: ArrayLike, c: ArrayLike, horizon: float = _FOREVER, rate: flo
 def proposition_4_2_8(h: ArrayLike, c: float) -> np.ndarray:
     """h/c, for ever.
 
-    Hypotheses: relative degree 1; A h >= 0 on all of C, so that the condition can be met everywhere on it; c = sup h over C is
+    Hypotheses: relative degree 1; A h >= 0 on all of C, so that the condition can be met everywhere
+        on it; c = sup h over C is
     finite, which the print does not ask for.
 
     Args:
@@ -80,16 +88,18 @@ def proposition_4_2_5(h: ArrayLike, c: float, k: float, horizon: float) -> np.nd
         k: rate in 1/s.
         horizon: T in s.
 
-    Source: thesis Prop. 4.2.5, corrected: Eq. (4.16) and (4.17) print e^(-c T), see `proposition_4_2_5_printed`.
+    Source: thesis Prop. 4.2.5, corrected: Eq. (4.16) and (4.17) print e^(-c T), see
+        `proposition_4_2_5_printed`.
     """
     return stage_bound(h, c, horizon, rate=k)
 
 
 def proposition_4_2_5_printed(h: ArrayLike, c: float, horizon: float) -> np.ndarray:
-    """(h/c) e^(-c T), as it is printed: false for k > c, and its exponent has the units of h times s.
+    """(h/c) e^(-c T), as it is printed: false for k > c, and its exponent has the units of h times
+    s.
 
-    For Brownian motion of variance s^2 t on (0, pi) and h = sin(x), A h = -k h with k = s^2/2 and c = 1: the probability of
-    staying is about (4/pi) h e^(-k T), which falls below h e^(-T) if k > 1.
+    For Brownian motion of variance s^2 t on (0, pi) and h = sin(x), A h = -k h with k = s^2/2 and c
+    = 1: the probability of staying is about (4/pi) h e^(-k T), which falls below h e^(-T) if k > 1.
 
     Args:
         h: value of the barrier at the start.
@@ -126,13 +136,15 @@ def union_bound(
 ) -> np.ndarray:
     """max(0, sum of the stages' bounds - (r - 1)): the valid form of Thm. 4.2.10.
 
-    X leaves the set through some b_j: each of these events has at most the probability that its `stage_bound` leaves, and
-    together at most their sum. No independence is needed.
+    X leaves the set through some b_j: each of these events has at most the probability that its
+    `stage_bound` leaves, and together at most their sum. No independence is needed.
 
-    Hypotheses: A b_j >= -a_j b_j - m_j for each j while all of b_0..b_(r-1) are positive. For j < r - 1 that holds by the
-    definition b_(j+1) = A b_j + a_j b_j, with m_j = 0; for the last one it is the condition. All b_j are positive at the
-    start, and each c_j = sup b_j over the intersection of the {b_j >= 0} is finite. Stages of several barriers may be put
-    together if one action meets all conditions up to the m_j.
+    Hypotheses: A b_j >= -a_j b_j - m_j for each j while all of b_0..b_(r-1) are positive. For j < r
+        - 1 that holds by the
+    definition b_(j+1) = A b_j + a_j b_j, with m_j = 0; for the last one it is the condition. All
+    b_j are positive at the start, and each c_j = sup b_j over the intersection of the {b_j >= 0} is
+    finite. Stages of several barriers may be put together if one action meets all conditions up to
+    the m_j.
 
     Args:
         b: b_0..b_(r-1) at the starts, shape (..., r).
@@ -150,17 +162,21 @@ def union_bound(
     return np.clip(sum(stages) - (len(stages) - 1), 0.0, 1.0)
 
 
-def theorem_4_2_10_printed(b: ArrayLike, c: ArrayLike, horizon: float = _FOREVER, rates: Sequence[float] | None = None) -> np.ndarray:
-    """The product of b_j/c_j, as it is printed, or its form for the zeroing chain: without a valid proof for r >= 2.
+def theorem_4_2_10_printed(
+    b: ArrayLike, c: ArrayLike, horizon: float = _FOREVER, rates: Sequence[float] | None = None
+) -> np.ndarray:
+    """The product of b_j/c_j, as it is printed, or its form for the zeroing chain: without a valid
+    proof for r >= 2.
 
-    Its proof takes P(b_j stays positive | b_(j+1) stays positive) for at least b_j/c_j, Eq. (4.23). That conditions on the
-    future: the paths on which b_(j+1) stays positive are not those of the unconditioned process, for which b_j is a
-    submartingale. Simulated systems fall below the product. For r = 1 it is Prop. 4.2.8 or 4.2.5.
+    Its proof takes P(b_j stays positive | b_(j+1) stays positive) for at least b_j/c_j, Eq. (4.23).
+    That conditions on the future: the paths on which b_(j+1) stays positive are not those of the
+    unconditioned process, for which b_j is a submartingale. Simulated systems fall below the
+    product. For r = 1 it is Prop. 4.2.8 or 4.2.5.
 
     Args:
         b: b_0..b_(r-1) at the starts, shape (..., r).
-        c: c_0..c_(r-1), suprema over the intersection of the {b_j >= 0}, shape (r,). The print takes them over each C_j alone,
-            where they may be infinite.
+        c: c_0..c_(r-1), suprema over the intersection of the {b_j >= 0}, shape (r,). The print
+            takes them over each C_j alone, where they may be infinite.
         horizon: T in s; infinite for ever.
         rates: a_1..a_r in 1/s; zeros by default.
 
@@ -173,9 +189,15 @@ def theorem_4_2_10_printed(b: ArrayLike, c: ArrayLike, horizon: float = _FOREVER
 
 
 def _stages(
-    b: ArrayLike, c: ArrayLike, horizon: float, rates: Sequence[float] | None, shortfalls: Sequence[float] | None
+    b: ArrayLike,
+    c: ArrayLike,
+    horizon: float,
+    rates: Sequence[float] | None,
+    shortfalls: Sequence[float] | None,
 ) -> list[np.ndarray]:
     values, suprema = np.asarray(b, dtype=np.float64), np.asarray(c, dtype=np.float64)
     count = values.shape[-1]
     settings = zip(rates or (0.0,) * count, shortfalls or (0.0,) * count, strict=True)
-    return [stage_bound(values[..., j], suprema[j], horizon, a, m) for j, (a, m) in enumerate(settings)]
+    return [
+        stage_bound(values[..., j], suprema[j], horizon, a, m) for j, (a, m) in enumerate(settings)
+    ]

@@ -11,7 +11,14 @@ import numpy as np
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.verification import bounds
-from safe_envs.wrappers.verification.assumptions import amount, failures, mismatch, no_bound, unbounded, unverified_assumptions
+from safe_envs.wrappers.verification.assumptions import (
+    amount,
+    failures,
+    mismatch,
+    no_bound,
+    unbounded,
+    unverified_assumptions,
+)
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.guarantee import Stages, assembled, outlasting
 from safe_envs.wrappers.verification.observed import above_suprema, below_slack
@@ -20,11 +27,13 @@ from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
 
 @dataclass(frozen=True)
 class EstimatedBound:
-    """The largest bound of conditions, with the suprema and the shortfall that a search found: an estimate.
+    """The largest bound of conditions, with the suprema and the shortfall that a search found: an
+    estimate.
 
     Attributes:
         note: why there is none; None if there is one.
-        remark: why it is weaker than what the condition promises where it can be met everywhere; may be empty.
+        remark: why it is weaker than what the condition promises where it can be met everywhere;
+            may be empty.
     """
 
     note: str | None
@@ -33,7 +42,8 @@ class EstimatedBound:
     _stages: Stages | None
 
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
-        """The bound on P(safe up to a horizon in s) at each start; states (B, n) in, values (B,) out; 0 where there is none."""
+        """The bound on P(safe up to a horizon in s) at each start; states (B, n) in, values (B,)
+        out; 0 where there is none."""
         b, stages = self._formulas.chain(np.asarray(starts, dtype=np.float64)), self._stages
         if stages is None:
             return np.zeros(len(b))
@@ -43,14 +53,18 @@ class EstimatedBound:
             return outlasting(stages, b, horizon)
         return (b > 0.0).all(axis=1).astype(float)
 
-    def contradiction(self, reached: np.ndarray, missed: np.ndarray, actions: np.ndarray, slack: np.ndarray) -> str:
-        """What states say against the numbers that the bound rests on; "" if nothing, or if there is no bound.
+    def contradiction(
+        self, reached: np.ndarray, missed: np.ndarray, actions: np.ndarray, slack: np.ndarray
+    ) -> str:
+        """What states say against the numbers that the bound rests on; "" if nothing, or if there
+        is no bound.
 
         Args:
             reached: states that were reached, starts among them, shape (B, n).
             missed: states where the filter missed its conditions, shape (E, n).
             actions: what it executed there, shape (E, m).
-            slack: by how much it says to have missed, shape (E,); the actions themselves say how much of it a sampling margin is.
+            slack: by how much it says to have missed, shape (E,); the actions themselves say how
+                much of it a sampling margin is.
         """
         if self._stages is None:
             return ""
@@ -58,8 +72,11 @@ class EstimatedBound:
         return high or below_slack(self._formulas, max(self._stages.shortfalls), missed, actions)
 
 
-def estimated_bound(problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str = "model") -> EstimatedBound:
-    """The bound that is estimated for conditions: deterministic, and without a look at more than that needs.
+def estimated_bound(
+    problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str = "model"
+) -> EstimatedBound:
+    """The bound that is estimated for conditions: deterministic, and without a look at more than
+    that needs.
 
     The suprema and the shortfall are those of `verify` with its defaults.
 
@@ -74,7 +91,9 @@ def estimated_bound(problem: SafetyProblem, conditions: Sequence[Condition], kno
     formulas = Formulas(problem, conditions, knowledge)
     # What needs no search comes first.
     note = no_bound(formulas) or mismatch(formulas)
-    return EstimatedBound(note, "", formulas, None) if note else from_survey(SafeSetAnalysis(formulas))
+    return (
+        EstimatedBound(note, "", formulas, None) if note else from_survey(SafeSetAnalysis(formulas))
+    )
 
 
 def from_survey(survey: SafeSetAnalysis) -> EstimatedBound:

@@ -1,4 +1,5 @@
-"""Where conditions can be met, and what their promises rest on: found by sampling the safe set, and by searching it."""
+"""Where conditions can be met, and what their promises rest on: found by sampling the safe set, and
+by searching it."""
 
 from __future__ import annotations
 
@@ -12,7 +13,14 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set import Region
-from safe_envs.wrappers.verification.safe_set_analysis import SAMPLES, SafeSetAnalysis, supremum, where_inside, without_control, worst
+from safe_envs.wrappers.verification.safe_set_analysis import (
+    SAMPLES,
+    SafeSetAnalysis,
+    supremum,
+    where_inside,
+    without_control,
+    worst,
+)
 from safe_envs.wrappers.verification.search import largest
 
 SMALL = 0.01
@@ -30,9 +38,10 @@ class Part:
         points: how many of its points were drawn.
         share: part of the workspace that it is; of C for the intersection.
         infeasible: part of it where no action in the box meets all conditions.
-        shortfall: by how much the worst condition is missed where that is most, 0 if all can be met everywhere; in the units
-            of b_(r-1) per s.
-        worst: the state where that is, shape (n,); where the conditions are nearest to it if they can be met.
+        shortfall: by how much the worst condition is missed where that is most, 0 if all can be met
+            everywhere; in the units of b_(r-1) per s.
+        worst: the state where that is, shape (n,); where the conditions are nearest to it if they
+            can be met.
     """
 
     points: int
@@ -50,12 +59,14 @@ class BarrierFindings:
         name: of the barrier.
         condition: its spec.
         degree: r.
-        leading: smallest size of the leading term L_g b_(r-1) over C: half of what the box lets it contribute to the condition.
+        leading: smallest size of the leading term L_g b_(r-1) over C: half of what the box lets it
+            contribute to the condition.
         leading_at: the state where that is, shape (n,).
         typical: its median over C.
         small: part of C where it is below `SMALL` of that.
         small_infeasible: part of these points where no action in the box meets all conditions.
-        supremum: of h over C within the workspace, infinite where it grows with the ranges that were chosen for states without any.
+        supremum: of h over C within the workspace, infinite where it grows with the ranges that
+            were chosen for states without any.
         growth: how sure it is that it is infinite, in words; empty where it is not.
         deepest: the state where h is largest in C within the workspace, shape (n,).
         deepest_h: h there.
@@ -92,7 +103,8 @@ class Verification:
         survey: what the bounds rest on.
         barriers: for each barrier.
         safe: C, where all barriers are positive.
-        kept: the intersection of the C_j, where all chains are positive: the set that the conditions keep. None if it is empty.
+        kept: the intersection of the C_j, where all chains are positive: the set that the
+            conditions keep. None if it is empty.
         beyond: whether C reaches beyond the workspace.
         undefined: part of C where a condition has no finite value.
     """
@@ -121,9 +133,14 @@ class Verification:
 
 
 def verify(
-    problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str = "model", samples: int = SAMPLES, seed: int = 0
+    problem: SafetyProblem,
+    conditions: Sequence[Condition],
+    knowledge: str = "model",
+    samples: int = SAMPLES,
+    seed: int = 0,
 ) -> Verification:
-    """Sample C, and search it for the worst: where the leading terms vanish, and where no action meets the conditions.
+    """Sample C, and search it for the worst: where the leading terms vanish, and where no action
+    meets the conditions.
 
     Args:
         problem: whose barriers, box, ranges and system are taken.
@@ -146,7 +163,9 @@ def verify(
     wide = survey.region.scaled(_BEYOND).draw(_BEYOND_LOG2, survey.rng(6))
     outside = ((wide < survey.region.low) | (wide > survey.region.high)).any(axis=1)
     beyond = bool((formulas.barrier_level(wide[outside]) >= 0.0).any())
-    return Verification(survey, found, safe, kept, beyond, len(survey.undefined) / len(survey.safe.points))
+    return Verification(
+        survey, found, safe, kept, beyond, len(survey.undefined) / len(survey.safe.points)
+    )
 
 
 def _kept_part(survey: SafeSetAnalysis, kept: np.ndarray) -> Part:
@@ -156,26 +175,48 @@ def _kept_part(survey: SafeSetAnalysis, kept: np.ndarray) -> Part:
 
 
 def _safe_part(survey: SafeSetAnalysis, kept: Part | None) -> Part:
-    """C: what was found of the intersection holds for it where that is all of it, but for what each is a part of."""
+    """C: what was found of the intersection holds for it where that is all of it, but for what each
+    is a part of."""
     formulas, points = survey.formulas, survey.safe.points
     if kept is not None and kept.share == 1.0:
         return replace(kept, share=survey.safe.share)
-    shortfall, state = worst(formulas, formulas.barrier_level, survey.with_starts(points, formulas.barrier_level), survey.rng(4))
+    shortfall, state = worst(
+        formulas,
+        formulas.barrier_level,
+        survey.with_starts(points, formulas.barrier_level),
+        survey.rng(4),
+    )
     return Part(len(points), survey.safe.share, _infeasible(formulas, points), shortfall, state)
 
 
 def _barrier(i: int, survey: SafeSetAnalysis) -> BarrierFindings:
-    formulas, region, safe, rng = survey.formulas, survey.region, survey.safe.points, survey.rng(100 + i)
+    formulas, region, safe, rng = (
+        survey.formulas,
+        survey.region,
+        survey.safe.points,
+        survey.rng(100 + i),
+    )
     stages, level = formulas.stages[i], formulas.barrier_level
     size = formulas.leading(safe)[:, i]
     typical = float(np.nanmedian(size))
-    negated, leading_at = largest(lambda x: where_inside(level, x, lambda y: -formulas.leading(y)[:, i]), safe, region, rng)
+    negated, leading_at = largest(
+        lambda x: where_inside(level, x, lambda y: -formulas.leading(y)[:, i]), safe, region, rng
+    )
     small = safe[size < SMALL * typical]
-    _, deepest = largest(lambda x: where_inside(level, x, lambda y: formulas.chain(y)[:, stages.start]), safe, region, rng)
+    _, deepest = largest(
+        lambda x: where_inside(level, x, lambda y: formulas.chain(y)[:, stages.start]),
+        safe,
+        region,
+        rng,
+    )
     deepest = without_control(formulas, i, deepest)
     suprema = survey.suprema[stages]
     highest = (
-        suprema[0] if formulas.first_order else supremum(stages.start, formulas, formulas.barriers, survey.with_starts(safe, level), rng)
+        suprema[0]
+        if formulas.first_order
+        else supremum(
+            stages.start, formulas, formulas.barriers, survey.with_starts(safe, level), rng
+        )
     )
     return BarrierFindings(
         name=formulas.problem.barriers[i].name,

@@ -44,17 +44,24 @@ class Formulas:
         RelativeDegreeError: a condition does not suit a barrier.
     """
 
-    def __init__(self, problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str) -> None:
+    def __init__(
+        self, problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str
+    ) -> None:
         self.problem, self.conditions, self.knowledge = problem, tuple(conditions), knowledge
         if any(isinstance(c, LearnedCondition) for c in self.conditions):
-            raise ConfigurationError("what a condition promises is known for a known system only; this one rests on something learned")
+            raise ConfigurationError(
+                "what a condition promises is known for a known system only; this one rests on"
+                " something learned"
+            )
         self.safety_filter = SafetyFilter.for_problem(problem, self.conditions, knowledge)
         self.system = self.safety_filter.model
         self._constraints = self.safety_filter.constraints
         self._low, self._high = np.array(problem.box).T
         self._rest = np.clip(0.0, self._low, self._high)
         ends = np.cumsum([len(c.chain) for c in self._constraints]).tolist()
-        self.stages = tuple(slice(end - len(c.chain), end) for end, c in zip(ends, self._constraints, strict=True))
+        self.stages = tuple(
+            slice(end - len(c.chain), end) for end, c in zip(ends, self._constraints, strict=True)
+        )
 
     @property
     def first_order(self) -> bool:
@@ -73,7 +80,8 @@ class Formulas:
 
     @property
     def certain(self) -> bool:
-        """Whether the conditions, where they can be met, keep every path and not only some: without noise, or SRCBF."""
+        """Whether the conditions, where they can be met, keep every path and not only some: without
+        noise, or SRCBF."""
         return not self.noisy or all(isinstance(c, SRCBF) for c in self.conditions)
 
     @property
@@ -96,7 +104,9 @@ class Formulas:
         return self._compiled(self._row_expressions())
 
     def _compiled(self, expressions: Sequence[Any]) -> Any:
-        function = compile_function(self.system.states, [self.system.numeric(e) for e in expressions], "arrays")
+        function = compile_function(
+            self.system.states, [self.system.numeric(e) for e in expressions], "arrays"
+        )
 
         def values(x: np.ndarray) -> np.ndarray:
             with np.errstate(all="ignore"):
@@ -110,7 +120,9 @@ class Formulas:
 
     @cached_property
     def _spreads(self) -> Any:
-        return self._compiled([quadratic_variation_rate(self.system, c.chain[0]) for c in self._constraints])
+        return self._compiled(
+            [quadratic_variation_rate(self.system, c.chain[0]) for c in self._constraints]
+        )
 
     def quadratic_variation_rate(self, x: np.ndarray, i: int) -> np.ndarray:
         """|sigma' grad h|^2 of a barrier, the variance of h per s, shape (B,)."""
@@ -125,11 +137,14 @@ class Formulas:
     def _sizes(self) -> tuple[np.ndarray, np.ndarray]:
         """Typical sizes over the workspace: of each b_j, and of each b, shape (k,)."""
         x = self.region.draw(_SIZES_LOG2, np.random.default_rng(0))
-        return _typical(self.chain(x)), _typical(self._rows(x).reshape(len(x), len(self.stages), -1)[:, :, -1])
+        return _typical(self.chain(x)), _typical(
+            self._rows(x).reshape(len(x), len(self.stages), -1)[:, :, -1]
+        )
 
     @cached_property
     def _edges(self) -> np.ndarray:
-        """How much of each b_j is left out at the edge: a hair where a reciprocal condition has no value, else nothing."""
+        """How much of each b_j is left out at the edge: a hair where a reciprocal condition has no
+        value, else nothing."""
         reciprocal = [c.demand is not None for c in self._constraints for _ in c.chain]
         return np.where(reciprocal, _EDGE * self._sizes[0], 0.0)
 
@@ -149,23 +164,28 @@ class Formulas:
 
     @property
     def joint(self) -> bool:
-        """Whether it is exact what the conditions miss together: for one, independent ones, or a single input.
+        """Whether it is exact what the conditions miss together: for one, independent ones, or a
+        single input.
 
-        Where several share an input that cannot meet their margins of first order, these decide how the filter shares out what
-        is missed, and they depend on what is proposed.
+        Where several share an input that cannot meet their margins of first order, these decide how
+        the filter shares out what is missed, and they depend on what is proposed.
         """
         sampled = any(c.change is not None for c in self._constraints)
         return self.independent or (self.problem.plant.m == 1 and not sampled)
 
     @cached_property
     def _changes(self) -> Any:
-        """By how much each a changes, at most and to first order, over states that rounding cannot tell apart."""
+        """By how much each a changes, at most and to first order, over states that rounding cannot
+        tell apart."""
         widths = (_EPSILONS * (self.region.high - self.region.low)).tolist()
         entries = [self.system.numeric(a) for c in self._constraints for a in c.coefficient]
-        return self._compiled([_change(a, dict(zip(self.system.states, widths, strict=True))) for a in entries])
+        return self._compiled(
+            [_change(a, dict(zip(self.system.states, widths, strict=True))) for a in entries]
+        )
 
     def rows(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """a, shape (B, k, m), and b, shape (B, k), of the conditions a u + b >= 0; an a that is 0 to rounding is 0.
+        """a, shape (B, k, m), and b, shape (B, k), of the conditions a u + b >= 0; an a that is 0
+        to rounding is 0.
 
         In a box that is wide enough, rounding would meet any condition.
         """
@@ -182,17 +202,22 @@ class Formulas:
         return (abs(self.rows(x)[0]) * (self._high - self._low) / 2.0).sum(axis=2)
 
     def reach(self, x: np.ndarray) -> float:
-        """The part of the box in which the input has about as much to say as the rest of the condition; at most 1."""
+        """The part of the box in which the input has about as much to say as the rest of the
+        condition; at most 1."""
         a, b = self.rows(x)
         with np.errstate(all="ignore"):
-            ratio = np.nanmedian(abs(b + a @ self._rest), axis=0) / np.nanmedian(self.leading(x), axis=0)
+            ratio = np.nanmedian(abs(b + a @ self._rest), axis=0) / np.nanmedian(
+                self.leading(x), axis=0
+            )
         ratio = ratio[(ratio > 0.0) & np.isfinite(ratio)]
         return min(1.0, float(ratio.min())) if ratio.size else 1.0
 
     def own(self, x: np.ndarray, reach: float = 1.0) -> np.ndarray:
-        """By how much each condition is missed by the action that is best for it alone, shape (B, k).
+        """By how much each condition is missed by the action that is best for it alone, shape (B,
+        k).
 
-        Where none is missed, to rounding, minus the margin of that action: the nearer to 0, the nearer to being missed.
+        Where none is missed, to rounding, minus the margin of that action: the nearer to 0, the
+        nearer to being missed.
 
         Args:
             x: states, shape (B, n).
@@ -205,14 +230,16 @@ class Formulas:
         return np.where(abs(spare) > rounding, -spare, 0.0)
 
     def missed(self, x: np.ndarray, reach: float = 1.0) -> np.ndarray:
-        """By how much the worst condition is missed, shape (B,); minus the best margin that all have where none is missed.
+        """By how much the worst condition is missed, shape (B,); minus the best margin that all
+        have where none is missed.
 
-        Where several conditions share the inputs it is the filter that decides how a violation is shared out. NaN where a
-        condition is undefined.
+        Where several conditions share the inputs it is the filter that decides how a violation is
+        shared out. NaN where a condition is undefined.
 
         Args:
             x: states, shape (B, n).
-            reach: see `own`; below 1, of several conditions the worst one is missed as little as can be.
+            reach: see `own`; below 1, of several conditions the worst one is missed as little as
+                can be.
         """
         own = self.own(x, reach).max(axis=1)
         if self.independent:
@@ -222,17 +249,21 @@ class Formulas:
         if unsettled.any():
             slack = self.slack(x[unsettled]).max(axis=1)
             rounding = _ROUNDING * abs(self.rows(x[unsettled])[1]).max(axis=1)
-            found[unsettled] = np.where(slack > rounding, np.maximum(slack, found[unsettled]), found[unsettled])
+            found[unsettled] = np.where(
+                slack > rounding, np.maximum(slack, found[unsettled]), found[unsettled]
+            )
         return found
 
     def _ends(self, reach: float) -> tuple[np.ndarray, np.ndarray]:
-        return self._rest + reach * (self._low - self._rest), self._rest + reach * (self._high - self._rest)
+        return self._rest + reach * (self._low - self._rest), self._rest + reach * (
+            self._high - self._rest
+        )
 
     def _common(self, x: np.ndarray, reach: float) -> np.ndarray:
         """Minus the best common margin of several conditions on one input.
 
-        The smallest of the margins is concave and piecewise linear in the input: it is largest where two of them cross, or at
-        an end of the box.
+        The smallest of the margins is concave and piecewise linear in the input: it is largest
+        where two of them cross, or at an end of the box.
         """
         a, b = self.rows(x)
         a = a[:, :, 0]
@@ -243,23 +274,34 @@ class Formulas:
         tried = np.clip(np.nan_to_num(crossings, nan=low, posinf=high, neginf=low), low, high)
         tried = np.concatenate([tried, np.broadcast_to([low, high], (len(x), 2))], axis=1)
         margins = a[:, :, None] * tried[:, None, :] + b[:, :, None]
-        rounding = _ROUNDING * (abs(a[:, :, None] * tried[:, None, :]) + abs(b[:, :, None])) + _ZERO * self._sizes[1][:, None]
+        rounding = (
+            _ROUNDING * (abs(a[:, :, None] * tried[:, None, :]) + abs(b[:, :, None]))
+            + _ZERO * self._sizes[1][:, None]
+        )
         return -np.where(abs(margins) > rounding, margins, 0.0).min(axis=1).max(axis=1)
 
     def slack(self, x: np.ndarray) -> np.ndarray:
         """By how much the filter misses each condition, shape (B, k)."""
-        return self.safety_filter.filter(x, np.broadcast_to(self._rest, (len(x), len(self._rest)))).slack
+        return self.safety_filter.filter(
+            x, np.broadcast_to(self._rest, (len(x), len(self._rest)))
+        ).slack
 
 
 def _change(expression: Any, widths: dict[sp.Symbol, float]) -> sp.Expr:
-    """Sum of the sizes of the slopes, times the widths; without those that sympy has no function for, as at a kink."""
+    """Sum of the sizes of the slopes, times the widths; without those that sympy has no function
+    for, as at a kink."""
     slopes = [(sp.diff(expression, s), width) for s, width in widths.items()]
-    known = [sp.Abs(slope) * width for slope, width in slopes if not slope.has(sp.DiracDelta, sp.Derivative, sp.Subs)]
+    known = [
+        sp.Abs(slope) * width
+        for slope, width in slopes
+        if not slope.has(sp.DiracDelta, sp.Derivative, sp.Subs)
+    ]
     return sp.Add(*known).evalf(17)
 
 
 def _typical(values: np.ndarray) -> np.ndarray:
-    """Medians of the sizes over the first axis, of those that are neither 0 nor undefined; 1 where all are."""
+    """Medians of the sizes over the first axis, of those that are neither 0 nor undefined; 1 where
+    all are."""
     sizes = np.where(np.isfinite(values) & (values != 0.0), abs(values), np.nan)
     empty = np.isnan(sizes).all(axis=0)
     return np.where(empty, 1.0, np.nanmedian(np.where(empty, 1.0, sizes), axis=0))

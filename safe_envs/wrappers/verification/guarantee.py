@@ -1,4 +1,5 @@
-"""The bounds of conditions at a start: which theorems apply, which fail and why, and what their values are estimated at."""
+"""The bounds of conditions at a start: which theorems apply, which fail and why, and what their
+values are estimated at."""
 
 from __future__ import annotations
 
@@ -9,7 +10,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.verification import bounds
-from safe_envs.wrappers.verification.assumptions import amount, failures, no_bound, unbounded, unverified_assumptions
+from safe_envs.wrappers.verification.assumptions import (
+    amount,
+    failures,
+    no_bound,
+    unbounded,
+    unverified_assumptions,
+)
 from safe_envs.wrappers.verification.feasibility import Verification
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.observed import above_suprema, described
@@ -17,8 +24,8 @@ from safe_envs.wrappers.verification.safe_set import sample
 from safe_envs.wrappers.verification.search import largest
 
 Status = Literal["estimated", "withheld", "hypothesis fails", "no bound", "not established"]
-"""What a bound is worth: no hypothesis was found to fail; it did until episodes contradicted it; one fails; there is none; or what it
-rests on is known to be false or was not looked at."""
+"""What a bound is worth: no hypothesis was found to fail; it did until episodes contradicted it;
+one fails; there is none; or what it rests on is known to be false or was not looked at."""
 
 _SAMPLES = 2048
 
@@ -44,7 +51,8 @@ class Bound:
     error: float = 0.0
 
     def without(self, reason: str) -> Bound:
-        """The bound as withheld for a reason, if it was estimated and there is one; itself otherwise."""
+        """The bound as withheld for a reason, if it was estimated and there is one; itself
+        otherwise."""
         if not reason or self.status != "estimated":
             return self
         return replace(self, value=None, error=0.0, status="withheld", reason=reason)
@@ -68,7 +76,8 @@ class Stages:
 def promise(verification: Verification, starts: np.ndarray, horizon: float) -> list[Bound]:
     """The bounds of the results that suit the conditions, at a start or on average over several.
 
-    P(safe) from a random start is the mean of P(safe) over it, so that the mean of a bound is a bound.
+    P(safe) from a random start is the mean of P(safe) over it, so that the mean of a bound is a
+    bound.
 
     Args:
         verification: of the conditions.
@@ -86,9 +95,22 @@ def promise(verification: Verification, starts: np.ndarray, horizon: float) -> l
     inside = (b > 0.0).all(axis=1)
     if not inside.any():
         return [Bound("all of them", None, "hypothesis fails", _outside(formulas, b))]
-    partly = "" if inside.all() else f"0 at the {100 * (1 - inside.mean()):.1f} % of the starts that are outside some C_j"
-    verdict = _Verdict(failures(verification.survey), _infeasible(verification), unverified_assumptions(verification.survey), partly)
-    candidates = _certain(verification, b, horizon) if formulas.certain else _from_chains(verification, b, horizon)
+    partly = (
+        ""
+        if inside.all()
+        else f"0 at the {100 * (1 - inside.mean()):.1f} % of the starts that are outside some C_j"
+    )
+    verdict = _Verdict(
+        failures(verification.survey),
+        _infeasible(verification),
+        unverified_assumptions(verification.survey),
+        partly,
+    )
+    candidates = (
+        _certain(verification, b, horizon)
+        if formulas.certain
+        else _from_chains(verification, b, horizon)
+    )
     found = [_judged(candidate, verdict) for candidate in candidates]
     high = above_suprema(formulas, _stages(verification).suprema, starts)
     return [bound.without(high) for bound in found]
@@ -129,12 +151,23 @@ class _Verdict(NamedTuple):
 
 
 def _judged(candidate: _Candidate, verdict: _Verdict) -> Bound:
-    broken = [*verdict.failures, *[verdict.infeasible] * (not candidate.allows_shortfall and bool(verdict.infeasible))]
+    broken = [
+        *verdict.failures,
+        *[verdict.infeasible] * (not candidate.allows_shortfall and bool(verdict.infeasible)),
+    ]
     open_questions = [*verdict.unverified_assumptions, *[candidate.gap] * bool(candidate.gap)]
-    status: Status = "hypothesis fails" if broken else "not established" if open_questions else "estimated"
+    status: Status = (
+        "hypothesis fails" if broken else "not established" if open_questions else "estimated"
+    )
     reason = "; ".join([*broken, *open_questions, *[verdict.partly] * bool(verdict.partly)])
-    error = float(candidate.values.std(ddof=1)) / math.sqrt(len(candidate.values)) if len(candidate.values) > 1 else 0.0
-    return Bound(candidate.name, float(candidate.values.mean()), status, reason, candidate.forever, error)
+    error = (
+        float(candidate.values.std(ddof=1)) / math.sqrt(len(candidate.values))
+        if len(candidate.values) > 1
+        else 0.0
+    )
+    return Bound(
+        candidate.name, float(candidate.values.mean()), status, reason, candidate.forever, error
+    )
 
 
 def _certain(verification: Verification, b: np.ndarray, horizon: float) -> list[_Candidate]:
@@ -144,7 +177,14 @@ def _certain(verification: Verification, b: np.ndarray, horizon: float) -> list[
     found = [_Candidate(name, (b > 0.0).all(axis=1).astype(float), forever=True)]
     if any(stages.shortfalls) and not noisy and not any(map(math.isnan, stages.rates)):
         values = outlasting(stages, b, horizon)
-        found.append(_Candidate("no noise, in spite of the shortfall: safe up to T", values, forever=False, allows_shortfall=True))
+        found.append(
+            _Candidate(
+                "no noise, in spite of the shortfall: safe up to T",
+                values,
+                forever=False,
+                allows_shortfall=True,
+            )
+        )
     return found
 
 
@@ -152,36 +192,67 @@ def _from_chains(verification: Verification, b: np.ndarray, horizon: float) -> l
     """Conditions that know the noise and have a chain of rates: SCBF and SZCBF."""
     stages = _stages(verification)
     c, rates, shortfalls = stages.suprema, stages.rates, stages.shortfalls
-    found = _of_order_one(b[:, 0], c[0], rates[0], horizon) if len(c) == 1 else _of_stages(verification, b, stages, horizon)
+    found = (
+        _of_order_one(b[:, 0], c[0], rates[0], horizon)
+        if len(c) == 1
+        else _of_stages(verification, b, stages, horizon)
+    )
     if any(shortfalls):
         name = f"repaired for the shortfall m = {max(shortfalls):.4g}, up to T"
-        found.append(_Candidate(name, bounds.union_bound(b, c, horizon, rates, shortfalls), forever=False, allows_shortfall=True))
+        found.append(
+            _Candidate(
+                name,
+                bounds.union_bound(b, c, horizon, rates, shortfalls),
+                forever=False,
+                allows_shortfall=True,
+            )
+        )
     return found
 
 
 def _of_order_one(h: np.ndarray, c: float, k: float, horizon: float) -> list[_Candidate]:
     if not k:
-        return [_Candidate("Prop. 4.2.8: h/c, for ever", bounds.proposition_4_2_8(h, c), forever=True)]
+        return [
+            _Candidate("Prop. 4.2.8: h/c, for ever", bounds.proposition_4_2_8(h, c), forever=True)
+        ]
     # For k <= c the misprinted exponent is merely larger than it has to be.
-    false = f"its exponent is misprinted, and false for k > c: k = {k:g}, c = {c:.4g}" if k > c else ""
-    printed, corrected = bounds.proposition_4_2_5_printed(h, c, horizon), bounds.proposition_4_2_5(h, c, k, horizon)
+    false = (
+        f"its exponent is misprinted, and false for k > c: k = {k:g}, c = {c:.4g}" if k > c else ""
+    )
+    printed, corrected = (
+        bounds.proposition_4_2_5_printed(h, c, horizon),
+        bounds.proposition_4_2_5(h, c, k, horizon),
+    )
     return [
         _Candidate("Prop. 4.2.5 as printed: (h/c) e^(-c T)", printed, forever=False, gap=false),
         _Candidate("Prop. 4.2.5 corrected: (h/c) e^(-k T)", corrected, forever=False),
     ]
 
 
-def _of_stages(verification: Verification, b: np.ndarray, stages: Stages, horizon: float) -> list[_Candidate]:
+def _of_stages(
+    verification: Verification, b: np.ndarray, stages: Stages, horizon: float
+) -> list[_Candidate]:
     """The product of the print, for a single barrier, and the union."""
     forever = not any(stages.rates)
     time, length = (math.inf, "for ever") if forever else (horizon, "up to T")
     several = len(verification.barriers) > 1
     union = bounds.union_bound(b, stages.suprema, time, stages.rates)
-    found = [_Candidate(f"union over the stages{' of all barriers' * several}, {length}", union, forever)]
+    found = [
+        _Candidate(f"union over the stages{' of all barriers' * several}, {length}", union, forever)
+    ]
     if not several:
-        name = "Thm. 4.2.10 as printed: product of b_j/c_j" if forever else "Thm. 4.2.10, zeroing: product of (b_j/c_j) e^(-a_j T)"
+        name = (
+            "Thm. 4.2.10 as printed: product of b_j/c_j"
+            if forever
+            else "Thm. 4.2.10, zeroing: product of (b_j/c_j) e^(-a_j T)"
+        )
         product = bounds.theorem_4_2_10_printed(b, stages.suprema, time, stages.rates)
-        found.insert(0, _Candidate(f"{name}, {length}", product, forever, gap="its proof conditions on the future"))
+        found.insert(
+            0,
+            _Candidate(
+                f"{name}, {length}", product, forever, gap="its proof conditions on the future"
+            ),
+        )
     return found
 
 
@@ -191,7 +262,9 @@ def _outside(formulas: Formulas, b: np.ndarray) -> str:
         return "no start lies in all C_j at once"
     j = int(b.max(axis=0).argmin())
     stage = j - next(s.start for s in formulas.stages if s.start <= j < s.stop)
-    return f"the start is outside C_{stage}: {described(formulas, j)} = {b[:, j].max():.4g}" + (" at most" if len(b) > 1 else "")
+    return f"the start is outside C_{stage}: {described(formulas, j)} = {b[:, j].max():.4g}" + (
+        " at most" if len(b) > 1 else ""
+    )
 
 
 def _infeasible(verification: Verification) -> str:
@@ -206,7 +279,9 @@ def _infeasible(verification: Verification) -> str:
 
 
 def _stages(verification: Verification) -> Stages:
-    return assembled(verification.formulas, verification.survey.suprema, verification.survey.missed[0])
+    return assembled(
+        verification.formulas, verification.survey.suprema, verification.survey.missed[0]
+    )
 
 
 def assembled(formulas: Formulas, suprema: np.ndarray, shortfall: float) -> Stages:
@@ -221,9 +296,14 @@ def assembled(formulas: Formulas, suprema: np.ndarray, shortfall: float) -> Stag
 
 
 def outlasting(stages: Stages, b: np.ndarray, horizon: float) -> np.ndarray:
-    """1 where no path leaves up to T: without noise b is at least what `stage_bound` subtracts from, so that a positive one is enough."""
+    """1 where no path leaves up to T: without noise b is at least what `stage_bound` subtracts
+    from, so that a positive one is enough."""
     kept = [
-        bounds.stage_bound(b[:, j], 1.0 + abs(b[:, j]), horizon, rate, m) > 0.0 if m else b[:, j] > 0.0
+        (
+            bounds.stage_bound(b[:, j], 1.0 + abs(b[:, j]), horizon, rate, m) > 0.0
+            if m
+            else b[:, j] > 0.0
+        )
         for j, (rate, m) in enumerate(zip(stages.rates, stages.shortfalls, strict=True))
     ]
     return np.all(kept, axis=0).astype(float)
@@ -237,9 +317,21 @@ def best_start(verification: Verification, seed: int = 0) -> np.ndarray | None:
         seed: of the search.
     """
     formulas = verification.formulas
-    if verification.kept is None or formulas.certain or no_bound(formulas) or unbounded(verification.survey):
+    if (
+        verification.kept is None
+        or formulas.certain
+        or no_bound(formulas)
+        or unbounded(verification.survey)
+    ):
         return None
     c = _stages(verification).suprema
     rng = np.random.default_rng(seed)
-    points = sample("the intersection of the C_j", formulas.kept_level, verification.region, _SAMPLES, rng).points
-    return largest(lambda x: bounds.theorem_4_2_10_printed(formulas.chain(x), c), points, verification.region, rng)[1]
+    points = sample(
+        "the intersection of the C_j", formulas.kept_level, verification.region, _SAMPLES, rng
+    ).points
+    return largest(
+        lambda x: bounds.theorem_4_2_10_printed(formulas.chain(x), c),
+        points,
+        verification.region,
+        rng,
+    )[1]

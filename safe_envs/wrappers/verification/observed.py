@@ -14,28 +14,38 @@ _RELATIVE = 1e-6
 
 
 def above_suprema(formulas: Formulas, suprema: Sequence[float], x: np.ndarray) -> str:
-    """Which b_j is above its c_j at one of the states (B, n) that are in the set that the conditions keep, in words; or ""."""
+    """Which b_j is above its c_j at one of the states (B, n) that are in the set that the
+    conditions keep, in words; or ""."""
     if formulas.certain:
         return ""  # No supremum matters there.
     b = formulas.chain(x[_inside(formulas, x)])
     for j in np.flatnonzero((b > np.array(suprema) * (1.0 + _RELATIVE)).any(axis=0)).tolist():
-        return f"{described(formulas, j)} reaches {b[:, j].max():.4g}, above the supremum of {suprema[j]:.4g} that the search found"
+        return (
+            f"{described(formulas, j)} reaches {b[:, j].max():.4g}, above the supremum of"
+            f" {suprema[j]:.4g} that the search found"
+        )
     return ""
 
 
 def below_slack(formulas: Formulas, shortfall: float, x: np.ndarray, u: np.ndarray) -> str:
-    """By how much actions (E, m) miss the conditions at states (E, n) of the set that is kept, if it is more than was found; or ""."""
+    """By how much actions (E, m) miss the conditions at states (E, n) of the set that is kept, if
+    it is more than was found; or ""."""
     inside = _inside(formulas, x)
     if not inside.any():
         return ""
     a, b = formulas.rows(x[inside])
     moved = np.einsum("eki,ei->ek", a, u[inside])
     # Where a condition has no finite value nothing can be said of by how much it is missed.
-    more = np.nan_to_num(-(moved + b) - shortfall, nan=0.0) > _RELATIVE * (shortfall + abs(moved) + abs(b))
+    more = np.nan_to_num(-(moved + b) - shortfall, nan=0.0) > _RELATIVE * (
+        shortfall + abs(moved) + abs(b)
+    )
     if not more.any():
         return ""
     most = float(np.where(more, -(moved + b), 0.0).max())
-    return f"the filter missed the condition by {most:.4g}, more than the shortfall of {shortfall:.4g} that the search found"
+    return (
+        f"the filter missed the condition by {most:.4g}, more than the shortfall of {shortfall:.4g}"
+        " that the search found"
+    )
 
 
 def _inside(formulas: Formulas, x: np.ndarray) -> np.ndarray:
@@ -47,4 +57,6 @@ def described(formulas: Formulas, j: int) -> str:
     """What the j-th of all chain functions is called."""
     i = next(i for i, stage in enumerate(formulas.stages) if stage.start <= j < stage.stop)
     name, stage = formulas.problem.barriers[i].name, j - formulas.stages[i].start
-    return name if stage == 0 else f"b_{stage}" + (f" of {name}" if len(formulas.stages) > 1 else "")
+    return (
+        name if stage == 0 else f"b_{stage}" + (f" of {name}" if len(formulas.stages) > 1 else "")
+    )

@@ -1,4 +1,5 @@
-"""The bound over a posterior: an estimate of the probability that a robust filter keeps every system that the data leave possible."""
+"""The bound over a posterior: an estimate of the probability that a robust filter keeps every
+system that the data leave possible."""
 
 from __future__ import annotations
 
@@ -16,7 +17,14 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import BayesianSCBF, Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification import bounds
-from safe_envs.wrappers.verification.safe_set import Region, draw_starts, in_workspace, region_of, sample, workspace_of
+from safe_envs.wrappers.verification.safe_set import (
+    Region,
+    draw_starts,
+    in_workspace,
+    region_of,
+    sample,
+    workspace_of,
+)
 from safe_envs.wrappers.verification.search import Score, largest
 from safe_envs.wrappers.verification.smoothness import Asked, roughness
 from safe_envs.wrappers.verification.step_bias import rate_bias
@@ -34,19 +42,24 @@ _RELATIVE = 1e-6
 
 @dataclass(frozen=True)
 class PosteriorBound:
-    """(1 - delta) (h_0 - (m + e) T)/c, estimated for P(safe on [0, T]) of a simultaneous `BayesianSCBF`.
+    """(1 - delta) (h_0 - (m + e) T)/c, estimated for P(safe on [0, T]) of a simultaneous
+    `BayesianSCBF`.
 
-    With probability 1 - delta of the posterior, A h of the true system is at least -(m + e) wherever X is in C and in the
-    workspace, and h/c less what that costs is then a lower bound (`safe_envs.wrappers.verification.bounds.stage_bound`). The posterior takes the prior,
-    the features and constant Gaussian noise for granted; c and m are found by sampling C and by a search, so that they are
-    estimates from below, and e is of first order in the length of the steps: so the whole is an estimate.
+    With probability 1 - delta of the posterior, A h of the true system is at least -(m + e)
+    wherever X is in C and in the workspace, and h/c less what that costs is then a lower bound
+    (`safe_envs.wrappers.verification.bounds.stage_bound`). The posterior takes the prior, the
+    features and constant Gaussian noise for granted; c and m are found by sampling C and by a
+    search, so that they are estimates from below, and e is of first order in the length of the
+    steps: so the whole is an estimate.
 
     Attributes:
-        delta: probability that the identification is outside its regions, delta_theta + delta_sigma.
+        delta: probability that the identification is outside its regions, delta_theta +
+            delta_sigma.
         supremum: c, of h over C.
-        shortfall: m, by how much the robust condition is missed where that is most, in the units of h per s.
-        bias: e, by how much the length of the steps in the data may shift A h, in the units of h per s; see
-            `safe_envs.wrappers.verification.step_bias.rate_bias`.
+        shortfall: m, by how much the robust condition is missed where that is most, in the units of
+            h per s.
+        bias: e, by how much the length of the steps in the data may shift A h, in the units of h
+            per s; see `safe_envs.wrappers.verification.step_bias.rate_bias`.
         remark: what weakens it, in words; may be empty.
     """
 
@@ -61,41 +74,64 @@ class PosteriorBound:
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
         """The estimate at starts (B, n) for a horizon in s, shape (B,)."""
         h = _values(self._barrier, np.asarray(starts, dtype=np.float64))
-        return (1.0 - self.delta) * bounds.stage_bound(h, self.supremum, horizon, shortfall=self.shortfall + self.bias)
+        return (1.0 - self.delta) * bounds.stage_bound(
+            h, self.supremum, horizon, shortfall=self.shortfall + self.bias
+        )
 
-    def contradiction(self, reached: np.ndarray, missed: np.ndarray, actions: np.ndarray, slack: np.ndarray) -> str:
-        """What states say against c and m; see `safe_envs.wrappers.verification.estimated_bound.EstimatedBound.contradiction`."""
+    def contradiction(
+        self, reached: np.ndarray, missed: np.ndarray, actions: np.ndarray, slack: np.ndarray
+    ) -> str:
+        """What states say against c and m; see
+        `safe_envs.wrappers.verification.estimated_bound.EstimatedBound.contradiction`."""
         h = _values(self._barrier, reached[in_workspace(reached, self._workspace)])
         if (h > self.supremum * (1.0 + _RELATIVE)).any():
-            return f"h reaches {h.max():.4g}, above the supremum of {self.supremum:.4g} that the search found"
+            return (
+                f"h reaches {h.max():.4g}, above the supremum of {self.supremum:.4g} that the"
+                " search found"
+            )
         inside = in_workspace(missed, self._workspace) & (_values(self._barrier, missed) > 0.0)
         most = float(slack[inside].max(initial=0.0))
         if most > self.shortfall * (1.0 + _RELATIVE):
-            return f"the filter missed the condition by {most:.4g}, more than the shortfall of {self.shortfall:.4g} that the search found"
+            return (
+                f"the filter missed the condition by {most:.4g}, more than the shortfall of"
+                f" {self.shortfall:.4g} that the search found"
+            )
         return ""
 
 
-def posterior_bound(problem: SafetyProblem, conditions: Sequence[Condition], seed: int = 0) -> PosteriorBound:
+def posterior_bound(
+    problem: SafetyProblem, conditions: Sequence[Condition], seed: int = 0
+) -> PosteriorBound:
     """Estimate the bound of a robust filter over its posterior.
 
     Args:
-        problem: whose barrier, box, workspace and starts are taken; its plant and model do not matter.
+        problem: whose barrier, box, workspace and starts are taken; its plant and model do not
+            matter.
         conditions: one, a `BayesianSCBF` with `simultaneous`.
         seed: of the search.
 
     Raises:
-        ConfigurationError: there is another condition or more than one barrier, the data contradict what the posterior takes for
-            granted, h is not twice differentiable, or C has no end in a workspace that has none, where neither c nor m is known.
+        ConfigurationError: there is another condition or more than one barrier, the data contradict
+            what the posterior takes for granted, h is not twice differentiable, or C has no end in
+            a workspace that has none, where neither c nor m is known.
     """
-    if len(conditions) != 1 or not isinstance(conditions[0], BayesianSCBF) or conditions[0].simultaneous is None:
-        raise ConfigurationError("a bound over a posterior is for one barrier with bayesian-scbf:simultaneous=P")
+    if (
+        len(conditions) != 1
+        or not isinstance(conditions[0], BayesianSCBF)
+        or conditions[0].simultaneous is None
+    ):
+        raise ConfigurationError(
+            "a bound over a posterior is for one barrier with bayesian-scbf:simultaneous=P"
+        )
     condition = conditions[0]
     _require_consistent(condition.learned)
     robust = SafetyFilter.for_problem(problem, condition)
     expression = condition.learned.system.numeric(problem.barriers[0].expression)
     barrier = compile_function(problem.plant.states, [expression], "arrays")
     row = robust.constraints[0]
-    region = region_of(problem, condition.learned.system, [expression, *row.coefficient, row.offset])
+    region = region_of(
+        problem, condition.learned.system, [expression, *row.coefficient, row.offset]
+    )
 
     def level(x: np.ndarray) -> np.ndarray:
         return _values(barrier, x)
@@ -103,7 +139,11 @@ def posterior_bound(problem: SafetyProblem, conditions: Sequence[Condition], see
     rest = np.mean(problem.box, axis=1)
 
     def missed(x: np.ndarray) -> np.ndarray:
-        return np.where(level(x) >= 0.0, robust.filter(x, np.broadcast_to(rest, (len(x), len(rest)))).slack[:, 0], -np.inf)
+        return np.where(
+            level(x) >= 0.0,
+            robust.filter(x, np.broadcast_to(rest, (len(x), len(rest)))).slack[:, 0],
+            -np.inf,
+        )
 
     _require_inside(level, region, problem, np.random.default_rng([seed, 0]))
     starts = draw_starts(problem, _STARTS)
@@ -113,32 +153,59 @@ def posterior_bound(problem: SafetyProblem, conditions: Sequence[Condition], see
     highest, _ = largest(level, points, region, np.random.default_rng([seed, 2]))
     shortfall, _ = largest(missed, points, region, np.random.default_rng([seed, 3]))
     bias = rate_bias(condition.learned, expression, np.array(problem.box), points)
-    remarks = [f"no action meets the robust condition somewhere, by up to {shortfall:.3g}"] * (shortfall > 0.0)
-    remarks += [f"steps of {condition.learned.dt:g} s in the data may shift the rate of h by up to {bias:.3g}"] * (bias > 0.0)
+    remarks = [f"no action meets the robust condition somewhere, by up to {shortfall:.3g}"] * (
+        shortfall > 0.0
+    )
+    remarks += [
+        f"steps of {condition.learned.dt:g} s in the data may shift the rate of h by up to"
+        f" {bias:.3g}"
+    ] * (bias > 0.0)
     delta, ends = condition.delta_theta + condition.delta_sigma, workspace_of(problem)
-    return PosteriorBound(delta, highest, max(shortfall, 0.0), bias, "; ".join(remarks), barrier, ends)
+    return PosteriorBound(
+        delta, highest, max(shortfall, 0.0), bias, "; ".join(remarks), barrier, ends
+    )
 
 
 def _require_smooth(
-    problem: SafetyProblem, expression: sp.Expr, level: Score, points: np.ndarray, region: Region, rng: np.random.Generator
+    problem: SafetyProblem,
+    expression: sp.Expr,
+    level: Score,
+    points: np.ndarray,
+    region: Region,
+    rng: np.random.Generator,
 ) -> None:
     name = problem.barriers[0].name
     if has_kinks(expression):
-        raise ConfigurationError(f"{name} is not twice differentiable, which Ito's formula asks for")
-    rough = roughness([Asked(name, expression, only_poles=False)], problem.plant.states, level, points, region, rng)
+        raise ConfigurationError(
+            f"{name} is not twice differentiable, which Ito's formula asks for"
+        )
+    rough = roughness(
+        [Asked(name, expression, only_poles=False)],
+        problem.plant.states,
+        level,
+        points,
+        region,
+        rng,
+    )
     if rough:
         raise ConfigurationError(rough)
 
 
 def _require_consistent(posterior: Posterior) -> None:
-    """Whatever is beyond chance counts: the regions of the weights and of sigma are for exact features and constant noise."""
-    for state, missed, varying in zip(posterior.features.states, posterior.misfit, posterior.variation, strict=True):
+    """Whatever is beyond chance counts: the regions of the weights and of sigma are for exact
+    features and constant noise."""
+    for state, missed, varying in zip(
+        posterior.features.states, posterior.misfit, posterior.variation, strict=True
+    ):
         if missed:
-            raise ConfigurationError(f"the features miss {100 * missed:.3g} % of the rate of {state}, beyond chance; raise the degree")
+            raise ConfigurationError(
+                f"the features miss {100 * missed:.3g} % of the rate of {state}, beyond chance;"
+                " raise the degree"
+            )
         if varying:
             raise ConfigurationError(
-                f"the variance of the noise of {state} varies by {100 * varying:.3g} %, beyond chance; a bound over the posterior "
-                "is for constant noise"
+                f"the variance of the noise of {state} varies by {100 * varying:.3g} %, beyond"
+                " chance; a bound over the posterior is for constant noise"
             )
 
 
@@ -146,9 +213,15 @@ def _values(barrier: Any, x: np.ndarray) -> np.ndarray:
     return np.broadcast_to(barrier(*np.ascontiguousarray(x.T))[0], len(x))
 
 
-def _require_inside(level: Score, region: Region, problem: SafetyProblem, rng: np.random.Generator) -> None:
-    """C may reach beyond the workspace, where episodes are at an end, but not beyond ranges that were chosen in place of one."""
+def _require_inside(
+    level: Score, region: Region, problem: SafetyProblem, rng: np.random.Generator
+) -> None:
+    """C may reach beyond the workspace, where episodes are at an end, but not beyond ranges that
+    were chosen in place of one."""
     wide = region.scaled(_BEYOND).within(*workspace_of(problem)).draw(_BEYOND_LOG2, rng)
     outside = ((wide < region.low) | (wide > region.high)).any(axis=1)
     if (level(wide[outside]) >= 0.0).any():
-        raise ConfigurationError("C reaches beyond the states that are searched, so that neither sup h nor the shortfall is known")
+        raise ConfigurationError(
+            "C reaches beyond the states that are searched, so that neither sup h nor the shortfall"
+            " is known"
+        )

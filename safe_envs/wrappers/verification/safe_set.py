@@ -30,7 +30,8 @@ class Region:
         low: lower ends, shape (n,).
         high: upper ends, shape (n,).
         periodic: the states of which the box holds a whole period, shape (n,).
-        chosen: the states whose range was chosen here, since the workspace is unbounded, shape (n,).
+        chosen: the states whose range was chosen here, since the workspace is unbounded, shape
+            (n,).
         notes: which of the ranges are not the workspace, in words.
     """
 
@@ -54,7 +55,9 @@ class Region:
         """The part of the box around points, wider than they are by a factor."""
         low, high = points.min(axis=0), points.max(axis=0)
         more = (widened - 1.0) * (high - low) / 2.0 + 1e-6 * (self.high - self.low)
-        return replace(self, low=np.maximum(self.low, low - more), high=np.minimum(self.high, high + more))
+        return replace(
+            self, low=np.maximum(self.low, low - more), high=np.minimum(self.high, high + more)
+        )
 
     def inside(self, x: np.ndarray) -> np.ndarray:
         """States (B, n) moved into the box: by whole periods, and to its nearest end."""
@@ -64,7 +67,8 @@ class Region:
         return np.where(self.periodic, self.low + (x - self.low) % (self.high - self.low), clipped)
 
     def draw(self, log2: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw 2^log2 points that fill the box evenly: a Sobol sequence, shifted at random; shape (2^log2, n)."""
+        """Draw 2^log2 points that fill the box evenly: a Sobol sequence, shifted at random; shape
+        (2^log2, n)."""
         from scipy.stats import qmc
 
         unit = qmc.Sobol(len(self.low), scramble=False).random_base2(log2)
@@ -72,30 +76,37 @@ class Region:
 
 
 def workspace_of(problem: SafetyProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper ends of the workspace, shape (n,); infinite where it has none. To leave it ends an episode."""
+    """Lower and upper ends of the workspace, shape (n,); infinite where it has none. To leave it
+    ends an episode."""
     return np.array([v.low for v in problem.states]), np.array([v.high for v in problem.states])
 
 
 def in_workspace(x: np.ndarray, ends: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Which states (B, n) are between the ends of a workspace, which the last step of an episode may leave, shape (B,)."""
+    """Which states (B, n) are between the ends of a workspace, which the last step of an episode
+    may leave, shape (B,)."""
     low, high = ends
     return np.all((x >= low) & (x <= high), axis=1)
 
 
-def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Sequence[sp.Expr]) -> Region:
+def region_of(
+    problem: SafetyProblem, system: ControlAffineSDE, expressions: Sequence[sp.Expr]
+) -> Region:
     """The workspace of a problem, with a finite range for what it leaves unbounded.
 
     Args:
         problem: whose ranges are taken.
         system: whose parameters are in the expressions.
-        expressions: all that will be asked of a state: where they repeat after 2 pi, a period is enough.
+        expressions: all that will be asked of a state: where they repeat after 2 pi, a period is
+            enough.
     """
     low, high = workspace_of(problem)
     periodic, chosen = np.zeros(len(low), dtype=bool), np.zeros(len(low), dtype=bool)
     unbounded = np.flatnonzero(~(np.isfinite(low) & np.isfinite(high)))
     for i in unbounded.tolist():
         s = problem.states[i].symbol
-        if not (np.isfinite(low[i]) or np.isfinite(high[i])) and all(repeats(system.numeric(e), s) for e in expressions):
+        if not (np.isfinite(low[i]) or np.isfinite(high[i])) and all(
+            repeats(system.numeric(e), s) for e in expressions
+        ):
             periodic[i], low[i], high[i] = True, -_PERIOD / 2.0, _PERIOD / 2.0
             continue
         chosen[i] = True
@@ -105,7 +116,10 @@ def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Seq
         high[i] = high[i] if np.isfinite(high[i]) else starts.max() + reach
     notes = []
     if chosen.any():
-        ranges = [f"{problem.states[i].symbol} in [{low[i]:.4g}, {high[i]:.4g}]" for i in np.flatnonzero(chosen).tolist()]
+        ranges = [
+            f"{problem.states[i].symbol} in [{low[i]:.4g}, {high[i]:.4g}]"
+            for i in np.flatnonzero(chosen).tolist()
+        ]
         whose = "its workspace is" if len(ranges) == 1 else "their workspace is"
         notes.append(f"{', '.join(ranges)}, chosen around the starts: {whose} unbounded")
     if periodic.any():
@@ -115,7 +129,8 @@ def region_of(problem: SafetyProblem, system: ControlAffineSDE, expressions: Seq
 
 
 def repeats(expression: Any, s: sp.Symbol) -> bool:
-    """Whether a state appears only within sines, cosines and tangents of whole multiples of it: then 2 pi more change nothing.
+    """Whether a state appears only within sines, cosines and tangents of whole multiples of it:
+    then 2 pi more change nothing.
 
     A look at values would not do: what is constant over some of the states may not be elsewhere.
     """
@@ -131,7 +146,9 @@ def repeats(expression: Any, s: sp.Symbol) -> bool:
 
 def draw_starts(problem: SafetyProblem, count: int, seed: int = 0) -> np.ndarray:
     """Draw initial states of a problem, shape (count, n)."""
-    rngs: list[Any] = [np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)]
+    rngs: list[Any] = [
+        np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)
+    ]
     return Simulation(problem, "floats").draw_starts(rngs).T
 
 
@@ -150,8 +167,11 @@ class Sample:
     share: float
 
 
-def sample(what: str, level: Score, region: Region, wanted: int, rng: np.random.Generator) -> Sample:
-    """Draw points of the set {level >= 0}, in smaller and smaller boxes if it is a small part of the region.
+def sample(
+    what: str, level: Score, region: Region, wanted: int, rng: np.random.Generator
+) -> Sample:
+    """Draw points of the set {level >= 0}, in smaller and smaller boxes if it is a small part of
+    the region.
 
     Args:
         what: the set, for the message.
@@ -180,19 +200,27 @@ def sample(what: str, level: Score, region: Region, wanted: int, rng: np.random.
             break
         box = region.around(seeds, 1.2 if enough else 4.0)
     if not len(found):
-        raise ConfigurationError(f"no point of {what} was found among {drawn} of the workspace; is the set empty?")
+        raise ConfigurationError(
+            f"no point of {what} was found among {drawn} of the workspace; is the set empty?"
+        )
     return Sample(found, drawn, share or 0.0)
 
 
 def _covers(box: Region, region: Region, points: np.ndarray) -> bool:
-    """Whether the points keep away from those ends of a box that are not the region's: then nothing is cut off."""
+    """Whether the points keep away from those ends of a box that are not the region's: then nothing
+    is cut off."""
     width = 0.01 * (box.high - box.low)
     below = (points.min(axis=0) > box.low + width) | (box.low <= region.low)
     above = (points.max(axis=0) < box.high - width) | (box.high >= region.high)
     return bool((below & above).all())
 
 
-def _climbed(level: Score, tried: np.ndarray, region: Region, rng: np.random.Generator) -> np.ndarray:
-    """Points with level >= 0, from the population of a search for the largest level, as soon as there are enough."""
-    population, values = search(level, tried, region, rng, until=lambda values: int(np.count_nonzero(values >= 0.0)) >= _FEW)
+def _climbed(
+    level: Score, tried: np.ndarray, region: Region, rng: np.random.Generator
+) -> np.ndarray:
+    """Points with level >= 0, from the population of a search for the largest level, as soon as
+    there are enough."""
+    population, values = search(
+        level, tried, region, rng, until=lambda values: int(np.count_nonzero(values >= 0.0)) >= _FEW
+    )
     return population[values >= 0.0]

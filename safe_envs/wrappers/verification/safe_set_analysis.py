@@ -1,4 +1,5 @@
-"""What the bounds of conditions rest on: the set that is kept, the suprema over it, and by how much the conditions are missed."""
+"""What the bounds of conditions rest on: the set that is kept, the suprema over it, and by how much
+the conditions are missed."""
 
 from __future__ import annotations
 
@@ -12,7 +13,13 @@ import sympy as sp
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.conditions import SRCBF
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.safe_set import Region, Sample, draw_starts, sample, workspace_of
+from safe_envs.wrappers.verification.safe_set import (
+    Region,
+    Sample,
+    draw_starts,
+    sample,
+    workspace_of,
+)
 from safe_envs.wrappers.verification.search import Score, largest, search, towards_zero
 from safe_envs.wrappers.verification.smoothness import asked_of, roughness
 
@@ -35,7 +42,8 @@ _STARTS = 64
 
 
 class SafeSetAnalysis:
-    """A sample of C, and what is searched for in it: each thing when it is asked for, the same whatever else is.
+    """A sample of C, and what is searched for in it: each thing when it is asked for, the same
+    whatever else is.
 
     Attributes:
         formulas: the chains and conditions, compiled.
@@ -70,26 +78,36 @@ class SafeSetAnalysis:
         if len(points) >= min(_FEW, len(safe)):
             return points
         try:
-            return sample("the intersection of the C_j", level, self.region, len(safe) // 4 + 1, self.rng(1)).points
+            return sample(
+                "the intersection of the C_j", level, self.region, len(safe) // 4 + 1, self.rng(1)
+            ).points
         except ConfigurationError:
             return None
 
     @cached_property
     def suprema(self) -> np.ndarray:
-        """c_j of every chain function over the intersection; infinite where it grows with the box, NaN if that is empty."""
+        """c_j of every chain function over the intersection; infinite where it grows with the box,
+        NaN if that is empty."""
         count = self.formulas.stages[-1].stop
         if self.kept is None:
             return np.full(count, np.nan)
         points = self.with_starts(self.kept, self.formulas.kept_level)
-        return np.array([supremum(j, self.formulas, range(count), points, self.rng(10 + j)) for j in range(count)])
+        return np.array(
+            [
+                supremum(j, self.formulas, range(count), points, self.rng(10 + j))
+                for j in range(count)
+            ]
+        )
 
     def with_starts(self, points: np.ndarray, level: Score) -> np.ndarray:
-        """Points (B, n) of a set {level >= 0} and its starts: what lies in a narrow pocket around these is found in any case."""
+        """Points (B, n) of a set {level >= 0} and its starts: what lies in a narrow pocket around
+        these is found in any case."""
         return np.concatenate([points, self.starts[level(self.starts) >= 0.0]])
 
     @cached_property
     def missed(self) -> tuple[float, np.ndarray]:
-        """By how much the conditions are missed where that is most in the intersection, and the state; of C if that is empty."""
+        """By how much the conditions are missed where that is most in the intersection, and the
+        state; of C if that is empty."""
         if self.kept is None:
             level, points = self.formulas.barrier_level, self.safe.points
         else:
@@ -100,7 +118,9 @@ class SafeSetAnalysis:
     def undefined(self) -> np.ndarray:
         """Those points of C where a condition has no finite value."""
         points = self.with_starts(self.safe.points, self.formulas.barrier_level)
-        return points[~(self.formulas.defined(points) & np.isfinite(self.formulas.chain(points)).all(axis=1))]
+        return points[
+            ~(self.formulas.defined(points) & np.isfinite(self.formulas.chain(points)).all(axis=1))
+        ]
 
     @cached_property
     def rough(self) -> str:
@@ -109,11 +129,19 @@ class SafeSetAnalysis:
             return ""
         level = self.formulas.kept_level
         points = self.with_starts(self.kept, level)
-        return roughness(asked_of(self.formulas), self.formulas.system.states, level, points, self.region, self.rng(7))
+        return roughness(
+            asked_of(self.formulas),
+            self.formulas.system.states,
+            level,
+            points,
+            self.region,
+            self.rng(7),
+        )
 
     @cached_property
     def limits(self) -> str:
-        """Of which states only a part of the workspace is looked at, in words; those that the conditions do not depend on aside."""
+        """Of which states only a part of the workspace is looked at, in words; those that the
+        conditions do not depend on aside."""
         asked = set().union(*(e.free_symbols for e in self.formulas.expressions))
         states = self.formulas.problem.states
         found = [
@@ -125,21 +153,27 @@ class SafeSetAnalysis:
 
     @cached_property
     def runaway(self) -> bool:
-        """Whether a condition asks for unbounded control towards the edge, which no box meets: an SRCBF with noise there."""
+        """Whether a condition asks for unbounded control towards the edge, which no box meets: an
+        SRCBF with noise there."""
         rows = enumerate(self.formulas.conditions)
-        return self.formulas.noisy and any(isinstance(c, SRCBF) and self._noise_at_the_edge(i) for i, c in rows)
+        return self.formulas.noisy and any(
+            isinstance(c, SRCBF) and self._noise_at_the_edge(i) for i, c in rows
+        )
 
     def _noise_at_the_edge(self, i: int) -> bool:
-        """Whether |sigma' grad h|^2 does not fall with h like h: the condition asks for that over h.
+        """Whether |sigma' grad h|^2 does not fall with h like h: the condition asks for that over
+        h.
 
-        The largest one over points with a small h is compared with the largest one over points with an even smaller h.
+        The largest one over points with a small h is compared with the largest one over points with
+        an even smaller h.
         """
         far, near = (self._largest_spread(i, part) for part in (_NEAR, _NEARER))
         typical = float(np.nanmedian(self.formulas.quadratic_variation_rate(self.safe.points, i)))
         return near > _FALL * far and near > _TOUCHED * _NEARER * typical
 
     def _largest_spread(self, i: int, part: float) -> float:
-        """Largest |sigma' grad h|^2 where h is a part of its size in C, on the ways from points of C to points beyond."""
+        """Largest |sigma' grad h|^2 where h is a part of its size in C, on the ways from points of
+        C to points beyond."""
         formulas, rng = self.formulas, self.rng(3)
 
         def h(x: np.ndarray) -> np.ndarray:
@@ -159,7 +193,8 @@ class SafeSetAnalysis:
         return float(np.nan_to_num(formulas.quadratic_variation_rate(edge, i)).max(initial=0.0))
 
     def infinite(self, j: int) -> str:
-        """That the supremum of a chain function is infinite, in words: whether it is so or only seems so."""
+        """That the supremum of a chain function is infinite, in words: whether it is so or only
+        seems so."""
         i = next(i for i, stage in enumerate(self.formulas.stages) if stage.start <= j < stage.stop)
         name, stage = self.formulas.problem.barriers[i].name, j - self.formulas.stages[i].start
         what = f"sup {name}" if stage == 0 else f"sup b_{stage} of {name}"
@@ -167,14 +202,26 @@ class SafeSetAnalysis:
 
     def how_infinite(self, j: int) -> str:
         """How sure it is that a supremum is infinite."""
-        return "is infinite" if unbounded(self.formulas, j) else "seems infinite: it grows with the box that is searched"
+        return (
+            "is infinite"
+            if unbounded(self.formulas, j)
+            else "seems infinite: it grows with the box that is searched"
+        )
 
 
-def supremum(j: int, formulas: Formulas, positive: Sequence[int], points: np.ndarray, rng: np.random.Generator) -> float:
-    """Supremum of the j-th chain function over the states of the workspace where others are positive.
+def supremum(
+    j: int,
+    formulas: Formulas,
+    positive: Sequence[int],
+    points: np.ndarray,
+    rng: np.random.Generator,
+) -> float:
+    """Supremum of the j-th chain function over the states of the workspace where others are
+    positive.
 
-    To leave the workspace ends an episode, so that what lies beyond does not matter (see `safe_envs.wrappers.verification.bounds`). Ranges that were
-    chosen for states without any are widened: it is infinite if it grows with them.
+    To leave the workspace ends an episode, so that what lies beyond does not matter (see
+    `safe_envs.wrappers.verification.bounds`). Ranges that were chosen for states without any are
+    widened: it is infinite if it grows with them.
 
     Args:
         j: which of all chain functions.
@@ -201,7 +248,8 @@ def supremum(j: int, formulas: Formulas, positive: Sequence[int], points: np.nda
 
 
 def unbounded(formulas: Formulas, j: int) -> bool:
-    """Whether it is certain that the j-th chain function is unbounded where all are positive: polynomials along a straight line.
+    """Whether it is certain that the j-th chain function is unbounded where all are positive:
+    polynomials along a straight line.
 
     The line stays in the workspace: it goes where that has no end.
     """
@@ -210,7 +258,10 @@ def unbounded(formulas: Formulas, j: int) -> bool:
     if not all(e.is_polynomial(*states) for e in chain):
         return False
     for direction in itertools.islice(filter(_endless(formulas), _directions(len(states))), _RAYS):
-        line = {s: p + int(d) * t for s, p, d in zip(states, _origin(formulas.region), direction, strict=True)}
+        line = {
+            s: p + int(d) * t
+            for s, p, d in zip(states, _origin(formulas.region), direction, strict=True)
+        }
         along = [sp.Poly(e.subs(line), t) for e in chain]
         if along[j].degree() > 0 and all(p.LC() > 0 for p in along):
             return True
@@ -220,7 +271,9 @@ def unbounded(formulas: Formulas, j: int) -> bool:
 def _endless(formulas: Formulas) -> Callable[[Sequence[int]], bool]:
     """Tells of a direction whether the workspace has no end there."""
     ends = np.isinf(workspace_of(formulas.problem))
-    return lambda direction: any(direction) and all(ends[int(d > 0), i] for i, d in enumerate(direction) if d)
+    return lambda direction: (
+        any(direction) and all(ends[int(d > 0), i] for i, d in enumerate(direction) if d)
+    )
 
 
 def _directions(n: int) -> Iterator[Sequence[int]]:
@@ -235,22 +288,36 @@ def _origin(region: Region) -> list[sp.Expr]:
     return [sp.Rational(x) for x in (region.low + shares * (region.high - region.low)).tolist()]
 
 
-def worst(formulas: Formulas, level: Score, points: np.ndarray, rng: np.random.Generator) -> tuple[float, np.ndarray]:
-    """The largest amount by which the conditions are missed over {level >= 0}, 0 if none is, and the state where that is.
+def worst(
+    formulas: Formulas, level: Score, points: np.ndarray, rng: np.random.Generator
+) -> tuple[float, np.ndarray]:
+    """The largest amount by which the conditions are missed over {level >= 0}, 0 if none is, and
+    the state where that is.
 
-    Where the box is wide the conditions are missed only on the thin set where the leading term vanishes, which no sample
-    meets. So the search begins with as much of the box as matters, and hands its population on to wider ones and, last, onto
-    that set.
+    Where the box is wide the conditions are missed only on the thin set where the leading term
+    vanishes, which no sample meets. So the search begins with as much of the box as matters, and
+    hands its population on to wider ones and, last, onto that set.
     """
-    tried = np.concatenate([points, _pool(points, formulas.region, rng)]) if formulas.joint else points
+    tried = (
+        np.concatenate([points, _pool(points, formulas.region, rng)]) if formulas.joint else points
+    )
     reach = formulas.reach(points)
     wider = [reach * k for k in _REACHES if reach * k < _WIDE]
     for part in wider:
-        population, _ = search(lambda x, part=part: where_inside(level, x, lambda y: formulas.missed(y, part)), tried, formulas.region, rng)
+        population, _ = search(
+            lambda x, part=part: where_inside(level, x, lambda y: formulas.missed(y, part)),
+            tried,
+            formulas.region,
+            rng,
+        )
         tried = np.concatenate([population, tried])
     if wider:
-        tried = np.concatenate([*_without_control(formulas, tried[: _SHARED_OUT * len(wider)]), tried])
-    population, values = search(lambda x: where_inside(level, x, formulas.missed), tried, formulas.region, rng)
+        tried = np.concatenate(
+            [*_without_control(formulas, tried[: _SHARED_OUT * len(wider)]), tried]
+        )
+    population, values = search(
+        lambda x: where_inside(level, x, formulas.missed), tried, formulas.region, rng
+    )
     best = int(values.argmax())
     if formulas.joint or values[best] <= 0.0:
         return max(float(values[best]), 0.0), population[best]
@@ -261,11 +328,15 @@ def worst(formulas: Formulas, level: Score, points: np.ndarray, rng: np.random.G
 
 def _without_control(formulas: Formulas, x: np.ndarray) -> list[np.ndarray]:
     """States moved to where the leading term of a condition vanishes, for each condition."""
-    return [towards_zero(lambda y, i=i: formulas.rows(y)[0][:, i], x, formulas.region) for i in range(len(formulas.stages))]
+    return [
+        towards_zero(lambda y, i=i: formulas.rows(y)[0][:, i], x, formulas.region)
+        for i in range(len(formulas.stages))
+    ]
 
 
 def without_control(formulas: Formulas, i: int, x: np.ndarray) -> np.ndarray:
-    """A state (n,) itself, or one that it cannot be told from where the leading term of a condition vanishes."""
+    """A state (n,) itself, or one that it cannot be told from where the leading term of a condition
+    vanishes."""
     moved = towards_zero(lambda y: formulas.rows(y)[0][:, i], x[None], formulas.region)[0]
     near = abs(moved - x) <= _NEAR * (formulas.region.high - formulas.region.low)
     return moved if near.all() and not formulas.rows(moved[None])[0][0, i].any() else x

@@ -38,7 +38,9 @@ class Box(Protocol):
         ...
 
 
-def largest(score: Score, points: np.ndarray, region: Box, rng: np.random.Generator) -> tuple[float, np.ndarray]:
+def largest(
+    score: Score, points: np.ndarray, region: Box, rng: np.random.Generator
+) -> tuple[float, np.ndarray]:
     """The largest score that is found, and the state (n,) that has it.
 
     Args:
@@ -53,13 +55,18 @@ def largest(score: Score, points: np.ndarray, region: Box, rng: np.random.Genera
 
 
 def search(
-    score: Score, points: np.ndarray, region: Box, rng: np.random.Generator, until: Callable[[np.ndarray], bool] | None = None
+    score: Score,
+    points: np.ndarray,
+    region: Box,
+    rng: np.random.Generator,
+    until: Callable[[np.ndarray], bool] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Differential evolution, twice: the final population and its scores.
 
-    It begins with the best points and a few others, and again with what was best so far among random ones: a population that
-    has gathered sees no other peak. Kinks in the score and the edge of the set make ridges here, on which gradients fail.
-    Differences of members take on the shape of such a ridge.
+    It begins with the best points and a few others, and again with what was best so far among
+    random ones: a population that has gathered sees no other peak. Kinks in the score and the edge
+    of the set make ridges here, on which gradients fail. Differences of members take on the shape
+    of such a ridge.
 
     Args:
         score: see `largest`.
@@ -70,18 +77,33 @@ def search(
     """
     values = _scores(score, points)
     best = np.argsort(-values)[: _POPULATION // 2]
-    x, value = _evolved(score, *_joined(points, values, best, region, score, rng), region, rng, _ROUNDS[0], until)
+    x, value = _evolved(
+        score, *_joined(points, values, best, region, score, rng), region, rng, _ROUNDS[0], until
+    )
     if until is not None:
         return x, value
     elite = np.argsort(-value)[:_ELITE]
     tried, found = np.concatenate([x[elite], points]), np.concatenate([value[elite], values])
-    return _evolved(score, *_joined(tried, found, np.arange(len(elite)), region, score, rng), region, rng, _ROUNDS[1], until)
+    return _evolved(
+        score,
+        *_joined(tried, found, np.arange(len(elite)), region, score, rng),
+        region,
+        rng,
+        _ROUNDS[1],
+        until,
+    )
 
 
 def _joined(
-    points: np.ndarray, values: np.ndarray, chosen: np.ndarray, region: Box, score: Score, rng: np.random.Generator
+    points: np.ndarray,
+    values: np.ndarray,
+    chosen: np.ndarray,
+    region: Box,
+    score: Score,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A population of the chosen points and random others, which count if there are any; of near ones where there are few."""
+    """A population of the chosen points and random others, which count if there are any; of near
+    ones where there are few."""
     counting = np.flatnonzero(np.isfinite(values))
     pool = counting if len(counting) else np.arange(len(points))
     others = rng.choice(pool, min(len(pool), _POPULATION - len(chosen)), replace=False)
@@ -89,7 +111,9 @@ def _joined(
     x, value = points[members], values[members]
     if len(x) < _POPULATION:
         near = np.resize(x, (_POPULATION - len(x), x.shape[1]))
-        near = region.inside(near + 1e-3 * (region.high - region.low) * rng.standard_normal(near.shape))
+        near = region.inside(
+            near + 1e-3 * (region.high - region.low) * rng.standard_normal(near.shape)
+        )
         x, value = np.concatenate([x, near]), np.concatenate([value, _scores(score, near)])
     return x, value
 
@@ -117,13 +141,17 @@ def _evolved(
 
 
 def _moved(x: np.ndarray, top: np.ndarray, region: Box, rng: np.random.Generator) -> np.ndarray:
-    """A trial for each member, from itself or, of a quarter, from the best one, half of them by a difference and half by a normal step.
+    """A trial for each member, from itself or, of a quarter, from the best one, half of them by a
+    difference and half by a normal step.
 
-    The normal steps are of all sizes, along one axis or all: where a whole ridge is best, differences never get small.
+    The normal steps are of all sizes, along one axis or all: where a whole ridge is best,
+    differences never get small.
     """
     size, n = x.shape
     base = np.where(rng.random((size, 1)) < 0.25, top, x)
-    difference = rng.uniform(0.3, 1.0, (size, 1)) * (x[rng.permutation(size)] - x[rng.permutation(size)])
+    difference = rng.uniform(0.3, 1.0, (size, 1)) * (
+        x[rng.permutation(size)] - x[rng.permutation(size)]
+    )
     chosen = (rng.random((size, 1)) < 0.5) | (rng.integers(n, size=(size, 1)) == np.arange(n))
     length = (region.high - region.low) * 10.0 ** rng.uniform(_FINEST, 0.0, (size, 1))
     normal = length * chosen * rng.standard_normal((size, n))
@@ -135,8 +163,11 @@ def _scores(score: Score, x: np.ndarray) -> np.ndarray:
     return np.where(np.isnan(values), -np.inf, values)
 
 
-def towards_zero(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, region: Box) -> np.ndarray:
-    """States moved to where a function is zero, the shortest way, by Newton's method; they may end where it is not.
+def towards_zero(
+    function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, region: Box
+) -> np.ndarray:
+    """States moved to where a function is zero, the shortest way, by Newton's method; they may end
+    where it is not.
 
     Args:
         function: from states (B, n) to values (B, m).

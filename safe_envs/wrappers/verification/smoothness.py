@@ -1,4 +1,5 @@
-"""Where functions are not smooth, by what they are made of: poles, and roots whose radicand reaches 0."""
+"""Where functions are not smooth, by what they are made of: poles, and roots whose radicand reaches
+0."""
 
 from __future__ import annotations
 
@@ -72,23 +73,40 @@ class Asked(NamedTuple):
 
 
 def asked_of(formulas: Formulas) -> list[Asked]:
-    """What the bounds of conditions ask to be smooth: the chains, which without noise need no derivative; the rows need values."""
+    """What the bounds of conditions ask to be smooth: the chains, which without noise need no
+    derivative; the rows need values."""
     found = []
     numeric = formulas.system.numeric
-    for barrier, row in zip(formulas.problem.barriers, formulas.safety_filter.constraints, strict=True):
+    for barrier, row in zip(
+        formulas.problem.barriers, formulas.safety_filter.constraints, strict=True
+    ):
         for j, function in enumerate(row.chain):
-            found.append(Asked(barrier.name if j == 0 else f"b_{j} of {barrier.name}", numeric(function), not formulas.noisy))
-        found += [Asked(f"the condition on {barrier.name}", numeric(entry), True) for entry in (*row.coefficient, row.offset)]
+            found.append(
+                Asked(
+                    barrier.name if j == 0 else f"b_{j} of {barrier.name}",
+                    numeric(function),
+                    not formulas.noisy,
+                )
+            )
+        found += [
+            Asked(f"the condition on {barrier.name}", numeric(entry), True)
+            for entry in (*row.coefficient, row.offset)
+        ]
     return found
 
 
 def roughness(
-    asked: Sequence[Asked], states: Sequence[sp.Symbol], level: Score, points: np.ndarray, region: Box, rng: np.random.Generator
+    asked: Sequence[Asked],
+    states: Sequence[sp.Symbol],
+    level: Score,
+    points: np.ndarray,
+    region: Box,
+    rng: np.random.Generator,
 ) -> str:
     """Which function is not smooth somewhere in a set, and where; "" if none was found.
 
-    Ito's formula asks for two continuous derivatives, and without noise paths may not pass a pole. What is a function with a kink
-    by its name is found by `safe_envs.dynamics.lie.has_kinks`.
+    Ito's formula asks for two continuous derivatives, and without noise paths may not pass a pole.
+    What is a function with a kink by its name is found by `safe_envs.dynamics.lie.has_kinks`.
 
     Args:
         asked: what has to be smooth.
@@ -104,14 +122,26 @@ def roughness(
                 continue
             state = _reaches_zero(edge.base, states, level, points, region, rng)
             if state is not None:
-                at = ", ".join(f"{s} = {value + 0.0:.4g}" for s, value in zip(states, state.tolist(), strict=True))
-                what = "has a pole" if edge.pole else "is not twice differentiable, which Ito's formula asks for,"
+                at = ", ".join(
+                    f"{s} = {value + 0.0:.4g}"
+                    for s, value in zip(states, state.tolist(), strict=True)
+                )
+                what = (
+                    "has a pole"
+                    if edge.pole
+                    else "is not twice differentiable, which Ito's formula asks for,"
+                )
                 return f"{name} {what} near {at}, by {_short(edge.part)}"
     return ""
 
 
 def _reaches_zero(
-    base: sp.Expr, states: Sequence[sp.Symbol], level: Score, points: np.ndarray, region: Box, rng: np.random.Generator
+    base: sp.Expr,
+    states: Sequence[sp.Symbol],
+    level: Score,
+    points: np.ndarray,
+    region: Box,
+    rng: np.random.Generator,
 ) -> np.ndarray | None:
     """A state (n,) of the set where a function is 0 to rounding, as far as a search finds one."""
     compiled = compile_function(tuple(states), [base], "arrays")

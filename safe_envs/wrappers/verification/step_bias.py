@@ -1,4 +1,5 @@
-"""What the length of steps does to an identified system: a regression takes the mean of a step for the rate at its start."""
+"""What the length of steps does to an identified system: a regression takes the mean of a step for
+the rate at its start."""
 
 from __future__ import annotations
 
@@ -21,12 +22,14 @@ _MOST_STATES = 1024
 
 
 def rate_bias(posterior: Posterior, barrier: sp.Expr, box: np.ndarray, x: np.ndarray) -> float:
-    """The most by which A h of the identified system is off over states and inputs, to first order in the length of the steps.
+    """The most by which A h of the identified system is off over states and inputs, to first order
+    in the length of the steps.
 
-    Along F = f + g u with held u the mean of a step of dt is F dt + dt^2/2 L F, with the generator L of the system, and its
-    covariance is S dt + dt^2/2 (J S + S J'), with S = sigma sigma' and J the Jacobian of F. So the regression finds
-    F + dt/2 L F in place of F and S + dt/2 (J S + S J') in place of S. It is 0 for data that were collected from a plant that is
-    integrated by one step of Euler and Maruyama a period: there the mean of a step is F dt exactly.
+    Along F = f + g u with held u the mean of a step of dt is F dt + dt^2/2 L F, with the generator
+    L of the system, and its covariance is S dt + dt^2/2 (J S + S J'), with S = sigma sigma' and J
+    the Jacobian of F. So the regression finds F + dt/2 L F in place of F and S + dt/2 (J S + S J')
+    in place of S. It is 0 for data that were collected from a plant that is integrated by one step
+    of Euler and Maruyama a period: there the mean of a step is F dt exactly.
 
     Args:
         posterior: of the system; its mean stands for the truth.
@@ -39,10 +42,17 @@ def rate_bias(posterior: Posterior, barrier: sp.Expr, box: np.ndarray, x: np.nda
     x = x[:: -(-len(x) // _MOST_STATES)]
     slope, curvature = _derivatives(posterior.features.states, barrier, x)
     spread = posterior.diffusion.matrix() * posterior.diffusion.matrix().T
-    covariance = stacked(compile_function(posterior.features.states, list(spread), "arrays")(*np.ascontiguousarray(x.T)), len(x))
+    covariance = stacked(
+        compile_function(posterior.features.states, list(spread), "arrays")(
+            *np.ascontiguousarray(x.T)
+        ),
+        len(x),
+    )
     covariance = covariance.reshape(len(x), *spread.shape)
     most = 0.0
-    for u in itertools.islice(itertools.product(*[np.linspace(low, high, 3) for low, high in box]), _MOST_INPUTS):
+    for u in itertools.islice(
+        itertools.product(*[np.linspace(low, high, 3) for low, high in box]), _MOST_INPUTS
+    ):
         rate, jacobian, curved = _rates(posterior, x, np.array(u), covariance)
         moved = np.einsum("bij,bj->bi", jacobian, rate) + curved
         widened = np.einsum("bij,bjk->bik", jacobian, covariance)
@@ -51,19 +61,30 @@ def rate_bias(posterior: Posterior, barrier: sp.Expr, box: np.ndarray, x: np.nda
     return 0.5 * posterior.dt * most
 
 
-def _derivatives(states: tuple[sp.Symbol, ...], barrier: sp.Expr, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _derivatives(
+    states: tuple[sp.Symbol, ...], barrier: sp.Expr, x: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Gradient (B, n) and Hessian (B, n, n) of h."""
     slopes = [sp.diff(barrier, s) for s in states]
     curves = [sp.diff(slope, s) for slope in slopes for s in states]
-    values = stacked(compile_function(states, [*slopes, *curves], "arrays")(*np.ascontiguousarray(x.T)), len(x))
+    values = stacked(
+        compile_function(states, [*slopes, *curves], "arrays")(*np.ascontiguousarray(x.T)), len(x)
+    )
     n = len(states)
     return values[:, :n], values[:, n:].reshape(len(x), n, n)
 
 
-def _rates(posterior: Posterior, x: np.ndarray, u: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """F (B, n), its Jacobian (B, n, n) and 1/2 tr(S F_xx) (B, n) under an input (m,), by differences."""
+def _rates(
+    posterior: Posterior, x: np.ndarray, u: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """F (B, n), its Jacobian (B, n, n) and 1/2 tr(S F_xx) (B, n) under an input (m,), by
+    differences."""
     n, parts = len(posterior.mean), 1 + len(posterior.inputs)
-    weights = np.einsum("ipk,p->ki", posterior.mean.reshape(n, parts, -1), np.array([1.0, *(posterior.input_scale * u)]))
+    weights = np.einsum(
+        "ipk,p->ki",
+        posterior.mean.reshape(n, parts, -1),
+        np.array([1.0, *(posterior.input_scale * u)]),
+    )
     width = np.ptp(np.array(posterior.features.region), axis=1)
 
     def rate(at: np.ndarray) -> np.ndarray:
@@ -76,6 +97,8 @@ def _rates(posterior: Posterior, x: np.ndarray, u: np.ndarray, covariance: np.nd
     for i, j in itertools.product(range(n), repeat=2):
         if covariance[:, i, j].any():
             a, b = steps[i], steps[j]
-            second = (rate(x + a + b) - rate(x + a - b) - rate(x - a + b) + rate(x - a - b)) / (4.0 * a.sum() * b.sum())
+            second = (rate(x + a + b) - rate(x + a - b) - rate(x - a + b) + rate(x - a - b)) / (
+                4.0 * a.sum() * b.sum()
+            )
             curved += 0.5 * covariance[:, i, j, None] * second
     return rate(x), jacobian, curved

@@ -26,7 +26,7 @@ class Schedule:
     """Physical inputs by the step, which it counts in the hidden state."""
 
     def __init__(self, problem, inputs):
-        (low, high) = problem.box[0]
+        low, high = problem.box[0]
         self.actions = [(u - low) / (high - low) * 2 - 1 for u in inputs]
         self.starts = []
 
@@ -56,7 +56,8 @@ def bare_env(env_id, options):
 
 
 def replay(env_id, options, spec, policy_name, episodes, seed, knowledge="model"):
-    """The row of an evaluation by brute force: the scalar env, an episode at a time, whole trajectories in lists."""
+    """The row of an evaluation by brute force: the scalar env, an episode at a time, whole
+    trajectories in lists."""
     safe, lowest, returns, efforts, kept = 0, [], [], [], []
     counted = intervened = infeasible = 0
     env = bare_env(env_id, options)
@@ -72,7 +73,14 @@ def replay(env_id, options, spec, policy_name, episodes, seed, knowledge="model"
             observation, reward, terminated, truncated, info = run.step(action)
             h.append(info["barrier"].min())
             executed = info["safe_action"] if spec != "none" else np.array(executed)
-            steps.append((float(executed @ executed), info.get("intervention", False), not info.get("feasible", True), reward))
+            steps.append(
+                (
+                    float(executed @ executed),
+                    info.get("intervention", False),
+                    not info.get("feasible", True),
+                    reward,
+                )
+            )
             ended = terminated or truncated
         first = next((k for k, value in enumerate(h) if value <= 0), len(h))
         before = steps[:first]

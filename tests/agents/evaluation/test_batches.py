@@ -30,7 +30,12 @@ def test_answer_is_the_same_for_every_num_envs(env_id):
     problem = load_problem(env_id, {"noise": 0.2})
     problem = problem.configured(horizon=6 * problem.dt)
     # The mean of a bound over the starts goes the same way for all ids.
-    arguments = {"episodes": 5, "seed": 3, "record": True, "bounds": env_id.endswith("CubicSDEDisk-v0")}
+    arguments = {
+        "episodes": 5,
+        "seed": 3,
+        "record": True,
+        "bounds": env_id.endswith("CubicSDEDisk-v0"),
+    }
     answers = [evaluate(problem, num_envs=n, **arguments) for n in (100, 3, 1)]
     for other in answers[1:]:
         assert_same_to_the_bit(answers[0], other)
@@ -45,7 +50,11 @@ def test_answer_is_the_same_for_every_num_envs(env_id):
     [
         # Episodes that end at different times: out of the workspace, and at the goal.
         ("Scalar-v0", ("none", "cbf:alpha=3"), {"noise": 0.9, "horizon": 3.0, "dt": 0.02}),
-        ("DubinsObstacle-v0", ("none", "hocbf"), {"noise": 0.1, "start": [2.0, 1.3, 0.3, 0.5, 1.0], "horizon": 2.0}),
+        (
+            "DubinsObstacle-v0",
+            ("none", "hocbf"),
+            {"noise": 0.1, "start": [2.0, 1.3, 0.3, 0.5, 1.0], "horizon": 2.0},
+        ),
         # More control periods than the noise is drawn ahead for.
         ("StochasticDubins-v0", ("none", "scbf"), {"dt": 0.01, "horizon": 2.7, "substeps": 2}),
     ],
@@ -59,7 +68,10 @@ def test_long_and_ending_episodes_are_the_same_for_every_num_envs(policy, env_id
 
 
 def test_another_seed_is_another_answer():
-    first, second = (evaluate("Scalar-v0", episodes=20, seed=s, options={"horizon": 0.5}, bounds=False) for s in (0, 1))
+    first, second = (
+        evaluate("Scalar-v0", episodes=20, seed=s, options={"horizon": 0.5}, bounds=False)
+        for s in (0, 1)
+    )
     assert first.rows[0]["return_mean"] != second.rows[0]["return_mean"]
 
 
@@ -67,18 +79,31 @@ def test_more_episodes_begin_with_the_same_ones():
     arguments = {"options": {"horizon": 0.5}, "num_envs": 8, "record": True, "bounds": False}
     few, many = (evaluate("Scalar-v0", "random", episodes=n, **arguments) for n in (10, 25))
     for name, recorder in few.recorders.items():
-        assert recorder.barrier.tobytes() == np.ascontiguousarray(many.recorders[name].barrier[:, :10]).tobytes()
+        assert (
+            recorder.barrier.tobytes()
+            == np.ascontiguousarray(many.recorders[name].barrier[:, :10]).tobytes()
+        )
 
 
 def test_starts_are_told_wave_by_wave():
     problem = load_problem("StochasticDubins-v0", {"horizon": 0.2})
     policy = NominalController(problem)
     told = []
-    totals = run_episodes(SafeVectorEnv(problem, 4), policy, 10, 7, on_start=lambda x, count: told.append((np.stack(x), count)))
+    totals = run_episodes(
+        SafeVectorEnv(problem, 4),
+        policy,
+        10,
+        7,
+        on_start=lambda x, count: told.append((np.stack(x), count)),
+    )
     assert totals.episodes == 10
     assert [(x.shape, count) for x, count in told] == [((3, 4), 4), ((3, 4), 4), ((3, 4), 2)]
     starts = np.concatenate([x[:, :count] for x, count in told], axis=1).T
-    recorded = evaluate(problem, policy, ["none"], episodes=10, seed=7, record=True).recorders["none"].states[0]
+    recorded = (
+        evaluate(problem, policy, ["none"], episodes=10, seed=7, record=True)
+        .recorders["none"]
+        .states[0]
+    )
     np.testing.assert_array_equal(starts, recorded)
 
 
@@ -94,7 +119,15 @@ def test_config_is_enough_to_run_it_again():
         "box": [-4.0, 5.0],
         "start": [0.5, 0.0, 1.0],
     }
-    first = evaluate("StochasticDubins-v0", "random", ["none", "hocbf"], options=options, episodes=25, seed=9, knowledge="plant")
+    first = evaluate(
+        "StochasticDubins-v0",
+        "random",
+        ["none", "hocbf"],
+        options=options,
+        episodes=25,
+        seed=9,
+        knowledge="plant",
+    )
     config = json.loads(json.dumps(first.config, allow_nan=False))
     again = evaluate(
         config["env_id"],
@@ -133,13 +166,23 @@ def test_recorder_keeps_a_bounded_number_of_episodes():
     recorder = Recorder(100, 12, 10**9)
     assert recorder.barrier.shape == (101, 256)
     assert recorder.states.shape == (101, 32, 12)
-    answer = evaluate("Scalar-v0", filters=["none"], episodes=300, num_envs=90, options={"horizon": 0.05}, record=True)
+    answer = evaluate(
+        "Scalar-v0",
+        filters=["none"],
+        episodes=300,
+        num_envs=90,
+        options={"horizon": 0.05},
+        record=True,
+    )
     kept = answer.recorders["none"]
     assert kept.barrier.shape == (6, 256)
     assert kept.states.shape == (6, 32, 1)
     assert np.isfinite(kept.barrier).all()
     np.testing.assert_allclose(kept.barrier[:, :32], 1 - kept.states[:, :, 0])
-    assert evaluate("Scalar-v0", filters=["none"], episodes=2, options={"horizon": 0.05}).recorders == {}
+    assert (
+        evaluate("Scalar-v0", filters=["none"], episodes=2, options={"horizon": 0.05}).recorders
+        == {}
+    )
 
 
 @pytest.mark.slow
@@ -149,21 +192,35 @@ def test_memory_does_not_grow_with_the_episodes():
     def peak(episodes):
         tracemalloc.start()
         try:
-            evaluate(problem, filters=["none"], episodes=episodes, num_envs=256, record=True, bounds=False)
+            evaluate(
+                problem,
+                filters=["none"],
+                episodes=episodes,
+                num_envs=256,
+                record=True,
+                bounds=False,
+            )
             return tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
 
     peak(256)
     few, many = peak(256), peak(2560)
-    # Of an episode nothing but the smallest h is kept (of the first 65536, and copied twice for their quantiles):
-    # that is far less than its steps or even its statistics.
+    # Of an episode nothing but the smallest h is kept (of the first 65536, and copied twice for
+    # their quantiles): that is far less than its steps or even its statistics.
     assert many - few < 4 * 8 * (2560 - 256)
 
 
 def test_progress_goes_from_nothing_to_all():
     told = []
-    evaluate("Scalar-v0", filters=["none", "scbf"], episodes=7, num_envs=3, options={"horizon": 0.05}, progress=told.append)
+    evaluate(
+        "Scalar-v0",
+        filters=["none", "scbf"],
+        episodes=7,
+        num_envs=3,
+        options={"horizon": 0.05},
+        progress=told.append,
+    )
     assert told == sorted(told)
     assert 0.0 < told[0] < 0.1
     assert told[-1] == 1.0
@@ -181,7 +238,9 @@ def test_progress_goes_from_nothing_to_all():
     ],
 )
 def test_evaluations_of_one_episode_over_and_over_are_marked(env_id, policy, options, repeats):
-    answer = evaluate(env_id, policy, ["none"], options={**options, "horizon": 0.2}, episodes=4, record=True)
+    answer = evaluate(
+        env_id, policy, ["none"], options={**options, "horizon": 0.2}, episodes=4, record=True
+    )
     assert answer.repeats == repeats
     barrier = answer.recorders["none"].barrier
     assert (barrier == barrier[:, :1]).all() == repeats

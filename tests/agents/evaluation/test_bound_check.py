@@ -22,7 +22,9 @@ CUBIC_DISK = "safe_envs/CubicSDEDisk-v0"
 
 def measured(env_id, text=None, knowledge="model", episodes=200, **options):
     problem = problem_of(env_id, **options)
-    found = verify_once(problem, parse_conditions(text or problem.filter, problem), knowledge, samples=512)
+    found = verify_once(
+        problem, parse_conditions(text or problem.filter, problem), knowledge, samples=512
+    )
     return measure(found, episodes=episodes)
 
 
@@ -47,7 +49,8 @@ def test_the_product_bound_of_the_stochastic_dubins_is_contradicted(monkeypatch)
     assert (first.time, last.time) == (5.0, 150.0)
     assert first.contradicted == ()
     (product,) = [b for b in last.bounds if "product" in b.name]
-    # Radially inwards at the distance rho: b_0 = r^2 - rho^2 and b_1 = 2 v rho - 2 sigma^2, with r = 3 and v = 2.
+    # Radially inwards at the distance rho: b_0 = r^2 - rho^2 and b_1 = 2 v rho - 2 sigma^2, with r
+    # = 3 and v = 2.
     rho = np.linspace(0.0, 3.0, 100_001)
     largest = ((9 - rho**2) * (4 * rho - 0.32)).max() / ((9 - 0.08**2) * 11.68)
     assert product.value == pytest.approx(largest, rel=1e-5)
@@ -111,8 +114,12 @@ def test_progress_reaches_the_end():
 @pytest.mark.usefixtures("short")
 def test_starts_are_one_or_many():
     assert starts_of(problem_of(CUBIC_DISK)).shape == (bound_check.STARTS, 2)
-    np.testing.assert_array_equal(starts_of(problem_of(CUBIC_DISK, start="thesis-1")), [[-0.1, 0.7]])
-    assert not np.array_equal(starts_of(problem_of(CUBIC_DISK), seed=1), starts_of(problem_of(CUBIC_DISK)))
+    np.testing.assert_array_equal(
+        starts_of(problem_of(CUBIC_DISK, start="thesis-1")), [[-0.1, 0.7]]
+    )
+    assert not np.array_equal(
+        starts_of(problem_of(CUBIC_DISK), seed=1), starts_of(problem_of(CUBIC_DISK))
+    )
 
 
 def test_an_unknown_policy_is_an_error():
@@ -128,7 +135,9 @@ def test_the_upper_end_errs_as_seldom_as_it_says(trials, error):
     successes = np.arange(trials + 1)
     ends = np.array([bound_check._upper_end(int(s), trials, error) for s in successes])
     for unsafe in np.geomspace(1e-6, 0.5, 60):
-        assert binom.pmf(successes, trials, 1 - unsafe)[ends < 1 - unsafe].sum() <= error * (1 + 1e-9)
+        assert binom.pmf(successes, trials, 1 - unsafe)[ends < 1 - unsafe].sum() <= error * (
+            1 + 1e-9
+        )
     assert (np.diff(ends) > 0).all()
 
 

@@ -26,10 +26,14 @@ def test_minimum_has_the_law_of_a_brownian_bridge(before, after):
     dt, sigma, count = 0.05, 1.5, 20_000
     bridge = BrownianBridge(brownian(dt, 1.0, 0.0, sigma))
     first, last = (np.full((count, 1), value) for value in (before, after))
-    lowest = bridge.lowest((np.zeros(count),), first, last, np.random.default_rng(0).standard_exponential((count, 1)))
+    lowest = bridge.lowest(
+        (np.zeros(count),), first, last, np.random.default_rng(0).standard_exponential((count, 1))
+    )
 
     def law(y):
-        return np.where(y < min(before, after), np.exp(-2 * (before - y) * (after - y) / (sigma**2 * dt)), 1.0)
+        return np.where(
+            y < min(before, after), np.exp(-2 * (before - y) * (after - y) / (sigma**2 * dt)), 1.0
+        )
 
     assert kstest(lowest[:, 0], law).pvalue > 0.01
 
@@ -38,11 +42,23 @@ def test_variance_is_that_of_the_beginning_of_the_period():
     problem = load_problem("safe_envs/CubicSDE-v0", {"noise": 0.3})
     bridge, x = BrownianBridge(problem), (np.array([0.5, -1.0]), np.array([0.2, 0.8]))
     h = problem.barriers[0].expression
-    points: list[Any] = [dict(zip(problem.plant.states, point, strict=True)) for point in np.stack(x, axis=1)]
-    row = sp.Matrix([h]).jacobian(problem.plant.states) * problem.plant.numeric(problem.plant.diffusion)
+    points: list[Any] = [
+        dict(zip(problem.plant.states, point, strict=True)) for point in np.stack(x, axis=1)
+    ]
+    row = sp.Matrix([h]).jacobian(problem.plant.states) * problem.plant.numeric(
+        problem.plant.diffusion
+    )
     rate = [float((row * row.T)[0, 0].subs(point)) for point in points]
-    before, after, draws = np.array([[0.3], [0.2]]), np.array([[0.25], [0.4]]), np.array([[0.7], [1.1]])
-    wanted = 0.5 * (before + after - np.sqrt((after - before) ** 2 + 2 * np.array(rate)[:, None] * problem.dt * draws))
+    before, after, draws = (
+        np.array([[0.3], [0.2]]),
+        np.array([[0.25], [0.4]]),
+        np.array([[0.7], [1.1]]),
+    )
+    wanted = 0.5 * (
+        before
+        + after
+        - np.sqrt((after - before) ** 2 + 2 * np.array(rate)[:, None] * problem.dt * draws)
+    )
     assert bridge.lowest(x, before, after, draws) == pytest.approx(wanted)
     assert bridge.barriers(x)[:, 0] == pytest.approx([float(h.subs(point)) for point in points])
 
@@ -54,26 +70,49 @@ def test_discrete_rate_flatters_and_continuous_rate_is_exact(dt, episodes):
     problem = brownian(dt, horizon, drift, sigma)
     exact = 1 - first_passage(1.0, drift, sigma, horizon)
     seen = 1 - walk_passage(1.0, round(horizon / dt), drift * dt, sigma * math.sqrt(dt))
-    arguments = {"filters": ["none"], "episodes": episodes, "seed": 2, "confidence": 0.99, "bounds": False}
-    discrete, continuous = (evaluate(problem, monitoring=m, **arguments).rows[0] for m in ("discrete", "continuous"))
+    arguments = {
+        "filters": ["none"],
+        "episodes": episodes,
+        "seed": 2,
+        "confidence": 0.99,
+        "bounds": False,
+    }
+    discrete, continuous = (
+        evaluate(problem, monitoring=m, **arguments).rows[0] for m in ("discrete", "continuous")
+    )
     assert exact < discrete["ci_low"] < seen < discrete["ci_high"]
     assert continuous["ci_low"] < exact < continuous["ci_high"] < seen
 
 
 def test_control_and_noise_are_those_of_discrete_monitoring():
-    arguments = {"filters": ["none", "scbf"], "episodes": 150, "seed": 2, "bounds": False, "record": True}
+    arguments = {
+        "filters": ["none", "scbf"],
+        "episodes": 150,
+        "seed": 2,
+        "bounds": False,
+        "record": True,
+    }
     options = {"horizon": 1.0, "noise": 0.3, "dt": 0.05, "start": [-0.1, 0.5]}
-    discrete, continuous = (evaluate("CubicSDEDisk-v0", options=options, monitoring=m, **arguments) for m in ("discrete", "continuous"))
+    discrete, continuous = (
+        evaluate("CubicSDEDisk-v0", options=options, monitoring=m, **arguments)
+        for m in ("discrete", "continuous")
+    )
     for first, second in zip(discrete.rows, continuous.rows, strict=True):
         assert first["return_mean"] == second["return_mean"]
         assert second["safe"] < first["safe"]
         assert second["min_h_median"] < first["min_h_median"]
         assert second["curve"]["safe"][-1] == second["safe"]
         name = first["filter"]
-        assert discrete.recorders[name].barrier.tobytes() == continuous.recorders[name].barrier.tobytes()
+        assert (
+            discrete.recorders[name].barrier.tobytes()
+            == continuous.recorders[name].barrier.tobytes()
+        )
         # Whoever violates at an instant violates.
         assert continuous.flags[name][0].table(discrete.flags[name][0])[1] == 0
-    assert (discrete.config["monitoring"], continuous.config["monitoring"]) == ("discrete", "continuous")
+    assert (discrete.config["monitoring"], continuous.config["monitoring"]) == (
+        "discrete",
+        "continuous",
+    )
 
 
 def test_answer_is_the_same_for_every_num_envs():
@@ -102,7 +141,10 @@ def test_without_noise_in_h_nothing_changes_and_a_note_says_so():
     problem = load_problem("safe_envs/ACC-v0", {"noise": 0.0, "horizon": 1.0})
     (note,) = bridge_notes(problem)
     assert "no noise reaches" in note
-    rows = [evaluate(problem, filters=["none"], episodes=4, monitoring=m).rows for m in ("discrete", "continuous")]
+    rows = [
+        evaluate(problem, filters=["none"], episodes=4, monitoring=m).rows
+        for m in ("discrete", "continuous")
+    ]
     assert rows[0] == rows[1]
     assert bridge_notes(load_problem("safe_envs/ACC-v0")) == []
 
@@ -113,7 +155,14 @@ def test_several_barriers_have_bridges_of_their_own():
     problem = brownian(0.1, 1.0, 0.0, 0.5, [1 - X, 1 + X])
     (note,) = bridge_notes(problem)
     assert "independently" in note
-    row = evaluate(problem, filters=["none"], episodes=6000, monitoring="continuous", confidence=0.99, bounds=False).rows[0]
+    row = evaluate(
+        problem,
+        filters=["none"],
+        episodes=6000,
+        monitoring="continuous",
+        confidence=0.99,
+        bounds=False,
+    ).rows[0]
     assert row["ci_low"] < 1 - 2 * first_passage(1.0, 0.0, 0.5, 1.0) < row["ci_high"]
 
 

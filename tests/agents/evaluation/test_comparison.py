@@ -32,6 +32,9 @@ def test_flags_take_little_room():
 def test_each_filter_is_compared_with_those_before_it():
     values = {"a": [1, 1, 0, 0, 1], "b": [1, 0, 0, 1, 1], "c": [1, 1, 1, 1, 1]}
     flags = {name: [flags_of(np.array(v, dtype=bool), 2)] for name, v in values.items()}
-    found = [(c["first"], c["second"], c["only_first"], c["only_second"], c["difference"]) for c in compare_all(flags, 0.95)]
+    found = [
+        (c["first"], c["second"], c["only_first"], c["only_second"], c["difference"])
+        for c in compare_all(flags, 0.95)
+    ]
     assert found == [("b", "a", 1, 1, 0.0), ("c", "a", 2, 0, 0.4), ("c", "b", 2, 0, 0.4)]
     assert compare_all({"a": flags["a"]}, 0.95) == []

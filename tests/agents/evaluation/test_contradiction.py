@@ -22,19 +22,42 @@ from tests.oracles import false_bounds
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_envs.errors.SystemDefinitionWarning")
 FALSE = [
-    (false_bounds.kink, "szcbf:alphas=0.1", "h is not twice differentiable", "the interval of the measured rate ends at"),
-    (false_bounds.pole, "cbf:alpha=1", "h has a pole near", "the interval of the measured rate ends at"),
-    (false_bounds.island, "scbf", "no action meets the condition somewhere, by up to", "h reaches 28.66, above the supremum of 1 that"),
-    (false_bounds.rotated, "cbf:alpha=0.1", "no action meets the condition somewhere, by up to 0.", "the filter missed the condition by"),
+    (
+        false_bounds.kink,
+        "szcbf:alphas=0.1",
+        "h is not twice differentiable",
+        "the interval of the measured rate ends at",
+    ),
+    (
+        false_bounds.pole,
+        "cbf:alpha=1",
+        "h has a pole near",
+        "the interval of the measured rate ends at",
+    ),
+    (
+        false_bounds.island,
+        "scbf",
+        "no action meets the condition somewhere, by up to",
+        "h reaches 28.66, above the supremum of 1 that",
+    ),
+    (
+        false_bounds.rotated,
+        "cbf:alpha=0.1",
+        "no action meets the condition somewhere, by up to 0.",
+        "the filter missed the condition by",
+    ),
 ]
 HORIZON = 0.5
 
 
 @pytest.fixture
 def credulous(monkeypatch):
-    """A search that knows neither of poles and kinks nor of the starts, and that is cut short: it finds what was found before."""
+    """A search that knows neither of poles and kinks nor of the starts, and that is cut short: it
+    finds what was found before."""
     monkeypatch.setattr(safe_set_analysis, "roughness", lambda *_: "")
-    monkeypatch.setattr(safe_set_analysis.SafeSetAnalysis, "with_starts", lambda _, points, level: points)
+    monkeypatch.setattr(
+        safe_set_analysis.SafeSetAnalysis, "with_starts", lambda _, points, level: points
+    )
 
 
 @pytest.mark.parametrize(("make", "text", "reason"), [case[:3] for case in FALSE])
@@ -55,21 +78,32 @@ def test_what_the_search_misses_the_episodes_contradict(make, text, reason):
 
 
 def test_margins_of_first_order_that_conflict_leave_no_bound():
-    (row,) = evaluate(false_bounds.corridor(), filters="cbf:alpha=10:sampling_margin=first-order", episodes=2).rows
+    (row,) = evaluate(
+        false_bounds.corridor(), filters="cbf:alpha=10:sampling_margin=first-order", episodes=2
+    ).rows
     assert (row["infeasible_rate"], row["safe"]) == (1.0, 0)
-    assert (row["estimated_bound"], row["bound_note"]) == (None, "the shortfall of several conditions together is not established")
-    (plain,) = evaluate(false_bounds.corridor(), filters="cbf:alpha=10", episodes=2, options=None).rows
+    assert (row["estimated_bound"], row["bound_note"]) == (
+        None,
+        "the shortfall of several conditions together is not established",
+    )
+    (plain,) = evaluate(
+        false_bounds.corridor(), filters="cbf:alpha=10", episodes=2, options=None
+    ).rows
     assert plain["infeasible_rate"] == 0.0
 
 
-@pytest.mark.filterwarnings("ignore::safe_envs.wrappers.learning.identifiability.IdentifiabilityWarning")
+@pytest.mark.filterwarnings(
+    "ignore::safe_envs.wrappers.learning.identifiability.IdentifiabilityWarning"
+)
 def test_a_bound_over_a_posterior_sees_a_hidden_kink(monkeypatch):
     problem = false_bounds.kink()
     name = "bayesian-scbf:simultaneous=0.9"
     learned = identify(problem, starts=100, repetitions=30, degree=1)
     (row,) = evaluate(problem, filters=[name], learned=[learned], episodes=40).rows
     assert row["posterior_bound"]["probability"] is None
-    assert row["posterior_bound"]["note"].startswith("h is not twice differentiable, which Ito's formula asks for, near x = ")
+    assert row["posterior_bound"]["note"].startswith(
+        "h is not twice differentiable, which Ito's formula asks for, near x = "
+    )
     monkeypatch.setattr("safe_envs.wrappers.verification.posterior_bound.roughness", lambda *_: "")
     (row,) = evaluate(problem, filters=[name], learned=[learned], episodes=40).rows
     assert row["posterior_bound"]["probability"] is None
@@ -98,7 +132,9 @@ def test_a_verification_withholds_what_its_simulation_contradicts(monkeypatch):
         inside = found.survey.safe.points[:1]
         bounds = promise(found, inside, problem.duration)
         assert "estimated" in {bound.status for bound in bounds}
-        bounds, measurements = bound_check.judged(bounds, bound_check.measure(found, episodes=40), found)
+        bounds, measurements = bound_check.judged(
+            bounds, bound_check.measure(found, episodes=40), found
+        )
         assert all(bound.value is None for bound in bounds if bound.status == "withheld")
         assert {bound.status for bound in bounds} <= {"withheld", "hypothesis fails"}
         horizons = [bound for m in measurements for h in m.horizons for bound in h.bounds]
@@ -107,36 +143,67 @@ def test_a_verification_withholds_what_its_simulation_contradicts(monkeypatch):
 
 
 def test_a_start_above_a_supremum_withholds_at_once(monkeypatch):
-    monkeypatch.setattr(safe_set_analysis.SafeSetAnalysis, "with_starts", lambda _, points, level: points)
+    monkeypatch.setattr(
+        safe_set_analysis.SafeSetAnalysis, "with_starts", lambda _, points, level: points
+    )
     problem = false_bounds.island()
     found = verify(problem, parse_conditions("scbf", problem), samples=512)
     bounds = promise(found, np.array([[1.5, 0.3]]), HORIZON)
     assert {bound.status for bound in bounds} == {"hypothesis fails", "withheld"}
-    assert all("above the supremum" in bound.reason for bound in bounds if bound.status == "withheld")
+    assert all(
+        "above the supremum" in bound.reason for bound in bounds if bound.status == "withheld"
+    )
 
 
 def test_a_rate_with_a_smaller_period_withholds_too():
-    row = {"filter": "scbf", "estimated_bound": 0.5, "bound_note": "", "posterior_bound": None, "withheld": None}
-    finer = [SimpleNamespace(rows=[{"filter": "none", "ci_high": 0.1}, {"filter": "scbf", "ci_high": high}]) for high in (0.6, 0.4)]
+    row = {
+        "filter": "scbf",
+        "estimated_bound": 0.5,
+        "bound_note": "",
+        "posterior_bound": None,
+        "withheld": None,
+    }
+    finer = [
+        SimpleNamespace(
+            rows=[{"filter": "none", "ci_high": 0.1}, {"filter": "scbf", "ci_high": high}]
+        )
+        for high in (0.6, 0.4)
+    ]
     assert refinement._judged(row, finer[:1]) == row
-    assert refinement._judged(row, finer)["withheld"].startswith("the interval of the measured rate ends at 40.0 %, below 50.0 %")
+    assert refinement._judged(row, finer)["withheld"].startswith(
+        "the interval of the measured rate ends at 40.0 %, below 50.0 %"
+    )
 
 
 def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch):
-    """h = 1 + x and b_1 = v + .1 h: a start with a large v brakes, so that no later state has as large a b_1."""
+    """h = 1 + x and b_1 = v + .1 h: a start with a large v brakes, so that no later state has as
+    large a b_1."""
     x, v, u = sp.symbols("x v u", real=True)
     system = ControlAffineSDE.from_rate((x, v), (u,), [v, u], diffusion=[0, 0.01])
     problem = state_problem(
-        system, [1 + x], box=(-9, 9), workspace={x: (-1, 1), v: (-1, 1)}, start=(0.0, 0.9), dt=0.05, horizon=1.0, nominal=-5
+        system,
+        [1 + x],
+        box=(-9, 9),
+        workspace={x: (-1, 1), v: (-1, 1)},
+        start=(0.0, 0.9),
+        dt=0.05,
+        horizon=1.0,
+        nominal=-5,
     )
     (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
-    assert (row["estimated_bound"], row["withheld"]) == (pytest.approx((1 / 2 + 1 / 1.2) * np.exp(-0.1) - 1, abs=1e-3), None)
+    assert (row["estimated_bound"], row["withheld"]) == (
+        pytest.approx((1 / 2 + 1 / 1.2) * np.exp(-0.1) - 1, abs=1e-3),
+        None,
+    )
     monkeypatch.setattr(safe_set_analysis.SafeSetAnalysis, "suprema", np.array([2.0, 0.8]))
     (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
     assert row["withheld"] == "b_1 reaches 1, above the supremum of 0.8 that the search found"
 
 
-@pytest.mark.parametrize(("bound", "high", "reason"), [(0.5, 0.5, ""), (0.5, 0.49, "ends at 49.0 %, below 50.0 %"), (None, 0.1, "")])
+@pytest.mark.parametrize(
+    ("bound", "high", "reason"),
+    [(0.5, 0.5, ""), (0.5, 0.49, "ends at 49.0 %, below 50.0 %"), (None, 0.1, "")],
+)
 def test_an_interval_contradicts_a_bound_that_is_wholly_above_it(bound, high, reason):
     assert reason in by_rate(bound, high)
     assert bool(by_rate(bound, high)) == bool(reason)
@@ -146,7 +213,16 @@ def test_an_interval_contradicts_a_bound_that_is_wholly_above_it(bound, high, re
 
 def test_a_posterior_keeps_its_numbers_where_its_bound_is_withheld():
     bound = {"probability": 0.9, "note": "", "delta": 0.1}
-    row = {"estimated_bound": None, "bound_note": "learned", "posterior_bound": bound, "withheld": None}
+    row = {
+        "estimated_bound": None,
+        "bound_note": "learned",
+        "posterior_bound": bound,
+        "withheld": None,
+    }
     found = judged(row, 0.2)
-    assert found["posterior_bound"] == {"probability": None, "note": f"withheld: {found['withheld']}", "delta": 0.1}
+    assert found["posterior_bound"] == {
+        "probability": None,
+        "note": f"withheld: {found['withheld']}",
+        "delta": 0.1,
+    }
     assert found["bound_note"] == "learned"

@@ -32,7 +32,13 @@ def test_the_filter_of_the_spec_makes_the_difference():
 
 def test_the_rate_is_that_of_episodes_played_by_hand():
     (row,) = evaluate("Pendulum-v1", "zero", ["cbf:alpha=1"], **FEW).rows
-    env = SafetyFilterWrapper(gym.make("Pendulum-v1"), "cbf:alpha=1", model=SPEC.model, barriers=SPEC.barriers, state_fn=SPEC.state_fn)
+    env = SafetyFilterWrapper(
+        gym.make("Pendulum-v1"),
+        "cbf:alpha=1",
+        model=SPEC.model,
+        barriers=SPEC.barriers,
+        state_fn=SPEC.state_fn,
+    )
     from safe_envs.agents.evaluation.rollout import episode_seed
 
     smallest, returns = [], []
@@ -57,7 +63,13 @@ def test_the_answer_does_not_depend_on_the_size_of_the_batch(policy):
 
 
 def test_an_agent_of_stable_baselines3_is_evaluated_behind_the_filter(tmp_path):
-    env = SafetyFilterWrapper(gym.make("Pendulum-v1"), SPEC.filter, model=SPEC.model, barriers=SPEC.barriers, state_fn=SPEC.state_fn)
+    env = SafetyFilterWrapper(
+        gym.make("Pendulum-v1"),
+        SPEC.filter,
+        model=SPEC.model,
+        barriers=SPEC.barriers,
+        state_fn=SPEC.state_fn,
+    )
     model = PPO("MlpPolicy", env, n_steps=128, batch_size=64, n_epochs=1, seed=0, device="cpu")
     model.learn(128)
     model.save(tmp_path / "agent.zip")
@@ -90,15 +102,22 @@ def test_inverted_pendulum_of_mujoco_where_it_is_installed():
 
     from safe_envs import ControlAffineSDE
 
-    # The mass of the cart and the pole make an input of 1 (times the gear of 100 N) accelerate the cart by about 9.8 m/s^2.
+    # The mass of the cart and the pole make an input of 1 (times the gear of 100 N) accelerate the
+    # cart by about 9.8 m/s^2.
     q, angle, v, w, a = sp.symbols("q angle v w a", real=True)
-    model = ControlAffineSDE((q, angle, v, w), (a,), [v, w, 0, 24 * angle], [0, 0, 9.8, -22.0], [0, 0, 0, 0])
+    model = ControlAffineSDE(
+        (q, angle, v, w), (a,), [v, w, 0, 24 * angle], [0, 0, 9.8, -22.0], [0, 0, 0, 0]
+    )
     spec = FilterSpec(model, 0.15**2 - angle**2, lambda o: o[..., :4], gains=(6.0, 6.0))
     bare, filtered = evaluate("InvertedPendulum-v5", "zero", spec=spec, episodes=3).rows
     assert filtered["min_h_median"] > bare["min_h_median"]
 
 
 def test_the_command_prints_the_table():
-    result = CliRunner().invoke(app, ["evaluate", "Pendulum-v1", "--filter-spec", PLACE, "--episodes", "2"])
+    result = CliRunner().invoke(
+        app, ["evaluate", "Pendulum-v1", "--filter-spec", PLACE, "--episodes", "2"]
+    )
     assert result.exit_code == 0, result.output
-    assert f"seen through {PLACE}, dt = 0.05 s, horizon 10 s; filters know the model" in result.output
+    assert (
+        f"seen through {PLACE}, dt = 0.05 s, horizon 10 s; filters know the model" in result.output
+    )

@@ -9,15 +9,31 @@ import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate, load_problem
-from safe_envs.agents.evaluation.statistics import mcnemar_p, paired_difference_interval, rate_interval
+from safe_envs.agents.evaluation.statistics import (
+    mcnemar_p,
+    paired_difference_interval,
+    rate_interval,
+)
 
 pytestmark = pytest.mark.slow
 
 
 def test_comparisons_are_of_the_same_episodes():
     filters = ["none", "hocbf:p=1,2", "scbf"]
-    arguments = {"options": {"horizon": 4.0, "noise": 0.4}, "episodes": 150, "seed": 4, "bounds": False}
-    answer = evaluate("StochasticDubins-v0", filters=filters, num_envs=64, record=True, confidence=0.9, **arguments)
+    arguments = {
+        "options": {"horizon": 4.0, "noise": 0.4},
+        "episodes": 150,
+        "seed": 4,
+        "bounds": False,
+    }
+    answer = evaluate(
+        "StochasticDubins-v0",
+        filters=filters,
+        num_envs=64,
+        record=True,
+        confidence=0.9,
+        **arguments,
+    )
     safe = {name: (answer.recorders[name].barrier > 0).all(axis=0) for name in filters}
     assert [(c["first"], c["second"]) for c in answer.comparisons] == [
         ("hocbf:p=1,2", "none"),
@@ -38,7 +54,10 @@ def test_comparisons_are_of_the_same_episodes():
 
 def test_confidence_is_that_of_every_interval():
     options = {"horizon": 1.0, "noise": 0.5}
-    narrow, wide = (evaluate("Scalar-v0", filters=["none", "scbf"], options=options, episodes=200, confidence=c) for c in (0.5, 0.999))
+    narrow, wide = (
+        evaluate("Scalar-v0", filters=["none", "scbf"], options=options, episodes=200, confidence=c)
+        for c in (0.5, 0.999)
+    )
     assert (narrow.config["confidence"], wide.config["confidence"]) == (0.5, 0.999)
     for a, b in zip(narrow.rows, wide.rows, strict=True):
         assert (a["ci_low"], a["ci_high"]) == rate_interval(a["safe"], 200, 0.5)
@@ -50,21 +69,43 @@ def test_confidence_is_that_of_every_interval():
 
 def test_episodes_that_are_all_safe_have_the_exact_interval():
     (row,) = evaluate("ACC-v0", filters=["scbf"], options={"horizon": 0.2}, episodes=1000).rows
-    assert (row["safe"], row["ci_low"], row["ci_high"]) == (1000, pytest.approx(0.025 ** (1 / 1000)), 1.0)
+    assert (row["safe"], row["ci_low"], row["ci_high"]) == (
+        1000,
+        pytest.approx(0.025 ** (1 / 1000)),
+        1.0,
+    )
 
 
 def test_a_filter_that_never_acts_leaves_everything_as_it_is():
     options = {"horizon": 3.0, "noise": 1.5}
-    answer = evaluate("ACC-v0", "random", ["none", "cbf:alpha=50"], options=options, episodes=40, num_envs=16, record=True)
+    answer = evaluate(
+        "ACC-v0",
+        "random",
+        ["none", "cbf:alpha=50"],
+        options=options,
+        episodes=40,
+        num_envs=16,
+        record=True,
+    )
     bare, filtered = answer.rows
     assert (bare["intervention_rate"], filtered["intervention_rate"]) == (0.0, 0.0)
     alike = {"filter": "", "bound_note": "", "outside_rate": None}
     assert {**bare, **alike} == {**filtered, **alike}
-    np.testing.assert_array_equal(answer.recorders["none"].states, answer.recorders["cbf:alpha=50"].states)
+    np.testing.assert_array_equal(
+        answer.recorders["none"].states, answer.recorders["cbf:alpha=50"].states
+    )
 
 
 def test_filters_see_the_same_episodes_until_they_act():
-    answer = evaluate("StochasticDubins-v0", "random", ["none", "hocbf"], episodes=30, options={"horizon": 2.0}, record=True, bounds=False)
+    answer = evaluate(
+        "StochasticDubins-v0",
+        "random",
+        ["none", "hocbf"],
+        episodes=30,
+        options={"horizon": 2.0},
+        record=True,
+        bounds=False,
+    )
     bare, filtered = (answer.recorders[name].states for name in ("none", "hocbf"))
     np.testing.assert_array_equal(bare[0], filtered[0])
     parted = (bare != filtered).any(axis=2)
@@ -78,7 +119,11 @@ def test_a_filter_may_have_a_condition_for_each_barrier():
     disk = problem.barriers[0]
     wall = replace(disk, name="wall", expression=1 - problem.plant.states[0])
     problem = replace(problem, barriers=(disk, wall))
-    filters = ["hocbf:p=1.0,1.0+hocbf:p=2.0,8.0", "hocbf:p=2.0,8.0+hocbf:p=1.0,1.0", "hocbf:p=2.0,8.0"]
+    filters = [
+        "hocbf:p=1.0,1.0+hocbf:p=2.0,8.0",
+        "hocbf:p=2.0,8.0+hocbf:p=1.0,1.0",
+        "hocbf:p=2.0,8.0",
+    ]
     answer = evaluate(problem, filters=filters, episodes=30)
     assert [f["spec"] for f in answer.config["filters"]] == filters
     assert len({row["effort_mean"] for row in answer.rows}) == 3

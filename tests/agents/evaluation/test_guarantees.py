@@ -14,13 +14,25 @@ from safe_envs.agents.evaluation.guarantees import together
 @pytest.fixture(scope="module")
 def falling():
     x, v, u, sigma = sp.symbols("x v u sigma", real=True)
-    system = ControlAffineSDE.from_rate((x, v), (u,), [v, u], diffusion=[0, sigma], parameters={sigma: 0.1})
+    system = ControlAffineSDE.from_rate(
+        (x, v), (u,), [v, u], diffusion=[0, sigma], parameters={sigma: 0.1}
+    )
     return state_problem(
-        system, [1.0 * x, 1 - 0.5 * x], box=(-5.0, 5.0), start=[(-0.2, 1.0), (-3.0, 1.0)], dt=0.05, horizon=0.1, nominal=0, gains=(2.0, 2.0)
+        system,
+        [1.0 * x, 1 - 0.5 * x],
+        box=(-5.0, 5.0),
+        start=[(-0.2, 1.0), (-3.0, 1.0)],
+        dt=0.05,
+        horizon=0.1,
+        nominal=0,
+        gains=(2.0, 2.0),
     )
 
 
-@pytest.mark.parametrize(("name", "p"), [("scbf", 0.0), ("szcbf:alphas=1,1", 1.0), ("hocbf:p=3,1", 3.0), ("ecbf:poles=-4,-2", 2.0)])
+@pytest.mark.parametrize(
+    ("name", "p"),
+    [("scbf", 0.0), ("szcbf:alphas=1,1", 1.0), ("hocbf:p=3,1", 3.0), ("ecbf:poles=-4,-2", 2.0)],
+)
 def test_starts_outside_the_kept_sets_are_counted(falling, name, p):
     answer = evaluate(falling, filters=name, episodes=100, num_envs=64, record=True)
     (row,) = answer.rows
@@ -34,7 +46,9 @@ def test_starts_outside_the_kept_sets_are_counted(falling, name, p):
 
 
 def test_where_there_is_no_chain_no_start_is_outside_of_it():
-    bare, scbf = evaluate("Scalar-v0", filters=["none", "scbf"], episodes=5, options={"horizon": 0.1}).rows
+    bare, scbf = evaluate(
+        "Scalar-v0", filters=["none", "scbf"], episodes=5, options={"horizon": 0.1}
+    ).rows
     assert bare["outside_rate"] is None
     assert scbf["outside_rate"] == 0.0
 

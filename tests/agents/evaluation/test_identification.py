@@ -1,4 +1,5 @@
-"""Evaluations of filters that rest on something learned: once or several times, from files or from memory."""
+"""Evaluations of filters that rest on something learned: once or several times, from files or from
+memory."""
 
 from __future__ import annotations
 
@@ -56,13 +57,19 @@ def test_each_repeat_has_a_seed_of_its_own(posterior):
     assert len(set(seeds)) == 4
     assert len({model.mean.tobytes() for model in found}) == 4
     # Evaluations with other seeds have other ones.
-    assert not set(seeds) & {Learning(DISK, LEARNED, (), 4, seed)._child(repeat) for seed in range(1, 50) for repeat in range(4)}
+    assert not set(seeds) & {
+        Learning(DISK, LEARNED, (), 4, seed)._child(repeat)
+        for seed in range(1, 50)
+        for repeat in range(4)
+    }
 
 
 def test_what_is_given_is_not_learned(posterior, tmp_path):
     posterior.save(tmp_path / "disk.npz")
     for given in (posterior, tmp_path / "disk.npz", str(tmp_path / "disk.npz")):
-        learning = Learning(DISK, [*LEARNED, "scbf", "ddscbf", "ddscbf+bayesian-scbf"], [given], 5, 0)
+        learning = Learning(
+            DISK, [*LEARNED, "scbf", "ddscbf", "ddscbf+bayesian-scbf"], [given], 5, 0
+        )
         assert {method for method, _ in learning.missing()} == {"ddscbf"}
         assert learning.repeats("bayesian-scbf") == learning.repeats("scbf") == 1
         assert learning.repeats("ddscbf") == learning.repeats("ddscbf+bayesian-scbf") == 5
@@ -75,7 +82,9 @@ def test_what_does_not_fit_is_refused(posterior):
         Learning(DISK, LEARNED, [posterior, posterior], 1, 0)
     with pytest.raises(LearnedFileError, match="Pendulum"):
         Learning(load_problem("Pendulum-v0"), LEARNED, [posterior], 1, 0)
-    with pytest.raises(ConfigurationError, match="holds bayesian, on which no filter rests; add bayesian-scbf"):
+    with pytest.raises(
+        ConfigurationError, match="holds bayesian, on which no filter rests; add bayesian-scbf"
+    ):
         Learning(DISK, ["scbf", "ddscbf"], [posterior], 1, 0)
     for names, given in ((["scbf"], ()), (LEARNED, [posterior])):
         with pytest.raises(ConfigurationError, match="repeats = 2, but nothing is learned anew"):
@@ -104,7 +113,11 @@ def test_the_filter_from_a_file_gives_the_same_as_from_memory(posterior, tmp_pat
         assert all(other == first for other in others)
     assert [row["learning"]["files"] for row in file.rows] == [[str(tmp_path / "disk.npz")]] * 2
     assert [row["learning"]["files"] for row in memory.rows] == [[]] * 2
-    assert file.rows[0]["learning"]["sha256"] == memory.rows[0]["learning"]["sha256"] == [posterior.sha256]
+    assert (
+        file.rows[0]["learning"]["sha256"]
+        == memory.rows[0]["learning"]["sha256"]
+        == [posterior.sha256]
+    )
 
 
 @pytest.mark.parametrize(
@@ -118,12 +131,18 @@ def test_the_filter_from_a_file_gives_the_same_as_from_memory(posterior, tmp_pat
         ("CubicSDEDisk-v0", "bayesian-scbf:simultaneous=0.9", {"starts": 100}),
     ],
 )
-def test_the_answer_is_the_same_for_every_num_envs_and_from_a_file(env_id, name, settings, tmp_path):
+def test_the_answer_is_the_same_for_every_num_envs_and_from_a_file(
+    env_id, name, settings, tmp_path
+):
     problem = load_problem(env_id, {"horizon": 0.2})
-    model = learner_of("bayesian" if name.startswith("bayesian") else name)(problem, seed=1, **settings)
+    model = learner_of("bayesian" if name.startswith("bayesian") else name)(
+        problem, seed=1, **settings
+    )
     model.save(tmp_path / "model.npz")
     rows = [
-        evaluate(problem, filters=[name], episodes=3, num_envs=num_envs, bounds=False, learned=[given]).rows[0]
+        evaluate(
+            problem, filters=[name], episodes=3, num_envs=num_envs, bounds=False, learned=[given]
+        ).rows[0]
         for num_envs, given in ((1, model), (2, model), (3, tmp_path / "model.npz"))
     ]
     first, *others = ({k: v for k, v in row.items() if k != "learning"} for row in rows)
@@ -138,7 +157,11 @@ def test_rows_of_repeats_are_sums_means_and_wider_intervals(repeated):
             assert row == single
             continue
         learning = row["learning"]
-        assert (learning["repeats"], len(learning["seeds"]), len(set(learning["sha256"]))) == (3, 3, 3)
+        assert (learning["repeats"], len(learning["seeds"]), len(set(learning["sha256"]))) == (
+            3,
+            3,
+            3,
+        )
         assert row["episodes"] == 120
         assert row["safe"] == round(40 * sum(learning["rates"]))
         assert row["safety_rate"] == pytest.approx(np.mean(learning["rates"]))
@@ -175,7 +198,8 @@ def test_bounds_over_posteriors_stand_beside_the_rates():
     assert plain["posterior_bound"] is None
     assert "its bound over the posterior" in row["bound_note"]
     assert row["posterior_bound"]["delta"] == pytest.approx(0.1)
-    # (1 - delta)(h_0 - m T)/c, of h = 1 - x_1^2 - x_2^2 with c = 1, for the mean m of both identifications.
+    # (1 - delta)(h_0 - m T)/c, of h = 1 - x_1^2 - x_2^2 with c = 1, for the mean m of both
+    # identifications.
     expected = 0.9 * (1 - 0.1**2 - 0.7**2 - row["posterior_bound"]["shortfall"] * DISK.horizon)
     assert row["posterior_bound"]["supremum"] == pytest.approx(1.0, abs=1e-6)
     assert row["posterior_bound"]["probability"] == pytest.approx(expected, abs=1e-6)
@@ -184,7 +208,15 @@ def test_bounds_over_posteriors_stand_beside_the_rates():
 
 def test_progress_goes_from_the_learning_to_the_end():
     told = []
-    evaluate(DISK, filters=["scbf", "bayesian-scbf"], episodes=8, num_envs=4, repeats=2, progress=told.append, bounds=False)
+    evaluate(
+        DISK,
+        filters=["scbf", "bayesian-scbf"],
+        episodes=8,
+        num_envs=4,
+        repeats=2,
+        progress=told.append,
+        bounds=False,
+    )
     assert told == sorted(told)
     assert told[-1] == pytest.approx(1.0)
     assert sum(0 < part <= 2 / 5 for part in told) >= 2  # two of five parts are the learning
@@ -197,14 +229,27 @@ def test_what_does_not_fit_the_heading_is_remarked(tmp_path):
     for given in (model, tmp_path / "gap.npz"):
         for knowledge in ("model", "plant"):
             found = evaluate(
-                "ACCGap-v0", filters=["ddscbf"], options=louder, episodes=4, learned=[given], knowledge=knowledge, bounds=False
+                "ACCGap-v0",
+                filters=["ddscbf"],
+                options=louder,
+                episodes=4,
+                learned=[given],
+                knowledge=knowledge,
+                bounds=False,
             )
             noise, *known = found.rows[0]["learning"]["remarks"]
-            assert re.fullmatch(r"it was learned of a plant with sigma_1 = .* \(here 0.3\), .*", noise)
+            assert re.fullmatch(
+                r"it was learned of a plant with sigma_1 = .* \(here 0.3\), .*", noise
+            )
             assert bool(known) == (knowledge == "plant")
     assert (
-        evaluate("ACCGap-v0", filters=["ddscbf"], options={"horizon": 0.5}, episodes=4, learned=[model], bounds=False).rows[0]["learning"][
-            "remarks"
-        ]
+        evaluate(
+            "ACCGap-v0",
+            filters=["ddscbf"],
+            options={"horizon": 0.5},
+            episodes=4,
+            learned=[model],
+            bounds=False,
+        ).rows[0]["learning"]["remarks"]
         == []
     )

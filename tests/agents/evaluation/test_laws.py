@@ -20,13 +20,24 @@ pytestmark = pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "tolerance"), [("policy", 0.999), ("filter", 0.999)])
 def test_gaussian_law_of_adaptive_cruise_control(scheme, tolerance):
-    # A h = 0 makes h_t = h_0 - tau sigma_1 W_t; an Euler-Maruyama step keeps that exactly. In one case a policy holds
-    # A h at 0, in the other the scbf holds a policy back that only wants to drive faster.
+    # A h = 0 makes h_t = h_0 - tau sigma_1 W_t; an Euler-Maruyama step keeps that exactly. In one
+    # case a policy holds A h at 0, in the other the scbf holds a policy back that only wants to
+    # drive faster.
     tau, sigma, dt, horizon, distance = 1.8, 1.0, 0.05, 10.0, 5.0
-    options = {"start": [15.0, 20.0, tau * 15 + distance], "box": [-1e5, 1e5], "horizon": horizon, "noise": sigma, "dt": dt}
+    options = {
+        "start": [15.0, 20.0, tau * 15 + distance],
+        "box": [-1e5, 1e5],
+        "horizon": horizon,
+        "noise": sigma,
+        "dt": dt,
+    }
     problem = load_problem("ACC-v0", options)
-    policy, filters = (Levelling(problem, tau), ["none"]) if scheme == "policy" else (Constant(1.0), ["scbf"])
-    (row,) = evaluate("ACC-v0", policy, filters, options=options, episodes=6000, seed=1, bounds=False).rows
+    policy, filters = (
+        (Levelling(problem, tau), ["none"]) if scheme == "policy" else (Constant(1.0), ["scbf"])
+    )
+    (row,) = evaluate(
+        "ACC-v0", policy, filters, options=options, episodes=6000, seed=1, bounds=False
+    ).rows
     deviation = tau * sigma * math.sqrt(horizon)
     shifted = 1 - 2 * norm.cdf(-(distance + 0.5826 * tau * sigma * math.sqrt(dt)) / deviation)
     low, high = wilson_interval(row["safe"], row["episodes"], tolerance)
@@ -36,7 +47,9 @@ def test_gaussian_law_of_adaptive_cruise_control(scheme, tolerance):
     assert low <= exact <= high
     # The distribution of the smallest h, from the same law at other levels.
     for key, level in (("min_h_median", 0.5), ("min_h_p05", 0.05)):
-        below = 2 * norm.cdf(-(distance - row[key] + 0.5826 * tau * sigma * math.sqrt(dt)) / deviation)
+        below = 2 * norm.cdf(
+            -(distance - row[key] + 0.5826 * tau * sigma * math.sqrt(dt)) / deviation
+        )
         assert below == pytest.approx(level, abs=4.0 * math.sqrt(level * (1 - level) / 6000))
     if scheme == "filter":
         assert (row["intervention_rate"], row["infeasible_rate"]) == (1.0, 0.0)
@@ -44,16 +57,30 @@ def test_gaussian_law_of_adaptive_cruise_control(scheme, tolerance):
 
 @pytest.mark.slow
 def test_law_of_the_scalar_system():
-    # The nominal controller makes dh = -h dt + sigma dW, symmetric about the edge: P(safe) = 2 Phi(mean/deviation) - 1
-    # in continuous time by reflection, and by quadrature at the control instants.
+    # The nominal controller makes dh = -h dt + sigma dW, symmetric about the edge: P(safe) = 2
+    # Phi(mean/deviation) - 1 in continuous time by reflection, and by quadrature at the control
+    # instants.
     sigma, dt, horizon, distance = 0.8, 0.01, 0.6, 0.5
-    options = {"start": [1 - distance], "noise": sigma, "horizon": horizon, "dt": dt, "box": [-100.0, 100.0]}
-    (row,) = evaluate("Scalar-v0", filters=["none"], options=options, episodes=8000, seed=2, bounds=False).rows
-    mean, deviation = distance * math.exp(-horizon), sigma * math.sqrt((1 - math.exp(-2 * horizon)) / 2)
+    options = {
+        "start": [1 - distance],
+        "noise": sigma,
+        "horizon": horizon,
+        "dt": dt,
+        "box": [-100.0, 100.0],
+    }
+    (row,) = evaluate(
+        "Scalar-v0", filters=["none"], options=options, episodes=8000, seed=2, bounds=False
+    ).rows
+    mean, deviation = (
+        distance * math.exp(-horizon),
+        sigma * math.sqrt((1 - math.exp(-2 * horizon)) / 2),
+    )
     continuous = 2 * norm.cdf(mean / deviation) - 1
     exact = survival(distance, round(horizon / dt), 1 - dt, sigma * math.sqrt(dt))
     assert continuous < exact < continuous + 0.1
-    assert survival(distance, 6 * 60, 1 - dt / 6, sigma * math.sqrt(dt / 6)) == pytest.approx(continuous, abs=0.03)
+    assert survival(distance, 6 * 60, 1 - dt / 6, sigma * math.sqrt(dt / 6)) == pytest.approx(
+        continuous, abs=0.03
+    )
     low, high = wilson_interval(row["safe"], row["episodes"], 0.999)
     assert low <= exact <= high
 

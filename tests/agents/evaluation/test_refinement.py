@@ -21,12 +21,22 @@ SCALAR = {"start": [0.5], "noise": 0.8, "box": [-100.0, 100.0]}
 @pytest.mark.slow
 def test_rates_are_those_of_evaluations_with_smaller_periods():
     options = {"horizon": 1.0, "noise": 0.4, "dt": 0.1}
-    answer = refine("StochasticDubins-v0", filters=["none", "scbf"], options=options, episodes=24, seed=2, confidence=0.8, num_envs=16)
+    answer = refine(
+        "StochasticDubins-v0",
+        filters=["none", "scbf"],
+        options=options,
+        episodes=24,
+        seed=2,
+        confidence=0.8,
+        num_envs=16,
+    )
     assert answer.periods == [0.1, 0.05, 0.025]
     assert [e.problem.steps for e in answer.evaluations] == [10, 20, 40]
     for i, dt in enumerate(answer.periods):
         arguments = {"options": {**options, "dt": dt}, "episodes": 24, "seed": 2, "confidence": 0.8}
-        wanted = evaluate("StochasticDubins-v0", filters=["none", "scbf"], bounds=i == 0, **arguments)
+        wanted = evaluate(
+            "StochasticDubins-v0", filters=["none", "scbf"], bounds=i == 0, **arguments
+        )
         assert wanted.rows == answer.evaluations[i].rows
         for row, refined in zip(wanted.rows, answer.rows, strict=True):
             assert refined["filter"] == row["filter"]
@@ -34,7 +44,11 @@ def test_rates_are_those_of_evaluations_with_smaller_periods():
                 assert refined[key][i] == row[key]
     for row in answer.rows:
         assert row["change"] == pytest.approx((row["safe"][2] - row["safe"][1]) / 24)
-        table = answer.evaluations[2].flags[row["filter"]][0].table(answer.evaluations[1].flags[row["filter"]][0])
+        table = (
+            answer.evaluations[2]
+            .flags[row["filter"]][0]
+            .table(answer.evaluations[1].flags[row["filter"]][0])
+        )
         assert table[0] + table[1] == row["safe"][2]
         assert table[0] + table[2] == row["safe"][1]
         assert (row["change_low"], row["change_high"]) == paired_difference_interval(*table, 0.8)
@@ -101,7 +115,13 @@ def test_document_is_that_of_the_given_period_and_the_refinement():
 
 def test_progress_goes_over_all_three():
     told = []
-    refine("Scalar-v0", filters=["none", "scbf"], episodes=3, options={"horizon": 0.05}, progress=told.append)
+    refine(
+        "Scalar-v0",
+        filters=["none", "scbf"],
+        episodes=3,
+        options={"horizon": 0.05},
+        progress=told.append,
+    )
     assert told == sorted(told)
     assert 0.0 < told[0] < 0.05
     assert told[-1] == 1.0
@@ -110,6 +130,11 @@ def test_progress_goes_over_all_three():
 
 
 def test_errors_are_those_of_an_evaluation():
-    for arguments in ({"episodes": 0}, {"confidence": 2}, {"filters": ["scb"]}, {"options": {"dt": 5e-324, "horizon": 5e-324}}):
+    for arguments in (
+        {"episodes": 0},
+        {"confidence": 2},
+        {"filters": ["scb"]},
+        {"options": {"dt": 5e-324, "horizon": 5e-324}},
+    ):
         with pytest.raises(ConfigurationError):
             refine("Scalar-v0", **arguments)

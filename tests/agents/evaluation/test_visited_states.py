@@ -14,7 +14,8 @@ EPISODES, STEPS = 90, 4
 
 
 def watched(x, slack, h):
-    """What a watch keeps of episodes, from states (STEPS + 1, 2, B), slacks (STEPS, B) and h (STEPS + 1, B)."""
+    """What a watch keeps of episodes, from states (STEPS + 1, 2, B), slacks (STEPS, B) and h (STEPS
+    + 1, B)."""
     watch, safe, h_min = Watch(tuple(x[0]), h[0], 1), h[0] > 0, h[0].copy()
     alive = np.ones(len(h_min), dtype=bool)
     for k in range(STEPS):
@@ -26,7 +27,11 @@ def watched(x, slack, h):
 
 
 @settings(max_examples=40)
-@given(seed=st.integers(0, 2**32 - 1), size=st.integers(1, EPISODES), missing=st.sampled_from([0.0, 0.5, 0.95, 1.0]))
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    size=st.integers(1, EPISODES),
+    missing=st.sampled_from([0.0, 0.5, 0.95, 1.0]),
+)
 def test_waves_of_any_size_keep_the_same(seed, size, missing):
     rng = np.random.default_rng(seed)
     x, h = rng.normal(size=(STEPS + 1, 2, EPISODES)), rng.normal(size=(STEPS + 1, EPISODES)) + 1.0
@@ -34,7 +39,10 @@ def test_waves_of_any_size_keep_the_same(seed, size, missing):
     whole = watched(x, slack, h)
     found = whole.seen(EPISODES)
     parts = [slice(i, min(i + size, EPISODES)) for i in range(0, EPISODES, size)]
-    waves = [watched(x[..., part], slack[:, part], h[:, part]).seen(part.stop - part.start) for part in parts]
+    waves = [
+        watched(x[..., part], slack[:, part], h[:, part]).seen(part.stop - part.start)
+        for part in parts
+    ]
     joined = reduce(Seen.joined, waves)
     for one, other in zip(vars(found).values(), vars(joined).values(), strict=True):
         np.testing.assert_array_equal(one, other)
@@ -47,7 +55,12 @@ def test_waves_of_any_size_keep_the_same(seed, size, missing):
         k, i = np.argwhere(missed == size_of)[0]
         np.testing.assert_array_equal(state, x[k, :, i])
         assert action == x[k, 0, i] - x[k, 1, i]
-    depth = np.where(np.concatenate([np.ones((1, EPISODES), dtype=bool), safe[:-1]]), h, -np.inf).max(axis=0)
+    depth = np.where(
+        np.concatenate([np.ones((1, EPISODES), dtype=bool), safe[:-1]]), h, -np.inf
+    ).max(axis=0)
     np.testing.assert_array_equal(found.depth, np.sort(depth)[::-1][:64])
     violated = np.flatnonzero(h.min(axis=0) <= 0)
-    np.testing.assert_array_equal(whole.lowest.T[violated], [x[h[:, i].argmin(), :, i] for i in violated.tolist()] or np.empty((0, 2)))
+    np.testing.assert_array_equal(
+        whole.lowest.T[violated],
+        [x[h[:, i].argmin(), :, i] for i in violated.tolist()] or np.empty((0, 2)),
+    )

@@ -1,4 +1,5 @@
-"""Sweeps over real processes, some of which end in the middle: on this machine, on a Dask scheduler, and on a Ray cluster."""
+"""Sweeps over real processes, some of which end in the middle: on this machine, on a Dask
+scheduler, and on a Ray cluster."""
 
 from __future__ import annotations
 
@@ -27,7 +28,8 @@ from safe_envs.errors import ConfigurationError
 
 pytestmark = pytest.mark.slow
 
-# With "ends", the first process that simulates it is killed, in the middle of the cell; with "kills", every one but that of the tests.
+# With "ends", the first process that simulates it is killed, in the middle of the cell; with
+# "kills", every one but that of the tests.
 SYSTEM = """
 import os, signal
 from pathlib import Path
@@ -44,7 +46,8 @@ def problem(kind="plain"):
     return load_problem("Scalar-v0", {"horizon": 0.2})
 """
 
-# The sweep of a file, told where: in a process of its own, which may be made to end after some cells.
+# The sweep of a file, told where: in a process of its own, which may be made to end after some
+# cells.
 DRIVER = """
 import json, os, signal, sys
 from pathlib import Path
@@ -79,7 +82,11 @@ def document(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Document:
     monkeypatch.setenv("SPARED", str(os.getpid()))
     (tmp_path / "system.py").write_text(SYSTEM)
     fixed = {"system": f"{tmp_path / 'system.py'}:problem", "filter": "scbf", "episodes": 20}
-    return {"fixed": fixed, "grid": {"noise": [0.1, 0.3], "seed": [0, 1, 2]}, "cells": [{"barrier.kind": "fails"}]}
+    return {
+        "fixed": fixed,
+        "grid": {"noise": [0.1, 0.3], "seed": [0, 1, 2]},
+        "cells": [{"barrier.kind": "fails"}],
+    }
 
 
 def killing(document: Document) -> Document:
@@ -103,11 +110,19 @@ def rows(folder: Path) -> list[dict[str, Any]]:
     return read(folder).drop_columns(["seconds"]).to_pylist()
 
 
-def driver(document: Document, folder: Path, place: Backend, last: int = -1) -> subprocess.CompletedProcess[str]:
+def driver(
+    document: Document, folder: Path, place: Backend, last: int = -1
+) -> subprocess.CompletedProcess[str]:
     spec = folder.with_suffix(".json")
     spec.write_text(json.dumps(document))
     words = [str(spec), str(folder), place.backend, place.address or "", str(place.jobs), str(last)]
-    return subprocess.run([sys.executable, "-c", DRIVER, *words], capture_output=True, text=True, timeout=LONG, check=False)
+    return subprocess.run(
+        [sys.executable, "-c", DRIVER, *words],
+        capture_output=True,
+        text=True,
+        timeout=LONG,
+        check=False,
+    )
 
 
 def local_answer(document: Document, folder: Path) -> list[dict[str, Any]]:
@@ -118,11 +133,15 @@ def local_answer(document: Document, folder: Path) -> list[dict[str, Any]]:
 
 @contextmanager
 def started(*commands: list[str], log: Path) -> Iterator[list[subprocess.Popen[bytes]]]:
-    """Processes with sessions of their own, which end with this context, and with all that they started."""
+    """Processes with sessions of their own, which end with this context, and with all that they
+    started."""
     processes = []
     try:
         with log.open("wb") as file:
-            processes += [subprocess.Popen(words, stdout=file, stderr=file, start_new_session=True) for words in commands]
+            processes += [
+                subprocess.Popen(words, stdout=file, stderr=file, start_new_session=True)
+                for words in commands
+            ]
         yield processes
     finally:
         for process in reversed(processes):
@@ -148,7 +167,8 @@ def wait_for(process: subprocess.Popen[bytes], log: Path, path: Path, text: str)
 
 @contextmanager
 def limited() -> Iterator[None]:
-    """What would wait for an answer that never comes ends, by what is no error that a sweep could take for one of its workers."""
+    """What would wait for an answer that never comes ends, by what is no error that a sweep could
+    take for one of its workers."""
 
     def stop(*_: Any) -> None:
         pytest.fail(f"no answer in {LONG} s")
@@ -173,7 +193,9 @@ def test_a_killed_worker_and_a_failing_cell_cost_no_other(tmp_path: Path, docume
     document = with_end(document)
     # By itself, too, it has a process of its own.
     single = {"fixed": {**document["fixed"], "barrier.kind": "ends"}}
-    assert [row["error"] for row in computed(single, tmp_path / "single", Backend(jobs=2))] == [None]
+    assert [row["error"] for row in computed(single, tmp_path / "single", Backend(jobs=2))] == [
+        None
+    ]
     (tmp_path / "system.ended").unlink()
     found = computed(document, tmp_path / "two", Backend(jobs=2))
     assert (tmp_path / "system.ended").exists()
@@ -190,7 +212,11 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path, document: Document):
     assert len(before) == 3
     seen: list[str] = []
     store = Store(folder, sweep_of(document))
-    run(store.missing, Backend(jobs=1), lambda outcome: (seen.append(outcome.key), store.keep(outcome))[0])
+    run(
+        store.missing,
+        Backend(jobs=1),
+        lambda outcome: (seen.append(outcome.key), store.keep(outcome))[0],
+    )
     assert len(seen) == 4
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert rows(folder) == local_answer(document, tmp_path / "one")
@@ -204,13 +230,23 @@ def test_the_processes_of_a_sweep_watch_their_parent():
 
 
 @pytest.mark.cluster
-def test_dask_with_a_killed_worker_and_with_none(tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch):
+def test_dask_with_a_killed_worker_and_with_none(
+    tmp_path: Path, document: Document, monkeypatch: pytest.MonkeyPatch
+):
     document = with_end(document)
     monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
     file, log = tmp_path / "scheduler.json", tmp_path / "log"
     common = ["--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", str(file)]
     scheduler = [sys.executable, "-m", "distributed.cli.dask_scheduler", "--port", "0", *common]
-    worker = [sys.executable, "-m", "distributed.cli.dask_worker", "--nthreads", "1", "--no-nanny", *common]
+    worker = [
+        sys.executable,
+        "-m",
+        "distributed.cli.dask_worker",
+        "--nthreads",
+        "1",
+        "--no-nanny",
+        *common,
+    ]
     with started(scheduler, log=log) as (process,):
         place = Backend("dask", json.loads(wait_for(process, log, file, "\n}"))["address"])
         with started(worker, worker, worker, log=tmp_path / "log-of-workers") as workers, limited():
@@ -227,14 +263,16 @@ def test_dask_with_a_killed_worker_and_with_none(tmp_path: Path, document: Docum
 
 @pytest.fixture
 def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Where a Ray cluster of this test alone keeps what it has: a short name, since those of sockets are."""
+    """Where a Ray cluster of this test alone keeps what it has: a short name, since those of
+    sockets are."""
     with tempfile.TemporaryDirectory(prefix="ray-", ignore_cleanup_errors=True) as folder:
         for name, value in (
             ("RAY_TMPDIR", folder),
             ("RAY_AUTH_MODE", "token"),
             ("RAY_AUTH_TOKEN", secrets.token_hex(32)),
             ("RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S", "0"),
-            # Ray takes 127.0.0.1 for the address of a node only where it takes itself to be confined to one machine.
+            # Ray takes 127.0.0.1 for the address of a node only where it takes itself to be
+            # confined to one machine.
             ("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0"),
         ):
             monkeypatch.setenv(name, value)
@@ -245,9 +283,22 @@ def ray_folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def test_ray_with_a_killed_worker(tmp_path: Path, document: Document, ray_folder: Path):
     document = with_end(document)
     log = tmp_path / "log"
-    where = ["--head", "--block", "--node-ip-address=127.0.0.1", "--port=0", f"--ray-client-server-port={free_port()}"]
-    size = ["--num-cpus=2", "--object-store-memory=100000000", "--include-dashboard=false", "--disable-usage-stats"]
-    with started([sys.executable, "-m", "ray.scripts.scripts", "start", *where, *size], log=log) as (process,):
+    where = [
+        "--head",
+        "--block",
+        "--node-ip-address=127.0.0.1",
+        "--port=0",
+        f"--ray-client-server-port={free_port()}",
+    ]
+    size = [
+        "--num-cpus=2",
+        "--object-store-memory=100000000",
+        "--include-dashboard=false",
+        "--disable-usage-stats",
+    ]
+    with started(
+        [sys.executable, "-m", "ray.scripts.scripts", "start", *where, *size], log=log
+    ) as (process,):
         wait_for(process, log, log, "Ray runtime started")
         address = wait_for(process, log, ray_folder / "ray" / "ray_current_cluster", ":").strip()
         both = {**document, "cells": [*document["cells"], {"barrier.kind": "kills"}]}
@@ -275,14 +326,19 @@ def test_places_that_are_none(arguments: tuple[Any, ...], message: str):
 
 def test_without_the_package_its_extra_is_named(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(executor, "find_spec", lambda name: None if name == "distributed" else name)
-    with pytest.raises(ConfigurationError, match=r"distributed is not installed.*safe-envs\[dask\]"):
+    with pytest.raises(
+        ConfigurationError, match=r"distributed is not installed.*safe-envs\[dask\]"
+    ):
         Backend("dask", "tcp://127.0.0.1:1")
 
 
 def test_an_address_where_nobody_listens(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(clusters, "_PATIENCE", 1)
     dask, ray = "tcp://127.0.0.1:9", "127.0.0.1:9"
-    with pytest.raises(ConfigurationError, match=f"answers at {dask}"), clusters.dask_settings(dask, print):
+    with (
+        pytest.raises(ConfigurationError, match=f"answers at {dask}"),
+        clusters.dask_settings(dask, print),
+    ):
         pass
     with pytest.raises(ConfigurationError, match=f"answers at {ray}"), clusters.ray_settings(ray):
         pass

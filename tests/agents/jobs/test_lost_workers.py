@@ -31,7 +31,11 @@ class Pretended:
 
     def compute(self) -> dict[int, str | None]:
         """The errors of cells, in the order in which they were kept."""
-        run(CELLS, Backend(), lambda outcome: self.kept.update({NUMBERS[outcome.key]: outcome.error}))
+        run(
+            CELLS,
+            Backend(),
+            lambda outcome: self.kept.update({NUMBERS[outcome.key]: outcome.error}),
+        )
         return self.kept
 
     def _outcomes(self, cells: Sequence[Cell], *_: Any) -> Iterator[Outcome]:
@@ -44,7 +48,9 @@ class Pretended:
 
 
 @pytest.mark.parametrize("killing", [{0, 1, 2}, {5, 6, 7}, {0, 2, 4, 6}, {3}])
-def test_cells_that_end_every_worker_are_found_wherever_they_stand(monkeypatch: pytest.MonkeyPatch, killing: set[int]):
+def test_cells_that_end_every_worker_are_found_wherever_they_stand(
+    monkeypatch: pytest.MonkeyPatch, killing: set[int]
+):
     found = Pretended(monkeypatch, killing.intersection).compute()
     assert found == {k: ENDED if k in killing else None for k in range(8)}
 
@@ -52,7 +58,8 @@ def test_cells_that_end_every_worker_are_found_wherever_they_stand(monkeypatch: 
 def test_only_what_was_under_way_is_computed_one_by_one(monkeypatch: pytest.MonkeyPatch):
     workers = Pretended(monkeypatch, lambda pair: 4 in pair)
     assert workers.compute()[4] == ENDED
-    # All, what the first pairs left three times, the first of the pair that was under way by itself, and the rest.
+    # All, what the first pairs left three times, the first of the pair that was under way by
+    # itself, and the rest.
     assert workers.given == [8, 4, 4, 1, 3]
 
 
@@ -65,7 +72,9 @@ def test_cells_that_are_too_much_together_are_computed_one_by_one(monkeypatch: p
 
 def test_workers_that_end_whatever_they_compute(monkeypatch: pytest.MonkeyPatch):
     workers = Pretended(monkeypatch, lambda pair: True)
-    with pytest.raises(WorkersLostError, match=r"no cell could be computed, .* the last: it went away"):
+    with pytest.raises(
+        WorkersLostError, match=r"no cell could be computed, .* the last: it went away"
+    ):
         workers.compute()
     assert workers.given == [8, 8, 8, *[1] * 5]
     # They count as failed, so that the next run begins with others.
@@ -98,7 +107,10 @@ def test_a_scheduler_that_has_lost_its_workers(monkeypatch: pytest.MonkeyPatch):
     scheduler: Any = Scheduler(1, 0, OSError("busy"), 0, 1, 0, 0, 0)
     clusters._watch(scheduler, "tcp://HOST:PORT", told.append, give_up, ended)
     # Once each time that they went.
-    gone = "The Dask scheduler at tcp://HOST:PORT has no workers any more; waiting for some. Start them by: dask worker tcp://HOST:PORT"
+    gone = (
+        "The Dask scheduler at tcp://HOST:PORT has no workers any more; waiting for some. Start"
+        " them by: dask worker tcp://HOST:PORT"
+    )
     assert told == [gone, gone]
     (error,) = raised
     assert isinstance(error, ConfigurationError)
@@ -108,7 +120,9 @@ def test_a_scheduler_that_has_lost_its_workers(monkeypatch: pytest.MonkeyPatch):
 @pytest.mark.parametrize("address", ["foo", "", "http://127.0.0.1:8786", "tcp://127.0.0.1"])
 def test_addresses_of_dask_that_cannot_be_tried(address: str):
     with (
-        pytest.raises(ConfigurationError, match=rf"answers at {address} \(this is not of the form HOST:PORT\)"),
+        pytest.raises(
+            ConfigurationError, match=rf"answers at {address} \(this is not of the form HOST:PORT\)"
+        ),
         clusters.dask_settings(address, print),
     ):
         pass
@@ -117,7 +131,9 @@ def test_addresses_of_dask_that_cannot_be_tried(address: str):
 @pytest.mark.parametrize("address", ["auto", "ray://127.0.0.1:10001", "127.0.0.1", ":6379"])
 def test_addresses_of_ray_that_cannot_be_tried(address: str):
     with (
-        pytest.raises(ConfigurationError, match=rf"answers at {address} \(this is not of the form HOST:PORT\)"),
+        pytest.raises(
+            ConfigurationError, match=rf"answers at {address} \(this is not of the form HOST:PORT\)"
+        ),
         clusters.ray_settings(address),
     ):
         pass

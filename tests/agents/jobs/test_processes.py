@@ -22,7 +22,12 @@ pytestmark = pytest.mark.slow
 
 def test_the_answer_does_not_depend_on_the_number_of_processes():
     told = []
-    arguments = {"filters": ["none", "scbf"], "episodes": 30, "num_envs": 3, "monitoring": "continuous"}
+    arguments = {
+        "filters": ["none", "scbf"],
+        "episodes": 30,
+        "num_envs": 3,
+        "monitoring": "continuous",
+    }
     one = evaluate("CubicSDEDisk-v0", "random", **arguments)
     two = evaluate("CubicSDEDisk-v0", "random", jobs=2, progress=told.append, **arguments)
     assert one.rows == two.rows
@@ -46,7 +51,10 @@ def test_functions_of_a_file_go_along(tmp_path):
     place = tmp_path / "mine.py"
     place.write_text((Path(__file__).parents[3] / "examples" / "pendulum_v1.py").read_text())
     arguments = {"filters": ["hocbf"], "episodes": 4, "bounds": False, "spec": f"{place}:spec"}
-    assert evaluate("Pendulum-v1", jobs=2, **arguments).rows == evaluate("Pendulum-v1", **arguments).rows
+    assert (
+        evaluate("Pendulum-v1", jobs=2, **arguments).rows
+        == evaluate("Pendulum-v1", **arguments).rows
+    )
 
 
 class _Failing(Policy):
@@ -70,7 +78,9 @@ class _Watched(Policy):
 
 
 def test_the_processes_of_an_evaluation_watch_their_parent():
-    assert evaluate("Scalar-v0", _Watched(), filters=["none"], episodes=4, bounds=False, jobs=2).rows
+    assert evaluate(
+        "Scalar-v0", _Watched(), filters=["none"], episodes=4, bounds=False, jobs=2
+    ).rows
     with pytest.raises(AssertionError):
         evaluate("Scalar-v0", _Watched(), filters=["none"], episodes=4, bounds=False, jobs=1)
 
@@ -132,7 +142,9 @@ def test_workers_of_a_parent_that_was_killed_end(tmp_path):
     folder.mkdir()
     root = Path(__file__).parents[3]
     parent = subprocess.Popen(
-        [sys.executable, str(script), str(folder)], env={**os.environ, "PYTHONPATH": str(root)}, start_new_session=True
+        [sys.executable, str(script), str(folder)],
+        env={**os.environ, "PYTHONPATH": str(root)},
+        start_new_session=True,
     )
     try:
         wait_until(lambda: len(list(folder.iterdir())) == 3)

@@ -1,4 +1,5 @@
-"""Policies that are no files, bombs, damaged, or written by whoever wants to do harm: loaded as they were saved, or refused."""
+"""Policies that are no files, bombs, damaged, or written by whoever wants to do harm: loaded as
+they were saved, or refused."""
 
 from __future__ import annotations
 
@@ -60,7 +61,9 @@ def observed(problem) -> np.ndarray:
     return np.zeros((2, len(problem.features)), dtype=np.float32)
 
 
-@hypothesis.settings(max_examples=30, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
+@hypothesis.settings(
+    max_examples=30, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture]
+)
 @hypothesis.given(data=st.data(), name=st.sampled_from([TENSORS, DESCRIPTION]))
 def test_a_damaged_policy_is_the_same_or_refused(saved, problem, tmp_path, data, name):
     shutil.copytree(saved, tmp_path, dirs_exist_ok=True)
@@ -68,10 +71,14 @@ def test_a_damaged_policy_is_the_same_or_refused(saved, problem, tmp_path, data,
     found = loaded(tmp_path, problem)
     if found is not None:
         expected = load_policy(saved, problem)
-        np.testing.assert_array_equal(found.predict(observed(problem))[0], expected.predict(observed(problem))[0])
+        np.testing.assert_array_equal(
+            found.predict(observed(problem))[0], expected.predict(observed(problem))[0]
+        )
 
 
-@hypothesis.settings(max_examples=30, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
+@hypothesis.settings(
+    max_examples=30, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture]
+)
 @hypothesis.given(data=st.data())
 def test_wrong_content_under_the_right_checksum(saved, problem, tmp_path, data):
     description = json.loads((saved / DESCRIPTION).read_text())
@@ -81,13 +88,18 @@ def test_wrong_content_under_the_right_checksum(saved, problem, tmp_path, data):
     tensors = load_tensors((saved / TENSORS).read_bytes())
     content = save_tensors(tensors, metadata={"description": _checksum(description)})
     (tmp_path / TENSORS).write_bytes(content)
-    (tmp_path / DESCRIPTION).write_text(json.dumps({**description, "sha256": hashlib.sha256(content).hexdigest()}))
+    (tmp_path / DESCRIPTION).write_text(
+        json.dumps({**description, "sha256": hashlib.sha256(content).hexdigest()})
+    )
     found = loaded(tmp_path, problem)
     if found is not None:
         assert (abs(found.predict(observed(problem))[0]) <= 1.0).all()
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, "[1, 2]", '{"format": 2, "sha256": ' + "9" * 10_000 + "}", '{"format": [2]}'])
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, "[1, 2]", '{"format": 2, "sha256": ' + "9" * 10_000 + "}", '{"format": [2]}'],
+)
 def test_descriptions_of_another_shape_are_refused(saved, problem, tmp_path, text):
     shutil.copytree(saved, tmp_path, dirs_exist_ok=True)
     (tmp_path / DESCRIPTION).write_text(text)
@@ -141,14 +153,21 @@ BOMB = archive_of(data=bytes(101_000_000), policy_pth=b"")
     ],
     ids=["empty", "nothing", "directory", "truncated", "bomb", "bomb within"],
 )
-def test_archives_that_are_damaged_or_bombs_are_refused_before_they_are_trusted(problem, tmp_path, content):
+def test_archives_that_are_damaged_or_bombs_are_refused_before_they_are_trusted(
+    problem, tmp_path, content
+):
     assert len(content) < 200_000
     (tmp_path / "policy.zip").write_bytes(content)
-    with pytest.raises(ConfigurationError, match="is not a policy that Stable-Baselines3 saved, or damaged, or larger than 100 MB"):
+    with pytest.raises(
+        ConfigurationError,
+        match="is not a policy that Stable-Baselines3 saved, or damaged, or larger than 100 MB",
+    ):
         make_policy(str(tmp_path / "policy.zip"), problem, trust=True)
 
 
-@pytest.mark.parametrize("data", [b"{}", b"[]", b"9" * 5000, b'{"policy_class": {":serialized:": "x"}}'])
+@pytest.mark.parametrize(
+    "data", [b"{}", b"[]", b"9" * 5000, b'{"policy_class": {":serialized:": "x"}}']
+)
 def test_archives_without_a_policy_are_refused(problem, tmp_path, data):
     (tmp_path / "policy.zip").write_bytes(archive_of(data=data, policy_pth=b"no tensors"))
     with pytest.raises(ConfigurationError, match="cannot be read as a policy"):

@@ -42,7 +42,9 @@ def problem():
 
 def small(algorithm=PPO, env=None, env_id=ENV_ID, **arguments):
     """A model whose actions vary: untrained ones of PPO and A2C hardly do."""
-    model = algorithm("MlpPolicy", gym.make(env_id) if env is None else env, device="cpu", seed=0, **arguments)
+    model = algorithm(
+        "MlpPolicy", gym.make(env_id) if env is None else env, device="cpu", seed=0, **arguments
+    )
     with torch.no_grad():
         for parameter in model.policy.parameters():
             noise = torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1))
@@ -86,7 +88,15 @@ def assert_predicts_like(model, policy, problem, scaled=lambda given: given):
         (TD3, OFF_POLICY),
         (DDPG, OFF_POLICY),
         *[
-            (PPO, {"policy_kwargs": {"net_arch": {"pi": [16, 8], "vf": [4]}, "activation_fn": activation}})
+            (
+                PPO,
+                {
+                    "policy_kwargs": {
+                        "net_arch": {"pi": [16, 8], "vf": [4]},
+                        "activation_fn": activation,
+                    }
+                },
+            )
             for activation in (NN.ReLU, NN.LeakyReLU, NN.ELU, NN.SiLU)
         ],
         (PPO, {"policy_kwargs": {"net_arch": [], "share_features_extractor": False}}),
@@ -125,7 +135,16 @@ def test_normalisation_is_part_of_the_policy(tmp_path, passed):
 def test_evaluation_is_the_same_for_every_num_envs(problem, tmp_path, algorithm, arguments):
     save_policy(small(algorithm, **arguments), tmp_path, problem)
     answers = [
-        evaluate(ENV_ID, str(tmp_path), ["none", "scbf"], options={"horizon": 0.15}, episodes=131, num_envs=n, record=True, bounds=False)
+        evaluate(
+            ENV_ID,
+            str(tmp_path),
+            ["none", "scbf"],
+            options={"horizon": 0.15},
+            episodes=131,
+            num_envs=n,
+            record=True,
+            bounds=False,
+        )
         for n in (1000, 9, 130)
     ]
     for other in answers[1:]:
@@ -133,7 +152,16 @@ def test_evaluation_is_the_same_for_every_num_envs(problem, tmp_path, algorithm,
         for name, recorder in answers[0].recorders.items():
             assert recorder.states.tobytes() == other.recorders[name].states.tobytes()
     one, all_of_them = (
-        evaluate(ENV_ID, str(tmp_path), ["none"], options={"horizon": 0.3}, episodes=5, num_envs=n, bounds=False).rows for n in (1, 5)
+        evaluate(
+            ENV_ID,
+            str(tmp_path),
+            ["none"],
+            options={"horizon": 0.3},
+            episodes=5,
+            num_envs=n,
+            bounds=False,
+        ).rows
+        for n in (1, 5)
     )
     assert one == all_of_them
 
@@ -143,13 +171,18 @@ def test_an_episode_has_the_same_actions_in_every_wave(saved, problem):
     whole = policy.predict(many)[0]
     for start, count in ((0, 1), (1, 1), (7, 130), (BLOCK, 40), (250, 50)):
         policy.begin(range(start, start + count), seed=0)
-        assert policy.predict(many[start : start + count])[0].tobytes() == whole[start : start + count].tobytes()
+        assert (
+            policy.predict(many[start : start + count])[0].tobytes()
+            == whole[start : start + count].tobytes()
+        )
 
 
 def test_every_path_of_a_policy_is_the_policy(saved, problem):
     wanted = make_policy(str(saved), problem).predict(observations(problem))[0]
     for path in (saved / "policy.json", saved / "policy.safetensors"):
-        np.testing.assert_array_equal(make_policy(str(path), problem).predict(observations(problem))[0], wanted)
+        np.testing.assert_array_equal(
+            make_policy(str(path), problem).predict(observations(problem))[0], wanted
+        )
 
 
 def test_the_folder_holds_two_files_and_what_they_are(saved, problem):
@@ -157,13 +190,23 @@ def test_the_folder_holds_two_files_and_what_they_are(saved, problem):
     found = json.loads((saved / "policy.json").read_text())
     assert (found["format"], found["layers"], found["activation"]) == (2, [4, 8, 8, 1], "tanh")
     assert found["problem"]["features"] == ["x", "y", "cos_theta", "sin_theta"]
-    assert (found["problem"]["observation"]["low"], found["dt"]) == ([-6.0, -6.0, -1.0, -1.0], problem.dt)
+    assert (found["problem"]["observation"]["low"], found["dt"]) == (
+        [-6.0, -6.0, -1.0, -1.0],
+        problem.dt,
+    )
     content = (saved / "policy.safetensors").read_bytes()
     assert found["sha256"] == hashlib.sha256(content).hexdigest()
     assert {array.dtype for array in load_tensors(content).values()} == {np.dtype(np.float32)}
     answer = evaluate(ENV_ID, str(saved), ["none"], options={"horizon": 0.1}, episodes=2)
     assert answer.config["policy"] == {"name": str(saved), "sha256": found["sha256"]}
-    assert len(refine(ENV_ID, str(saved), filters=["none"], options={"horizon": 0.1}, episodes=2).evaluations) == 3
+    assert (
+        len(
+            refine(
+                ENV_ID, str(saved), filters=["none"], options={"horizon": 0.1}, episodes=2
+            ).evaluations
+        )
+        == 3
+    )
 
 
 def test_another_normalisation_is_another_policy(problem, tmp_path):
@@ -196,13 +239,35 @@ class Derived(ActorCriticPolicy):
     ("algorithm", "policy", "arguments", "message"),
     [
         (PPO, Derived, {}, "it is a Derived"),
-        (PPO, "MlpPolicy", {"policy_kwargs": {"features_extractor_class": Halved}}, "the features extractor Halved"),
-        (PPO, "MlpPolicy", {"policy_kwargs": {"activation_fn": NN.Softplus}}, "its activation is Softplus"),
-        (PPO, "MlpPolicy", {"policy_kwargs": {"activation_fn": lambda: NN.ELU(0.5)}}, r"its activation is ELU\(alpha=0.5\)"),
-        (SAC, "MlpPolicy", {"use_sde": True, **OFF_POLICY}, "it has a Sequential where a fully connected layer"),
+        (
+            PPO,
+            "MlpPolicy",
+            {"policy_kwargs": {"features_extractor_class": Halved}},
+            "the features extractor Halved",
+        ),
+        (
+            PPO,
+            "MlpPolicy",
+            {"policy_kwargs": {"activation_fn": NN.Softplus}},
+            "its activation is Softplus",
+        ),
+        (
+            PPO,
+            "MlpPolicy",
+            {"policy_kwargs": {"activation_fn": lambda: NN.ELU(0.5)}},
+            r"its activation is ELU\(alpha=0.5\)",
+        ),
+        (
+            SAC,
+            "MlpPolicy",
+            {"use_sde": True, **OFF_POLICY},
+            "it has a Sequential where a fully connected layer",
+        ),
     ],
 )
-def test_unusual_policies_are_refused_with_the_reason(problem, tmp_path, algorithm, policy, arguments, message):
+def test_unusual_policies_are_refused_with_the_reason(
+    problem, tmp_path, algorithm, policy, arguments, message
+):
     model = algorithm(policy, gym.make(ENV_ID), device="cpu", **arguments)
     with pytest.raises(ConfigurationError, match=f"cannot be saved as data: .*{message}.*--trust"):
         save_policy(model, tmp_path, problem)
@@ -218,7 +283,9 @@ def test_layers_that_differ_among_each_other_are_refused(problem, tmp_path):
 
 def test_diverged_policies_and_those_of_other_problems_are_not_saved(problem, tmp_path):
     model = small()
-    with pytest.raises(ConfigurationError, match="the policy of PPO was trained for another observation space"):
+    with pytest.raises(
+        ConfigurationError, match="the policy of PPO was trained for another observation space"
+    ):
         save_policy(model, tmp_path, load_problem("ACC-v0"))
     with torch.no_grad():
         model.policy.action_net.bias[0] = torch.nan
@@ -235,7 +302,11 @@ def test_a_folder_that_cannot_be_made_is_an_error(problem, tmp_path):
 
 def test_policies_of_other_problems_are_errors(saved):
     for env_id, barrier, message in (
-        ("safe_envs/DubinsDisk-v0", None, "with system StochasticDubins; that of DubinsDisk is DubinsDisk"),
+        (
+            "safe_envs/DubinsDisk-v0",
+            None,
+            "with system StochasticDubins; that of DubinsDisk is DubinsDisk",
+        ),
         (ENV_ID, {"radius": 5.0}, "with observation "),
         ("safe_envs/Scalar-v0", None, "with system"),
     ):
@@ -259,7 +330,9 @@ def rewrite(folder, change, arrays=None):
     description = json.loads(path.read_text())
     del description["sha256"]
     change(description)
-    metadata = {"description": hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()}
+    metadata = {
+        "description": hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
+    }
     content = save_tensors(arrays or load_tensors(tensors.read_bytes()), metadata=metadata)
     tensors.write_bytes(content)
     path.write_text(json.dumps({**description, "sha256": hashlib.sha256(content).hexdigest()}))
@@ -273,11 +346,27 @@ def unchanged(description):
     ("name", "damage", "message"),
     [
         ("policy.safetensors", lambda data: data[:-1], "altered or truncated"),
-        ("policy.safetensors", lambda data: data[:-1] + bytes([data[-1] ^ 1]), "altered or truncated"),
+        (
+            "policy.safetensors",
+            lambda data: data[:-1] + bytes([data[-1] ^ 1]),
+            "altered or truncated",
+        ),
         ("policy.safetensors", lambda data: b"", "altered or truncated"),
-        ("policy.json", lambda data: data.replace(b'"clip"', b'"tanh"'), r"policy\.json was altered"),
-        ("policy.json", lambda data: data.replace(b'"activation": "tanh"', b'"activation": "relu"'), r"policy\.json was altered"),
-        ("policy.json", lambda data: data.replace(b'"format": 2', b'"format": 1'), "has the format 1; this version reads 2"),
+        (
+            "policy.json",
+            lambda data: data.replace(b'"clip"', b'"tanh"'),
+            r"policy\.json was altered",
+        ),
+        (
+            "policy.json",
+            lambda data: data.replace(b'"activation": "tanh"', b'"activation": "relu"'),
+            r"policy\.json was altered",
+        ),
+        (
+            "policy.json",
+            lambda data: data.replace(b'"format": 2', b'"format": 1'),
+            "has the format 1; this version reads 2",
+        ),
         ("policy.json", lambda data: data[:-40], "JSONDecodeError"),
         ("policy.json", lambda data: b"[]", "TypeError"),
         ("policy.json", lambda data: b"{}", "KeyError"),
@@ -303,10 +392,29 @@ def test_damaged_files_are_errors(copy, problem, name, damage, message):
         ({"layers": [4, 8, 1]}, "damaged or altered"),
         ({"layers": "text"}, "damaged or altered"),
         ({"layers": []}, "damaged or altered"),
-        ({"normalization": {"mean": [0.0], "var": [1.0], "clip": 1.0, "epsilon": 1e-8}}, "damaged or altered"),
-        ({"normalization": {"mean": 4 * [0.0], "var": 4 * [-1.0], "clip": 1.0, "epsilon": 1e-8}}, "the normalisation"),
-        ({"normalization": {"mean": 4 * [0.0], "var": 4 * [1.0], "clip": float("nan"), "epsilon": 1e-8}}, "the normalisation"),
-        ({"normalization": {"mean": 4 * ["a"], "var": 4 * [1.0], "clip": 1.0, "epsilon": 1e-8}}, "ValueError"),
+        (
+            {"normalization": {"mean": [0.0], "var": [1.0], "clip": 1.0, "epsilon": 1e-8}},
+            "damaged or altered",
+        ),
+        (
+            {"normalization": {"mean": 4 * [0.0], "var": 4 * [-1.0], "clip": 1.0, "epsilon": 1e-8}},
+            "the normalisation",
+        ),
+        (
+            {
+                "normalization": {
+                    "mean": 4 * [0.0],
+                    "var": 4 * [1.0],
+                    "clip": float("nan"),
+                    "epsilon": 1e-8,
+                }
+            },
+            "the normalisation",
+        ),
+        (
+            {"normalization": {"mean": 4 * ["a"], "var": 4 * [1.0], "clip": 1.0, "epsilon": 1e-8}},
+            "ValueError",
+        ),
         ({"box": [[-10.0, 10.0], [-10.0, 10.0]]}, "damaged or altered"),
         ({"box": [[10.0, -10.0]]}, "damaged or altered"),
         ({"box": [[-10.0, float("inf")]]}, "damaged or altered"),

@@ -23,12 +23,18 @@ def one_thread():
     torch.set_num_threads(1)
 
 
-@pytest.fixture(scope="module", params=[(DUBINS, PPO, {}), (QUADROTOR, SAC, {"buffer_size": 10})], ids=["ppo, m = 1", "sac, m = 4"])
+@pytest.fixture(
+    scope="module",
+    params=[(DUBINS, PPO, {}), (QUADROTOR, SAC, {"buffer_size": 10})],
+    ids=["ppo, m = 1", "sac, m = 4"],
+)
 def trained(request, tmp_path_factory):
     """A policy whose actions vary and reach their bounds: the env's id and the folder."""
     env_id, algorithm, arguments = request.param
     folder = tmp_path_factory.mktemp("trained")
-    model = algorithm("MlpPolicy", gym.make(env_id, box=BOXES[env_id]), device="cpu", seed=0, **arguments)
+    model = algorithm(
+        "MlpPolicy", gym.make(env_id, box=BOXES[env_id]), device="cpu", seed=0, **arguments
+    )
     last = model.policy.action_net if algorithm is PPO else model.policy.actor.mu
     with torch.no_grad():
         last.weight.mul_(300.0 if algorithm is PPO else 30.0)
@@ -69,7 +75,9 @@ def test_another_box_gets_the_same_inputs_or_the_nearest_ones(trained, change):
     assert (actions.dtype, actions.shape) == (np.float32, wanted.shape)
     assert np.abs(actions).max() <= 1.0
     assert (np.ptp(wanted, axis=0) > 0.8 * (high - low)).all()
-    np.testing.assert_allclose(found, np.clip(wanted, least, most), rtol=0, atol=1e-6 * (high - low).max())
+    np.testing.assert_allclose(
+        found, np.clip(wanted, least, most), rtol=0, atol=1e-6 * (high - low).max()
+    )
 
 
 def test_the_env_executes_the_same_input(trained):

@@ -8,7 +8,13 @@ import pytest
 from scipy.optimize import minimize_scalar
 
 from safe_envs import ConfigurationError, InvalidInputError, NumericalError, SafeEnv
-from safe_envs.agents import NominalController, RandomPolicy, ZeroController, load_problem, make_policy
+from safe_envs.agents import (
+    NominalController,
+    RandomPolicy,
+    ZeroController,
+    load_problem,
+    make_policy,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -68,7 +74,10 @@ def test_zero_controller_executes_the_point_of_the_box_nearest_to_zero(env_id):
     np.testing.assert_allclose(physical(problem, action), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("box", "wanted"), [([-2.0, 6.0], 0.0), ([1.0, 6.0], 1.0), ([-6.0, -2.0], -2.0), ([0.0, 3.0], 0.0)])
+@pytest.mark.parametrize(
+    ("box", "wanted"),
+    [([-2.0, 6.0], 0.0), ([1.0, 6.0], 1.0), ([-6.0, -2.0], -2.0), ([0.0, 3.0], 0.0)],
+)
 def test_zero_controller_in_boxes_off_centre(box, wanted):
     env = gym.make("safe_envs/Scalar-v0", box=box).unwrapped
     assert isinstance(env, SafeEnv)
@@ -79,32 +88,47 @@ def test_zero_controller_in_boxes_off_centre(box, wanted):
 def test_nominal_actions_are_clipped_to_the_box():
     problem = load_problem("Scalar-v0", {"box": [-0.5, 2.0]})
     observation = np.array([[-2.5], [0.0], [1.9]])
-    np.testing.assert_allclose(physical(problem, NominalController(problem).predict(observation)[0]), [[2.0], [1.0], [-0.5]])
+    np.testing.assert_allclose(
+        physical(problem, NominalController(problem).predict(observation)[0]),
+        [[2.0], [1.0], [-0.5]],
+    )
 
 
 def test_quadrotor_law_is_the_closed_form():
-    problem = load_problem("QuadrotorAltitude-v0", {"model": {"m": 0.45}, "plant": {"m": 0.9}, "box": [-1000.0, 1000.0]})
+    problem = load_problem(
+        "QuadrotorAltitude-v0",
+        {"model": {"m": 0.45}, "plant": {"m": 0.9}, "box": [-1000.0, 1000.0]},
+    )
     given = observations(problem, 300)
     z, zdot, z_ref, z_ref_rate = given.astype(float).T
     thrust = 0.45 * (9.81 + 6 * (z_ref - z) + 4 * (z_ref_rate - zdot))
-    np.testing.assert_allclose(physical(problem, NominalController(problem).predict(given)[0])[:, 0], thrust, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        physical(problem, NominalController(problem).predict(given)[0])[:, 0],
+        thrust,
+        rtol=1e-9,
+        atol=1e-9,
+    )
 
 
 def test_full_quadrotor_has_the_thrust_of_the_altitude_law():
     problem = load_problem("Quadrotor-v0", {"box": [-1e9, 1e9]})
     given = observations(problem, 100)
     names = [f.name for f in problem.features]
-    z, zdot, z_ref, z_ref_rate = (given[:, names.index(n)].astype(float) for n in ("z", "zdot", "z_ref", "z_ref_rate"))
+    z, zdot, z_ref, z_ref_rate = (
+        given[:, names.index(n)].astype(float) for n in ("z", "zdot", "z_ref", "z_ref_rate")
+    )
     squared_speeds = physical(problem, NominalController(problem).predict(given)[0])
     thrust = 0.4 * (9.81 + 6 * (z_ref - z) + 4 * (z_ref_rate - zdot))
     np.testing.assert_allclose(3.13e-5 * squared_speeds.sum(axis=1), thrust, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("env_id", "speed", "rate", "slack_weight", "sigma"), [("ACC-v0", "x_1", 5, 0.02, 1.2), ("ACCGap-v0", "v", 1, 2, 0.05)]
+    ("env_id", "speed", "rate", "slack_weight", "sigma"),
+    [("ACC-v0", "x_1", 5, 0.02, 1.2), ("ACCGap-v0", "v", 1, 2, 0.05)],
 )
 def test_cruise_law_solves_its_quadratic_program(env_id, speed, rate, slack_weight, sigma):
-    # min 2 (u/M)^2 + w_d d^2 subject to A V + rate V <= d with V = (v - 22)^2, over u/M, with the best d for each u.
+    # min 2 (u/M)^2 + w_d d^2 subject to A V + rate V <= d with V = (v - 22)^2, over u/M, with the
+    # best d for each u.
     M = 1500.0
     problem = load_problem(env_id, {"model": {"sigma_1": sigma, "M": M}, "box": [-1e6, 1e6]})
     column = [f.name for f in problem.features].index(speed)
@@ -121,7 +145,9 @@ def test_cruise_law_solves_its_quadratic_program(env_id, speed, rate, slack_weig
         def cost(a, decay=decay):
             return 2 * a**2 + slack_weight * max(decay(a), 0.0) ** 2
 
-        best = minimize_scalar(cost, bounds=(-300.0, 300.0), method="bounded", options={"xatol": 1e-10})
+        best = minimize_scalar(
+            cost, bounds=(-300.0, 300.0), method="bounded", options={"xatol": 1e-10}
+        )
         assert cost(force / M) <= best.fun * (1 + 1e-9) + 1e-12
         assert force / M == pytest.approx(best.x, rel=1e-5, abs=1e-5)
         active += abs(force) > 0
@@ -140,7 +166,10 @@ def test_wrong_shapes_are_errors(name):
 
 def test_no_finite_value_is_an_error_that_names_the_observation():
     policy = make_policy("nominal", load_problem("QuadrotorAltitude-v0"))
-    for given in (np.array([5.0, np.nan, 5.0, 0.0]), np.array([[5.0, 0.0, 5.0, 0.0], [5.0, np.nan, 5.0, 0.0]])):
+    for given in (
+        np.array([5.0, np.nan, 5.0, 0.0]),
+        np.array([[5.0, 0.0, 5.0, 0.0], [5.0, np.nan, 5.0, 0.0]]),
+    ):
         with pytest.raises(NumericalError, match="nan"):
             policy.predict(given)
 
@@ -176,7 +205,9 @@ def test_random_policy_is_uniform_and_independent():
 
 def test_random_policy_outside_an_evaluation_follows_its_seed():
     problem = load_problem("Scalar-v0")
-    first, second, other = (RandomPolicy(problem, seed).predict(np.zeros((5, 1)))[0] for seed in (3, 3, 4))
+    first, second, other = (
+        RandomPolicy(problem, seed).predict(np.zeros((5, 1)))[0] for seed in (3, 3, 4)
+    )
     np.testing.assert_array_equal(first, second)
     assert not np.allclose(first, other)
 

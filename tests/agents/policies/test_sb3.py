@@ -33,9 +33,23 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     models = {
         "ppo": PPO(
-            "MlpPolicy", gym.make(ENV_ID, **OPTIONS), n_steps=128, batch_size=64, n_epochs=2, learning_rate=0.01, device="cpu", seed=0
+            "MlpPolicy",
+            gym.make(ENV_ID, **OPTIONS),
+            n_steps=128,
+            batch_size=64,
+            n_epochs=2,
+            learning_rate=0.01,
+            device="cpu",
+            seed=0,
         ),
-        "sac": SAC("MlpPolicy", gym.make(ENV_ID, **OPTIONS), **OFF_POLICY, learning_rate=0.01, device="cpu", seed=0),
+        "sac": SAC(
+            "MlpPolicy",
+            gym.make(ENV_ID, **OPTIONS),
+            **OFF_POLICY,
+            learning_rate=0.01,
+            device="cpu",
+            seed=0,
+        ),
     }
     models["ppo"].learn(256)
     models["sac"].learn(120)
@@ -78,7 +92,10 @@ def test_loaded_policy_predicts_like_the_model(trained, name):
     ("algorithm", "arguments"),
     [
         (A2C, {}),
-        (PPO, {"use_sde": True, "policy_kwargs": {"net_arch": [8], "activation_fn": torch.nn.ReLU}}),
+        (
+            PPO,
+            {"use_sde": True, "policy_kwargs": {"net_arch": [8], "activation_fn": torch.nn.ReLU}},
+        ),
         (SAC, {"use_sde": True, **OFF_POLICY}),
         (TD3, OFF_POLICY),
         (DDPG, {**OFF_POLICY, "policy_kwargs": {"net_arch": [16, 16]}}),
@@ -114,7 +131,18 @@ def test_evaluation_is_the_same_for_every_num_envs(trained, name):
         for filter_name, recorder in answers[0].recorders.items():
             assert recorder.states.tobytes() == other.recorders[filter_name].states.tobytes()
     few = [
-        evaluate(ENV_ID, path, ["none"], trust=True, options=OPTIONS, episodes=12, seed=2, num_envs=n, bounds=False).rows for n in (1, 12)
+        evaluate(
+            ENV_ID,
+            path,
+            ["none"],
+            trust=True,
+            options=OPTIONS,
+            episodes=12,
+            seed=2,
+            num_envs=n,
+            bounds=False,
+        ).rows
+        for n in (1, 12)
     ]
     assert few[0] == few[1]
 
@@ -124,13 +152,24 @@ def test_an_episode_keeps_its_row_of_a_network_call(trained):
     class Coarse:
         def predict(self, rows, deterministic):
             sizes.add(len(rows))
-            return np.linspace(-1.0, 1.0, len(rows), dtype=np.float32)[:, None] + 0.0 * rows[:, :1], None
+            return (
+                np.linspace(-1.0, 1.0, len(rows), dtype=np.float32)[:, None] + 0.0 * rows[:, :1],
+                None,
+            )
 
     sizes = set()
     policy = make_policy(trained["ppo"][1], load_problem(ENV_ID), trust=True)
     policy._network = Coarse()
     rows = [
-        evaluate(ENV_ID, policy, ["none"], options={"horizon": 0.1}, episodes=200, num_envs=n, bounds=False).rows
+        evaluate(
+            ENV_ID,
+            policy,
+            ["none"],
+            options={"horizon": 0.1},
+            episodes=200,
+            num_envs=n,
+            bounds=False,
+        ).rows
         for n in (200, 1, 7, 128, 130)
     ]
     assert all(other == rows[0] for other in rows)
@@ -139,13 +178,21 @@ def test_an_episode_keeps_its_row_of_a_network_call(trained):
 
 def test_evaluation_of_a_file_and_of_the_model_agree(trained):
     model, path = trained["ppo"]
-    by_file, by_model = (evaluate(ENV_ID, policy, trust=True, options=OPTIONS, episodes=20, bounds=False) for policy in (path, model))
+    by_file, by_model = (
+        evaluate(ENV_ID, policy, trust=True, options=OPTIONS, episodes=20, bounds=False)
+        for policy in (path, model)
+    )
     for a, b in zip(by_file.rows, by_model.rows, strict=True):
         assert (a["policy"], b["policy"]) == (path, "PPO")
         assert (a["safe"], a["episodes"]) == (b["safe"], b["episodes"])
         assert a["return_mean"] == pytest.approx(b["return_mean"], rel=1e-4)
     assert len(by_file.config["policy"]["sha256"]) == 64
-    assert evaluate(ENV_ID, path, trust=True, options=OPTIONS, episodes=1, bounds=False).config["policy"] == by_file.config["policy"]
+    assert (
+        evaluate(ENV_ID, path, trust=True, options=OPTIONS, episodes=1, bounds=False).config[
+            "policy"
+        ]
+        == by_file.config["policy"]
+    )
 
 
 class Bomb:
@@ -168,12 +215,17 @@ def test_a_file_is_loaded_only_where_it_is_trusted(trained, tmp_path):
         lambda: evaluate(ENV_ID, str(tmp_path / "bomb.zip"), episodes=1),
         lambda: refine(ENV_ID, str(tmp_path / "bomb.zip"), episodes=1),
     ):
-        with pytest.raises(ConfigurationError, match=r"bomb\.zip runs code that it contains; if you trust its source, pass --trust"):
+        with pytest.raises(
+            ConfigurationError,
+            match=r"bomb\.zip runs code that it contains; if you trust its source, pass --trust",
+        ):
             ask()
     assert not (tmp_path / "exploded").exists()
     make_policy(str(tmp_path / "bomb.zip"), problem, trust=True)
     assert (tmp_path / "exploded").exists()
-    refined = refine(ENV_ID, path, trust=True, filters=["none"], options={"horizon": 0.1}, episodes=1)
+    refined = refine(
+        ENV_ID, path, trust=True, filters=["none"], options={"horizon": 0.1}, episodes=1
+    )
     assert len(refined.evaluations) == 3
 
 
@@ -200,7 +252,14 @@ def test_missing_files_and_files_of_another_kind_are_errors(tmp_path):
         {"policy.pth": b"no weights"},
         {"policy.pth": None},
     ],
-    ids=["data no JSON", "data a list", "data empty", "data of other types", "weights garbage", "weights missing"],
+    ids=[
+        "data no JSON",
+        "data a list",
+        "data empty",
+        "data of other types",
+        "weights garbage",
+        "weights missing",
+    ],
 )
 def test_damaged_archives_are_errors(trained, tmp_path, changed):
     with zipfile.ZipFile(trained["ppo"][1]) as archive:
@@ -224,7 +283,10 @@ def test_policies_for_other_spaces_are_errors(trained, tmp_path):
         evaluate("safe_envs/Scalar-v0", path, trust=True, episodes=1)
 
 
-@pytest.mark.parametrize("space", [gym.spaces.Box(-2.0, 2.0, (1,)), gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Discrete(3)])
+@pytest.mark.parametrize(
+    "space",
+    [gym.spaces.Box(-2.0, 2.0, (1,)), gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Discrete(3)],
+)
 def test_policies_for_other_actions_are_errors(tmp_path, space):
     env = gym.make(ENV_ID).unwrapped
     env.action_space = space
@@ -233,7 +295,9 @@ def test_policies_for_other_actions_are_errors(tmp_path, space):
         make_policy(path, load_problem(ENV_ID), trust=True)
 
 
-@pytest.mark.parametrize("name", ["normalization.pkl", "vecnormalize.pkl", "StochasticDubins-v0/vecnormalize.pkl"])
+@pytest.mark.parametrize(
+    "name", ["normalization.pkl", "vecnormalize.pkl", "StochasticDubins-v0/vecnormalize.pkl"]
+)
 def test_policies_of_normalised_observations_are_refused(trained, tmp_path, name):
     path = tmp_path / "best_model.zip"
     shutil.copyfile(trained["ppo"][1], path)
@@ -242,7 +306,8 @@ def test_policies_of_normalised_observations_are_refused(trained, tmp_path, name
     beside.write_bytes(b"not to be read")
     for trust in (False, True):
         with pytest.raises(
-            ConfigurationError, match=r"trained on normalised observations.*save_policy\(model, folder, problem, norm"
+            ConfigurationError,
+            match=r"trained on normalised observations.*save_policy\(model, folder, problem, norm",
         ) as error:
             make_policy(str(path), load_problem(ENV_ID), trust=trust)
         assert str(beside) in str(error.value)

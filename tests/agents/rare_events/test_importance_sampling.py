@@ -14,7 +14,12 @@ from safe_envs.agents import NominalController, evaluate
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.rare_events.estimate import estimate_rare, verdict
-from safe_envs.agents.rare_events.importance_sampling import Drifting, TiltedNoiseEnv, log_ratio, optimal_tilt
+from safe_envs.agents.rare_events.importance_sampling import (
+    Drifting,
+    TiltedNoiseEnv,
+    log_ratio,
+    optimal_tilt,
+)
 from safe_envs.agents.rare_events.splitting import Splitting
 from tests.oracles.laws import X, brownian, first_passage, walk_passage
 
@@ -22,7 +27,13 @@ pytestmark = pytest.mark.slow
 
 
 def both(problem, bridge=None):
-    how = (lambda lengths: TiltedNoiseEnv(problem, lengths), NominalController(problem), 0, 4096, bridge)
+    how = (
+        lambda lengths: TiltedNoiseEnv(problem, lengths),
+        NominalController(problem),
+        0,
+        4096,
+        bridge,
+    )
     return Splitting(*how), Drifting(*how)
 
 
@@ -45,14 +56,34 @@ def test_exact_for_several_barriers_and_substeps():
 def test_ratios_undo_a_drift_of_several_channels():
     x, y, u, v = sp.symbols("x y u v", real=True)
     diffusion = [[0.3, 0.2], [0.0, 0.4]]
-    system = ControlAffineSDE(states=(x, y), inputs=(u, v), drift=[0, 0], input_matrix=[[1, 0], [0, 1]], diffusion=diffusion)
-    problem = state_problem(system, 3 - x - y, box=(-1.0, 1.0), start=[0.0, 0.0], dt=0.1, horizon=0.5, substeps=2, nominal=[0, 0])
+    system = ControlAffineSDE(
+        states=(x, y),
+        inputs=(u, v),
+        drift=[0, 0],
+        input_matrix=[[1, 0], [0, 1]],
+        diffusion=diffusion,
+    )
+    problem = state_problem(
+        system,
+        3 - x - y,
+        box=(-1.0, 1.0),
+        start=[0.0, 0.0],
+        dt=0.1,
+        horizon=0.5,
+        substeps=2,
+        nominal=[0, 0],
+    )
     env = TiltedNoiseEnv(problem, np.full(5000, 1.5))
     env.reset(seed=0)
     for _ in range(4):
         env.step(np.zeros((5000, 2)))
     ratios, time = np.exp(log_ratio(env.girsanov_integrals, 1.5)), 0.4
-    moments = [ratios, ratios * env.state[:, 0], ratios * env.state[:, 1], ratios * env.state[:, 0] * env.state[:, 1]]
+    moments = [
+        ratios,
+        ratios * env.state[:, 0],
+        ratios * env.state[:, 1],
+        ratios * env.state[:, 0] * env.state[:, 1],
+    ]
     for found, exact in zip(moments, (1.0, 0.0, 0.0, time * 0.2 * 0.4), strict=True):
         assert found.mean() == pytest.approx(exact, abs=4 * found.std() / math.sqrt(5000))
     # The drift is the steepest way, (.3, .6) for x + y, and of length 1.5.
@@ -71,7 +102,9 @@ def test_best_drift_of_a_walk_goes_straight_to_the_level():
     assert length == pytest.approx(5.0, rel=0.1)
     assert 1.0 < deviation < 5.0
     plain = 1 / math.sqrt(walk_passage(1.0, 20, 0.0, 0.2 * math.sqrt(0.05)))
-    assert optimal_tilt(0.0 * found.girsanov_integrals, found.shares, 1.0)[1] == pytest.approx(plain, rel=0.5)
+    assert optimal_tilt(0.0 * found.girsanov_integrals, found.shares, 1.0)[1] == pytest.approx(
+        plain, rel=0.5
+    )
 
 
 def test_violations_on_another_way_count_against_a_drift():
@@ -87,18 +120,37 @@ def test_violations_on_another_way_count_against_a_drift():
 def test_two_ways_to_fail_in_different_units_are_both_found():
     x, y, u, v = sp.symbols("x y u v", real=True)
     system = ControlAffineSDE(
-        states=(x, y), inputs=(u, v), drift=[0, 0], input_matrix=[[1, 0], [0, 1]], diffusion=[[0.2, 0], [0, 3 / 5.15]]
+        states=(x, y),
+        inputs=(u, v),
+        drift=[0, 0],
+        input_matrix=[[1, 0], [0, 1]],
+        diffusion=[[0.2, 0], [0, 3 / 5.15]],
     )
-    problem = state_problem(system, [1 - x, 3 - y], box=(-1.0, 1.0), start=[0.0, 0.0], dt=0.05, horizon=1.0, nominal=[0, 0])
-    exact = walk_passage(1.0, 20, 0.0, 0.2 * math.sqrt(0.05)) + walk_passage(3.0, 20, 0.0, 3 / 5.15 * math.sqrt(0.05))
+    problem = state_problem(
+        system,
+        [1 - x, 3 - y],
+        box=(-1.0, 1.0),
+        start=[0.0, 0.0],
+        dt=0.05,
+        horizon=1.0,
+        nominal=[0, 0],
+    )
+    exact = walk_passage(1.0, 20, 0.0, 0.2 * math.sqrt(0.05)) + walk_passage(
+        3.0, 20, 0.0, 3 / 5.15 * math.sqrt(0.05)
+    )
     (row,) = estimate_rare(problem, filters=["none"], particles=400).rows
     assert row["method"].startswith("splitting")
     assert row["ci_low"] < exact < row["ci_high"]
 
 
 def test_without_noise_chance_may_come_from_the_policy():
-    arguments = {"filters": ["none"], "options": {"horizon": 3.0, "start": [0.0, 0.0, 0.0], "barrier": {"radius": 2.35}}}
-    (found,) = estimate_rare("DubinsDisk-v0", "random", particles=50, repetitions=10, **arguments).rows
+    arguments = {
+        "filters": ["none"],
+        "options": {"horizon": 3.0, "start": [0.0, 0.0, 0.0], "barrier": {"radius": 2.35}},
+    }
+    (found,) = estimate_rare(
+        "DubinsDisk-v0", "random", particles=50, repetitions=10, **arguments
+    ).rows
     (plain,) = evaluate("DubinsDisk-v0", "random", episodes=2000, bounds=False, **arguments).rows
     assert found["status"] == "estimated"
     assert found["check"] is None
@@ -108,7 +160,13 @@ def test_without_noise_chance_may_come_from_the_policy():
 
 def row(p, width, error, spread=0.1):
     estimates = p * np.exp(spread * np.resize((-1, 1), 20))
-    return {"probability": p, "ci_low": p / width, "ci_high": p * width, "relative_error": error, "estimates": estimates.tolist()}
+    return {
+        "probability": p,
+        "ci_low": p / width,
+        "ci_high": p * width,
+        "relative_error": error,
+        "estimates": estimates.tolist(),
+    }
 
 
 NOTHING_SEEN = {"episodes": 5000, "violations": 0, "ci_low": 0.0, "ci_high": 7e-4}
@@ -121,10 +179,28 @@ FEW_SEEN = {"episodes": 5000, "violations": 5, "ci_low": 4e-4, "ci_high": 2e-3}
         (row(1e-7, 1.5, 0.2), None, NOTHING_SEEN, "split", None),
         (row(1e-7, 1.5, 0.2), row(1.2e-7, 1.1, 0.05), NOTHING_SEEN, "drift", None),
         (row(1e-7, 1.5, 0.2), row(1.2e-7, 1.2, 0.11), NOTHING_SEEN, "split", None),
-        (row(1e-7, 1.5, 0.2), row(2e-7, 1.1, 0.05), NOTHING_SEEN, "split", "importance sampling says 2e-07"),
-        (row(1e-7, 1.5, 0.2), row(5e-7, 1.1, 0.19), NOTHING_SEEN, "split", "importance sampling says 5e-07"),
+        (
+            row(1e-7, 1.5, 0.2),
+            row(2e-7, 1.1, 0.05),
+            NOTHING_SEEN,
+            "split",
+            "importance sampling says 2e-07",
+        ),
+        (
+            row(1e-7, 1.5, 0.2),
+            row(5e-7, 1.1, 0.19),
+            NOTHING_SEEN,
+            "split",
+            "importance sampling says 5e-07",
+        ),
         (row(1e-7, 1.5, 0.2), None, FEW_SEEN, "split", "5 violations among 5000 contradict it"),
-        (row(1e-7, 1.5, 0.2), row(1.2e-7, 1.1, 0.05), FEW_SEEN, "drift", "5 violations among 5000 contradict it"),
+        (
+            row(1e-7, 1.5, 0.2),
+            row(1.2e-7, 1.1, 0.05),
+            FEW_SEEN,
+            "drift",
+            "5 violations among 5000 contradict it",
+        ),
         (row(1e-7, 1.5, 0.2, 1.1), None, NOTHING_SEEN, "split", "differ by large factors"),
         (row(1e-7, 1.5, 0.2, 1.1), row(1.2e-7, 1.1, 0.05), NOTHING_SEEN, "drift", None),
     ],

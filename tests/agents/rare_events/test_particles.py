@@ -72,20 +72,41 @@ def test_several_barriers_are_compared_in_units_of_their_own():
 def test_records_find_the_first_one_below_a_level():
     generator = np.random.default_rng(0)
     paths, steps = 7, 300
-    records, heights = Records(paths, 2, 1), np.minimum.accumulate(generator.standard_normal((steps, paths)).cumsum(axis=0) - 0.1, axis=0)
+    records, heights = (
+        Records(paths, 2, 1),
+        np.minimum.accumulate(
+            generator.standard_normal((steps, paths)).cumsum(axis=0) - 0.1, axis=0
+        ),
+    )
     for k, row in enumerate(heights):
         fell = np.flatnonzero(row < heights[k - 1]) if k else np.arange(paths)
         state = np.stack([row[fell], np.full(len(fell), k)], axis=1)
-        records.add(fell, row[fell], np.full(len(fell), k), np.zeros(len(fell), dtype=bool), state, state[:, :1].astype(np.float32), -state)
+        records.add(
+            fell,
+            row[fell],
+            np.full(len(fell), k),
+            np.zeros(len(fell), dtype=bool),
+            state,
+            state[:, :1].astype(np.float32),
+            -state,
+        )
     levels = heights[-1] + generator.uniform(0.1, 3.0, paths)
     height, time, _, state, _, girsanov_integrals = records.first_below(levels, np.arange(paths))
     wanted = [int(np.argmax(heights[:, i] < levels[i])) for i in range(paths)]
     assert time.tolist() == wanted
     assert height.tolist() == [heights[k, i] for i, k in enumerate(wanted)]
-    assert state.tolist() == (-girsanov_integrals).tolist() == [[heights[k, i], k] for i, k in enumerate(wanted)]
+    assert (
+        state.tolist()
+        == (-girsanov_integrals).tolist()
+        == [[heights[k, i], k] for i, k in enumerate(wanted)]
+    )
     records.clear(np.array([3]))
     records.add(
-        np.array([3]), *(np.array([v]) for v in (0.5, 4, True)), np.zeros((1, 2)), np.zeros((1, 1), dtype=np.float32), np.zeros((1, 2))
+        np.array([3]),
+        *(np.array([v]) for v in (0.5, 4, True)),
+        np.zeros((1, 2)),
+        np.zeros((1, 1), dtype=np.float32),
+        np.zeros((1, 2)),
     )
     assert records.first_below(np.array([1.0]), np.array([3]))[1].tolist() == [4]
     assert records.last(np.array([3]))[1].tolist() == [4]

@@ -35,7 +35,13 @@ def row_of(problem, filter_name="none", **arguments):
 
 
 def splitting_of(problem, bridge=None):
-    return Splitting(lambda lengths: TiltedNoiseEnv(problem, lengths), NominalController(problem), 0, 4096, bridge)
+    return Splitting(
+        lambda lengths: TiltedNoiseEnv(problem, lengths),
+        NominalController(problem),
+        0,
+        4096,
+        bridge,
+    )
 
 
 def assert_holds(row, exact, within):
@@ -61,7 +67,9 @@ def test_gaussian_walk_of_probability_1e_8():
     assert_near(row["check"], exact, 2.0)
     assert row["plain"]["violations"] == 0
     # What plain episodes need for the same relative error, and how many steps these are.
-    assert row["plain_episodes_needed"] == pytest.approx(1 / (row["probability"] * row["relative_error"] ** 2), rel=1e-6)
+    assert row["plain_episodes_needed"] == pytest.approx(
+        1 / (row["probability"] * row["relative_error"] ** 2), rel=1e-6
+    )
     assert row["plain_steps_needed"] == pytest.approx(40 * row["plain_episodes_needed"])
     assert row["probability"] == pytest.approx(np.mean(row["estimates"]))
 
@@ -86,7 +94,8 @@ def test_geometric_martingale_of_probability_1e_8():
 
 @pytest.mark.slow
 def test_cruise_control_under_its_filter_has_the_gaussian_law():
-    # At 10 m/s the desired speed is far off, so that the filter acts all the time and A h = 0: h is a walk.
+    # At 10 m/s the desired speed is far off, so that the filter acts all the time and A h = 0: h is
+    # a walk.
     exact = walk_passage(32.0, 50, 0.0, 1.8 * math.sqrt(0.2))
     assert 1e-8 < exact < 2e-8
     options = {"start": [10.0, 10.0, 50.0], "horizon": 10.0, "dt": 0.2}
@@ -131,12 +140,17 @@ def test_pilots_and_estimates_have_noise_of_their_own():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("episodes", [6_000, pytest.param(100_000, marks=pytest.mark.oracle)])
-@pytest.mark.parametrize(("policy", "monitoring"), [("nominal", "discrete"), ("random", "discrete"), ("nominal", "continuous")])
+@pytest.mark.parametrize(
+    ("policy", "monitoring"),
+    [("nominal", "discrete"), ("random", "discrete"), ("nominal", "continuous")],
+)
 def test_agrees_with_plain_episodes_where_these_do(policy, monitoring, episodes):
     # Random starts, and a box that is too small for some of them.
     options = {"noise": 0.3, "horizon": 1.0, "dt": 0.05, "box": [-1.0, 1.0]}
     arguments = {"filters": ["szcbf"], "options": options, "monitoring": monitoring}
-    (plain,) = evaluate("Scalar-v0", policy, episodes=episodes, confidence=0.99, bounds=False, **arguments).rows
+    (plain,) = evaluate(
+        "Scalar-v0", policy, episodes=episodes, confidence=0.99, bounds=False, **arguments
+    ).rows
     (rare,) = estimate_rare("Scalar-v0", policy, seed=3, particles=100, **arguments).rows
     assert rare["ci_low"] < 1 - plain["ci_low"]
     assert rare["ci_high"] > 1 - plain["ci_high"]
@@ -153,7 +167,9 @@ def test_what_is_sure_needs_no_level():
 
 def test_same_seed_is_the_same_answer_and_is_json():
     arguments = {"filters": ["none"], **SHORT}
-    first, second, other = (estimate_rare(brownian(0.1, 1.0, 0.0, 0.3), seed=s, **arguments) for s in (1, 1, 2))
+    first, second, other = (
+        estimate_rare(brownian(0.1, 1.0, 0.0, 0.3), seed=s, **arguments) for s in (1, 1, 2)
+    )
     assert first.rows == second.rows
     assert first.rows != other.rows
     document = json.loads(json.dumps(first.document(), allow_nan=False))
@@ -201,7 +217,9 @@ def test_what_cannot_be_taken_up_again_is_refused():
         estimate_rare(problem, Remembering(problem), filters=["none"])
 
 
-@pytest.mark.parametrize(("name", "value"), [("particles", 19), ("repetitions", 9), ("num_envs", 0), ("particles", 2.5)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("particles", 19), ("repetitions", 9), ("num_envs", 0), ("particles", 2.5)]
+)
 def test_numbers_out_of_range_are_refused(name, value):
     with pytest.raises(ConfigurationError, match=f"{name} = {value}"):
         estimate_rare("Scalar-v0", **{name: value})
@@ -212,7 +230,10 @@ def test_log_normal_interval_is_coxs_around_the_mean():
     s = math.log(2)
     half = student.ppf(0.975, 2) * math.sqrt(s**2 / 3 + s**4 / 4)
     mean = 7e-8 / 3
-    assert log_normal_interval(values) == (pytest.approx(mean * math.exp(-half)), pytest.approx(mean * math.exp(half)))
+    assert log_normal_interval(values) == (
+        pytest.approx(mean * math.exp(-half)),
+        pytest.approx(mean * math.exp(half)),
+    )
     assert log_normal_interval([3.0, 3.0]) == (3.0, 3.0)
     for wrong in ([1.0], [1.0, 0.0]):
         with pytest.raises(ConfigurationError, match="at least two, all above 0"):

@@ -16,7 +16,9 @@ from safe_envs.agents.sweeps.spec import sweep_of
 pytestmark = pytest.mark.slow
 
 
-def test_versions_change_with_each_byte_and_name_of_the_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_versions_change_with_each_byte_and_name_of_the_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr(cell, "files", lambda package: tmp_path / package)
     (tmp_path / "safe_envs" / "inner").mkdir(parents=True)
     file = tmp_path / "safe_envs" / "inner" / "code.py"

@@ -9,7 +9,10 @@ from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_importe
 from safe_envs.agents.sweeps.spec import sweep_of
 
 FILES = {
-    "mine.py": "import os, numpy as np, near.inner\nfrom other import x\nfrom bare import part\ndef problem():\n    import late, broken",
+    "mine.py": (
+        "import os, numpy as np, near.inner\nfrom other import x\nfrom bare import part\ndef"
+        " problem():\n    import late, broken"
+    ),
     "near/__init__.py": "from . import beside",
     "near/beside.py": "from .deep.end import y",
     "near/inner.py": "",
@@ -24,7 +27,12 @@ FILES = {
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for name, text in {**FILES, "unused.py": "", "near/unused.py": "", "numpy/unused.py": ""}.items():
+    for name, text in {
+        **FILES,
+        "unused.py": "",
+        "near/unused.py": "",
+        "numpy/unused.py": "",
+    }.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
     return tmp_path
@@ -39,7 +47,11 @@ def test_what_a_file_imports_from_its_folder_is_found_without_running_it(folder:
 def test_paths_mean_the_same_in_every_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "ppo").mkdir()
     monkeypatch.chdir(tmp_path)
-    given = {"filter": "ddscbf:file=a.npz+bayesian-scbf:file=in/b.npz:delta=0.1", "policy": "ppo", "system": "mine.py:problem"}
+    given = {
+        "filter": "ddscbf:file=a.npz+bayesian-scbf:file=in/b.npz:delta=0.1",
+        "policy": "ppo",
+        "system": "mine.py:problem",
+    }
     first, second = tmp_path / "a.npz", tmp_path / "in" / "b.npz"
     found = absolute({**given, "seed": 1})
     assert found == {
@@ -51,7 +63,10 @@ def test_paths_mean_the_same_in_every_process(tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir("/")
     assert absolute(found) == found
     assert list(read_by({"filter": found["filter"], "policy": "nominal"})) == [first, second]
-    assert absolute({"filter": "none", "policy": "nominal"}) == {"filter": "none", "policy": "nominal"}
+    assert absolute({"filter": "none", "policy": "nominal"}) == {
+        "filter": "none",
+        "policy": "nominal",
+    }
 
 
 def test_a_cell_is_known_by_what_its_system_imports(folder: Path):

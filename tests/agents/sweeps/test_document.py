@@ -33,7 +33,8 @@ def refusal_of(path: Path, content: str) -> str:
 
 
 BOMB = "fixed:\n  start: &a [1,1]\ngrid:\n" + "".join(
-    f"  plant.p{i}: &p{i} [{','.join(['*' + ('a' if i == 0 else f'p{i - 1}')] * 10)}]\n" for i in range(8)
+    f"  plant.p{i}: &p{i} [{','.join(['*' + ('a' if i == 0 else f'p{i - 1}')] * 10)}]\n"
+    for i in range(8)
 )
 
 
@@ -62,7 +63,14 @@ BOMB = "fixed:\n  start: &a [1,1]\ngrid:\n" + "".join(
         ("fixed: {system: " + "x" * 60_000 + "}", "give FILE.py:NAME"),
         ("x" * 60_000 + ": 1", "is no YAML"),
         ("a" * 70_000, "larger than"),
-        ("fixed: {env: Scalar-v0, filter: none}\ngrid: {seed: [" + "1," * 800 + "], episodes: [" + "2," * 800 + "]}", "640000 cells"),
+        (
+            "fixed: {env: Scalar-v0, filter: none}\ngrid: {seed: ["
+            + "1," * 800
+            + "], episodes: ["
+            + "2," * 800
+            + "]}",
+            "640000 cells",
+        ),
     ],
     ids=lambda text: text[:24],
 )
@@ -92,15 +100,21 @@ def test_files_that_a_sweep_reads_are_regular_ones(tmp_path: Path, monkeypatch):
 
 
 words = st.text(st.characters(codec="ascii"), max_size=5)
-scalars = st.none() | st.booleans() | st.integers(-(10**30), 10**30) | st.floats(-1e10, 1e10) | words
+scalars = (
+    st.none() | st.booleans() | st.integers(-(10**30), 10**30) | st.floats(-1e10, 1e10) | words
+)
 mappings = st.dictionaries(st.text("abc", max_size=3), scalars, max_size=3)
-documents = st.recursive(scalars | mappings, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(words, inner, max_size=3))
+documents = st.recursive(
+    scalars | mappings,
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(words, inner, max_size=3),
+)
 
 
 @hypothesis.given(documents)
 def test_what_json_can_say_is_read_as_it_was_written(document: Any):
     text = yaml.safe_dump(document)
-    # PyYAML may write equal texts as aliases, and texts that look like numbers in odd forms with tags.
+    # PyYAML may write equal texts as aliases, and texts that look like numbers in odd forms with
+    # tags.
     assert value_of(text, "sweep") == document
 
 

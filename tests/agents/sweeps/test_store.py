@@ -23,7 +23,9 @@ SMALL: dict[str, Any] = {"env": "Scalar-v0", "filter": "scbf", "episodes": 20, "
 
 @pytest.fixture(scope="module")
 def sweep() -> Sweep:
-    return sweep_of({"fixed": SMALL, "grid": {"noise": [0.1, [0.2], 0.3]}, "cells": [{"start": [0.5]}]})
+    return sweep_of(
+        {"fixed": SMALL, "grid": {"noise": [0.1, [0.2], 0.3]}, "cells": [{"start": [0.5]}]}
+    )
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +33,9 @@ def outcomes(sweep: Sweep) -> list[Outcome]:
     return [compute(cell) for cell in sweep.cells]
 
 
-def test_what_was_kept_is_read_in_the_order_of_the_file(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+def test_what_was_kept_is_read_in_the_order_of_the_file(
+    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+):
     store = Store(tmp_path, sweep)
     assert store.missing == list(sweep.cells)
     for outcome in reversed(outcomes[1:]):
@@ -44,7 +48,15 @@ def test_what_was_kept_is_read_in_the_order_of_the_file(tmp_path: Path, sweep: S
     for row, outcome in zip(table.to_pylist(), outcomes[1:], strict=True):
         assert outcome.row is not None
         assert all(
-            row[name] == outcome.row[name] for name in ("safe", "safety_rate", "ci_low", "min_h_p05", "return_mean", "estimated_bound")
+            row[name] == outcome.row[name]
+            for name in (
+                "safe",
+                "safety_rate",
+                "ci_low",
+                "min_h_p05",
+                "return_mean",
+                "estimated_bound",
+            )
         )
         assert json.loads(row["row"]) == outcome.row
         assert json.loads(row["config"])["problem"]["dt"] == 0.01
@@ -52,7 +64,9 @@ def test_what_was_kept_is_read_in_the_order_of_the_file(tmp_path: Path, sweep: S
     assert Store(tmp_path, sweep).missing == [sweep.cells[0]]
 
 
-def test_a_failed_cell_is_told_and_tried_again(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+def test_a_failed_cell_is_told_and_tried_again(
+    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+):
     store = Store(tmp_path, sweep)
     store.keep(Outcome(sweep.cells[0].key, None, None, "it broke", 0.1))
     assert read(tmp_path)["error"].to_pylist() == ["it broke"]
@@ -62,7 +76,9 @@ def test_a_failed_cell_is_told_and_tried_again(tmp_path: Path, sweep: Sweep, out
     assert read(tmp_path)["error"].to_pylist() == [None]
 
 
-def test_a_failure_replaces_no_result_of_another_run(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+def test_a_failure_replaces_no_result_of_another_run(
+    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+):
     store, other = Store(tmp_path, sweep), Store(tmp_path, sweep)
     other.keep(outcomes[0])
     store.keep(Outcome(sweep.cells[0].key, None, None, "it broke", 0.1))
@@ -70,17 +86,24 @@ def test_a_failure_replaces_no_result_of_another_run(tmp_path: Path, sweep: Swee
     assert store.missing == list(sweep.cells[1:])
 
 
-def test_settings_of_cells_that_are_not_there_have_columns(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+def test_settings_of_cells_that_are_not_there_have_columns(
+    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+):
     Store(tmp_path, sweep).keep(outcomes[0])
     assert read(tmp_path).select(["noise", "start"]).to_pylist() == [{"noise": 0.1, "start": None}]
 
 
-def test_the_results_of_another_sweep_are_read_until_there_is_one_of_this(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+def test_the_results_of_another_sweep_are_read_until_there_is_one_of_this(
+    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+):
     first = Store(tmp_path, sweep)
     for outcome in outcomes:
         first.keep(outcome)
     # As after an update of the code: nothing of it has been computed yet.
-    newer = Sweep(tuple(replace(cell, versions={**cell.versions, "source": "newer"}) for cell in sweep.cells), sweep.swept)
+    newer = Sweep(
+        tuple(replace(cell, versions={**cell.versions, "source": "newer"}) for cell in sweep.cells),
+        sweep.swept,
+    )
     store = Store(tmp_path, newer)
     assert store.missing == list(newer.cells)
     assert len(read(tmp_path)) == 4
@@ -101,7 +124,9 @@ def test_what_was_being_written_when_a_run_was_killed_is_removed(tmp_path: Path,
     assert [path.exists() for path in (old, young, of_index)] == [False, True, False]
 
 
-def test_cells_of_another_sweep_stay_and_are_not_read(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+def test_cells_of_another_sweep_stay_and_are_not_read(
+    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+):
     store = Store(tmp_path, sweep)
     for outcome in outcomes:
         store.keep(outcome)
@@ -111,7 +136,9 @@ def test_cells_of_another_sweep_stay_and_are_not_read(tmp_path: Path, sweep: Swe
     assert Store(tmp_path, sweep).missing == []
 
 
-def test_a_full_disk_loses_nothing_that_is_finished(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome], monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_loses_nothing_that_is_finished(
+    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome], monkeypatch: pytest.MonkeyPatch
+):
     store = Store(tmp_path, sweep)
     store.keep(outcomes[0])
 
@@ -121,7 +148,10 @@ def test_a_full_disk_loses_nothing_that_is_finished(tmp_path: Path, sweep: Sweep
 
     with monkeypatch.context() as patch:
         patch.setattr(pq, "write_table", full)
-        with pytest.raises(ConfigurationError, match=r"No space left on device; .*\. 1 of 4 cells are finished and kept"):
+        with pytest.raises(
+            ConfigurationError,
+            match=r"No space left on device; .*\. 1 of 4 cells are finished and kept",
+        ):
             store.keep(outcomes[1])
     assert [path.stem for path in (tmp_path / "cells").iterdir()] == [sweep.cells[0].key]
     again = Store(tmp_path, sweep)
@@ -161,13 +191,17 @@ def test_folders_that_cannot_be(tmp_path: Path, sweep: Sweep):
     assert len(read(tmp_path / "empty")) == 0
 
 
-def test_without_pyarrow_the_extra_is_named(tmp_path: Path, sweep: Sweep, monkeypatch: pytest.MonkeyPatch):
+def test_without_pyarrow_the_extra_is_named(
+    tmp_path: Path, sweep: Sweep, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setattr("safe_envs.agents.sweeps.store.find_spec", lambda name: None)
     with pytest.raises(ConfigurationError, match=r"safe-envs\[sweep\]"):
         Store(tmp_path, sweep)
 
 
-def test_a_cell_that_is_a_bomb_or_no_file_is_not_read(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+def test_a_cell_that_is_a_bomb_or_no_file_is_not_read(
+    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+):
     Store(tmp_path, sweep).keep(outcomes[0])
     (path,) = (tmp_path / "cells").iterdir()
     row = pq.read_table(path)
@@ -175,7 +209,11 @@ def test_a_cell_that_is_a_bomb_or_no_file_is_not_read(tmp_path: Path, sweep: Swe
     with pytest.raises(ConfigurationError, match="no cell of a sweep"):
         read(tmp_path)
     # A text of 10 MB, in a file of a few kB.
-    pq.write_table(row.set_column(row.schema.get_field_index("row"), "row", pa.array(["x" * 10**7])), path, compression="zstd")
+    pq.write_table(
+        row.set_column(row.schema.get_field_index("row"), "row", pa.array(["x" * 10**7])),
+        path,
+        compression="zstd",
+    )
     assert path.stat().st_size < 100_000
     with pytest.raises(ConfigurationError, match="no cell of a sweep"):
         read(tmp_path)

@@ -22,7 +22,11 @@ def one_thread():
 
 
 def test_monitor_reports_the_last_step_of_an_episode(tmp_path):
-    env = VecMonitor(make_sb3_env(DUBINS, 2, "scbf", seed=0, max_episode_steps=4), str(tmp_path), info_keywords=("episode_cost",))
+    env = VecMonitor(
+        make_sb3_env(DUBINS, 2, "scbf", seed=0, max_episode_steps=4),
+        str(tmp_path),
+        info_keywords=("episode_cost",),
+    )
     env.reset()
     total = np.zeros(2)
     for action in np.random.default_rng(0).uniform(-1.0, 1.0, (4, 2, 1)):
@@ -38,7 +42,10 @@ def test_monitor_reports_the_last_step_of_an_episode(tmp_path):
 
 @pytest.mark.parametrize("algorithm", [PPO, SAC])
 def test_algorithms_learn(algorithm):
-    settings = {PPO: {"n_steps": 32, "batch_size": 64, "n_epochs": 2}, SAC: {"learning_starts": 100, "batch_size": 32}}[algorithm]
+    settings = {
+        PPO: {"n_steps": 32, "batch_size": 64, "n_epochs": 2},
+        SAC: {"learning_starts": 100, "batch_size": 32},
+    }[algorithm]
     native = make_sb3_env(DUBINS, 4, "scbf", intervention_penalty=0.1, max_episode_steps=10)
     env = VecNormalize(VecMonitor(native, info_keywords=("episode_cost", "episode_interventions")))
     model = algorithm("MlpPolicy", env, device="cpu", seed=0, **settings)

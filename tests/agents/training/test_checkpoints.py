@@ -1,4 +1,5 @@
-"""What a training goes on from: all of it, nothing that runs code, nothing of another size, and nothing half written."""
+"""What a training goes on from: all of it, nothing that runs code, nothing of another size, and
+nothing half written."""
 
 from __future__ import annotations
 
@@ -25,14 +26,27 @@ from tests.oracles.full_disk import no_file_larger_than
 pytestmark = pytest.mark.slow
 
 DUBINS = "safe_envs/StochasticDubins-v0"
-SAC = {"learning_starts": 16, "batch_size": 16, "train_freq": 4, "gradient_steps": 1, "policy_kwargs": {"net_arch": [8]}}
+SAC = {
+    "learning_starts": 16,
+    "batch_size": 16,
+    "train_freq": 4,
+    "gradient_steps": 1,
+    "policy_kwargs": {"net_arch": [8]},
+}
 PPO = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}}
 
 
 def training(algorithm="ppo", changes=None, **arguments):
     """Two parts of a few steps; episodes of 10 steps do not end where they do."""
     known = {"ppo": PPO, "a2c": {"policy_kwargs": {"net_arch": [8]}}}.get(algorithm, SAC)
-    given = {"filter": "scbf", "num_envs": 2, "n_timesteps": 96, "eval_freq": 32, "eval_episodes": 2, "options": {"horizon": 0.5}}
+    given = {
+        "filter": "scbf",
+        "num_envs": 2,
+        "n_timesteps": 96,
+        "eval_freq": 32,
+        "eval_episodes": 2,
+        "options": {"horizon": 0.5},
+    }
     return Training.of(DUBINS, algorithm, settings=known | (changes or {}), **given | arguments)
 
 
@@ -53,7 +67,11 @@ def outcome(folder):
     """All that a training leaves but for the clock."""
     lines = [json.loads(line) for line in (folder / "progress.jsonl").read_text().splitlines()]
     logged = [{k: v for k, v in line.items() if not k.startswith("time/")} for line in lines]
-    return logged, json.loads((folder / "evaluations.json").read_text()), (folder / "policy.safetensors").read_bytes()
+    return (
+        logged,
+        json.loads((folder / "evaluations.json").read_text()),
+        (folder / "policy.safetensors").read_bytes(),
+    )
 
 
 @pytest.mark.parametrize(
@@ -66,12 +84,32 @@ def outcome(folder):
         ("sac", {"n_steps": 3, "buffer_size": 40}, {}),
         (
             "sac",
-            {"optimize_memory_usage": True, "replay_buffer_kwargs": {"handle_timeout_termination": False}, "ent_coef": 0.1},
+            {
+                "optimize_memory_usage": True,
+                "replay_buffer_kwargs": {"handle_timeout_termination": False},
+                "ent_coef": 0.1,
+            },
             {"filter": None},
         ),
-        ("td3", {"noise_type": "ornstein-uhlenbeck", "noise_std": 0.3, "policy_kwargs": {"optimizer_kwargs": {"amsgrad": True}}}, {}),
+        (
+            "td3",
+            {
+                "noise_type": "ornstein-uhlenbeck",
+                "noise_std": 0.3,
+                "policy_kwargs": {"optimizer_kwargs": {"amsgrad": True}},
+            },
+            {},
+        ),
     ],
-    ids=["normalised", "rewards-normalised", "gsde", "both-actions", "n-step-full-buffer", "small-memory", "noise"],
+    ids=[
+        "normalised",
+        "rewards-normalised",
+        "gsde",
+        "both-actions",
+        "n-step-full-buffer",
+        "small-memory",
+        "noise",
+    ],
 )
 def test_a_stopped_training_ends_as_one_that_was_not(algorithm, changes, arguments, tmp_path):
     wanted = training(algorithm, changes, **arguments)
@@ -165,7 +203,9 @@ def test_a_state_that_is_a_list_is_refused_in_words(copied):
 
 
 @pytest.mark.parametrize("name", READ)
-def test_files_that_are_not_there_or_endless_or_too_large_are_refused_before_they_are_read(name, copied):
+def test_files_that_are_not_there_or_endless_or_too_large_are_refused_before_they_are_read(
+    name, copied
+):
     folder, checkpoint = copied
     path = checkpoint / name
     for damage, reason in (
@@ -227,7 +267,9 @@ def test_a_state_of_another_shape_is_refused(name, value, copied):
         train(WHOLE, folder, resume=True)
 
 
-@pytest.mark.parametrize("text", ["[1]", "[" * 20_000, '[{"timesteps": 32}]', "null", '[{"timesteps": "a"}]', "\udcff"])
+@pytest.mark.parametrize(
+    "text", ["[1]", "[" * 20_000, '[{"timesteps": 32}]', "null", '[{"timesteps": "a"}]', "\udcff"]
+)
 @pytest.mark.parametrize("name", TEXTS)
 def test_texts_of_another_shape_are_refused(name, text, copied):
     folder, _ = copied
@@ -248,7 +290,10 @@ def whole(tmp_path_factory):
 def test_a_full_disk_leaves_what_was_there_and_nothing_else(size, whole, copied):
     folder, _ = copied
     for_more = {path.name for path in folder.iterdir()} | {"policy.safetensors"}
-    with no_file_larger_than(size), pytest.raises(ConfigurationError, match=r"cannot write .*File too large"):
+    with (
+        no_file_larger_than(size),
+        pytest.raises(ConfigurationError, match=r"cannot write .*File too large"),
+    ):
         train(WHOLE, folder, resume=True)
     assert {path.name for path in folder.iterdir()} <= for_more
     train(WHOLE, folder, resume=True)
@@ -267,7 +312,9 @@ def test_two_trainings_do_not_write_to_one_folder(tmp_path):
     def begin_another(part):
         if not told:
             for resume in (False, True):
-                with pytest.raises(ConfigurationError, match=r"another training is writing to .*run just now; wait"):
+                with pytest.raises(
+                    ConfigurationError, match=r"another training is writing to .*run just now; wait"
+                ):
                     train(training(), tmp_path / "run", resume=resume)
         told.append(part)
 
@@ -282,7 +329,9 @@ def test_a_training_that_was_killed_holds_its_folder_no_more(run, tmp_path):
     lock = tmp_path / "run" / ".lock"
     code = "import sys, time\nfrom pathlib import Path\nfrom safe_envs.file_locks import locked\n"
     code += "with locked(Path(sys.argv[1]), ''):\n    print('held', flush=True)\n    time.sleep(60)"
-    process = subprocess.Popen([sys.executable, "-c", code, str(lock)], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, str(lock)], stdout=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None
     assert process.stdout.readline() == "held\n"
     with pytest.raises(ConfigurationError, match="another training"):

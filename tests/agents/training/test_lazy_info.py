@@ -65,7 +65,10 @@ def test_every_way_to_read_an_info_gives_all_of_it(reading):
     env = make_sb3_env(DUBINS, 2, "scbf", seed=0, max_episode_steps=1)
     env.reset()
     info = env.step(np.ones((2, 1), dtype=np.float32))[3][1]
-    wanted = {**{key: values[1] for key, values in env.batch_info.items()}, "terminal_observation": dict.get(info, "terminal_observation")}
+    wanted = {
+        **{key: values[1] for key, values in env.batch_info.items()},
+        "terminal_observation": dict.get(info, "terminal_observation"),
+    }
     read = reading(info)
     assert len(read) == len(wanted) == 17
     for key, value in wanted.items():
@@ -85,8 +88,18 @@ def test_infos_are_equal_if_their_entries_are():
     changed[2]["another"] = 1
     del changed[3]["cost"]
     # A copy of a lazy one is lazy, so that no comparison can rely on an earlier one.
-    for other, same in ((twin, True), (info, True), (dict(twin.copy()), True), *((other, False) for other in changed)):
-        for a, b in ((info.copy(), other), (other, info.copy()), (info.copy(), other.copy()), (other.copy(), info.copy())):
+    for other, same in (
+        (twin, True),
+        (info, True),
+        (dict(twin.copy()), True),
+        *((other, False) for other in changed),
+    ):
+        for a, b in (
+            (info.copy(), other),
+            (other, info.copy()),
+            (info.copy(), other.copy()),
+            (other.copy(), info.copy()),
+        ):
             assert ((a == b), (a != b)) == (same, not same)
     assert info.copy() != 3
 

@@ -15,7 +15,11 @@ from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from safe_envs import ConfigurationError
-from safe_envs.agents.training.replay_buffer import FilteredNStepReplayBuffer, FilteredReplayBuffer, replay_options
+from safe_envs.agents.training.replay_buffer import (
+    FilteredNStepReplayBuffer,
+    FilteredReplayBuffer,
+    replay_options,
+)
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
@@ -23,7 +27,14 @@ pytestmark = pytest.mark.slow
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
 BOX = (-3.0, 5.0)
-SETTINGS = {"buffer_size": 600, "learning_starts": 20, "batch_size": 8, "train_freq": 4, "device": "cpu", "seed": 3}
+SETTINGS = {
+    "buffer_size": 600,
+    "learning_starts": 20,
+    "batch_size": 8,
+    "train_freq": 4,
+    "device": "cpu",
+    "seed": 3,
+}
 SPACES = (gym.spaces.Box(-1.0, 1.0, (2,)), gym.spaces.Box(-1.0, 1.0, (2,)))
 TWO_INPUTS = ((0.0, 4.0), (-3.0, 5.0))
 
@@ -48,7 +59,8 @@ def native():
 
 
 class Witness(BaseCallback):
-    """Keeps what the learner proposed and what the simulations were given (of native ones: what infos say) at every step."""
+    """Keeps what the learner proposed and what the simulations were given (of native ones: what
+    infos say) at every step."""
 
     def __init__(self):
         super().__init__()
@@ -56,7 +68,9 @@ class Witness(BaseCallback):
 
     def _on_step(self):
         envs = [env.unwrapped for env in getattr(self.training_env.unwrapped, "envs", [])]
-        executed = [env.normalized_action(env.executed) for env in envs] or [(info["safe_action"] - 1) / 4 for info in self.locals["infos"]]
+        executed = [env.normalized_action(env.executed) for env in envs] or [
+            (info["safe_action"] - 1) / 4 for info in self.locals["infos"]
+        ]
         self.proposed.append(self.locals["buffer_actions"])
         self.executed.append(np.clip(executed, -1.0, 1.0))
         self.intervened.append([info.get("intervention") for info in self.locals["infos"]])
@@ -85,7 +99,9 @@ def assert_same_learning(a, b):
     assert a.replay_buffer.pos == b.replay_buffer.pos > 0
 
 
-@pytest.mark.parametrize("make_envs", [lambda: several(1), several, native], ids=["one", "several", "native"])
+@pytest.mark.parametrize(
+    "make_envs", [lambda: several(1), several, native], ids=["one", "several", "native"]
+)
 @pytest.mark.parametrize("algorithm", [SAC, TD3, DDPG])
 def test_executed_actions_are_stored_also_at_the_end_of_episodes(algorithm, make_envs):
     env = make_envs()
@@ -112,7 +128,9 @@ def test_proposed_is_what_stable_baselines_stores():
     executed, _ = learned(SAC, several(), **replay_options(several()))
     assert_same_learning(plain, proposed)
     assert stored(proposed).tobytes() == witness.actions()[0].tobytes()
-    assert not torch.equal(next(executed.policy.critic.parameters()), next(plain.policy.critic.parameters()))
+    assert not torch.equal(
+        next(executed.policy.critic.parameters()), next(plain.policy.critic.parameters())
+    )
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -132,7 +150,9 @@ def test_both_stores_each_step_with_either_action(count):
 @pytest.mark.parametrize("algorithm", [SAC, TD3])
 def test_without_a_filter_nothing_changes(algorithm, action):
     plain, _ = learned(algorithm, several(filtered=False))
-    ours, _ = learned(algorithm, several(filtered=False), **replay_options(several(filtered=False), action))
+    ours, _ = learned(
+        algorithm, several(filtered=False), **replay_options(several(filtered=False), action)
+    )
     assert type(ours.replay_buffer) is FilteredReplayBuffer
     assert_same_learning(plain, ours)
 
@@ -170,17 +190,26 @@ def test_ppo_keeps_the_proposals_and_their_probabilities():
         def _on_rollout_end(self):
             rollout = self.model.rollout_buffer
             actions.append(rollout.actions.copy())
-            observations, sampled = (torch.as_tensor(rows.reshape(-1, rows.shape[-1])) for rows in (rollout.observations, rollout.actions))
+            observations, sampled = (
+                torch.as_tensor(rows.reshape(-1, rows.shape[-1]))
+                for rows in (rollout.observations, rollout.actions)
+            )
             with torch.no_grad():
                 _, log_probs, _ = self.model.policy.evaluate_actions(observations, sampled)
-            np.testing.assert_allclose(log_probs.numpy(), rollout.log_probs.ravel(), rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(
+                log_probs.numpy(), rollout.log_probs.ravel(), rtol=1e-5, atol=1e-5
+            )
 
     nominal, interventions, actions = [], [], []
-    PPO("MlpPolicy", several(), n_steps=32, batch_size=48, n_epochs=2, device="cpu", seed=0).learn(192, callback=BeforeTheUpdate())
+    PPO("MlpPolicy", several(), n_steps=32, batch_size=48, n_epochs=2, device="cpu", seed=0).learn(
+        192, callback=BeforeTheUpdate()
+    )
     center, half = np.mean(BOX), np.ptp(BOX) / 2
     assert np.any(interventions)
     assert len(actions) == 2
-    np.testing.assert_allclose(np.array(nominal), center + half * np.clip(np.concatenate(actions), -1.0, 1.0), atol=1e-5)
+    np.testing.assert_allclose(
+        np.array(nominal), center + half * np.clip(np.concatenate(actions), -1.0, 1.0), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("action", ["executed", "both"])
@@ -195,7 +224,10 @@ def test_saving_and_loading(tmp_path, action):
     assert stored(again).tobytes() == stored(model).tobytes()
     before = again.replay_buffer.size()
     again.learn(30, callback=(witness := Witness()), reset_num_timesteps=False)
-    assert stored(again)[before :: 2 if action == "both" else 1].tobytes() == witness.actions()[1].tobytes()
+    assert (
+        stored(again)[before :: 2 if action == "both" else 1].tobytes()
+        == witness.actions()[1].tobytes()
+    )
 
 
 def buffer_of(envs=3, action="executed", kind=FilteredReplayBuffer, box=TWO_INPUTS, **arguments):
@@ -206,7 +238,14 @@ def add(buffer, infos, rewards=0.0):
     count = len(infos)
     rng = np.random.default_rng(1)
     proposed = rng.uniform(-1.0, 1.0, (count, 2))
-    buffer.add(np.zeros((count, 2)), np.zeros((count, 2)), proposed, np.full(count, rewards), np.zeros(count, dtype=bool), infos)
+    buffer.add(
+        np.zeros((count, 2)),
+        np.zeros((count, 2)),
+        proposed,
+        np.full(count, rewards),
+        np.zeros(count, dtype=bool),
+        infos,
+    )
     return proposed.astype(np.float32)
 
 
@@ -260,7 +299,14 @@ def test_a_full_buffer_starts_again():
 def test_options_of_a_problem_and_of_any_env_of_it():
     env = make()
     vector = SafetyFilterVectorWrapper(gym.make_vec(ENV_ID, num_envs=2, box=BOX), "scbf")
-    for source in (env.unwrapped.problem, env, vector, several(), VecNormalize(several()), native()):
+    for source in (
+        env.unwrapped.problem,
+        env,
+        vector,
+        several(),
+        VecNormalize(several()),
+        native(),
+    ):
         assert replay_options(source, "both") == {
             "replay_buffer_class": FilteredReplayBuffer,
             "replay_buffer_kwargs": {"box": (BOX,), "action": "both"},
@@ -268,7 +314,16 @@ def test_options_of_a_problem_and_of_any_env_of_it():
 
 
 @pytest.mark.parametrize(
-    "box", [None, (0.0, 4.0), ((0.0, 4.0),), ((0.0, 4.0), (5.0, -3.0)), ((0.0, 4.0), (0.0, np.inf)), "box", ((0,), (1, 2))]
+    "box",
+    [
+        None,
+        (0.0, 4.0),
+        ((0.0, 4.0),),
+        ((0.0, 4.0), (5.0, -3.0)),
+        ((0.0, 4.0), (0.0, np.inf)),
+        "box",
+        ((0,), (1, 2)),
+    ],
 )
 def test_boxes_that_do_not_fit(box):
     with pytest.raises(ConfigurationError, match=r"box = .* for each of the 2 inputs"):
@@ -276,7 +331,12 @@ def test_boxes_that_do_not_fit(box):
 
 
 def test_actions_and_combinations_that_are_not_allowed():
-    with pytest.raises(ConfigurationError, match=r"action = 'excuted'; did you mean 'executed'\? \(allowed: executed, proposed, both\)"):
+    with pytest.raises(
+        ConfigurationError,
+        match=(
+            r"action = 'excuted'; did you mean 'executed'\? \(allowed: executed, proposed, both\)"
+        ),
+    ):
         buffer_of(action="excuted")
     with pytest.raises(ConfigurationError, match="action = None; "):
         buffer_of(action=None)
@@ -290,7 +350,10 @@ def test_actions_and_combinations_that_are_not_allowed():
 
 @pytest.mark.parametrize("executed", [[4.1, 0.0], [2.0, -30.0], [np.nan, 0.0]])
 def test_executed_actions_beyond_the_box(executed):
-    with pytest.raises(ConfigurationError, match=r"not between \[0.0, -3.0\] and \[4.0, 5.0\]; give the box of the env's problem"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"not between \[0.0, -3.0\] and \[4.0, 5.0\]; give the box of the env's problem",
+    ):
         add(buffer_of(envs=1), [{"safe_action": np.array(executed)}])
 
 
@@ -298,5 +361,7 @@ def test_envs_without_one_box():
     for source in (gym.make("CartPole-v1"), DummyVecEnv([lambda: gym.make("CartPole-v1")]), None):
         with pytest.raises(ConfigurationError, match="not one of this project's envs"):
             replay_options(source)
-    with pytest.raises(ConfigurationError, match=r"different boxes \[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]"):
+    with pytest.raises(
+        ConfigurationError, match=r"different boxes \[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]"
+    ):
         replay_options(DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))]))

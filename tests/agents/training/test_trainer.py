@@ -1,4 +1,5 @@
-"""Training: what it leaves, that it can be gone on with, and that its figures are those of the evaluation."""
+"""Training: what it leaves, that it can be gone on with, and that its figures are those of the
+evaluation."""
 
 from __future__ import annotations
 
@@ -43,7 +44,10 @@ def training(algorithm="ppo", steps=None, every=None, **changes):
 
 def logged(folder):
     """All that was logged, but for the clock."""
-    return [{k: v for k, v in line.items() if not k.startswith("time/")} for line in read_progress(folder / "progress.jsonl")]
+    return [
+        {k: v for k, v in line.items() if not k.startswith("time/")}
+        for line in read_progress(folder / "progress.jsonl")
+    ]
 
 
 def evaluations(folder):
@@ -64,7 +68,15 @@ def finished(request, tmp_path_factory):
 def test_the_folder_holds_all_that_is_needed(finished):
     algorithm, folder = finished
     names = {path.name for path in folder.iterdir()}
-    wanted = {"config.json", "evaluations.json", "progress.jsonl", "model.zip", "policy.safetensors", "policy.json", "best"}
+    wanted = {
+        "config.json",
+        "evaluations.json",
+        "progress.jsonl",
+        "model.zip",
+        "policy.safetensors",
+        "policy.json",
+        "best",
+    }
     assert wanted <= names
     assert len([name for name in names if name.startswith("checkpoint_")]) == 1
     config = json.loads((folder / "config.json").read_text())
@@ -80,9 +92,20 @@ def test_the_folder_holds_all_that_is_needed(finished):
 def test_its_figures_are_those_of_the_evaluation(finished):
     _, folder = finished
     assert len({row["seed"] for row in evaluations(folder)}) == 1
-    last, best = evaluations(folder)[-1], max(evaluations(folder), key=lambda row: row["return_mean"])
+    last, best = (
+        evaluations(folder)[-1],
+        max(evaluations(folder), key=lambda row: row["return_mean"]),
+    )
     for path, row in ((folder, last), (folder / "best", best)):
-        (found,) = evaluate(DUBINS, str(path), ["scbf"], episodes=8, seed=row["seed"], bounds=False, options=SMALL["options"]).rows
+        (found,) = evaluate(
+            DUBINS,
+            str(path),
+            ["scbf"],
+            episodes=8,
+            seed=row["seed"],
+            bounds=False,
+            options=SMALL["options"],
+        ).rows
         assert {key: found[key] for key in ("safe", "return_mean", "violations")} == {
             key: row[key] for key in ("safe", "return_mean", "violations")
         }
@@ -102,7 +125,9 @@ def test_the_same_seed_gives_the_same_training(finished, tmp_path):
     algorithm, folder = finished
     train(training(algorithm), tmp_path / "again")
     assert logged(tmp_path / "again") == logged(folder)
-    assert (tmp_path / "again" / "policy.safetensors").read_bytes() == (folder / "policy.safetensors").read_bytes()
+    assert (tmp_path / "again" / "policy.safetensors").read_bytes() == (
+        folder / "policy.safetensors"
+    ).read_bytes()
 
 
 def test_a_training_that_was_interrupted_goes_on_as_if_it_had_not_been(finished, tmp_path):
@@ -122,7 +147,9 @@ def test_a_training_that_was_interrupted_goes_on_as_if_it_had_not_been(finished,
     train(training(algorithm), interrupted, resume=True)
     assert logged(interrupted) == logged(folder)
     assert evaluations(interrupted) == evaluations(folder)
-    assert (interrupted / "policy.safetensors").read_bytes() == (folder / "policy.safetensors").read_bytes()
+    assert (interrupted / "policy.safetensors").read_bytes() == (
+        folder / "policy.safetensors"
+    ).read_bytes()
     train(training(algorithm), interrupted, resume=True)  # there is nothing left to do
     assert logged(interrupted) == logged(folder)
 
@@ -178,13 +205,23 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
     with pytest.raises(ConfigurationError, match="holds no training"):
         train(training(), tmp_path / "empty", resume=True)
     with pytest.raises(ConfigurationError, match=r"has seed = 0, not 1"):
-        train(training(json.loads((folder / "config.json").read_text())["training"]["algorithm"], seed=1), folder, resume=True)
+        train(
+            training(
+                json.loads((folder / "config.json").read_text())["training"]["algorithm"], seed=1
+            ),
+            folder,
+            resume=True,
+        )
 
 
 @pytest.mark.parametrize(
     ("algorithm", "settings", "message"),
     [
-        ("ppo", {"learning_rat": 3}, "ppo does not take the hyperparameter 'learning_rat'; did you mean 'learning_rate'"),
+        (
+            "ppo",
+            {"learning_rat": 3},
+            "ppo does not take the hyperparameter 'learning_rat'; did you mean 'learning_rate'",
+        ),
         ("ppo", {"policy_kwargs": {"speed": 3}}, r"ppo does not take these hyperparameters.*speed"),
         ("a2c", {"n_epochs": 3}, "a2c does not take"),
         ("ppo", {"normalize": "no thanks"}, "normalize|does not take"),
@@ -202,25 +239,44 @@ def test_what_cannot_be_trained_is_refused(finished, tmp_path):
         ("ppo", {"normalize": "[" * 5000}, "does not take"),
     ],
 )
-def test_hyperparameters_that_do_not_work_are_refused_and_leave_the_folder_to_others(algorithm, settings, message, tmp_path):
+def test_hyperparameters_that_do_not_work_are_refused_and_leave_the_folder_to_others(
+    algorithm, settings, message, tmp_path
+):
     with pytest.raises(ConfigurationError, match=message):
         train(training(algorithm, settings=settings), tmp_path / "run")
     train(training("a2c", steps=64, every=64), tmp_path / "run")
 
 
 def test_the_zoo_s_texts_and_lists_are_understood(tmp_path):
-    session = _Session(training(settings={"normalize": "{'norm_obs': False, 'norm_reward': True}", "gamma": 0.9}), tmp_path)
+    session = _Session(
+        training(settings={"normalize": "{'norm_obs': False, 'norm_reward': True}", "gamma": 0.9}),
+        tmp_path,
+    )
     scales = session._model.get_env()
     assert (scales.norm_obs, scales.norm_reward, scales.gamma) == (False, True, 0.9)
     session = _Session(
-        training("sac", settings={"train_freq": [2, "step"], "noise_type": "ornstein-uhlenbeck", "noise_std": 0.2}), tmp_path
+        training(
+            "sac",
+            settings={
+                "train_freq": [2, "step"],
+                "noise_type": "ornstein-uhlenbeck",
+                "noise_std": 0.2,
+            },
+        ),
+        tmp_path,
     )
     assert session._model.train_freq.frequency == 2
     assert "OrnsteinUhlenbeck" in str(session._model.action_noise)
 
 
 def test_a_rollout_is_cut_into_whole_batches():
-    assert [whole_batches(512, rollout, False) for rollout in (2048, 625, 448, 37, 1021)] == [512, 125, 448, 37, 1021]
+    assert [whole_batches(512, rollout, False) for rollout in (2048, 625, 448, 37, 1021)] == [
+        512,
+        125,
+        448,
+        37,
+        1021,
+    ]
     assert whole_batches(64, 256, True) == 64
     with pytest.raises(ConfigurationError, match="give 64"):
         whole_batches(100, 256, True)
@@ -233,14 +289,22 @@ def test_a_rollout_is_cut_into_whole_batches():
 def test_the_filter_in_the_loop_knows_what_it_is_to_know(tmp_path):
     problem = load_problem("safe_envs/QuadrotorAltitude-v0")
     for knowledge, system in (("model", problem.model), ("plant", problem.plant)):
-        session = _Session(Training.of("QuadrotorAltitude-v0", "ppo", filter="hocbf", knowledge=knowledge), tmp_path)
-        assert session._model.get_env().unwrapped.env.safety_filter.model.parameters == system.parameters
+        session = _Session(
+            Training.of("QuadrotorAltitude-v0", "ppo", filter="hocbf", knowledge=knowledge),
+            tmp_path,
+        )
+        assert (
+            session._model.get_env().unwrapped.env.safety_filter.model.parameters
+            == system.parameters
+        )
     assert problem.model.parameters != problem.plant.parameters
 
 
 def test_episodes_go_on_from_one_part_to_the_next(tmp_path):
     """Their 10 steps are longer than a part, which are 4 of each env."""
-    train(training("a2c", steps=160, every=16, settings={"n_steps": 4}, filter=None), tmp_path / "run")
+    train(
+        training("a2c", steps=160, every=16, settings={"n_steps": 4}, filter=None), tmp_path / "run"
+    )
     last = {key: value for line in logged(tmp_path / "run") for key, value in line.items()}
     assert last["rollout/ep_len_mean"] == 10
     assert len(evaluations(tmp_path / "run")) == 10
@@ -248,15 +312,23 @@ def test_episodes_go_on_from_one_part_to_the_next(tmp_path):
 
 
 def test_the_learning_rate_falls_over_the_whole_training_and_never_below_zero(tmp_path):
-    train(training(steps=700, settings={"learning_rate": "lin_1e-3", "n_steps": 64}), tmp_path / "run")
-    found = {line["step"]: line["train/learning_rate"] for line in logged(tmp_path / "run") if "train/learning_rate" in line}
+    train(
+        training(steps=700, settings={"learning_rate": "lin_1e-3", "n_steps": 64}), tmp_path / "run"
+    )
+    found = {
+        line["step"]: line["train/learning_rate"]
+        for line in logged(tmp_path / "run")
+        if "train/learning_rate" in line
+    }
     assert max(found) > 700
     assert found == pytest.approx({step: 1e-3 * max(0.0, 1 - step / 700) for step in found})
 
 
 def test_the_figures_are_those_of_the_infos():
     envs, figures = make_sb3_env(DUBINS, 3, "scbf", seed=0, horizon=0.5, noise=1.0), SafetyFigures()
-    figures.init_callback(type("Model", (), {"get_env": lambda self: envs, "logger": None, "num_timesteps": 0})())  # pyright: ignore
+    figures.init_callback(
+        type("Model", (), {"get_env": lambda self: envs, "logger": None, "num_timesteps": 0})()
+    )  # pyright: ignore
     envs.reset()
     rng, seen, ended = np.random.default_rng(0), [], []
     for _ in range(60):
@@ -277,9 +349,13 @@ def test_the_figures_are_those_of_the_infos():
 
 def test_the_figures_are_those_of_the_evaluation_on_the_same_episodes():
     options, episodes = {"horizon": 0.5, "noise": 1.0}, 32
-    (row,) = evaluate(DUBINS, "zero", ["scbf"], options=options, episodes=episodes, bounds=False).rows
+    (row,) = evaluate(
+        DUBINS, "zero", ["scbf"], options=options, episodes=episodes, bounds=False
+    ).rows
     envs, figures = make_sb3_env(DUBINS, episodes, "scbf", **options), SafetyFigures()
-    figures.init_callback(type("Model", (), {"get_env": lambda self: envs, "logger": None, "num_timesteps": 0})())  # pyright: ignore
+    figures.init_callback(
+        type("Model", (), {"get_env": lambda self: envs, "logger": None, "num_timesteps": 0})()
+    )  # pyright: ignore
     envs._seeds = [episode_seed(0, i) for i in range(episodes)]
     envs.reset()
     dones = np.zeros(episodes, dtype=bool)
@@ -293,11 +369,16 @@ def test_the_figures_are_those_of_the_evaluation_on_the_same_episodes():
 
 
 def test_the_files_have_the_form_that_the_zoo_reads():
-    """Its ExperimentManager takes YAML with ids for keys, and evaluates texts for arguments, so that there are none here."""
+    """Its ExperimentManager takes YAML with ids for keys, and evaluates texts for arguments, so
+    that there are none here."""
     from importlib.resources import files
 
     for algorithm in ALGORITHMS:
-        table = yaml.safe_load(files("safe_envs.agents.training").joinpath("hyperparams", f"{algorithm}.yml").read_text())
+        table = yaml.safe_load(
+            files("safe_envs.agents.training")
+            .joinpath("hyperparams", f"{algorithm}.yml")
+            .read_text()
+        )
         assert set(safe_envs.ENV_IDS) <= set(table)
         for settings in table.values():
             assert not isinstance(settings["policy_kwargs"], str)
@@ -306,7 +387,9 @@ def test_the_files_have_the_form_that_the_zoo_reads():
 
 def test_schedules_fall_to_nothing():
     settings = scheduled({"learning_rate": "lin_2e-3", "gamma": 0.9})
-    assert [settings["learning_rate"](left) for left in (1.0, 0.5, 0.0, -1.0)] == pytest.approx([2e-3, 1e-3, 0.0, 0.0])
+    assert [settings["learning_rate"](left) for left in (1.0, 0.5, 0.0, -1.0)] == pytest.approx(
+        [2e-3, 1e-3, 0.0, 0.0]
+    )
     for text in ("exp_3", "lin_x"):
         with pytest.raises(ConfigurationError, match="learning_rate"):
             scheduled({"learning_rate": text})
@@ -319,4 +402,7 @@ def test_a_log_forgets_what_came_after_the_checkpoint_and_half_a_line(tmp_path):
         log.write({"a": np.float32(step), "b": float("nan"), "text": "c"}, {}, step)
     path.write_text(path.read_text() + '{"step": 4, "a"')
     ProgressLog(path, 2)
-    assert read_progress(path) == [{"step": 1, "a": 1.0, "b": None}, {"step": 2, "a": 2.0, "b": None}]
+    assert read_progress(path) == [
+        {"step": 1, "a": 1.0, "b": None},
+        {"step": 2, "a": 2.0, "b": None},
+    ]

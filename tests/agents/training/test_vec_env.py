@@ -34,7 +34,11 @@ def pair(env_id, filter_text, **options):
 
 
 def drawn_actions(env, steps, seed=0):
-    return np.random.default_rng(seed).uniform(-1.0, 1.0, (steps, env.num_envs, *env.action_space.shape)).astype(np.float32)
+    return (
+        np.random.default_rng(seed)
+        .uniform(-1.0, 1.0, (steps, env.num_envs, *env.action_space.shape))
+        .astype(np.float32)
+    )
 
 
 def assert_same_info(ours, theirs, where):
@@ -58,7 +62,9 @@ def assert_same_steps(ours, theirs, actions):
             assert np.allclose(a, b, rtol=1e-6, atol=1e-7), (k, name, a, b)
         for i in range(NUM_ENVS):
             assert_same_info(my_infos[i], other_infos[i], f"step {k}, env {i}")
-            assert_same_info(ours.reset_infos[i], theirs.reset_infos[i], f"step {k}, reset of env {i}")
+            assert_same_info(
+                ours.reset_infos[i], theirs.reset_infos[i], f"step {k}, reset of env {i}"
+            )
         for key, values in ours.batch_info.items():
             assert np.array_equal(values, [info[key] for info in my_infos]), (k, key)
         shown.append((mine[2], my_infos))
@@ -68,7 +74,9 @@ def assert_same_steps(ours, theirs, actions):
 @pytest.mark.parametrize("filtered", [False, True])
 def test_equals_dummy_vec_env(env_id, filtered):
     problem = problem_of(env_id)
-    ours, theirs = pair(env_id, problem.filter if filtered else None, noise=0.05, horizon=4 * problem.dt)
+    ours, theirs = pair(
+        env_id, problem.filter if filtered else None, noise=0.05, horizon=4 * problem.dt
+    )
     shown = assert_same_steps(ours, theirs, drawn_actions(ours, 9))
     assert sum(dones.sum() for dones, _ in shown) >= 2 * NUM_ENVS
 
@@ -76,7 +84,12 @@ def test_equals_dummy_vec_env(env_id, filtered):
 def test_equals_dummy_vec_env_when_episodes_end_at_different_steps():
     ours, theirs = pair("safe_envs/Scalar-v0", "scbf", noise=4.0, horizon=0.3)
     shown = assert_same_steps(ours, theirs, np.abs(drawn_actions(ours, 70)))
-    ends = [info["TimeLimit.truncated"] for dones, infos in shown for done, info in zip(dones, infos, strict=True) if done]
+    ends = [
+        info["TimeLimit.truncated"]
+        for dones, infos in shown
+        for done, info in zip(dones, infos, strict=True)
+        if done
+    ]
     assert {True, False} == set(ends)
     assert any(dones.any() and not dones.all() for dones, _ in shown)
 
@@ -97,10 +110,16 @@ def test_infos_of_an_end_are_those_of_the_episode():
         observations, _, dones, infos = env.step(action)
     assert dones.all()
     # Before the first step nothing was proposed: that info must not stand in for the last one.
-    assert all(info["nominal_action"] == 10.0 * a for info, a in zip(infos, action[:, 0].astype(float), strict=True))
+    assert all(
+        info["nominal_action"] == 10.0 * a
+        for info, a in zip(infos, action[:, 0].astype(float), strict=True)
+    )
     assert all(info["nominal_action"] == 0.0 for info in env.reset_infos)
     assert all(a is not b for a, b in zip(resets, env.reset_infos, strict=True))
-    assert all(not np.array_equal(info["terminal_observation"], row) for info, row in zip(infos, observations, strict=True))
+    assert all(
+        not np.array_equal(info["terminal_observation"], row)
+        for info, row in zip(infos, observations, strict=True)
+    )
 
 
 def test_infos_stay_as_they_were():
@@ -163,11 +182,18 @@ def test_attributes_are_set_for_all_envs():
 def test_methods_are_called_once_for_the_batch():
     env = make_sb3_env(DUBINS, 2, "scbf", seed=0)
     env.reset()
-    assert env.env_method("get_wrapper_attr", "problem", indices=[0]) == [env.get_attr("problem")[0]]
-    assert [env.env_method("has_wrapper_attr", name) for name in ("problem", "nothing")] == [[True, True], [False, False]]
+    assert env.env_method("get_wrapper_attr", "problem", indices=[0]) == [
+        env.get_attr("problem")[0]
+    ]
+    assert [env.env_method("has_wrapper_attr", name) for name in ("problem", "nothing")] == [
+        [True, True],
+        [False, False],
+    ]
     rows = env.env_method("normalized_action", [np.array([5.0, -10.0])])
     np.testing.assert_array_equal(rows, [[0.5], [-1.0]])
-    np.testing.assert_array_equal(env.env_method("normalized_action", [np.array([5.0, -10.0])], indices=1), [[-1.0]])
+    np.testing.assert_array_equal(
+        env.env_method("normalized_action", [np.array([5.0, -10.0])], indices=1), [[-1.0]]
+    )
     with pytest.raises(ConfigurationError, match="'reset', which acts on all envs"):
         env.env_method("reset", indices=[0])
 
@@ -181,7 +207,9 @@ def test_components_are_handed_out_by_env():
         env.step(action)
     for name in ("executed", "components"):
         values = ours.get_attr(name)
-        np.testing.assert_allclose(values, [getattr(env.unwrapped, name) for env in theirs.envs], rtol=1e-6)
+        np.testing.assert_allclose(
+            values, [getattr(env.unwrapped, name) for env in theirs.envs], rtol=1e-6
+        )
         assert all(type(u) is float for value in values for u in value)
         assert ours.get_attr(name, [2]) == [values[2]]
     wanted = [env.unwrapped.physical_action(a) for env, a in zip(theirs.envs, action, strict=True)]
@@ -227,11 +255,16 @@ def test_render_of_each_env_is_its_picture():
 
 
 def test_video_recorder_gets_what_it_asks_for(monkeypatch, tmp_path):
-    # The render mode, the frame rate in the metadata, and one picture of all envs, here from a stand-in for rendering.
+    # The render mode, the frame rate in the metadata, and one picture of all envs, here from a
+    # stand-in for rendering.
     native = make_sb3_env(DUBINS, 2).env
     native.render_mode = "rgb_array"
     native.metadata = {**native.metadata, "render_modes": ["rgb_array"], "render_fps": 20}
-    monkeypatch.setattr(type(native), "render", lambda self: tuple(np.full((4, 6, 3), i, dtype=np.uint8) for i in range(self.num_envs)))
+    monkeypatch.setattr(
+        type(native),
+        "render",
+        lambda self: tuple(np.full((4, 6, 3), i, dtype=np.uint8) for i in range(self.num_envs)),
+    )
     monkeypatch.setitem(sys.modules, "moviepy", ModuleType("moviepy"))
     recorder = VecVideoRecorder(SafeVecEnv(native), str(tmp_path), lambda _: True, video_length=5)
     assert recorder.frames_per_sec == 20
@@ -244,27 +277,46 @@ def test_video_recorder_gets_what_it_asks_for(monkeypatch, tmp_path):
 
 def test_penalty_is_the_distance_in_units_of_the_box():
     env_id, c = "safe_envs/QuadrotorLimits-v0", 0.7
-    envs = [make_sb3_env(env_id, 2, "hocbf", seed=3, intervention_penalty=p, noise=0.05, max_episode_steps=12) for p in (0.0, c)]
+    envs = [
+        make_sb3_env(
+            env_id, 2, "hocbf", seed=3, intervention_penalty=p, noise=0.05, max_episode_steps=12
+        )
+        for p in (0.0, c)
+    ]
     for env in envs:
         env.reset()
     half = np.diff(np.array(envs[0].get_attr("problem")[0].box))[:, 0] / 2.0
     reduced = 0
     for action in drawn_actions(envs[0], 24):
         (_, plain, dones, infos), (_, rewards, _, penalised) = (env.step(action) for env in envs)
-        distances = np.array([np.linalg.norm((info["safe_action"] - info["nominal_action"]) / half) for info in infos])
+        distances = np.array(
+            [
+                np.linalg.norm((info["safe_action"] - info["nominal_action"]) / half)
+                for info in infos
+            ]
+        )
         np.testing.assert_allclose(rewards, plain - c * distances, rtol=1e-5, atol=1e-6)
         assert rewards.dtype == np.float32
         reduced += (distances[dones] > 0.0).sum()
-        assert all((d > 0.0) == info["intervention"] for d, info in zip(distances, infos, strict=True))
-        np.testing.assert_allclose([info["intervention_penalty"] for info in penalised], c * distances, rtol=1e-12)
+        assert all(
+            (d > 0.0) == info["intervention"] for d, info in zip(distances, infos, strict=True)
+        )
+        np.testing.assert_allclose(
+            [info["intervention_penalty"] for info in penalised], c * distances, rtol=1e-12
+        )
     assert reduced, "an episode should end with an intervention"
 
 
 def test_penalty_is_in_all_infos_if_there_is_one():
-    free, penalised = (make_sb3_env(DUBINS, 2, "scbf", seed=3, intervention_penalty=c, max_episode_steps=3) for c in (0.0, 0.5))
+    free, penalised = (
+        make_sb3_env(DUBINS, 2, "scbf", seed=3, intervention_penalty=c, max_episode_steps=3)
+        for c in (0.0, 0.5)
+    )
     for env in (free, penalised):
         env.reset()
-        assert all(("intervention_penalty" in info) == (env is penalised) for info in env.reset_infos)
+        assert all(
+            ("intervention_penalty" in info) == (env is penalised) for info in env.reset_infos
+        )
     for action in drawn_actions(penalised, 3):
         infos = penalised.step(action)[3]
         assert all("intervention_penalty" not in info for info in free.step(action)[3])
@@ -297,7 +349,10 @@ def test_filters_are_texts_conditions_or_nothing(given):
         ({"filter": 3}, "condition = 3"),
         ({"filter": "scbf", "knowledge": "oracle"}, "oracle"),
         ({"filter": "scbf", "objective": "fastest"}, "fastest"),
-        ({"filter": "scbf", "intervention_penalty": -0.1}, "intervention_penalty = -0.1; give a finite number from 0"),
+        (
+            {"filter": "scbf", "intervention_penalty": -0.1},
+            "intervention_penalty = -0.1; give a finite number from 0",
+        ),
         ({"filter": "scbf", "intervention_penalty": float("nan")}, "intervention_penalty = nan"),
         ({"filter": "scbf", "intervention_penalty": "1"}, "intervention_penalty = '1'"),
         ({"intervention_penalty": 0.1}, "without a filter"),

@@ -14,7 +14,14 @@ from safe_envs.scripts.figures.evaluation_figure import add_legend
     [
         (["none", "scbf"], 2),
         (["none", "a", "b", "c", "d"], 4),
-        (["none: 83.0 % safe", "bayesian-scbf:simultaneous=0.9: 88.0 % safe", "bayesian-scbf:confidence=0.95: 85.0 % safe"], 1),
+        (
+            [
+                "none: 83.0 % safe",
+                "bayesian-scbf:simultaneous=0.9: 88.0 % safe",
+                "bayesian-scbf:confidence=0.95: 85.0 % safe",
+            ],
+            1,
+        ),
         ([f"ddscbf:margin=0.{i}: 88.0 % safe" for i in range(4)], 2),
         (["none: 83.0 % safe", f"bayesian-scbf:file={'long/' * 30}x.npz: 88.0 % safe"], 1),
     ],

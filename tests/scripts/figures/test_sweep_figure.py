@@ -22,7 +22,13 @@ def rows_of(**values: Any) -> list[dict[str, Any]]:
     rows = [dict(zip(names, each, strict=True)) for each in itertools.product(*values.values())]
     for k, row in enumerate(rows):
         low, high = rate_interval(k % 20, 20)
-        row |= {"safe": k % 20, "episodes": 20, "safety_rate": (k % 20) / 20, "ci_low": low, "ci_high": high}
+        row |= {
+            "safe": k % 20,
+            "episodes": 20,
+            "safety_rate": (k % 20) / 20,
+            "ci_low": low,
+            "ci_high": high,
+        }
         row |= {"config": '{"title": "mine"}', "row": '{"learning": null}'}
     return rows
 
@@ -56,9 +62,15 @@ def test_episodes_of_several_seeds_are_put_together():
 
 
 def test_the_band_of_seeds_that_learned_anew_is_over_what_they_learned_too():
-    rows = [{**row, "row": json.dumps({"learning": {"sha256": [str(k)]}})} for k, row in enumerate(ROWS[1:4])]
+    rows = [
+        {**row, "row": json.dumps({"learning": {"sha256": [str(k)]}})}
+        for k, row in enumerate(ROWS[1:4])
+    ]
     rate, low, high = _rate(rows) or (0.0, 0.0, 0.0)
-    assert (rate, low, high) == (6 / 60, *repeated_interval([1 / 20, 2 / 20, 3 / 20], rate_interval(6, 60), 0.95, (0.0, 1.0)))
+    assert (rate, low, high) == (
+        6 / 60,
+        *repeated_interval([1 / 20, 2 / 20, 3 / 20], rate_interval(6, 60), 0.95, (0.0, 1.0)),
+    )
     # As of a file, which is the same for all of them.
     same = [{**row, "row": rows[0]["row"]} for row in rows]
     assert _rate(same) == (6 / 60, *rate_interval(6, 60))
@@ -79,7 +91,9 @@ def test_what_no_cell_has_yet_is_drawn_as_the_envs_own(tmp_path: Path):
         (("seed",), (), ("mine: safety rate",)),
     ],
 )
-def test_a_picture_of_each_kind(tmp_path: Path, swept: tuple[str, ...], given: tuple[str, ...], panels: tuple[str, ...]):
+def test_a_picture_of_each_kind(
+    tmp_path: Path, swept: tuple[str, ...], given: tuple[str, ...], panels: tuple[str, ...]
+):
     path = tmp_path / "rates.svg"
     assert draw(ROWS, Layout.of(ROWS, swept, *given), path) == 0
     text = path.read_text()

@@ -22,7 +22,18 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[3]
 SCRIPTS = {"list": "listing.py", "reproduce": "reproduce/command.py"}
-QUICK = ("evaluate", "Scalar-v0", "--filter", "none", "--filter", "scbf", "--episodes", "8", "--horizon", "0.2")
+QUICK = (
+    "evaluate",
+    "Scalar-v0",
+    "--filter",
+    "none",
+    "--filter",
+    "scbf",
+    "--episodes",
+    "8",
+    "--horizon",
+    "0.2",
+)
 
 
 def failing(error):
@@ -51,7 +62,9 @@ def test_sizes_beyond_the_memory_end_with_status_2(capsys, error):
     assert "choose smaller settings" in printed
 
 
-@pytest.mark.parametrize("error", [ValueError("a fault of the program"), RuntimeError("another"), KeyError("x")])
+@pytest.mark.parametrize(
+    "error", [ValueError("a fault of the program"), RuntimeError("another"), KeyError("x")]
+)
 def test_faults_of_the_program_are_not_hidden(error):
     with pytest.raises(type(error)):
         run(failing(error))
@@ -102,7 +115,9 @@ def test_errors_are_not_quiet(safe_envs_command):
 
 @pytest.mark.parametrize("arguments", [QUICK, ("list",), ("verify", "Scalar-v0", "--no-simulate")])
 def test_json_goes_to_stdout_by_itself(safe_envs_command, monkeypatch, arguments):
-    monkeypatch.setattr("safe_envs.scripts.listing.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0"))
+    monkeypatch.setattr(
+        "safe_envs.scripts.listing.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0")
+    )
     monkeypatch.setattr("safe_envs.agents.evaluation.bound_check.STARTS", 512)
     monkeypatch.setattr("safe_envs.wrappers.verification.feasibility.verify", verify_once)
     status, out, err = safe_envs_command(*arguments, "--json", "-")
@@ -118,7 +133,18 @@ def test_json_goes_to_stdout_by_itself(safe_envs_command, monkeypatch, arguments
 
 def test_every_command_has_both_options(safe_envs_command):
     commands = typer.main.get_command(cli.app).commands  # pyright: ignore[reportAttributeAccessIssue]
-    assert {"list", "doctor", "demo", "evaluate", "verify", "identify", "train", "leaderboard", "reproduce", "benchmark"} <= set(commands)
+    assert {
+        "list",
+        "doctor",
+        "demo",
+        "evaluate",
+        "verify",
+        "identify",
+        "train",
+        "leaderboard",
+        "reproduce",
+        "benchmark",
+    } <= set(commands)
     for name, command in commands.items():
         options = {option for parameter in command.params for option in parameter.opts}
         assert "--quiet" in options, name
@@ -143,8 +169,14 @@ def test_the_package_is_the_command(safe_envs_command, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["-m", *QUICK, "-q"])
     with pytest.raises(SystemExit):
         runpy.run_module("safe_envs", run_name="__main__")
-    without_speed = [line.rpartition("  ")[0].rstrip() for line in capsys.readouterr().out.splitlines() if "─" not in line]
-    assert without_speed == [line.rpartition("  ")[0].rstrip() for line in expected.splitlines() if "─" not in line]
+    without_speed = [
+        line.rpartition("  ")[0].rstrip()
+        for line in capsys.readouterr().out.splitlines()
+        if "─" not in line
+    ]
+    assert without_speed == [
+        line.rpartition("  ")[0].rstrip() for line in expected.splitlines() if "─" not in line
+    ]
 
 
 @pytest.mark.parametrize(
@@ -160,9 +192,18 @@ def test_the_package_is_the_command(safe_envs_command, monkeypatch, capsys):
         (("evaluate", "Scalar-v0", "--knowledge", "plan"), "did you mean 'plant'"),
         (("verify", "Scalar-v0", "--filter", "scfb"), "did you mean 'scbf'"),
         (("train", "Scalar-v0", "--algo", "pp", "--out", "x"), "did you mean 'ppo'"),
-        (("train", "Scalar-v0", "--algo", "ppo", "--out", "x", "--set", "learning_rat=1"), "did you mean 'learning_rate'"),
-        (("identify", "Scalar-v0", "--method", "bayes", "--out", "x.npz"), "did you mean 'bayesian'"),
-        (("identify", "Scalar-v0", "--method", "bayesian", "--out", "x.npz", "--set", "start=1"), "did you mean 'starts'"),
+        (
+            ("train", "Scalar-v0", "--algo", "ppo", "--out", "x", "--set", "learning_rat=1"),
+            "did you mean 'learning_rate'",
+        ),
+        (
+            ("identify", "Scalar-v0", "--method", "bayes", "--out", "x.npz"),
+            "did you mean 'bayesian'",
+        ),
+        (
+            ("identify", "Scalar-v0", "--method", "bayesian", "--out", "x.npz", "--set", "start=1"),
+            "did you mean 'starts'",
+        ),
         (("reproduce", "table-9.1"), "did you mean 'table-"),
         (("leaderboard", "Scaler-v0"), "did you mean 'safe_envs/Scalar-v0'"),
     ],
@@ -174,7 +215,9 @@ def test_what_is_misspelt_has_a_suggestion(safe_envs_command, arguments, suggest
 
 
 def test_tables_on_a_pipe_have_no_trailing_blanks(safe_envs_command, monkeypatch):
-    monkeypatch.setattr("safe_envs.scripts.listing.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0"))
+    monkeypatch.setattr(
+        "safe_envs.scripts.listing.ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0")
+    )
     lines = safe_envs_command("list")[1].splitlines()
     assert any("─" in line for line in lines)
     assert [line for line in lines if line != line.rstrip()] == []

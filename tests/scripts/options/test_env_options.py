@@ -1,4 +1,5 @@
-"""The options of an env, which stand once for five commands, and the files that these do not overwrite."""
+"""The options of an env, which stand once for five commands, and the files that these do not
+overwrite."""
 
 from __future__ import annotations
 
@@ -21,7 +22,16 @@ COMMANDS = {
     "train": ("--algo", "ppo", "--out", "run"),
     "render": ("--out", "film.gif"),
 }
-GIVEN = ("--noise=-.1,0", "--plant=v=.8", "--plant=w=2", "--barrier=kind=a b", "--dt=0.05", "--substeps=2", "--box=-1,2", "--start=-1,2")
+GIVEN = (
+    "--noise=-.1,0",
+    "--plant=v=.8",
+    "--plant=w=2",
+    "--barrier=kind=a b",
+    "--dt=0.05",
+    "--substeps=2",
+    "--box=-1,2",
+    "--start=-1,2",
+)
 
 
 def read(*words: str) -> EnvOptions:
@@ -52,10 +62,15 @@ def test_a_command_is_handed_the_env_that_its_options_ask_for():
     }
     assert read("Pendulum-v0").arguments == {}
     # What is 0 was given, and is refused by the env.
-    assert read("Pendulum-v0", "--dt", "0", "--substeps", "0").arguments == {"dt": 0.0, "substeps": 0}
+    assert read("Pendulum-v0", "--dt", "0", "--substeps", "0").arguments == {
+        "dt": 0.0,
+        "substeps": 0,
+    }
 
 
-@pytest.mark.parametrize("which", [("safe_envs/Pendulum-v0",), ("--system", "my folder/own.py:problem")])
+@pytest.mark.parametrize(
+    "which", [("safe_envs/Pendulum-v0",), ("--system", "my folder/own.py:problem")]
+)
 def test_its_command_line_asks_for_the_same_env(which):
     env = read(*which, *GIVEN)
     words = shlex.split(env.evaluate_command("--policy", "a b"))
@@ -68,13 +83,17 @@ def test_a_system_of_ones_own_takes_the_place_of_an_id():
     assert env.full_id == "safe_envs/Custom-v0"
     assert env.arguments == {"system": "own.py:problem", "horizon": 2.0}
     for words in ((), ("Pendulum-v0", "--system", "own.py:problem")):
-        with pytest.raises(ConfigurationError, match="name an env by ENV_ID, or a system of your own"):
+        with pytest.raises(
+            ConfigurationError, match="name an env by ENV_ID, or a system of your own"
+        ):
             read(*words).full_id  # noqa: B018
 
 
 def test_identify_has_no_episodes(safe_envs_command):
     for option in ("--horizon", "--start"):
-        status, _, err = safe_envs_command("identify", "Scalar-v0", *COMMANDS["identify"], option, "1")
+        status, _, err = safe_envs_command(
+            "identify", "Scalar-v0", *COMMANDS["identify"], option, "1"
+        )
         assert status == 2
         assert f"No such option: {option}" in err
 
@@ -87,9 +106,14 @@ def test_identify_has_no_episodes(safe_envs_command):
 def test_the_file_of_a_system_is_not_overwritten(safe_envs_command, command, option):
     path = Path("own.py")
     path.write_text(SYSTEM)
-    status, out, err = safe_envs_command(command, "--system", "own.py:problem", *COMMANDS[command], option, "./own.py")
+    status, out, err = safe_envs_command(
+        command, "--system", "own.py:problem", *COMMANDS[command], option, "./own.py"
+    )
     assert (status, out) == (2, "")
-    assert f"{option} own.py would overwrite the file of --system own.py; name another file" in " ".join(err.split())
+    assert (
+        f"{option} own.py would overwrite the file of --system own.py; name another file"
+        in " ".join(err.split())
+    )
     assert path.read_text() == SYSTEM
     assert list(Path().iterdir()) == [path]
 
@@ -98,7 +122,10 @@ def test_the_file_of_a_system_is_not_overwritten(safe_envs_command, command, opt
     ("arguments", "file"),
     [
         (("evaluate", "Pendulum-v1", "--filter-spec", "own.py:spec"), "--filter-spec own.py"),
-        (("train", "Pendulum-v0", *COMMANDS["train"], "--filter", "ddscbf:file=own.py"), "--filter own.py"),
+        (
+            ("train", "Pendulum-v0", *COMMANDS["train"], "--filter", "ddscbf:file=own.py"),
+            "--filter own.py",
+        ),
     ],
 )
 def test_nor_is_another_file_that_is_read(safe_envs_command, arguments, file):
@@ -110,7 +137,18 @@ def test_nor_is_another_file_that_is_read(safe_envs_command, arguments, file):
 
 def test_bounds_are_of_the_horizon_that_is_simulated(safe_envs_command):
     """Which is 7 periods of .3 s where 2 s were asked for."""
-    arguments = ("Pendulum-v0", "--start", ".1,.1", "--filter", "szcbf:alphas=1", "--dt", ".3", "--no-simulate", "--json", "found.json")
+    arguments = (
+        "Pendulum-v0",
+        "--start",
+        ".1,.1",
+        "--filter",
+        "szcbf:alphas=1",
+        "--dt",
+        ".3",
+        "--no-simulate",
+        "--json",
+        "found.json",
+    )
     status, out, _ = safe_envs_command("verify", *arguments)
     assert status == 0
     assert "dt = 0.3 s, horizon 2.1 s;" in out

@@ -25,19 +25,31 @@ X = sp.Symbol("x", real=True)
 def evaluated(safe_envs_command):
     """Evaluates a system of `SYSTEM`."""
     Path("own.py").write_text(SYSTEM)
-    return lambda name, *arguments: safe_envs_command("evaluate", "--system", f"own.py:{name}", "--episodes", 40, *arguments)
+    return lambda name, *arguments: safe_envs_command(
+        "evaluate", "--system", f"own.py:{name}", "--episodes", 40, *arguments
+    )
 
 
-@pytest.mark.parametrize(("name", "noise"), [("problem", "noise sigma = 0.1,"), ("fixed", "fixed noise,"), ("still", "no noise,")])
+@pytest.mark.parametrize(
+    ("name", "noise"),
+    [("problem", "noise sigma = 0.1,"), ("fixed", "fixed noise,"), ("still", "no noise,")],
+)
 def test_the_heading_has_the_noise_and_the_horizon_of_what_is_simulated(evaluated, name, noise):
     status, out, err = evaluated(name, "--filter", "none")
     assert (status, err) == (0, "")
     # 33 whole periods.
-    assert out.splitlines()[1] == f"{noise} model = plant, dt = 0.03 s, horizon 0.99 s; filters know the model"
+    assert (
+        out.splitlines()[1]
+        == f"{noise} model = plant, dt = 0.03 s, horizon 0.99 s; filters know the model"
+    )
 
 
 @pytest.mark.parametrize(
-    ("name", "told"), [("fixed", "write it as a parameter, so that it can be changed"), ("still", "no noise channels\n")]
+    ("name", "told"),
+    [
+        ("fixed", "write it as a parameter, so that it can be changed"),
+        ("still", "no noise channels\n"),
+    ],
 )
 def test_noise_that_is_no_parameter_cannot_be_set(evaluated, name, told):
     status, _, err = evaluated(name, "--noise", 0.2)
@@ -47,15 +59,22 @@ def test_noise_that_is_no_parameter_cannot_be_set(evaluated, name, told):
 
 
 def test_starts_from_which_nothing_is_promised_are_told(evaluated):
-    status, out, _ = evaluated("falling", "--filter", "none", "--filter", "scbf", "--json", "out.json")
+    status, out, _ = evaluated(
+        "falling", "--filter", "none", "--filter", "scbf", "--json", "out.json"
+    )
     assert status == 0
     bare, scbf = strictly("out.json")["rows"]
     assert bare["outside_rate"] is None
     # b_1 = v, and v is even in [-3, 1].
     assert 0.5 < scbf["outside_rate"] < 0.95
-    told = "lie outside the sets C_j = {b_j >= 0}, j >= 1, that scbf keeps: nothing is promised from there"
+    told = (
+        "lie outside the sets C_j = {b_j >= 0}, j >= 1, that scbf keeps: nothing is promised from"
+        " there"
+    )
     assert f"Note: {100 * scbf['outside_rate']:.3g} % of the starts {told}\n" in out
-    assert "nothing is promised" not in evaluated("falling", "--filter", "scbf", "--start", "1,1")[1]
+    assert (
+        "nothing is promised" not in evaluated("falling", "--filter", "scbf", "--start", "1,1")[1]
+    )
 
 
 def printed(answer):
@@ -68,21 +87,35 @@ def moving(rate, barrier, *, start=0.0, horizon=4.0, nominal=0):
     """dx = (rate + u) dt in [-1, 1], in steps of .5 s at most."""
     u = sp.Symbol("u", real=True)
     system = ControlAffineSDE.from_rate((X,), (u,), [rate + u], diffusion=[0])
-    options = {"workspace": {X: (-1, 1)}, "start": (start,), "dt": 0.5, "horizon": horizon, "nominal": nominal}
+    options = {
+        "workspace": {X: (-1, 1)},
+        "start": (start,),
+        "dt": 0.5,
+        "horizon": horizon,
+        "nominal": nominal,
+    }
     return state_problem(system, [barrier], box=(-1, 1), **options)
 
 
 def test_an_early_end_is_noted_by_the_mean_length_of_all_episodes():
-    early = "with none the mean episode ends after 3.0 of 8 steps, at the goal or outside the workspace"
+    early = (
+        "with none the mean episode ends after 3.0 of 8 steps, at the goal or outside the workspace"
+    )
     answer = evaluate(moving(0.5, 2 - X), filters=["none"], episodes=5, bounds=False)
     # From 0 to 1.25, in steps of .25: five of eight.
     assert early.replace("3.0", "5.0") in printed(answer)
-    assert "the mean episode" not in printed(evaluate(moving(0.2, 2 - X), filters=["none"], episodes=5, bounds=False))
+    assert "the mean episode" not in printed(
+        evaluate(moving(0.2, 2 - X), filters=["none"], episodes=5, bounds=False)
+    )
     # Of three identifications the steps and the episodes are three times as many.
     (row,), (speed,) = answer.rows, answer.timing["rows"]
-    thrice = replace(answer, rows=[{**row, "episodes": 15}], timing={"rows": [{**speed, "steps": 45}]})
+    thrice = replace(
+        answer, rows=[{**row, "episodes": 15}], timing={"rows": [{**speed, "steps": 45}]}
+    )
     assert early in printed(thrice)
-    assert "the mean episode" not in printed(replace(thrice, timing={"rows": [{**speed, "steps": 120}]}))
+    assert "the mean episode" not in printed(
+        replace(thrice, timing={"rows": [{**speed, "steps": 120}]})
+    )
 
 
 def test_violations_that_are_no_more_than_rounding_are_told():
@@ -91,14 +124,23 @@ def test_violations_that_are_no_more_than_rounding_are_told():
     (row,) = evaluate(edge, filters="cbf:alpha=1", episodes=3, bounds=False).rows
     assert (row["safe"], row["violations"], row["touching"]) == (0, 3, 3)
     assert abs(row["min_h_median"]) < 1e-15
-    told = "all violations of cbf:alpha=1 come no lower than h = 0 to rounding: they touch the edge, and safe is h > 0"
+    told = (
+        "all violations of cbf:alpha=1 come no lower than h = 0 to rounding: they touch the edge,"
+        " and safe is h > 0"
+    )
     assert told in printed(evaluate(edge, filters="cbf:alpha=1", episodes=3, bounds=False))
     # What is below by more than rounding is a violation like any other, however little it is.
     below = evaluate(moving(1e-12, 1e-12 - X, start=0.0), filters="none", episodes=3, bounds=False)
     assert (below.rows[0]["violations"], below.rows[0]["touching"]) == (3, 0)
     assert "touch the edge" not in printed(below)
-    # The terms are those at the lowest state, not at the start: here h is x, and the state itself is as far below 0.
-    passed = evaluate(moving(-1.000000000000002, X, start=0.5, horizon=0.5), filters="none", episodes=3, bounds=False)
+    # The terms are those at the lowest state, not at the start: here h is x, and the state itself
+    # is as far below 0.
+    passed = evaluate(
+        moving(-1.000000000000002, X, start=0.5, horizon=0.5),
+        filters="none",
+        episodes=3,
+        bounds=False,
+    )
     assert -1e-14 < passed.rows[0]["min_h_median"] < 0.0
     assert (passed.rows[0]["violations"], passed.rows[0]["touching"]) == (3, 0)
 

@@ -17,9 +17,23 @@ from safe_envs.scripts.reports.learned_columns import learned_columns, learned_n
 from safe_envs.wrappers import LEARNED
 
 NO_BOUND = "no bound for what rests on something learned"
-LEARNING = {"repeats": 1, "transitions": 20, "files": [], "remarks": [], "warnings": [], "rates": [0.9]}
+LEARNING = {
+    "repeats": 1,
+    "transitions": 20,
+    "files": [],
+    "remarks": [],
+    "warnings": [],
+    "rates": [0.9],
+}
 OFTEN = {**LEARNING, "repeats": 3, "rates": [0.9, 0.5, 0.8]}
-POSTERIOR_BOUND = {"probability": 0.4, "note": "", "delta": 0.1, "shortfall": 0.0, "bias": 0.0, "supremum": 1.0}
+POSTERIOR_BOUND = {
+    "probability": 0.4,
+    "note": "",
+    "delta": 0.1,
+    "shortfall": 0.0,
+    "bias": 0.0,
+    "supremum": 1.0,
+}
 
 
 def row(learning=None, bound=None, name="bayesian-scbf"):
@@ -29,7 +43,14 @@ def row(learning=None, bound=None, name="bayesian-scbf"):
 @pytest.mark.parametrize(
     ("env_id", "rows", "first"),
     [
-        ("CubicSDEDisk-v0", [row(LEARNING)], f"{NO_BOUND}; for bayesian-scbf:simultaneous=P one may be estimated over the posterior."),
+        (
+            "CubicSDEDisk-v0",
+            [row(LEARNING)],
+            (
+                f"{NO_BOUND}; for bayesian-scbf:simultaneous=P one may be estimated over the"
+                " posterior."
+            ),
+        ),
         ("CubicSDEDisk-v0", [row(LEARNING), row(LEARNING, POSTERIOR_BOUND)], f"{NO_BOUND}."),
         ("CubicSDEDisk-v0", [row(LEARNING, {"probability": None, "note": "none"})], f"{NO_BOUND}."),
         ("StochasticDubins-v0", [row(LEARNING)], f"{NO_BOUND}."),
@@ -52,16 +73,34 @@ def test_repeats_are_means_and_their_intervals_have_a_condition():
     rows = [row(), row(LEARNING), row(OFTEN)]
     speeds = [{"learning_seconds": seconds} for seconds in (None, 1.5, 1.5)]
     columns = learned_columns(rows)
-    assert [list(map(cell, rows, speeds)) for cell in columns.values()] == [["-", "1.50 s", "1.50 s"], ["-", "-", "50.0 %"]]
+    assert [list(map(cell, rows, speeds)) for cell in columns.values()] == [
+        ["-", "1.50 s", "1.50 s"],
+        ["-", "-", "50.0 %"],
+    ]
     assert list(columns) == ["learned in,\nmean", "worst\nident."]
     assert list(learned_columns([row(LEARNING)])) == ["learned\nin"]
-    assert sum("for nearly normal: bad ones that are rarer than about 1 in 3" in note for note in learned_notes(rows, problem)) == 1
+    assert (
+        sum(
+            "for nearly normal: bad ones that are rarer than about 1 in 3" in note
+            for note in learned_notes(rows, problem)
+        )
+        == 1
+    )
     assert not any("nearly normal" in note for note in learned_notes([row(LEARNING)], problem))
 
 
 def test_texts_of_the_user_are_no_markup_and_the_heading_counts_what_was_learned():
-    answer = evaluate("CubicSDEDisk-v0", filters=["none", "scbf"], options={"horizon": 0.1}, episodes=2, bounds=False)
-    rows = [answer.rows[0], {**answer.rows[1], "filter": "scbf:file=[red]x.npz", "learning": LEARNING}]
+    answer = evaluate(
+        "CubicSDEDisk-v0",
+        filters=["none", "scbf"],
+        options={"horizon": 0.1},
+        episodes=2,
+        bounds=False,
+    )
+    rows = [
+        answer.rows[0],
+        {**answer.rows[1], "filter": "scbf:file=[red]x.npz", "learning": LEARNING},
+    ]
     console = Console(width=200, file=io.StringIO())
     changed = replace(answer, rows=rows, config={**answer.config, "repeats": 2})
     print_evaluation(console, changed)

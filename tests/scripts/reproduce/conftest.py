@@ -21,7 +21,10 @@ def coin(computed):
         computed.append("table-0.1")
         trials = sample.size(1000)
         return Outcome(
-            [Number.rate("heads", trials // 2, trials, 48.0, 50), Number("edge", 0.25, 0.2, 0.3, unit="s")],
+            [
+                Number.rate("heads", trials // 2, trials, 48.0, 50),
+                Number("edge", 0.25, 0.2, 0.3, unit="s"),
+            ],
             [Claim("it lands", True, "1 of 1"), Claim("it rolls", False, "|v| = 0", printed=False)],
             data={"x": [0.0, 1.0]},
             notes=["a < b"],
@@ -31,7 +34,13 @@ def coin(computed):
         figure.subplots().plot(outcome.data["x"])
 
     return Artefact(
-        "table-0.1", "A coin", compute, lambda sample: (f"thrown {sample.size(1000)} times",), ("the coin",), ("Eq 0.1: a sign",), draw=draw
+        "table-0.1",
+        "A coin",
+        compute,
+        lambda sample: (f"thrown {sample.size(1000)} times",),
+        ("the coin",),
+        ("Eq 0.1: a sign",),
+        draw=draw,
     )
 
 
@@ -44,5 +53,6 @@ def catalogue(coin, monkeypatch):
 
 @pytest.fixture
 def pictures(monkeypatch):
-    """Has real figures saved as PNG only, which takes half as long; those of the coin are saved as SVG, too."""
+    """Has real figures saved as PNG only, which takes half as long; those of the coin are saved as
+    SVG, too."""
     monkeypatch.setattr("safe_envs.scripts.reproduce.framework.store._SUFFIXES", (".png",))

@@ -8,7 +8,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from safe_envs.registry import load_problem
-from safe_envs.scripts.reproduce.chapter_3 import dubins_disk, dubins_learning, learned_runs, quadrotor
+from safe_envs.scripts.reproduce.chapter_3 import (
+    dubins_disk,
+    dubins_learning,
+    learned_runs,
+    quadrotor,
+)
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import runs, thinned
 from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
 from safe_envs.scripts.reproduce.framework import store, verdict
@@ -16,14 +21,18 @@ from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
 from safe_envs.wrappers import HOCBF
 
 pytestmark = pytest.mark.slow
-ARTEFACTS = {artefact.name: artefact for artefact in (*dubins_learning.ARTEFACTS, *quadrotor.ARTEFACTS)}
+ARTEFACTS = {
+    artefact.name: artefact for artefact in (*dubins_learning.ARTEFACTS, *quadrotor.ARTEFACTS)
+}
 QUICK = Sample(episodes=8, quick=True)
 
 
 def compute(name):
     """The quick outcome, of shorter runs in the disk."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dubins_disk, "disk", lambda _: load_problem(dubins_disk.DISK).configured(horizon=1.5))
+        patch.setattr(
+            dubins_disk, "disk", lambda _: load_problem(dubins_disk.DISK).configured(horizon=1.5)
+        )
         return ARTEFACTS[name].compute(QUICK)
 
 
@@ -56,11 +65,17 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
     # Sec. 3.5.1, static case, with Eq. (3.27), (3.28).
     world = dubins_disk.disk(Sample())
     assert (world.dt, world.horizon, world.steps) == (0.05, 50.0, 1000)
-    assert [learned_runs.parameters(system)["v"] for system in (world.plant, world.model)] == [0.8, 0.5]
+    assert [learned_runs.parameters(system)["v"] for system in (world.plant, world.model)] == [
+        0.8,
+        0.5,
+    ]
     assert (dubins_disk.RATES, dubins_disk.PRINTED_START) == ((0.5, 1.0, 5.0), (0.9, 0.1, 0.0))
     outcome = outcomes["figure-3.1"]
     assert [n.printed for n in outcome.numbers] == [3, None, None, None]
-    assert all([n.printed for n in other.numbers] == [3, None, None, None] for other in outcome.elsewhere.values())
+    assert all(
+        [n.printed for n in other.numbers] == [3, None, None, None]
+        for other in outcome.elsewhere.values()
+    )
     assert {c["p"] for c in outcome.data["curves"]} == {0.5, 1.0, 5.0}
     # Sec. 3.5.1, moving case, with Fig. 3.2; p_1 = p_2 = 1 are of thesis-notes.
     world = load_problem(dubins_learning.OBSTACLE, {"start": "thesis"})
@@ -70,10 +85,17 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
     assert [instant["time"] for instant in instants] == [0.0, 4.0, 7.0]
     assert [instants[0][what] for what in ("vehicle", "obstacle")] == [[-2.0, -2.0], [-1.0, 0.0]]
     assert [instant["obstacle"][0] for instant in instants] == pytest.approx([-1.0, 1.0, 2.5])
-    assert (dubins_learning.OBSTACLE_RADIUS, dubins_learning.SPEED, dubins_learning.OBSTACLE_RATES) == (0.5, 0.8, "1,1")
+    assert (
+        dubins_learning.OBSTACLE_RADIUS,
+        dubins_learning.SPEED,
+        dubins_learning.OBSTACLE_RATES,
+    ) == (0.5, 0.8, "1,1")
     # Sec. 3.5.2 with Fig. 3.3.
     world = quadrotor.hover(Sample())
-    assert [learned_runs.parameters(system)["m"] for system in (world.plant, world.model)] == [0.6, 0.4]
+    assert [learned_runs.parameters(system)["m"] for system in (world.plant, world.model)] == [
+        0.6,
+        0.4,
+    ]
     assert (quadrotor.GAINS, quadrotor.HALF_WIDTH) == ((2.0, 8.0), 2.0)
     assert outcomes["figure-3.3"].data["true"]["z"][0] == 5.0
     # Sec. 3.5.1, 3.5.2: 500 epochs; the rest is of thesis-notes, and three learnings are ours.
@@ -82,7 +104,9 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
 
 
 def test_claims_of_the_thesis_are_apart_from_ours(outcomes):
-    flags = {name: [claim.printed for claim in outcome.claims] for name, outcome in outcomes.items()}
+    flags = {
+        name: [claim.printed for claim in outcome.claims] for name, outcome in outcomes.items()
+    }
     assert flags == {
         "figure-3.1": [True, False],
         "figure-3.2a": [True, True, True, False],
@@ -92,7 +116,10 @@ def test_claims_of_the_thesis_are_apart_from_ours(outcomes):
 
 
 def test_settings_are_those_of_the_sample():
-    for sample, learnings, long in ((Sample(), "3 learnings from 2000 states", "50 s;"), (QUICK, "2 learnings from 400 states", "2.5 s;")):
+    for sample, learnings, long in (
+        (Sample(), "3 learnings from 2000 states", "50 s;"),
+        (QUICK, "2 learnings from 400 states", "2.5 s;"),
+    ):
         for artefact in ARTEFACTS.values():
             assert learnings in " ".join(artefact.setting(sample))
         text = " ".join(ARTEFACTS["figure-3.1"].setting(sample))
@@ -111,12 +138,20 @@ def test_what_is_told_of_the_learning_is_so(outcomes):
         assert len(models) == 2
         told = {"states": 400, "label_dt": 1e-3, "hidden": [100, 30], "epochs": 80}
         assert [model.record.settings for model in models] == [told, told]
-    coordinates = [list(map(str, load_problem(env_id).exploration.coordinates)) for env_id in (dubins_disk.DISK, dubins_learning.OBSTACLE)]
-    assert coordinates == [["x", "y", "cos(theta)", "sin(theta)"], ["cos(theta)", "sin(theta)", "-x + x_o", "-y + y_o"]]
+    coordinates = [
+        list(map(str, load_problem(env_id).exploration.coordinates))
+        for env_id in (dubins_disk.DISK, dubins_learning.OBSTACLE)
+    ]
+    assert coordinates == [
+        ["x", "y", "cos(theta)", "sin(theta)"],
+        ["cos(theta)", "sin(theta)", "-x + x_o", "-y + y_o"],
+    ]
     assert load_problem(quadrotor.QUADROTOR).exploration.inputs == ((3.0,), (9.0,))
     for name in ("figure-3.1", "figure-3.2a", "figure-3.2b"):
         assert any("3 inputs; " in line for line in ARTEFACTS[name].corrections)
-    assert all(any("0.001 s" in line for line in artefact.corrections) for artefact in ARTEFACTS.values())
+    assert all(
+        any("0.001 s" in line for line in artefact.corrections) for artefact in ARTEFACTS.values()
+    )
 
 
 @pytest.mark.parametrize("name", ARTEFACTS)
@@ -152,7 +187,9 @@ def test_names_of_numbers_are_unique_and_printed_forms_have_one_of_ours(name, ou
     assert {number.name for number in outcome.as_printed} <= set(names)
     for other in outcome.elsewhere.values():
         assert [number.name for number in other.numbers] == names
-        assert [claim.sentence for claim in other.claims] == [claim.sentence for claim in outcome.claims if claim.printed]
+        assert [claim.sentence for claim in other.claims] == [
+            claim.sentence for claim in outcome.claims if claim.printed
+        ]
 
 
 @pytest.mark.parametrize("name", ARTEFACTS)
@@ -170,18 +207,24 @@ def test_curves_are_thinned(name, outcomes):
 @pytest.mark.parametrize(("p", "b_1"), [(0.5, -1.35), (1.0, -1.26), (5.0, -0.54)])
 def test_the_printed_start_of_the_disk_is_outside_the_kept_set(p, b_1):
     # By hand: h = .18, L_f h = -2 v x = -1.44, L_f^2 h = -2 v^2 = -1.28.
-    h, first, second = dubins_disk.chain_at(load_problem(dubins_disk.DISK), p, dubins_disk.PRINTED_START)
+    h, first, second = dubins_disk.chain_at(
+        load_problem(dubins_disk.DISK), p, dubins_disk.PRINTED_START
+    )
     assert h == pytest.approx(0.18)
     assert first == pytest.approx(b_1)
     assert second == pytest.approx(-1.28 - 1.44 * 2 * p + 0.18 * p * p)
     assert second < 0
-    assert dubins_disk.chain_at(load_problem(dubins_disk.DISK), p, dubins_disk.VALID_START)[1] == pytest.approx(0.99 * p)
+    assert dubins_disk.chain_at(load_problem(dubins_disk.DISK), p, dubins_disk.VALID_START)[
+        1
+    ] == pytest.approx(0.99 * p)
 
 
 @pytest.mark.parametrize("p", [0.5, 1.0])
 def test_with_a_fine_period_the_exact_filter_follows_the_closed_form(p):
     dt = 0.002
-    world = load_problem(dubins_disk.DISK).configured(start=dubins_disk.PRINTED_START, dt=dt, horizon=2.6, box=(-1000.0, 1000.0))
+    world = load_problem(dubins_disk.DISK).configured(
+        start=dubins_disk.PRINTED_START, dt=dt, horizon=2.6, box=(-1000.0, 1000.0)
+    )
     (run,) = runs(world, [f"hocbf:p={p},{p}"], policy="zero", knowledge="plant")
     time, depth = dubins_disk.crossing(world, p, dubins_disk.PRINTED_START)
     assert dt * int(np.argmax(run.h < 0)) == pytest.approx(time, abs=2 * dt)
@@ -196,13 +239,18 @@ def test_the_printed_differences_give_half_of_the_gain():
 
 def test_exact_derivatives_leave_the_disk_from_the_printed_start_too():
     world = dubins_disk.disk(QUICK).configured(start=(0.9, 0.1, 0.0), box=dubins_disk.WIDE)
-    lowest = [run.smallest for run in runs(world, ["hocbf:p=0.5,0.5", "hocbf:p=1,1"], policy="zero", knowledge="plant")]
+    lowest = [
+        run.smallest
+        for run in runs(world, ["hocbf:p=0.5,0.5", "hocbf:p=1,1"], policy="zero", knowledge="plant")
+    ]
     assert max(lowest) < -0.1
 
 
 def test_other_settings_of_the_disk_are_tried_with_every_learning(outcomes):
     others = outcomes["figure-3.1"].elsewhere
-    assert [("start (0.0, 0.1, 0.0)" in name, "pi" in name, "margin" in name) for name in others] == [
+    assert [
+        ("start (0.0, 0.1, 0.0)" in name, "pi" in name, "margin" in name) for name in others
+    ] == [
         (True, False, False),
         (True, True, False),
         (False, True, False),
@@ -228,18 +276,31 @@ def test_the_way_past_the_obstacle_is_longer_at_the_same_speed(outcomes):
     outcome = outcomes["figure-3.2a"]
     found = ours(outcome.numbers)
     assert found["lowest speed, learned"] == pytest.approx(0.8, rel=2e-3)
-    assert found["path, true"] > found["path, none"] == pytest.approx(0.8 * found["time to the goal, none"], rel=1e-3)
-    assert found["path, none"] > math.dist((-2, -2), dubins_learning.GOAL) - dubins_learning.GOAL_RADIUS
+    assert (
+        found["path, true"]
+        > found["path, none"]
+        == pytest.approx(0.8 * found["time to the goal, none"], rel=1e-3)
+    )
+    assert (
+        found["path, none"]
+        > math.dist((-2, -2), dubins_learning.GOAL) - dubins_learning.GOAL_RADIUS
+    )
     assert held(outcome.claims, "longer")
 
 
 def test_the_nominal_and_the_printed_derivatives_collide_and_the_true_ones_do_not(outcomes):
     outcome = outcomes["figure-3.2b"]
     found, printed = ours(outcome.numbers), ours(outcome.as_printed)
-    assert found["smallest h, true"] > 0 > max(found["smallest h, nominal"], found["smallest h, none"])
+    assert (
+        found["smallest h, true"] > 0 > max(found["smallest h, nominal"], found["smallest h, none"])
+    )
     assert printed["smallest h, true"] < 0
     (at_rest,) = outcome.elsewhere.values()
-    assert ours(at_rest.numbers)["smallest h, nominal"] == printed["smallest h, nominal"] < found["smallest h, nominal"]
+    assert (
+        ours(at_rest.numbers)["smallest h, nominal"]
+        == printed["smallest h, nominal"]
+        < found["smallest h, nominal"]
+    )
     assert held(outcome.claims, "falls below")
     assert not held(outcome.claims, "slows down")
 
@@ -251,7 +312,10 @@ def test_the_printed_formula_of_the_quadrotor_diverges_and_the_corrected_one_doe
     assert printed["smallest h, true"] < -10
     assert printed["time in the workspace, true"] < 3.0
     assert verdict.judge(ARTEFACTS["figure-3.3"], outcome, Sample()).wrong_formula
-    assert "the state leaves the workspace, of which the altitudes are [0, 10] m, after 1.85 s of 7 s, at 10.4 m" in outcome.notes[0]
+    assert (
+        "the state leaves the workspace, of which the altitudes are [0, 10] m, after 1.85 s of 7 s,"
+        " at 10.4 m" in outcome.notes[0]
+    )
 
 
 def test_the_band_is_drawn_where_it_is(outcomes):
@@ -272,9 +336,14 @@ def test_the_obstacle_is_drawn_where_it_is(outcomes):
 def test_the_printed_row_differs_from_the_derived_one_as_the_errata_say():
     problem = load_problem(quadrotor.QUADROTOR)
     barrier, model = problem.barriers[0], problem.model
-    derived, printed = (condition.constraint(model, barrier) for condition in (HOCBF(quadrotor.GAINS), quadrotor.PrintedHOCBF()))
+    derived, printed = (
+        condition.constraint(model, barrier)
+        for condition in (HOCBF(quadrotor.GAINS), quadrotor.PrintedHOCBF())
+    )
     at = {quadrotor.z: 6.5, quadrotor.zdot: 0.7, **model.parameters}
-    assert float((derived.coefficient[0] + printed.coefficient[0]).subs(at)) == pytest.approx(0.0, abs=1e-12)
+    assert float((derived.coefficient[0] + printed.coefficient[0]).subs(at)) == pytest.approx(
+        0.0, abs=1e-12
+    )
     cubed, squared = 4 * 1.5**3 / 16, 12 * 1.5**2 / 16
     expected = 2 * cubed * 9.81 - squared * (0.7**2 - 0.7)
     assert float((derived.offset - printed.offset).subs(at)) == pytest.approx(expected)

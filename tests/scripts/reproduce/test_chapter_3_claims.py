@@ -35,7 +35,8 @@ def runs_of_the_disk(*counts):
 
 
 def passage(learned=(1.0, 0.2), nominal=(1.0, -0.1), end=(3.0, 1.5), lengths=None, bare=None):
-    """Made-up ways past the obstacle of at least one control period, which end where they are told to, at .8 m/s unless told otherwise."""
+    """Made-up ways past the obstacle of at least one control period, which end where they are told
+    to, at .8 m/s unless told otherwise."""
     lengths = lengths or [0.04] * (len(learned) - 1)
     way = run_with(*learned, at=(end[0] - sum(lengths), end[1]), lengths=lengths)
     none = run_with(1.0, -0.1, at=GOAL, lengths=[bare or 0.02])
@@ -58,12 +59,18 @@ def test_the_printed_differences_give_the_print_if_all_are_safe_in_every_learnin
     failed = runs_of_the_disk(1, 1, 1)
     outcome = Outcome(dubins_disk.disk_numbers(failed, 3), [dubins_disk.all_safe(failed)])
     for counts, same in (((3, 3, 3), True), ((3, 3, 2), False)):
-        found = Outcome(outcome.numbers, outcome.claims, as_printed=dubins_disk.disk_numbers(runs_of_the_disk(*counts)))
+        found = Outcome(
+            outcome.numbers,
+            outcome.claims,
+            as_printed=dubins_disk.disk_numbers(runs_of_the_disk(*counts)),
+        )
         judged = verdict.judge(dubins_disk.FIGURE, found, Sample())
         assert (judged.wrong_formula, judged.gives_print) == (True, same)
 
 
-@pytest.mark.parametrize(("learned", "nominal", "holds"), [(3, 0, True), (2, 0, False), (3, 1, False)])
+@pytest.mark.parametrize(
+    ("learned", "nominal", "holds"), [(3, 0, True), (2, 0, False), (3, 1, False)]
+)
 def test_the_theory_of_the_disk_can_fail(learned, nominal, holds):
     claim = dubins_disk.theory_holds(runs_of_the_disk(3, learned), runs_of_the_disk(nominal)[0])
     assert claim.holds is holds
@@ -102,7 +109,10 @@ def test_each_claim_about_the_barrier_can_hold_and_fail(word, good, bad):
 def test_claims_hold_only_if_they_do_in_every_learning():
     fine, worse = passage(), passage((1.0, -0.01), end=(9.0, 9.0))
     mixed = {**fine, "learned": [fine["learned"][0], worse["learned"][0]]}
-    for claims, words in ((dubins_learning.passage_claims, ("avoids", "goal")), (dubins_learning.clearance_claims, ("always positive",))):
+    for claims, words in (
+        (dubins_learning.passage_claims, ("avoids", "goal")),
+        (dubins_learning.clearance_claims, ("always positive",)),
+    ):
         assert not any(held(claims(mixed, OBSTACLE), word) for word in words)
     steps = {**fine, "learned": [passage((1.0, 0.2, 0.2))["learned"][0], fine["learned"][0]]}
     assert not held(dubins_learning.clearance_claims(steps, OBSTACLE), "more time steps")
@@ -116,19 +126,30 @@ def test_a_turn_at_full_speed_is_no_slowing_down():
     arc = math.pi * 0.05
     chord = 2 * 0.8 / math.pi * math.sin(arc / 2)
     for length, slower in ((chord, False), (chord - 1e-6, True)):
-        assert held(dubins_learning.clearance_claims(passage(lengths=[length]), OBSTACLE), "slows down") is slower
+        assert (
+            held(
+                dubins_learning.clearance_claims(passage(lengths=[length]), OBSTACLE), "slows down"
+            )
+            is slower
+        )
 
 
 def test_what_becomes_of_a_run_is_told_as_it_is():
     problem = quadrotor.hover(Sample(quick=True))
     whole = [0.5] * (problem.steps + 1)
     assert quadrotor.fate(run_with(*whole), problem) == "smallest h 0.5; h stays at 0 or above"
-    assert "h < 0 from t = 0.1 s" in quadrotor.fate(run_with(0.5, 0.5, -0.5, at=(5.0, 0.0)), problem)
+    assert "h < 0 from t = 0.1 s" in quadrotor.fate(
+        run_with(0.5, 0.5, -0.5, at=(5.0, 0.0)), problem
+    )
 
 
 @pytest.mark.parametrize(
-    ("nominal", "learned", "holds"), [(-0.1, 0.1, [True, True]), (0.1, 0.1, [False, True]), (-0.1, -0.1, [True, False])]
+    ("nominal", "learned", "holds"),
+    [(-0.1, 0.1, [True, True]), (0.1, 0.1, [False, True]), (-0.1, -0.1, [True, False])],
 )
 def test_each_claim_about_the_altitude_can_fail(nominal, learned, holds):
-    found = {"nominal": [run_with(1.0, nominal)], "learned": [run_with(1.0, 0.1), run_with(1.0, learned)]}
+    found = {
+        "nominal": [run_with(1.0, nominal)],
+        "learned": [run_with(1.0, 0.1), run_with(1.0, learned)],
+    }
     assert [claim.holds for claim in quadrotor.altitude_claims(found)] == holds

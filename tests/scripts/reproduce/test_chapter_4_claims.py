@@ -7,7 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from safe_envs.scripts.reproduce.chapter_4 import cruise, cruise_effort, dubins_noise, dubins_points, dubins_runs, martingale
+from safe_envs.scripts.reproduce.chapter_4 import (
+    cruise,
+    cruise_effort,
+    dubins_noise,
+    dubins_points,
+    dubins_runs,
+    martingale,
+)
 from safe_envs.scripts.reproduce.chapter_4.cruise_effort import Run
 from safe_envs.scripts.reproduce.chapter_4.paired_episodes import Exits
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
@@ -39,7 +46,10 @@ def test_inputs_at_the_edge(asked: dict[str, np.ndarray], expected: list[bool]) 
 
 def test_certainty_is_lost_only_if_the_intervals_are_apart() -> None:
     """The bounded rate has to be the lower one."""
-    low, high = (Number.rate(f"SRCBF, {where}", safe, 1000) for where, safe in (("|u| <= 1.5", 800), ("unbounded", 990)))
+    low, high = (
+        Number.rate(f"SRCBF, {where}", safe, 1000)
+        for where, safe in (("|u| <= 1.5", 800), ("unbounded", 990))
+    )
     assert martingale.claim_on_limits(low, high).holds
     assert not martingale.claim_on_limits(high, low).holds
     assert not martingale.claim_on_limits(low, low).holds
@@ -47,7 +57,8 @@ def test_certainty_is_lost_only_if_the_intervals_are_apart() -> None:
 
 
 def test_bound_is_contradicted_by_any_start() -> None:
-    """A rate above the bound, or below it by chance, does not contradict it; one start that does is enough."""
+    """A rate above the bound, or below it by chance, does not contradict it; one start that does is
+    enough."""
     above, by_chance, below = (Number.rate("", safe, 1000) for safe in (800, 740, 700))
     assert martingale.claim_on_bound([above, by_chance], [0.75, 0.75]).holds
     claim = martingale.claim_on_bound([above, below], [0.75, 0.75])
@@ -97,7 +108,9 @@ def test_effort_over_time() -> None:
     peaks[:2] = 1e9
     ended = ones.copy()
     ended[1:] = np.nan
-    larger, smaller = (cruise_effort.share_of_time(run_of(a), run_of(b)) for a, b in ((peaks, ones), (ones, peaks)))
+    larger, smaller = (
+        cruise_effort.share_of_time(run_of(a), run_of(b)) for a, b in ((peaks, ones), (ones, peaks))
+    )
     assert larger == pytest.approx([0.2] * 3)
     assert smaller == pytest.approx([0.8] * 3)
     assert cruise_effort.share_of_time(run_of(peaks), run_of(ended)) == pytest.approx([1.0] * 3)
@@ -114,7 +127,10 @@ def test_effort_at_the_edge() -> None:
     """A force that grows like 1/h has no bound, a constant one has."""
     grows, stays = 1.0 / cruise_effort.DISTANCES, np.full_like(cruise_effort.DISTANCES, 200.0)
     assert [cruise_effort.claim_on_edge(force).holds for force in (grows, stays)] == [True, False]
-    assert [cruise_effort.claim_on_bounded(force).holds for force in (grows, stays)] == [False, True]
+    assert [cruise_effort.claim_on_bounded(force).holds for force in (grows, stays)] == [
+        False,
+        True,
+    ]
     assert cruise_effort.claim_on_edge(grows).printed
     assert not cruise_effort.claim_on_bounded(stays).printed
 
@@ -125,7 +141,10 @@ def test_peaks_and_growth_are_checks_of_ours() -> None:
     assert cruise_effort.claim_on_peaks(high, low).holds
     assert not cruise_effort.claim_on_peaks(low, high).holds
     barrier = np.array([[0.1], [2.0]])
-    claims = [cruise_effort.claim_on_growth(run_of(np.array(effort), barrier)) for effort in ([[5.0], [1.0]], [[1.0], [5.0]])]
+    claims = [
+        cruise_effort.claim_on_growth(run_of(np.array(effort), barrier))
+        for effort in ([[5.0], [1.0]], [[1.0], [5.0]])
+    ]
     assert held(claims) == [True, False]
     never = cruise_effort.claim_on_growth(run_of(np.full((2, 1), np.nan), barrier))
     assert not never.holds
@@ -142,7 +161,8 @@ def test_median_peak_is_between_order_statistics() -> None:
 def runs_of(scbf: int, one: int, half: int, of: int = 200) -> dict[str, Exits]:
     """Runs with so many safe episodes."""
     return {
-        name: Exits(np.where(first(count, of), 1000, 1), 0.1) for name, count in zip(dubins_runs.FILTERS, (scbf, one, half), strict=True)
+        name: Exits(np.where(first(count, of), 1000, 1), 0.1)
+        for name, count in zip(dubins_runs.FILTERS, (scbf, one, half), strict=True)
     }
 
 
@@ -158,34 +178,56 @@ def runs_of(scbf: int, one: int, half: int, of: int = 200) -> dict[str, Exits]:
     ],
 )
 def test_noises(by_noise: list[tuple[int, int, int]], holds: bool) -> None:
-    """At every level and for all rates of the SZCBF, apart from levels at which neither fails, and somewhere for certain."""
-    claim = dubins_noise.claim_on_noises({level: runs_of(*counts) for level, counts in zip((0.0, 0.2), by_noise, strict=True)}, 5.0)
+    """At every level and for all rates of the SZCBF, apart from levels at which neither fails, and
+    somewhere for certain."""
+    claim = dubins_noise.claim_on_noises(
+        {level: runs_of(*counts) for level, counts in zip((0.0, 0.2), by_noise, strict=True)}, 5.0
+    )
     assert claim.holds is holds
     assert "at 0," in claim.evidence
 
 
 def test_noises_tells_ahead_from_behind() -> None:
     """The counts of the evidence."""
-    claim = dubins_noise.claim_on_noises({0.0: runs_of(100, 150, 99), 0.2: runs_of(150, 90, 110)}, 5.0)
-    assert "ahead of SZCBF(1, 1) at 1 of 2 noise levels, behind at 1: in points -25.0 [" in claim.evidence
-    assert "ahead of SZCBF(.5, .5) at 1 of 2 noise levels, behind at 0: in points +0.5 [" in claim.evidence
+    claim = dubins_noise.claim_on_noises(
+        {0.0: runs_of(100, 150, 99), 0.2: runs_of(150, 90, 110)}, 5.0
+    )
+    assert (
+        "ahead of SZCBF(1, 1) at 1 of 2 noise levels, behind at 1: in points -25.0 ["
+        in claim.evidence
+    )
+    assert (
+        "ahead of SZCBF(.5, .5) at 1 of 2 noise levels, behind at 0: in points +0.5 ["
+        in claim.evidence
+    )
 
 
 @pytest.mark.parametrize(
     ("by_start", "holds"),
-    [([(150, 90, 90), (100, 110, 110)], True), ([(150, 90, 90), (20, 110, 20)], False), ([(150, 90, 90), (20, 10, 110)], False)],
+    [
+        ([(150, 90, 90), (100, 110, 110)], True),
+        ([(150, 90, 90), (20, 110, 20)], False),
+        ([(150, 90, 90), (20, 10, 110)], False),
+    ],
 )
 def test_points(by_start: list[tuple[int, int, int]], holds: bool) -> None:
     """All starts together, and both rates: one start far ahead is not enough."""
-    assert dubins_points.claim_on_points([runs_of(*counts) for counts in by_start], 5.0).holds is holds
+    assert (
+        dubins_points.claim_on_points([runs_of(*counts) for counts in by_start], 5.0).holds is holds
+    )
 
 
 def test_horizon_counts() -> None:
-    """An exit after the horizon is none: with control periods of .05 s instant 101 is past 5 s, instant 100 is not."""
+    """An exit after the horizon is none: with control periods of .05 s instant 101 is past 5 s,
+    instant 100 is not."""
     late, soon = Exits(np.full(50, 101), 0.0), Exits(np.full(50, 100), 0.0)
-    claim = dubins_points.claim_on_points([{"SCBF": late, "SZCBF(1, 1)": soon, "SZCBF(.5, .5)": soon}], 5.0)
+    claim = dubins_points.claim_on_points(
+        [{"SCBF": late, "SZCBF(1, 1)": soon, "SZCBF(.5, .5)": soon}], 5.0
+    )
     assert claim.holds
-    assert not dubins_points.claim_on_points([{"SCBF": late, "SZCBF(1, 1)": soon, "SZCBF(.5, .5)": soon}], 10.0).holds
+    assert not dubins_points.claim_on_points(
+        [{"SCBF": late, "SZCBF(1, 1)": soon, "SZCBF(.5, .5)": soon}], 10.0
+    ).holds
 
 
 def test_turning_time() -> None:
@@ -196,7 +238,8 @@ def test_turning_time() -> None:
 
 
 def test_bounds_of_the_disk() -> None:
-    """At (1, 0) with the heading to the centre, sigma = .2: h = 8, A h = 4 - .08, c = 9 and 12 - .08."""
+    """At (1, 0) with the heading to the centre, sigma = .2: h = 8, A h = 4 - .08, c = 9 and 12 -
+    .08."""
     starts = np.array([[1.0, 0.0, math.pi], [1.0, 0.0, 0.0]])
     product, union = dubins_points.printed_and_union_bound(starts)
     assert product == pytest.approx([8 / 9 * 3.92 / 11.92, 0.0])
@@ -206,7 +249,9 @@ def test_bounds_of_the_disk() -> None:
 def test_product_is_contradicted_where_the_rate_is_below_it() -> None:
     """In per cent as the rate, and only at starts for which it is anything."""
     runs = [runs_of(count, 0, 0)["SCBF"] for count in (20, 190, 0)]
-    note = dubins_points.bound_note("here", runs, np.array([0.5, 0.9, 0.0]), np.array([0.1, 0.2, 0.0]))
+    note = dubins_points.bound_note(
+        "here", runs, np.array([0.5, 0.9, 0.0]), np.array([0.1, 0.2, 0.0])
+    )
     assert "holds at 2 of 3" in note
     assert "at most 90.0 % there, and contradicted at 1 by T = 10 s" in note
     assert "in 10.0 % of the steps" in note
@@ -216,7 +261,13 @@ def test_what_holds_elsewhere_is_named() -> None:
     """Both kinds of settings, or that there is none."""
     worse, better = ({0.0: runs_of(*counts)} for counts in ((100, 150, 150), (150, 100, 100)))
     found = dubins_runs.elsewhere_of({"all starts": worse}, better, dubins_noise.claim_on_noises)
-    assert list(found) == [*(f"{dubins_runs.AS_PRINTED}, T = {t} s" for t in (5, 3, 10)), "all starts, T = 3 s", "all starts, T = 10 s"]
+    assert list(found) == [
+        *(f"{dubins_runs.AS_PRINTED}, T = {t} s" for t in (5, 3, 10)),
+        "all starts, T = 3 s",
+        "all starts, T = 10 s",
+    ]
     note = dubins_runs.holds_note(found)
     assert note.index(dubins_runs.AS_PRINTED) < note.index("It does not with: all starts, T = 3 s")
-    assert "none of the other settings" in dubins_runs.holds_note({"all starts, T = 3 s": found["all starts, T = 3 s"]})
+    assert "none of the other settings" in dubins_runs.holds_note(
+        {"all starts, T = 3 s": found["all starts, T = 3 s"]}
+    )

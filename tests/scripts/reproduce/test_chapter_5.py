@@ -7,14 +7,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from safe_envs.scripts.reproduce.chapter_5 import cubic, cubic_paths, noise_terms, paired_rates, pendulum
+from safe_envs.scripts.reproduce.chapter_5 import (
+    cubic,
+    cubic_paths,
+    noise_terms,
+    paired_rates,
+    pendulum,
+)
 from safe_envs.scripts.reproduce.framework import store
 from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
 from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
 
 pytestmark = pytest.mark.slow
 SAMPLE, FULL = Sample(quick=True), Sample()
-ARTEFACTS = {artefact.name: artefact for artefact in (*pendulum.ARTEFACTS, *cubic.ARTEFACTS, *cubic_paths.ARTEFACTS)}
+ARTEFACTS = {
+    artefact.name: artefact
+    for artefact in (*pendulum.ARTEFACTS, *cubic.ARTEFACTS, *cubic_paths.ARTEFACTS)
+}
 PICTURES = [f"figure-5.3{key}" for key in "abcd"]
 EACH = pytest.mark.parametrize("name", list(ARTEFACTS))
 
@@ -48,14 +57,36 @@ def test_what_is_printed_and_what_is_taken(outcomes):
     assert cubic.PRINTED == {"SCBF": (86.8, 84.3), "DDSCBF": (85.2, 83.0), "CBF": (77.3, 57.5)}
     assert cubic.LEVELS == (0.1, 0.15)
     # Sec. 5.4.1: sigma, "over 1000 runs", 200 points, 50000 transitions.
-    assert (pendulum.NOISE, paired_rates.EPISODES, noise_terms.POINTS, noise_terms.REPETITIONS) == (0.1, 1000, 200, 50_000)
-    # Not printed: starts, horizons in s and class-K rates in 1/s of settings A and B, of Sec. 5.4.2, and of Figure 5.3.
+    assert (pendulum.NOISE, paired_rates.EPISODES, noise_terms.POINTS, noise_terms.REPETITIONS) == (
+        0.1,
+        1000,
+        200,
+        50_000,
+    )
+    # Not printed: starts, horizons in s and class-K rates in 1/s of settings A and B, of Sec.
+    # 5.4.2, and of Figure 5.3.
     assert (pendulum.A.start, pendulum.A.horizon, pendulum.A.alpha) == ("uniform", 2.0, 5.0)
     assert (pendulum.B.start, pendulum.B.horizon, pendulum.B.alpha) == ("near-origin", 20.0, 1.0)
     assert (cubic.ALPHA, cubic_paths.HORIZON, cubic_paths.WIDE) == (2.0, 4.0, [-1e3, 1e3])
-    assert (pendulum.B.cbf, pendulum.A.cbf, cubic.CBF) == ("cbf:alpha=1.0", "cbf:alpha=5.0", "cbf:alpha=2.0")
-    found = {name: n for table in ("table-5.1", "table-5.2") for name, n in numbers(outcomes[table]).items() if n.printed is not None}
-    printed = {"SCBF": 92.0, "DDSCBF": 91.0, "CBF": 0.0, "SCBF, k = 0.1": 86.8, "DDSCBF, k = 0.1": 85.2, "CBF, k = 0.1": 77.3}
+    assert (pendulum.B.cbf, pendulum.A.cbf, cubic.CBF) == (
+        "cbf:alpha=1.0",
+        "cbf:alpha=5.0",
+        "cbf:alpha=2.0",
+    )
+    found = {
+        name: n
+        for table in ("table-5.1", "table-5.2")
+        for name, n in numbers(outcomes[table]).items()
+        if n.printed is not None
+    }
+    printed = {
+        "SCBF": 92.0,
+        "DDSCBF": 91.0,
+        "CBF": 0.0,
+        "SCBF, k = 0.1": 86.8,
+        "DDSCBF, k = 0.1": 85.2,
+        "CBF, k = 0.1": 77.3,
+    }
     printed |= {"SCBF, k = 0.15": 84.3, "DDSCBF, k = 0.15": 83.0, "CBF, k = 0.15": 57.5}
     assert {name: (n.printed, n.printed_trials, n.unit) for name, n in found.items()} == {
         name: (p, 1000, "%") for name, p in printed.items()
@@ -77,7 +108,9 @@ def test_names_fit_and_there_is_something_to_judge(outcomes, name):
     names = [number.name for number in outcome.numbers]
     assert len(set(names)) == len(names)
     assert {number.name for number in outcome.as_printed} <= set(names)
-    assert any(claim.printed for claim in outcome.claims) or any(number.printed is not None for number in outcome.numbers)
+    assert any(claim.printed for claim in outcome.claims) or any(
+        number.printed is not None for number in outcome.numbers
+    )
     assert judge(artefact, outcome, SAMPLE).verdict == Verdict.NONE
 
 
@@ -86,8 +119,12 @@ def test_other_settings_have_all_that_is_printed(outcomes, name):
     outcome = outcomes[name]
     assert set(outcome.elsewhere) == set(OTHERS.get(name, ()))
     for other in outcome.elsewhere.values():
-        assert [(n.name, n.printed) for n in other.numbers] == [(n.name, n.printed) for n in outcome.numbers]
-        assert [(c.sentence, c.printed) for c in other.claims] == [(c.sentence, c.printed) for c in outcome.claims]
+        assert [(n.name, n.printed) for n in other.numbers] == [
+            (n.name, n.printed) for n in outcome.numbers
+        ]
+        assert [(c.sentence, c.printed) for c in other.claims] == [
+            (c.sentence, c.printed) for c in outcome.claims
+        ]
 
 
 OTHERS = {
@@ -99,7 +136,9 @@ OTHERS = {
 
 @EACH
 def test_setting_is_that_of_the_sample(name):
-    full, quick, few = (" ".join(ARTEFACTS[name].setting(sample)) for sample in (FULL, SAMPLE, Sample(episodes=7)))
+    full, quick, few = (
+        " ".join(ARTEFACTS[name].setting(sample)) for sample in (FULL, SAMPLE, Sample(episodes=7))
+    )
     if name in ("figure-5.1", "figure-5.2"):
         assert "200 states" in full
         assert "50000 Euler steps" in full
@@ -109,12 +148,18 @@ def test_setting_is_that_of_the_sample(name):
         assert "2 identifications" in quick
         assert full == few
     else:
-        assert ("1000 episodes" in full, " 50 episodes" in quick, " 7 episodes" in f" {few}") == (True, True, True)
+        assert ("1000 episodes" in full, " 50 episodes" in quick, " 7 episodes" in f" {few}") == (
+            True,
+            True,
+            True,
+        )
 
 
 def test_a_quick_run_is_told_its_horizon():
     setting = ARTEFACTS["table-5.1"].setting
-    assert setting(FULL)[0].startswith("B: from (.1 rad, .1 rad/s), 20 s, CBF with alpha(h) = 1 h 1/s")
+    assert setting(FULL)[0].startswith(
+        "B: from (.1 rad, .1 rad/s), 20 s, CBF with alpha(h) = 1 h 1/s"
+    )
     assert ", 5 s," in setting(SAMPLE)[0]
     assert pendulum.B.options(SAMPLE) == {"start": "near-origin", "horizon": 5.0}
     assert pendulum.A.options(SAMPLE)["horizon"] == pendulum.A.options(FULL)["horizon"] == 2.0
@@ -122,7 +167,10 @@ def test_a_quick_run_is_told_its_horizon():
 
 @EACH
 def test_is_kept_and_drawn(outcomes, name, tmp_path, pictures):
-    artefact, outcome = ARTEFACTS[name], Outcome.from_document(json.loads(json.dumps(outcomes[name].document())))
+    artefact, outcome = (
+        ARTEFACTS[name],
+        Outcome.from_document(json.loads(json.dumps(outcomes[name].document()))),
+    )
     store.keep(tmp_path, artefact, SAMPLE, outcome, 1.0)
     assert (tmp_path / f"{name}.png").exists() == (artefact.draw is not None)
     assert store.read(tmp_path, artefact, SAMPLE) == (outcome, 1.0)
@@ -137,14 +185,22 @@ def test_the_same_seed_gives_the_same(outcomes):
 
 @pytest.mark.parametrize(
     ("name", "term"),
-    [("figure-5.1", lambda theta: -math.sqrt(3) * (0.1 * theta) ** 2), ("figure-5.2", lambda x_2: -((0.1 * x_2) ** 2))],
+    [
+        ("figure-5.1", lambda theta: -math.sqrt(3) * (0.1 * theta) ** 2),
+        ("figure-5.2", lambda x_2: -((0.1 * x_2) ** 2)),
+    ],
 )
 def test_learned_term_has_its_closed_form_and_label_noise(outcomes, name, term):
     data = outcomes[name].data
-    assert data["term"] == pytest.approx([term(value) for value in data["grid"]], rel=1e-9, abs=1e-15)
+    assert data["term"] == pytest.approx(
+        [term(value) for value in data["grid"]], rel=1e-9, abs=1e-15
+    )
     exact = term(np.array(data["points"]))
-    # The repaired estimate of a quadratic h with one channel of noise has the relative deviation sqrt(2/n).
-    score = (np.array(data["repaired"]["labels"]) / exact - 1.0) / math.sqrt(2.0 / SAMPLE.work(noise_terms.REPETITIONS))
+    # The repaired estimate of a quadratic h with one channel of noise has the relative deviation
+    # sqrt(2/n).
+    score = (np.array(data["repaired"]["labels"]) / exact - 1.0) / math.sqrt(
+        2.0 / SAMPLE.work(noise_terms.REPETITIONS)
+    )
     assert 0.4 < np.sqrt(np.mean(score**2)) < 1.8
 
 
@@ -155,14 +211,24 @@ def test_printed_estimator_misses_by_its_bias_for_the_pendulum():
     weights = np.array([[math.sqrt(3), 1.0], [1.0, math.sqrt(3)]])
     bias = -0.01 * np.einsum("ip,ij,jp->p", f, weights, f)
     term = -math.sqrt(3) * (0.1 * theta) ** 2
-    spread = 0.1 * np.abs(theta) * np.abs(2 * weights[0] @ first.x.T) / math.sqrt(0.01 * SAMPLE.work(noise_terms.REPETITIONS))
+    spread = (
+        0.1
+        * np.abs(theta)
+        * np.abs(2 * weights[0] @ first.x.T)
+        / math.sqrt(0.01 * SAMPLE.work(noise_terms.REPETITIONS))
+    )
     assert np.all(np.abs(first.labels["printed"] - term - bias) < 4.5 * spread + 1e-4)
     assert np.sqrt(np.mean(bias**2)) > 50 * np.sqrt(np.mean(term**2))
 
 
 def test_identifications_have_data_of_their_own():
     learned = noise_terms.lessons(pendulum.ENV, pendulum.NOISE, SAMPLE)
-    assert len({each.seed for each in learned}) == len(learned) == noise_terms.identifications(SAMPLE) == 2
+    assert (
+        len({each.seed for each in learned})
+        == len(learned)
+        == noise_terms.identifications(SAMPLE)
+        == 2
+    )
     assert noise_terms.identifications(FULL) == 3
     assert not np.isclose(learned[0].x, learned[1].x).any()
     assert {each.seed for each in learned}.isdisjoint(
@@ -189,19 +255,27 @@ def test_pendulum_table_keeps_to_theory(outcomes):
 def test_cubic_table_has_more_safety_with_stricter_filters(outcomes):
     found = numbers(outcomes["table-5.2"])
     for k in cubic.LEVELS:
-        scbf, cbf, bare = (found[f"{name}, k = {k:g}"].ours for name in ("SCBF", "CBF", "no filter"))
+        scbf, cbf, bare = (
+            found[f"{name}, k = {k:g}"].ours for name in ("SCBF", "CBF", "no filter")
+        )
         assert scbf > cbf > bare
 
 
 def test_no_noise_leaves_no_gap_between_scbf_and_a_cbf_without_class_k_term():
-    found = paired_rates.measured(cubic.ENV, {"noise": 0.0, "horizon": 0.5}, [cubic.WITHOUT, "scbf"], [], Sample(episodes=20))
+    found = paired_rates.measured(
+        cubic.ENV, {"noise": 0.0, "horizon": 0.5}, [cubic.WITHOUT, "scbf"], [], Sample(episodes=20)
+    )
     assert found["scbf"].row["safe"] == found[cubic.WITHOUT].row["safe"]
-    assert found["scbf"].row["min_h_median"] == pytest.approx(found[cubic.WITHOUT].row["min_h_median"], rel=1e-6)
+    assert found["scbf"].row["min_h_median"] == pytest.approx(
+        found[cubic.WITHOUT].row["min_h_median"], rel=1e-6
+    )
 
 
 def test_printed_rate_of_the_cbf_is_below_that_without_a_filter():
     # At the larger noise the rate without any filter is above the printed one with the CBF.
-    bare = paired_rates.measured(cubic.ENV, {"noise": cubic.LEVELS[1]}, ["none"], [], Sample(episodes=400))["none"].number("")
+    bare = paired_rates.measured(
+        cubic.ENV, {"noise": cubic.LEVELS[1]}, ["none"], [], Sample(episodes=400)
+    )["none"].number("")
     assert bare.low is not None
     assert bare.low > cubic.PRINTED["CBF"][1]
 
@@ -222,13 +296,17 @@ def test_pictures_show_the_same_starts_and_what_they_are_for(outcomes):
 
 def test_pictures_rest_on_their_own_claims(outcomes):
     sentences = [outcomes[name].claims[0].sentence for name in PICTURES]
-    assert ["origin" in sentences[0], "guarantees" in sentences[1], "unsafe with the CBF" in sentences[2], "DDSCBF" in sentences[3]] == [
-        True
-    ] * 4
+    assert [
+        "origin" in sentences[0],
+        "guarantees" in sentences[1],
+        "unsafe with the CBF" in sentences[2],
+        "DDSCBF" in sentences[3],
+    ] == [True] * 4
     assert all(claim.printed for name in PICTURES for claim in outcomes[name].claims)
     # The claim is of all episodes, not of the shown one.
     assert (
-        f"{outcomes['figure-5.3d'].numbers[0].ours:.1f} % less {outcomes['figure-5.3c'].numbers[0].ours:.1f} %"
+        f"{outcomes['figure-5.3d'].numbers[0].ours:.1f} % less"
+        f" {outcomes['figure-5.3c'].numbers[0].ours:.1f} %"
         in outcomes["figure-5.3d"].claims[0].evidence
     )
 

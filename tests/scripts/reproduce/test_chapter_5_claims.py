@@ -7,14 +7,21 @@ import pytest
 
 from safe_envs.agents.evaluation.comparison import SafetyBits
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.scripts.reproduce.chapter_5 import cubic, cubic_paths, noise_terms, paired_rates, pendulum
+from safe_envs.scripts.reproduce.chapter_5 import (
+    cubic,
+    cubic_paths,
+    noise_terms,
+    paired_rates,
+    pendulum,
+)
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import Runs
 from safe_envs.scripts.reproduce.framework.artefact import Sample
 from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
 
 
 def made(*safe, episodes=1000):
-    """Runs in which the first so many episodes are safe, a number for each identification; or which ones, where an array is given."""
+    """Runs in which the first so many episodes are safe, a number for each identification; or which
+    ones, where an array is given."""
     flags = [np.arange(episodes) < each if isinstance(each, int) else each for each in safe]
     kept = [SafetyBits() for _ in flags]
     for each, values in zip(kept, flags, strict=True):
@@ -28,7 +35,9 @@ def made(*safe, episodes=1000):
 def test_a_root_mean_square_has_the_interval_of_its_mean_square():
     number = noise_terms.root_mean_square("", np.sqrt([1.0, 3.0] * 50))
     half = 1.96 * math.sqrt(100 / 99) / 10
-    assert (number.ours, number.low, number.high) == pytest.approx(tuple(map(math.sqrt, (2.0, 2.0 - half, 2.0 + half))))
+    assert (number.ours, number.low, number.high) == pytest.approx(
+        tuple(map(math.sqrt, (2.0, 2.0 - half, 2.0 + half)))
+    )
 
 
 def test_claims_about_a_learned_term_can_fail():
@@ -37,7 +46,9 @@ def test_claims_about_a_learned_term_can_fail():
     assert not noise_terms.as_derived("", -(grid**2), -1.001 * grid**2).holds
     truth = -(grid**2)  # rms .49, about its mean .32
     assert noise_terms.learnable([0.1, 0.1, 0.1], truth).holds
-    assert not noise_terms.learnable([0.1, 0.3, 0.1], truth).holds  # in the mean, but not by more than chance
+    assert not noise_terms.learnable(
+        [0.1, 0.3, 0.1], truth
+    ).holds  # in the mean, but not by more than chance
     assert not noise_terms.learnable([0.4, 0.4, 0.4], truth).holds
     assert noise_terms.near([0.04, 0.05], truth).holds
     assert not noise_terms.near([0.05, 0.05], truth).holds
@@ -45,7 +56,12 @@ def test_claims_about_a_learned_term_can_fail():
 
 
 def pendulum_outcome(scbf=920, ddscbf=910, cbf=0, quiet=1000):
-    runs = {"scbf": made(scbf), "ddscbf": made(ddscbf), pendulum.B.cbf: made(cbf), pendulum.WITHOUT: made(900)}
+    runs = {
+        "scbf": made(scbf),
+        "ddscbf": made(ddscbf),
+        pendulum.B.cbf: made(cbf),
+        pendulum.WITHOUT: made(900),
+    }
     return pendulum.outcome_of(pendulum.B, runs, made(quiet))
 
 
@@ -65,7 +81,9 @@ def pendulum_outcome(scbf=920, ddscbf=910, cbf=0, quiet=1000):
 def test_claims_about_the_pendulum_can_fail(of, failed):
     found = [claim for claim in pendulum_outcome(**of).claims if not claim.holds]
     assert len(found) == len(failed)
-    assert all(claim.sentence.startswith(sentence) for claim, sentence in zip(found, failed, strict=True))
+    assert all(
+        claim.sentence.startswith(sentence) for claim, sentence in zip(found, failed, strict=True)
+    )
     # What the thesis does not say counts for no verdict.
     assert all(claim.printed != claim.sentence.startswith("DDSCBF is as safe") for claim in found)
 
@@ -113,10 +131,16 @@ def test_closeness_needs_the_whole_interval_within_the_limit():
 
 
 def cubic_levels(ddscbf):
-    return {k: {"scbf": made(850), "ddscbf": made(each), cubic.CBF: made(770)} for k, each in zip(cubic.LEVELS, ddscbf, strict=True)}
+    return {
+        k: {"scbf": made(850), "ddscbf": made(each), cubic.CBF: made(770)}
+        for k, each in zip(cubic.LEVELS, ddscbf, strict=True)
+    }
 
 
-@pytest.mark.parametrize(("ddscbf", "holds"), [((850, 850), [1, 1, 1, 1]), ((770, 890), [0, 0, 0, 1]), ((850, 771), [1, 0, 1, 0])])
+@pytest.mark.parametrize(
+    ("ddscbf", "holds"),
+    [((850, 850), [1, 1, 1, 1]), ((770, 890), [0, 0, 0, 1]), ((850, 771), [1, 0, 1, 0])],
+)
 def test_claims_about_the_cubic_table_can_fail_and_are_ours(ddscbf, holds):
     found = cubic.claims(cubic_levels(ddscbf))
     assert [claim.holds for claim in found] == [bool(each) for each in holds]
@@ -134,11 +158,18 @@ def test_the_side_of_no_filter_is_computed():
 
 def path(*safe):
     states = np.zeros((2, len(safe), 2))
-    return cubic_paths.Path(made(5), states, np.array([[0.1] * len(safe), [0.1 if each else -0.1 for each in safe]]))
+    return cubic_paths.Path(
+        made(5), states, np.array([[0.1] * len(safe), [0.1 if each else -0.1 for each in safe]])
+    )
 
 
 def test_the_shown_episode_ends_as_in_the_text():
-    found = {"a": path(0, 0, 0, 1), "b": path(1, 1, 0, 1), "c": path(1, 0, 0, 0), "d": path(1, 1, 1, 1)}
+    found = {
+        "a": path(0, 0, 0, 1),
+        "b": path(1, 1, 0, 1),
+        "c": path(1, 0, 0, 0),
+        "d": path(1, 1, 1, 1),
+    }
     assert cubic_paths.alike(found).tolist() == [1]
     assert cubic_paths.alike({**found, "d": path(1, 0, 1, 1)}).tolist() == []
 

@@ -13,7 +13,13 @@ from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.lie import derivatives, generator
 from safe_envs.errors import RelativeDegreeError
 from safe_envs.registry import load_problem
-from safe_envs.scripts.reproduce.chapter_6 import bayesian_cruise, bayesian_cubic, cubic_drift, identifications, learning_times
+from safe_envs.scripts.reproduce.chapter_6 import (
+    bayesian_cruise,
+    bayesian_cubic,
+    cubic_drift,
+    identifications,
+    learning_times,
+)
 from safe_envs.scripts.reproduce.chapter_6.learned_controllers import Learned, known, printed_totals
 from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
 from safe_envs.scripts.reproduce.framework.store import keep
@@ -31,7 +37,8 @@ LESS = (
     (cubic_drift, {"_PICTURED": 2}),
     (learning_times, {"_TIMED": 2, "_ONE_BY_ONE": 50}),
 )
-"""Sizes of these tests: as much as makes an outcome whole. Intervals over identifications need two of them."""
+"""Sizes of these tests: as much as makes an outcome whole. Intervals over identifications need two
+of them."""
 
 
 def compute(name: str, sample: Sample) -> Outcome:
@@ -52,11 +59,16 @@ def number(found, name):
 
 
 def test_the_chapter_is_complete():
-    assert sorted(ARTEFACTS) == sorted(f"{kind}-6.{i}" for kind in ("figure", "table") for i in range(1, 5))
+    assert sorted(ARTEFACTS) == sorted(
+        f"{kind}-6.{i}" for kind in ("figure", "table") for i in range(1, 5)
+    )
 
 
 def test_printed_numbers_and_settings_are_those_of_the_thesis():
-    printed = {name: {n.name: n.printed for n in outcome(name).numbers if n.printed is not None} for name in ARTEFACTS}
+    printed = {
+        name: {n.name: n.printed for n in outcome(name).numbers if n.printed is not None}
+        for name in ARTEFACTS
+    }
     assert printed == {
         "figure-6.1": {},
         "figure-6.2": {},
@@ -86,31 +98,52 @@ def test_printed_numbers_and_settings_are_those_of_the_thesis():
         "table-6.4": {"DDSCBF (in print: more than)": 5 * 60 * 60, "Bayesian SCBF": 15},
     }
     # 1000 simulations each, in the captions of Tables 6.2 and 6.3.
-    assert {n.printed_trials for name in ("table-6.2", "table-6.3") for n in outcome(name).numbers if n.printed is not None} == {1000}
+    assert {
+        n.printed_trials
+        for name in ("table-6.2", "table-6.3")
+        for n in outcome(name).numbers
+        if n.printed is not None
+    } == {1000}
     assert (bayesian_cubic.EPISODES, bayesian_cruise.EPISODES) == (1000, 1000)
-    # Sec. 6.3.1: 10 initial points, K = 10, 30, 100 at u = 0, g at u = .1; 100 and 300 for the noise, 10000 draws, alpha = beta = 1.
+    # Sec. 6.3.1: 10 initial points, K = 10, 30, 100 at u = 0, g at u = .1; 100 and 300 for the
+    # noise, 10000 draws, alpha = beta = 1.
     assert identifications.STARTS == 10
     assert identifications.REPETITIONS == (10, 30, 100)
     assert identifications.AT_REST == ((0.0,),)
     assert bayesian_cubic.FEEBLE == ((0.0,), (0.1,))
-    assert (identifications.NOISE_STARTS, identifications.NOISE_STEPS, identifications.DRAWS) == (100, 300, 10_000)
+    assert (identifications.NOISE_STARTS, identifications.NOISE_STEPS, identifications.DRAWS) == (
+        100,
+        300,
+        10_000,
+    )
     assert identifications.PRIOR_OF_SIGMA == (1.0, 1.0)
     # Captions of Table 6.1, Fig. 6.1 and Fig. 6.3: random points.
     assert (cubic_drift.POINTS, cubic_drift.SHOWN, bayesian_cruise.FRESH) == (100, 30, 100)
     # Sec. 6.3.2: N = 300 and K = 10000 of DDSCBF; the starts are in the captions of the tables.
     assert (learning_times.POINTS, learning_times.GENERATOR_REPETITIONS) == (300, 10_000)
     disk, car = load_problem(bayesian_cubic.ENV), load_problem(bayesian_cruise.ENV)
-    starts = [disk.starts[name].state for name in bayesian_cubic.PLACES.values()] + [car.starts[car.start].state]
+    starts = [disk.starts[name].state for name in bayesian_cubic.PLACES.values()] + [
+        car.starts[car.start].state
+    ]
     assert np.array(starts, dtype=float).tolist() == [[-0.1, 0.7], [-0.1, 0.8], [10.0, 15.0]]
     for problem, sigma in ((disk, 0.2), (car, 0.5)):
         assert problem.dt == 0.01
-        assert [identifications.noise_level(problem, name) for name in ("sigma_1", "sigma_2")] == [sigma, sigma]
+        assert [identifications.noise_level(problem, name) for name in ("sigma_1", "sigma_2")] == [
+            sigma,
+            sigma,
+        ]
 
 
 @pytest.mark.parametrize("sample", [Sample(), Sample(7), QUICK])
 def test_settings_say_what_is_simulated(sample):
     text = {name: " ".join(ARTEFACTS[name].setting(sample)) for name in ARTEFACTS}
-    sizes = {"table-6.1": (40, ""), "figure-6.1": (20, ""), "figure-6.3": (10, ""), "table-6.2": (10, ""), "table-6.3": (30, "Bayesian ")}
+    sizes = {
+        "table-6.1": (40, ""),
+        "figure-6.1": (20, ""),
+        "figure-6.3": (10, ""),
+        "table-6.2": (10, ""),
+        "table-6.3": (30, "Bayesian "),
+    }
     for name, (full, kind) in sizes.items():
         assert f"{len(identifications.seeds(sample, full))} {kind}identifications" in text[name]
     for name in ("table-6.2", "table-6.3"):
@@ -127,7 +160,11 @@ def test_an_outcome_is_json_is_drawn_and_judged(name, tmp_path, pictures):
     text = json.dumps(found.document(), allow_nan=False)
     assert Outcome.from_document(json.loads(text)) == found
     keep(tmp_path, ARTEFACTS[name], QUICK, found, 1.0)
-    assert (tmp_path / f"{name}.png").exists() == (ARTEFACTS[name].draw is not None) == name.startswith("figure")
+    assert (
+        (tmp_path / f"{name}.png").exists()
+        == (ARTEFACTS[name].draw is not None)
+        == name.startswith("figure")
+    )
     assert judge(ARTEFACTS[name], found, Sample()).verdict in Verdict
     names = [n.name for n in found.numbers]
     assert len(set(names)) == len(names)
@@ -147,10 +184,13 @@ def test_the_error_of_the_drift_is_the_law_for_states_over_the_disk():
     problem = load_problem(bayesian_cubic.ENV)
     x = np.random.default_rng(1).uniform(-0.6, 0.6, (400, 2))
     found = cubic_drift.study(problem, x, 10, range(6), 1000, 1)
-    # Ten features, sigma = .2, K = 10, R = 1000, dt = .01. Near the centre the errors are smaller than on average over the disk.
+    # Ten features, sigma = .2, K = 10, R = 1000, dt = .01. Near the centre the errors are smaller
+    # than on average over the disk.
     assert 0.3 < found.squares.mean() / (10 * 0.2**2 / (10 * 1000 * 0.01)) < 1.2
-    assert 0.7 < found.unverified_assumptions.mean() < 1.3
-    assert found.overconfident.mean() == pytest.approx(found.unverified_assumptions.mean() / math.sqrt(problem.dt), rel=0.05)
+    assert 0.7 < found.errors_in_deviations.mean() < 1.3
+    assert found.overconfident.mean() == pytest.approx(
+        found.errors_in_deviations.mean() / math.sqrt(problem.dt), rel=0.05
+    )
 
 
 @pytest.mark.parametrize("name", ["figure-6.1", "table-6.1"])
@@ -177,7 +217,11 @@ def test_levels_gather_at_the_true_ones_and_the_printed_likelihood_ten_times_bel
 
 def test_the_drift_of_the_car_is_known_where_it_is_large():
     found = outcome("figure-6.3")
-    assert number(found.numbers, "relative rms error of f_2").ours < 10 < number(found.numbers, "relative rms error of f_1").ours
+    assert (
+        number(found.numbers, "relative rms error of f_2").ours
+        < 10
+        < number(found.numbers, "relative rms error of f_1").ours
+    )
     assert [claim.printed for claim in found.claims] == [True, False, False]
     assert number(found.numbers, "rms error in standard deviations of the posterior").ours < 3
 
@@ -185,7 +229,9 @@ def test_the_drift_of_the_car_is_known_where_it_is_large():
 def test_the_bounds_of_the_table_and_what_known_noise_makes_of_it():
     found = outcome("table-6.2")
     for place, h in (("(-.1, .7)", 50), ("(-.1, .8)", 35)):
-        bound, repaired = (number(numbers, f"Analytical {place}") for numbers in (found.as_printed, found.numbers))
+        bound, repaired = (
+            number(numbers, f"Analytical {place}") for numbers in (found.as_printed, found.numbers)
+        )
         assert bound.ours == pytest.approx(h)
         assert bound.printed == h
         assert repaired.ours == pytest.approx(h - 8, abs=0.1)
@@ -210,7 +256,10 @@ def test_a_row_by_hand_gives_the_same_episodes_as_the_condition():
     (x_1, x_2), _ = problem.plant.states, problem.plant.inputs
     row = bayesian_cubic.printed_generator(problem) + x_1 * x_2
     by_hand = printed_totals(problem, row, 60, 0)
-    assert by_hand.safe == evaluate(problem, filters=["scbf"], episodes=60, bounds=False).rows[0]["safe"]
+    assert (
+        by_hand.safe
+        == evaluate(problem, filters=["scbf"], episodes=60, bounds=False).rows[0]["safe"]
+    )
 
 
 def test_the_printed_second_generator_of_the_car_is_not_safe():
@@ -231,7 +280,10 @@ def test_a_quick_table_of_the_car_has_all_rows_and_says_that_it_is_short():
 def test_the_recursion_takes_longest():
     found = outcome(TIMED)
     assert judge(ARTEFACTS[TIMED], found, Sample()).verdict == Verdict.ORDERING
-    assert number(found.numbers, "DDSCBF (in print: more than)").ours > number(found.numbers, "Bayesian SCBF").ours
+    assert (
+        number(found.numbers, "DDSCBF (in print: more than)").ours
+        > number(found.numbers, "Bayesian SCBF").ours
+    )
 
 
 def test_a_controller_is_compared_on_the_episodes_of_the_reference():
@@ -240,7 +292,9 @@ def test_a_controller_is_compared_on_the_episodes_of_the_reference():
     learned = identifications.identified(problem, 100, 0, bayesian_cubic.PRIOR)
     found = Learned.run(problem, "bayesian-scbf", [learned, learned], reference)
     assert found.rates[0] == found.rates[1]
-    assert found.difference[0] == pytest.approx(100 * (found.rates[0] - reference.rows[0]["safety_rate"]))
+    assert found.difference[0] == pytest.approx(
+        100 * (found.rates[0] - reference.rows[0]["safety_rate"])
+    )
     assert found.difference[1] <= found.difference[0] <= found.difference[2]
     assert "average over 2 identifications" in found.told
 

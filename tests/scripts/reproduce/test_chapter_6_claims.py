@@ -32,7 +32,10 @@ def learned(*difference, rates=(0.8, 0.9)):
 def test_one_more_of_many_is_in_its_interval_with_95_percent():
     values = np.random.default_rng(0).standard_normal((4000, 5))
     new = np.random.default_rng(1).standard_normal(4000)
-    inside = [low <= one <= high for one, (low, high) in zip(new, map(identifications.one_more, values), strict=True)]
+    inside = [
+        low <= one <= high
+        for one, (low, high) in zip(new, map(identifications.one_more, values), strict=True)
+    ]
     assert np.mean(inside) == pytest.approx(0.95, abs=0.012)
 
 
@@ -40,15 +43,24 @@ def test_a_positive_quantity_is_predicted_by_its_logarithm():
     found = identifications.predicted("a", np.exp([1.0, 2.0, 3.0]), 7.0, "s")
     half = t.ppf(0.975, 2) * math.sqrt(4 / 3)
     assert (found.ours, found.printed, found.unit) == (pytest.approx(math.exp(2.0)), 7.0, "s")
-    assert (found.low, found.high) == (pytest.approx(math.exp(2.0 - half)), pytest.approx(math.exp(2.0 + half)))
+    assert (found.low, found.high) == (
+        pytest.approx(math.exp(2.0 - half)),
+        pytest.approx(math.exp(2.0 + half)),
+    )
 
 
 def test_an_interval_of_draws_holds_95_percent_of_them():
     found = identifications.credible("sigma", DRAWS, "")
-    assert (found.low, found.high) == (pytest.approx(-1.96, abs=1e-3), pytest.approx(1.96, abs=1e-3))
+    assert (found.low, found.high) == (
+        pytest.approx(-1.96, abs=1e-3),
+        pytest.approx(1.96, abs=1e-3),
+    )
 
 
-@pytest.mark.parametrize(("true", "holds"), [((0.0, 2.2), True), ((2.2, -2.2), True), ((0.0, 2.3), False), ((-2.3, 0.0), False)])
+@pytest.mark.parametrize(
+    ("true", "holds"),
+    [((0.0, 2.2), True), ((2.2, -2.2), True), ((0.0, 2.3), False), ((-2.3, 0.0), False)],
+)
 def test_posteriors_are_around_the_truth_together_in_95_percent(true, holds):
     # Each of the two with 97.5 %, that is 2.24 standard deviations.
     claim = identifications.gathered([DRAWS, DRAWS], true)
@@ -59,7 +71,10 @@ def test_posteriors_are_around_the_truth_together_in_95_percent(true, holds):
 def squares(*levels, spread=0.05):
     """Errors of five identifications around a level for each K, independent of each other."""
     noise = np.random.default_rng(3).standard_normal((len(levels), 5))
-    return {k: level * np.exp(spread * each) for k, level, each in zip((10, 30, 100), levels, noise, strict=True)}
+    return {
+        k: level * np.exp(spread * each)
+        for k, level, each in zip((10, 30, 100), levels, noise, strict=True)
+    }
 
 
 def test_an_error_falls_if_it_surely_does():
@@ -93,7 +108,9 @@ def test_a_printed_fall_is_possible_or_not():
     ids=["wide", "near", "low", "high", "one is far", "print"],
 )
 def test_similar_is_what_the_interval_says_in_points_of_the_print(differences, holds):
-    claim = learned_controllers.similar({str(i): learned(*each) for i, each in enumerate(differences)})
+    claim = learned_controllers.similar(
+        {str(i): learned(*each) for i, each in enumerate(differences)}
+    )
     assert claim.holds is holds
     assert claim.printed
 
@@ -101,7 +118,11 @@ def test_similar_is_what_the_interval_says_in_points_of_the_print(differences, h
 def test_the_interval_of_a_rate_is_that_with_one_more_identification():
     low, high = rate_interval(700, 1000)
     same = learned(0.0, 0.0, 0.0, rates=(0.7, 0.7)).number("a", 65)
-    assert (same.low, same.high, same.printed_trials) == (pytest.approx(100 * low), pytest.approx(100 * high), 1000)
+    assert (same.low, same.high, same.printed_trials) == (
+        pytest.approx(100 * low),
+        pytest.approx(100 * high),
+        1000,
+    )
     found = learned(0.0, 0.0, 0.0, rates=(0.69, 0.7, 0.71)).number("a")
     half = t.ppf(0.975, 2) * 0.01 * math.sqrt(4 / 3)
     assert found.low == pytest.approx(70 - 100 * math.hypot(0.7 - low, half))
@@ -112,7 +133,9 @@ def test_the_interval_of_a_rate_is_that_with_one_more_identification():
 def test_measured_rates_are_above_the_worst_case_or_not():
     def claim(*rates):
         each = [Number.rate(str(i), rate, 1000) for i, rate in enumerate(rates)]
-        return worst_case.above_worst(1.0, {"here": (each, 35.0), "there": ([Number.rate("x", 910, 1000)], 50.0)})
+        return worst_case.above_worst(
+            1.0, {"here": (each, 35.0), "there": ([Number.rate("x", 910, 1000)], 50.0)}
+        )
 
     assert claim(550, 450, 430).holds
     assert not claim(550, 450, 340).holds
@@ -123,7 +146,13 @@ def test_measured_rates_are_above_the_worst_case_or_not():
 
 def test_the_worst_case_is_for_ever_or_not():
     def claim(safe):
-        return worst_case.worst_for_ever(400.0, {"here": (Number.rate("a", safe, 250), 50.0), "there": (Number.rate("b", 200, 250), 35.0)})
+        return worst_case.worst_for_ever(
+            400.0,
+            {
+                "here": (Number.rate("a", safe, 250), 50.0),
+                "there": (Number.rate("b", 200, 250), 35.0),
+            },
+        )
 
     assert claim(120).holds
     assert not claim(105).holds
@@ -132,7 +161,11 @@ def test_the_worst_case_is_for_ever_or_not():
 
 
 @pytest.mark.parametrize(
-    ("second", "said"), [((1000, 560, 300), "first at T = 0.50 s"), ((1000, 750, 700), "At none of 3 instants up to T = 1 s")]
+    ("second", "said"),
+    [
+        ((1000, 560, 300), "first at T = 0.50 s"),
+        ((1000, 750, 700), "At none of 3 instants up to T = 1 s"),
+    ],
 )
 def test_both_printed_rates_are_looked_for_at_one_horizon(second, said):
     def row(safe):
@@ -155,7 +188,9 @@ def test_near_is_a_check_of_ours():
     assert not far.printed
 
 
-@pytest.mark.parametrize(("ratio", "holds"), [(0.5, [False, False]), (5.0, [True, False]), (12.0, [True, True])])
+@pytest.mark.parametrize(
+    ("ratio", "holds"), [(0.5, [False, False]), (5.0, [True, False]), (12.0, [True, True])]
+)
 def test_identifying_is_sooner_or_not_and_ten_times_is_ours(ratio, holds):
     claims = learning_times.sooner(ratio)
     assert [claim.holds for claim in claims] == holds
@@ -164,6 +199,12 @@ def test_identifying_is_sooner_or_not_and_ten_times_is_ours(ratio, holds):
 
 
 def test_the_limit_of_similar_is_the_largest_printed_difference():
-    pairs = [*zip(bayesian_cubic.PRINTED_RATES["SCBF"], bayesian_cubic.PRINTED_RATES["Bayesian SCBF"], strict=True)]
+    pairs = [
+        *zip(
+            bayesian_cubic.PRINTED_RATES["SCBF"],
+            bayesian_cubic.PRINTED_RATES["Bayesian SCBF"],
+            strict=True,
+        )
+    ]
     pairs.append((bayesian_cruise.PRINTED["SCBF"], bayesian_cruise.PRINTED["Bayesian SCBF"]))
     assert max(abs(a - b) for a, b in pairs) == learned_controllers.SIMILAR

@@ -32,9 +32,28 @@ from tests.scripts.reproduce.test_chapter_6 import outcome as outcome_of
 
 pytestmark = pytest.mark.slow
 
-ALL = [f"figure-{n}" for n in ("3.1", "3.2a", "3.2b", "3.3", "4.1", "4.2", "4.3", "5.1", "5.2", "5.3a", "5.3b", "5.3c", "5.3d")]
+ALL = [
+    f"figure-{n}"
+    for n in (
+        "3.1",
+        "3.2a",
+        "3.2b",
+        "3.3",
+        "4.1",
+        "4.2",
+        "4.3",
+        "5.1",
+        "5.2",
+        "5.3a",
+        "5.3b",
+        "5.3c",
+        "5.3d",
+    )
+]
 ALL += (
-    [f"figure-6.{n}" for n in range(1, 5)] + [f"table-{n}" for n in ("4.1", "5.1", "5.2", "6.1", "6.2", "6.3", "6.4")] + ["example-4.2.2"]
+    [f"figure-6.{n}" for n in range(1, 5)]
+    + [f"table-{n}" for n in ("4.1", "5.1", "5.2", "6.1", "6.2", "6.3", "6.4")]
+    + ["example-4.2.2"]
 )
 
 
@@ -53,7 +72,9 @@ def test_results_are_kept_by_configuration_and_version(tmp_path, coin, monkeypat
     assert read(tmp_path, coin, sample) == (outcome, 1.5)
     assert read(tmp_path, coin, Sample(101)) is None
     with monkeypatch.context() as patch:
-        patch.setattr("safe_envs.scripts.reproduce.framework.store.source_checksum", lambda: "another")
+        patch.setattr(
+            "safe_envs.scripts.reproduce.framework.store.source_checksum", lambda: "another"
+        )
         assert read(tmp_path, coin, sample) is None
     (tmp_path / "table-0.1.svg").unlink()
     assert read(tmp_path, coin, sample) is None
@@ -64,15 +85,27 @@ def test_equal_outcomes_make_equal_pictures(tmp_path, coin):
         (tmp_path / name).mkdir()
         keep(tmp_path / name, coin, Sample(100), coin.compute(Sample(100)), 1.0)
     for suffix in (".png", ".svg"):
-        assert (tmp_path / "a" / f"table-0.1{suffix}").read_bytes() == (tmp_path / "b" / f"table-0.1{suffix}").read_bytes()
+        assert (tmp_path / "a" / f"table-0.1{suffix}").read_bytes() == (
+            tmp_path / "b" / f"table-0.1{suffix}"
+        ).read_bytes()
 
 
 def test_sizes_follow_what_was_asked_for():
-    assert [Sample().size(1000), Sample(7).size(1000), Sample(quick=True).size(1000)] == [1000, 7, 50]
-    assert [Sample(7).work(200), Sample(7, quick=True).work(200), Sample(quick=True).work(4)] == [200, 10, 4]
+    assert [Sample().size(1000), Sample(7).size(1000), Sample(quick=True).size(1000)] == [
+        1000,
+        7,
+        50,
+    ]
+    assert [Sample(7).work(200), Sample(7, quick=True).work(200), Sample(quick=True).work(4)] == [
+        200,
+        10,
+        4,
+    ]
 
 
-def test_the_command_leaves_a_page_and_does_nothing_twice(safe_envs_command, catalogue, computed, tmp_path):
+def test_the_command_leaves_a_page_and_does_nothing_twice(
+    safe_envs_command, catalogue, computed, tmp_path
+):
     arguments = ("reproduce", "--episodes", 100, "--jobs", 1, "--out", "report")
     status, out, err = safe_envs_command(*arguments)
     assert (status, err) == (0, "")
@@ -96,19 +129,32 @@ def test_the_command_leaves_a_page_and_does_nothing_twice(safe_envs_command, cat
 
 def test_a_page_says_what_it_rests_on(safe_envs_command, catalogue, tmp_path):
     assert safe_envs_command("reproduce", "--episodes", 100, "--jobs", 1, "--out", "report")[0] == 0
-    page, markdown = ((tmp_path / "report" / f"index.{kind}").read_text() for kind in ("html", "md"))
+    page, markdown = (
+        (tmp_path / "report" / f"index.{kind}").read_text() for kind in ("html", "md")
+    )
     for text in (page, markdown):
-        assert text.index("claim of the thesis") < text.index("it lands") < text.index("check of ours") < text.index("it rolls")
+        assert (
+            text.index("claim of the thesis")
+            < text.index("it lands")
+            < text.index("check of ours")
+            < text.index("it rolls")
+        )
         assert "thrown 100 times" in text
     assert "| it rolls | no | \\|v\\| = 0 |" in markdown
     seconds = strictly("report/table-0.1.json")["seconds"]
     assert f"Computed in {seconds:.0f} s in all" in page
 
 
-def test_results_of_other_options_are_not_written_over(safe_envs_command, catalogue, computed, tmp_path):
+def test_results_of_other_options_are_not_written_over(
+    safe_envs_command, catalogue, computed, tmp_path
+):
     assert safe_envs_command("reproduce", "--episodes", 100, "--jobs", 1, "--out", "report")[0] == 0
     before = {path.name: path.read_bytes() for path in (tmp_path / "report").iterdir()}
-    for other in (("--episodes", 101), ("--episodes", 100, "--quick"), ("--episodes", 100, "--seed", 1)):
+    for other in (
+        ("--episodes", 101),
+        ("--episodes", 100, "--quick"),
+        ("--episodes", 100, "--seed", 1),
+    ):
         status, _, err = safe_envs_command("reproduce", *other, "--jobs", 1, "--out", "report")
         assert status == 2
         assert 'report holds table-0.1 by other options: {"episodes": 100' in err
@@ -130,7 +176,10 @@ def test_an_interrupt_ends_a_single_job_at_once(safe_envs_command, catalogue, co
         computed.append(1)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("safe_envs.scripts.reproduce.catalogue.ARTEFACTS", (replace(coin, name="table-0.2", compute=interrupted), coin))
+    monkeypatch.setattr(
+        "safe_envs.scripts.reproduce.catalogue.ARTEFACTS",
+        (replace(coin, name="table-0.2", compute=interrupted), coin),
+    )
     status, _, err = safe_envs_command("reproduce", "all", "--jobs", 1, "--out", "report")
     assert status == 130
     assert "Stopped. The same command goes on after what is in report." in err
@@ -178,8 +227,17 @@ def test_a_picture_without_its_numbers_is_not_taken_for_a_result(tmp_path, coin,
     with monkeypatch.context() as patch:
         patch.setattr("safe_envs.scripts.reproduce.framework.store.write_json", full)
         with pytest.raises(ConfigurationError, match="no room"):
-            keep(tmp_path, replace(coin, draw=lambda figure, _: figure.subplots()), Sample(100), coin.compute(Sample(100)), 1.0)
-    with pytest.raises(ConfigurationError, match=r"table-0.1.png is another picture.*remove it, and it is computed again"):
+            keep(
+                tmp_path,
+                replace(coin, draw=lambda figure, _: figure.subplots()),
+                Sample(100),
+                coin.compute(Sample(100)),
+                1.0,
+            )
+    with pytest.raises(
+        ConfigurationError,
+        match=r"table-0.1.png is another picture.*remove it, and it is computed again",
+    ):
         read(tmp_path, coin, Sample(100))
 
 
@@ -193,7 +251,12 @@ def kept(tmp_path, coin):
 def with_checksum(document):
     """As somebody writes it who knows how."""
     document = {name: value for name, value in document.items() if name != "sha256"}
-    return json.dumps({**document, "sha256": hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()})
+    return json.dumps(
+        {
+            **document,
+            "sha256": hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest(),
+        }
+    )
 
 
 @pytest.mark.slow
@@ -206,15 +269,24 @@ def test_a_digit_that_was_changed_is_not_taken_for_a_result(data, kept, coin, tm
         digit = data.draw(st.sampled_from([d for d in "0123456789" if d != content[place]]))
         kept.write_text(content[:place] + digit + content[place + 1 :])
         with suppress(ConfigurationError):
-            # One in its configuration makes it the result of another version, which is computed again.
+            # One in its configuration makes it the result of another version, which is computed
+            # again.
             assert read(tmp_path, coin, Sample(100)) is None
     finally:
         kept.write_text(content)
 
 
 json_values = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.just(10**400) | st.text(max_size=3),
-    lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.sampled_from(["numbers", "ours", "name", "x"]), inner, max_size=2),
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False)
+    | st.just(10**400)
+    | st.text(max_size=3),
+    lambda inner: (
+        st.lists(inner, max_size=2)
+        | st.dictionaries(st.sampled_from(["numbers", "ours", "name", "x"]), inner, max_size=2)
+    ),
     max_leaves=4,
 )
 
@@ -229,7 +301,9 @@ def test_a_result_of_another_shape_is_refused_or_shown(data, kept, coin, tmp_pat
     place: Any = document
     steps = data.draw(st.integers(1, 4))
     for step in range(steps):
-        key = data.draw(st.sampled_from(sorted(place) if isinstance(place, dict) else list(range(len(place)))))
+        key = data.draw(
+            st.sampled_from(sorted(place) if isinstance(place, dict) else list(range(len(place))))
+        )
         if step == steps - 1 or not isinstance(place[key], dict | list) or not place[key]:
             place[key] = data.draw(json_values)
             break
@@ -244,11 +318,27 @@ def test_a_result_of_another_shape_is_refused_or_shown(data, kept, coin, tmp_pat
         kept.write_text(content)
 
 
-@pytest.mark.parametrize("text", ["{", "[1]", "[" * 20_000, "null", '{"configuration": 3}', '{"configuration": {}, "x": NaN}', "{}", ""])
-def test_what_is_no_result_is_told_before_the_work(text, safe_envs_command, catalogue, computed, tmp_path):
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{",
+        "[1]",
+        "[" * 20_000,
+        "null",
+        '{"configuration": 3}',
+        '{"configuration": {}, "x": NaN}',
+        "{}",
+        "",
+    ],
+)
+def test_what_is_no_result_is_told_before_the_work(
+    text, safe_envs_command, catalogue, computed, tmp_path
+):
     (tmp_path / "report").mkdir()
     (tmp_path / "report" / "table-0.1.json").write_text(text)
-    status, _, err = safe_envs_command("reproduce", "--episodes", 100, "--jobs", 1, "--out", "report")
+    status, _, err = safe_envs_command(
+        "reproduce", "--episodes", 100, "--jobs", 1, "--out", "report"
+    )
     assert status == 2
     assert "report/table-0.1.json cannot be read" in err
     assert not computed
@@ -281,7 +371,9 @@ def test_what_a_lost_process_computed_is_computed_again(tmp_path, monkeypatch):
     def pooled(names, sample, out, jobs):
         asked.append((list(names), jobs))
         lost = len(names) > 1 or names == ["kills"]
-        yield from ((name, BrokenProcessPool() if lost and name != "first" else None) for name in names)
+        yield from (
+            (name, BrokenProcessPool() if lost and name != "first" else None) for name in names
+        )
 
     monkeypatch.setattr(command, "_pooled", pooled)
     ended = dict(command._in_processes(["first", "kills", "beside"], Sample(), tmp_path, 2))
@@ -318,7 +410,9 @@ def test_a_run_that_was_stopped_goes_on(safe_envs_command, catalogue, computed, 
     assert status == 2
     assert "table-0.2 failed: ValueError: no luck" in err
     assert "table-0.1" in out
-    monkeypatch.setattr("safe_envs.scripts.reproduce.catalogue.ARTEFACTS", (replace(coin, name="table-0.2"), coin))
+    monkeypatch.setattr(
+        "safe_envs.scripts.reproduce.catalogue.ARTEFACTS", (replace(coin, name="table-0.2"), coin)
+    )
     status, out, _ = safe_envs_command("reproduce", "table-0.2", "--jobs", 1, "--out", "report")
     assert status == 0
     assert len(computed) == 2
@@ -329,9 +423,15 @@ def test_a_run_that_was_stopped_goes_on(safe_envs_command, catalogue, computed, 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [(("table-9.9",), "unknown artefact 'table-9.9'"), (("--out", "file"), "cannot be made"), (("--seed", -1), "seed")],
+    [
+        (("table-9.9",), "unknown artefact 'table-9.9'"),
+        (("--out", "file"), "cannot be made"),
+        (("--seed", -1), "seed"),
+    ],
 )
-def test_what_it_cannot_take_ends_with_status_2(safe_envs_command, catalogue, tmp_path, arguments, message):
+def test_what_it_cannot_take_ends_with_status_2(
+    safe_envs_command, catalogue, tmp_path, arguments, message
+):
     (tmp_path / "file").write_text("")
     status, _, err = safe_envs_command("reproduce", *arguments)
     assert status == 2
@@ -340,7 +440,8 @@ def test_what_it_cannot_take_ends_with_status_2(safe_envs_command, catalogue, tm
 
 @pytest.mark.slow
 def test_processes_compute_what_a_single_one_does(safe_envs_command, monkeypatch, tmp_path):
-    """Over real artefacts, the quickest ones; in one process, whose start takes longer than they do."""
+    """Over real artefacts, the quickest ones; in one process, whose start takes longer than they
+    do."""
     from safe_envs.scripts.reproduce import command
 
     asked = []

@@ -28,11 +28,20 @@ def test_the_most_probable_system_is_filtered_as_if_it_were_known(request, name)
     learned = request.getfixturevalue("posterior" if name == "cubic" else "gap_posterior")
     for margin in ("none", 0.02) if name == "cubic" else ("none",):
         ours = SafetyFilter.for_problem(problem, BayesianSCBF(learned, sampling_margin=margin))
-        known = SafetyFilter(learned.system, [(problem.barriers[0], SCBF(sampling_margin=margin))], problem.box)
+        known = SafetyFilter(
+            learned.system, [(problem.barriers[0], SCBF(sampling_margin=margin))], problem.box
+        )
         assert_same_decisions(problem, ours, known, tolerance=1e-12)
     if name == "cubic":
-        ours = SafetyFilter.for_problem(problem, BayesianSCBF(learned, sampling_margin="first-order"))
-        known = SafetyFilter(learned.system, [(problem.barriers[0], SCBF(sampling_margin="first-order"))], problem.box, dt=problem.dt)
+        ours = SafetyFilter.for_problem(
+            problem, BayesianSCBF(learned, sampling_margin="first-order")
+        )
+        known = SafetyFilter(
+            learned.system,
+            [(problem.barriers[0], SCBF(sampling_margin="first-order"))],
+            problem.box,
+            dt=problem.dt,
+        )
         assert_same_decisions(problem, ours, known, tolerance=1e-12)
 
 
@@ -49,15 +58,20 @@ def linear_form(learned, x, u):
 
 
 def slopes_of(learned, barrier, x):
-    return values(learned.system, [sp.diff(barrier.expression, s) for s in learned.system.states], x)
+    return values(
+        learned.system, [sp.diff(barrier.expression, s) for s in learned.system.states], x
+    )
 
 
 def curvatures_of(learned, barrier, x):
-    return values(learned.system, [sp.diff(barrier.expression, s, 2) for s in learned.system.states], x)
+    return values(
+        learned.system, [sp.diff(barrier.expression, s, 2) for s in learned.system.states], x
+    )
 
 
 def robust_row(learned, law, barrier, x, u, z):
-    """mean - deviation of L_f h + L_g h u, that of each state times z, for weights of a Gaussian law."""
+    """mean - deviation of L_f h + L_g h u, that of each state times z, for weights of a Gaussian
+    law."""
     design, slopes = linear_form(learned, x, u), slopes_of(learned, barrier, x)
     mean = (slopes * (design @ law.mean.T)).sum(axis=1)
     spread = np.stack([((design @ c) * design).sum(axis=1) for c in law.covariance], axis=1)
@@ -67,7 +81,9 @@ def robust_row(learned, law, barrier, x, u, z):
 def least_ito(learned, barrier, x, intervals):
     """The least of 1/2 sum_i sigma_i^2 d^2 h/dx_i^2 over the corners of the intervals."""
     curvatures = curvatures_of(learned, barrier, x)
-    return np.min([0.5 * curvatures @ np.square(corner) for corner in itertools.product(*intervals)], axis=0)
+    return np.min(
+        [0.5 * curvatures @ np.square(corner) for corner in itertools.product(*intervals)], axis=0
+    )
 
 
 @pytest.mark.slow
@@ -77,28 +93,39 @@ def test_the_robust_row_is_mean_less_deviations(cubic, posterior, which):
     barrier, (x, u) = problem.barriers[0], situations(problem, 700)
     law, noise = Gaussian(posterior.mean, posterior.covariance), posterior.diffusion
     all_sure = math.sqrt(stats.chi2.ppf(0.95, 2 * posterior.mean.shape[1]))
-    intervals, fixed = posterior.diffusion.sigma_intervals(0.05), np.column_stack([posterior.diffusion.sigma] * 2)
+    intervals, fixed = (
+        posterior.diffusion.sigma_intervals(0.05),
+        np.column_stack([posterior.diffusion.sigma] * 2),
+    )
     assert (intervals[:, 0] < fixed[:, 0]).all()
     assert (intervals[:, 1] > fixed[:, 1]).all()
     # The weights are as unsure as the noise is large, which may be as large as its interval allows.
     widest = intervals[:, 1] / np.sqrt(noise.squares / noise.count)
     cases = [
         (BayesianSCBF(posterior, confidence=0.97), stats.t.ppf(0.97, noise.count), fixed),
-        (BayesianSCBF(posterior, simultaneous=0.9, sampling_margin=0.1), all_sure * widest, intervals),
+        (
+            BayesianSCBF(posterior, simultaneous=0.9, sampling_margin=0.1),
+            all_sure * widest,
+            intervals,
+        ),
         (BayesianSCBF(posterior, simultaneous=0.9), all_sure * widest, intervals),
         (BayesianSCBF(posterior, confidence=0.3), 0.0, fixed),
     ]
     for condition, z, levels in cases if which == "disk" else cases[:2]:
         found = SafetyFilter.for_problem(problem, condition).filter(x, u)
-        rest = least_ito(posterior, barrier, x, levels) - (0.1 if condition.sampling_margin == 0.1 else 0.0)
+        rest = least_ito(posterior, barrier, x, levels) - (
+            0.1 if condition.sampling_margin == 0.1 else 0.0
+        )
         expected = robust_row(posterior, law, barrier, x, found.action, z) + rest
-        # The variance is a polynomial whose coefficients cancel by some digits, and its root is known to half of the rest.
+        # The variance is a polynomial whose coefficients cancel by some digits, and its root is
+        # known to half of the rest.
         np.testing.assert_allclose(found.margin[:, 0], expected, atol=1e-6)
         assert found.feasible.any()
         assert found.active.any()
         for tried in np.linspace(*problem.box[0], 21):
             row = robust_row(posterior, law, barrier, x, np.full_like(u, tried), z) + rest
-            # Nothing in the box meets or misses it by less where it cannot be met, or is met and nearer where it can.
+            # Nothing in the box meets or misses it by less where it cannot be met, or is met and
+            # nearer where it can.
             assert (row <= found.margin[:, 0] + 1e-6)[~found.feasible].all()
             nearer = abs(tried - u[:, 0]) < abs(found.action - u)[:, 0] - 1e-6
             assert (row <= 1e-6)[nearer & found.feasible].all()
@@ -108,7 +135,12 @@ def test_mean_and_deviation_are_those_of_draws_of_the_weights(cubic, posterior):
     rng, (x, u) = np.random.default_rng(4), situations(cubic, 1000, seed=8)
     barrier, draws = curved_barrier(cubic), 2000
     design, slopes, v = linear_form(posterior, x, u), slopes_of(posterior, barrier, x), u[:, 0]
-    weights = np.stack([rng.multivariate_normal(m, c, draws) for m, c in zip(posterior.mean, posterior.covariance, strict=True)])
+    weights = np.stack(
+        [
+            rng.multivariate_normal(m, c, draws)
+            for m, c in zip(posterior.mean, posterior.covariance, strict=True)
+        ]
+    )
     drawn = sum(slopes[:, [i]] * (design @ weights[i].T) for i in range(2))
     condition = BayesianSCBF(posterior, simultaneous=0.9)
     row = condition.constraint(cubic.model, barrier)
@@ -122,11 +154,14 @@ def test_mean_and_deviation_are_those_of_draws_of_the_weights(cubic, posterior):
     factor = condition.variance_factors(np.array([True, True]))
     assert factor[0] == pytest.approx(factor[1], rel=0.02)
     expected = np.sqrt(factor.mean()) * deviation
-    np.testing.assert_allclose(np.sqrt(q_0 + 2 * q_1 * v + q_2 * v * v), expected, rtol=0.02 + 5 / math.sqrt(2 * draws))
+    np.testing.assert_allclose(
+        np.sqrt(q_0 + 2 * q_1 * v + q_2 * v * v), expected, rtol=0.02 + 5 / math.sqrt(2 * draws)
+    )
 
 
 def test_the_simultaneous_form_holds_for_its_share_of_the_weights(cubic, posterior):
-    """At all states and inputs at once: so for draws of the weights and levels, at those where the row is met."""
+    """At all states and inputs at once: so for draws of the weights and levels, at those where the
+    row is met."""
     rng, (x, u) = np.random.default_rng(5), situations(cubic, 400, seed=9)
     barrier = cubic.barriers[0]
     condition = BayesianSCBF(posterior, simultaneous=0.5)
@@ -135,13 +170,21 @@ def test_the_simultaneous_form_holds_for_its_share_of_the_weights(cubic, posteri
     slopes, curvatures = slopes_of(posterior, barrier, x), curvatures_of(posterior, barrier, x)
     below, times = 0, 100
     for _ in range(times):
-        weights = np.array([rng.multivariate_normal(m, c) for m, c in zip(posterior.mean, posterior.covariance, strict=True)])
+        weights = np.array(
+            [
+                rng.multivariate_normal(m, c)
+                for m, c in zip(posterior.mean, posterior.covariance, strict=True)
+            ]
+        )
         levels = posterior.diffusion._levels(rng)
         truth = (slopes * (design @ weights.T)).sum(axis=1) + 0.5 * curvatures @ levels**2
         below += bool((truth < found.margin[:, 0]).any())
     assert below <= 0.5 * times
     both, one = np.array([True, True]), np.array([True, False])
-    assert (condition.variance_factors(both) < BayesianSCBF(posterior, simultaneous=0.99).variance_factors(both)).all()
+    assert (
+        condition.variance_factors(both)
+        < BayesianSCBF(posterior, simultaneous=0.99).variance_factors(both)
+    ).all()
     assert (condition.variance_factors(one) < condition.variance_factors(both)).all()
     assert (condition.delta_theta, condition.delta_sigma) == (0.25, 0.25)
 
@@ -151,7 +194,9 @@ def test_the_robust_form_is_for_relative_degree_one(cubic, gap, posterior, gap_p
         with pytest.raises(RelativeDegreeError, match=r"relative degree 2.*Leave out confidence"):
             SafetyFilter.for_problem(gap, BayesianSCBF(gap_posterior, **how))
         with pytest.raises(ConfigurationError, match="first order"):
-            SafetyFilter.for_problem(cubic, BayesianSCBF(posterior, sampling_margin="first-order", **how))
+            SafetyFilter.for_problem(
+                cubic, BayesianSCBF(posterior, sampling_margin="first-order", **how)
+            )
     with pytest.raises(ConfigurationError, match="not both"):
         BayesianSCBF(posterior, confidence=0.9, simultaneous=0.9)
     for value in (0.0, 1.0, -0.1, math.nan, True, "much"):

@@ -15,7 +15,20 @@ x, y, u = sp.symbols("x y u", real=True)
 
 
 @pytest.mark.parametrize(
-    "text", ["s", "2*s**3", "2*s^3", "tanh(s)", "s*Abs(s)", "pi*s", "s+sin(s)/2", "s + s**5/10", "sinh(s)", "atan(3*s)", "exp(s) - 1"]
+    "text",
+    [
+        "s",
+        "2*s**3",
+        "2*s^3",
+        "tanh(s)",
+        "s*Abs(s)",
+        "pi*s",
+        "s+sin(s)/2",
+        "s + s**5/10",
+        "sinh(s)",
+        "atan(3*s)",
+        "exp(s) - 1",
+    ],
 )
 def test_functions_that_increase_through_0_are_taken_and_round_trip(text):
     alpha = ClassK(text)
@@ -63,7 +76,11 @@ def test_sympy_expressions_are_taken_as_they_are():
     assert CBF(sp.Symbol("s") ** 3).alpha == ClassK("s**3")
     with pytest.raises(ConfigurationError, match="s alone"):
         CBF(x**3)
-    for no_text in (S + 10 * sp.sign(S), sp.Max(S, 2 * S), sp.Piecewise((S, S < 1), (2 * S - 1, True))):
+    for no_text in (
+        S + 10 * sp.sign(S),
+        sp.Max(S, 2 * S),
+        sp.Piecewise((S, S < 1), (2 * S - 1, True)),
+    ):
         with pytest.raises(ConfigurationError, match="class-K function"):
             CBF(no_text)
     for nothing in (None, [1], object()):
@@ -81,7 +98,9 @@ def test_power():
     for exponent in (1, 3, 2, 1.5):
         alpha = power(2.0, exponent)
         for value in (-1.7, -0.2, 0.0, 0.4, 3.0):
-            assert float(alpha(sp.Float(value))) == pytest.approx(2 * np.sign(value) * abs(value) ** exponent)
+            assert float(alpha(sp.Float(value))) == pytest.approx(
+                2 * np.sign(value) * abs(value) ** exponent
+            )
     for arguments in ((0.0, 3), (-1.0, 3), (1.0, 0.5), (1.0, float("nan"))):
         with pytest.raises(ConfigurationError):
             power(*arguments)
@@ -98,17 +117,31 @@ def test_chain_of_curved_functions_follows_the_chain_rule():
 
 
 def test_functions_that_are_not_smooth_enough_are_refused():
-    third = ControlAffineSDE((x, y, sp.Symbol("w", real=True)), (u,), [y, sp.Symbol("w", real=True), 0], [0, 0, 1], [0, 0, 0])
+    third = ControlAffineSDE(
+        (x, y, sp.Symbol("w", real=True)),
+        (u,),
+        [y, sp.Symbol("w", real=True), 0],
+        [0, 0, 1],
+        [0, 0, 0],
+    )
     barrier = Barrier(1 - x)
     HOCBF((1.0, power(1.0, 2), power(1.0, 2))).constraint(third, barrier)
-    with pytest.raises(SystemDefinitionError, match=r"s\*Abs\(s\) is the 1\. of 3 and needs 2 continuous derivatives"):
+    with pytest.raises(
+        SystemDefinitionError,
+        match=r"s\*Abs\(s\) is the 1\. of 3 and needs 2 continuous derivatives",
+    ):
         HOCBF((power(1, 2), 1.0, 1.0)).constraint(third, barrier)
-    with pytest.raises(SystemDefinitionError, match=r"is the 2\. of 3 and needs 1 continuous derivatives"):
+    with pytest.raises(
+        SystemDefinitionError, match=r"is the 2\. of 3 and needs 1 continuous derivatives"
+    ):
         HOCBF((1.0, power(1, 1.5), 1.0)).constraint(third, barrier)
 
 
 def test_a_steeper_function_near_the_edge_lets_the_policy_go_nearer():
     problem = problem_of("safe_envs/Scalar-v0", noise=0.0)
-    rows = {c: c.constraint(problem.model, problem.barriers[0]) for c in (CBF(1.0), CBF(power(1.0, 3)), CBF(ClassK("tanh(5*s)")))}
+    rows = {
+        c: c.constraint(problem.model, problem.barriers[0])
+        for c in (CBF(1.0), CBF(power(1.0, 3)), CBF(ClassK("tanh(5*s)")))
+    }
     margins = [float(r.offset.subs(problem.model.states[0], 0.9)) for r in rows.values()]
     assert margins == pytest.approx([0.1 - 0.9, 0.001 - 0.9, np.tanh(0.5) - 0.9])

@@ -6,8 +6,26 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, RelativeDegreeError, SystemDefinitionError
-from safe_envs.wrappers import CBF, CONDITIONS, ECBF, HOCBF, RCBF, SCBF, SRCBF, SZCBF, parse_condition, parse_conditions, spec_of
+from safe_envs import (
+    Barrier,
+    ConfigurationError,
+    ControlAffineSDE,
+    RelativeDegreeError,
+    SystemDefinitionError,
+)
+from safe_envs.wrappers import (
+    CBF,
+    CONDITIONS,
+    ECBF,
+    HOCBF,
+    RCBF,
+    SCBF,
+    SRCBF,
+    SZCBF,
+    parse_condition,
+    parse_conditions,
+    spec_of,
+)
 from tests.conftest import problem_of
 
 X = sp.Symbol("x", real=True)
@@ -35,11 +53,17 @@ def test_hocbf_of_the_disk_is_the_polynomial_of_its_rates():
     x, y, theta, v = 0.3, -0.4, 1.1, 0.5
     h, hdot = 1 - x * x - y * y, -2 * v * (x * np.cos(theta) + y * np.sin(theta))
     offset = -2 * v**2 + (p1 + p2) * hdot + p1 * p2 * h
-    assert float(problem.model.numeric(found.offset).subs(values)) == pytest.approx(offset, rel=1e-12)
-    assert float(problem.model.numeric(found.chain[1]).subs(values)) == pytest.approx(hdot + p1 * h, rel=1e-12)
+    assert float(problem.model.numeric(found.offset).subs(values)) == pytest.approx(
+        offset, rel=1e-12
+    )
+    assert float(problem.model.numeric(found.chain[1]).subs(values)) == pytest.approx(
+        hdot + p1 * h, rel=1e-12
+    )
 
 
-@pytest.mark.parametrize("env_id", ["safe_envs/DubinsObstacle-v0", "safe_envs/Quadrotor-v0", "safe_envs/ACC-v0"])
+@pytest.mark.parametrize(
+    "env_id", ["safe_envs/DubinsObstacle-v0", "safe_envs/Quadrotor-v0", "safe_envs/ACC-v0"]
+)
 def test_hocbf_equals_the_ecbf_with_the_gains_of_its_polynomial(env_id):
     gains = problem_of(env_id).gains
     problem, hocbf = constraint(HOCBF.for_gains(gains), env_id)
@@ -47,7 +71,9 @@ def test_hocbf_equals_the_ecbf_with_the_gains_of_its_polynomial(env_id):
     assert hocbf.coefficient == ecbf.coefficient
     rng = np.random.default_rng(0)
     for _ in range(5):
-        values = dict(zip(problem.model.states, rng.uniform(0.1, 1.0, problem.model.n), strict=True))
+        values = dict(
+            zip(problem.model.states, rng.uniform(0.1, 1.0, problem.model.n), strict=True)
+        )
         first, second = (float(problem.model.numeric(c.offset).subs(values)) for c in (hocbf, ecbf))
         assert first == pytest.approx(second, rel=1e-10)
 
@@ -63,9 +89,13 @@ def test_cbf_ignores_the_noise_and_scbf_does_not():
 def test_wrong_relative_degrees_are_named():
     with pytest.raises(RelativeDegreeError, match=r"relative degree 2.*use hocbf or ecbf"):
         constraint(CBF(1.0), "safe_envs/DubinsDisk-v0")
-    with pytest.raises(RelativeDegreeError, match=r"relative degree 1 and needs as many rates; 2 given"):
+    with pytest.raises(
+        RelativeDegreeError, match=r"relative degree 1 and needs as many rates; 2 given"
+    ):
         constraint(HOCBF((1.0, 1.0)), "safe_envs/ACC-v0")
-    with pytest.raises(RelativeDegreeError, match=r"relative degree 2 and needs as many gains; 1 given"):
+    with pytest.raises(
+        RelativeDegreeError, match=r"relative degree 2 and needs as many gains; 1 given"
+    ):
         constraint(ECBF((1.0,)), "safe_envs/DubinsDisk-v0")
 
 
@@ -78,7 +108,14 @@ def test_ecbf_needs_real_negative_poles():
     for p in rates[:3]:  # 50 digits of multiple roots take their time
         ECBF(k=ECBF.for_gains((p, p, p)).k)
     complex_pair = {"k": (1.16, 2.0)}  # -1 +- .4 i
-    for wrong in ({"k": (2.0, 1.0)}, complex_pair, {"poles": (-1 + 1j, -1 - 1j)}, {"poles": (-1.0, 0.0)}, {"poles": (2.0,)}, {"poles": ()}):
+    for wrong in (
+        {"k": (2.0, 1.0)},
+        complex_pair,
+        {"poles": (-1 + 1j, -1 - 1j)},
+        {"poles": (-1.0, 0.0)},
+        {"poles": (2.0,)},
+        {"poles": ()},
+    ):
         with pytest.raises(ConfigurationError, match="place real negative ones"):
             ECBF(**wrong)
     with pytest.raises(ConfigurationError, match="place real negative ones"):
@@ -94,12 +131,23 @@ def test_ecbf_takes_multiple_poles_and_its_text_is_read_as_the_same(count):
     ecbf = ECBF(poles=(-1 / 3,) * count)
     assert ecbf.chain_rates(count) == (1 / 3,) * count
     assert parse_condition(ecbf.spec, ()) == ecbf
-    assert parse_condition(f"ecbf:sampling_margin={0.5}", (1 / 3,) * count).chain_rates(count) == (1 / 3,) * count
+    assert (
+        parse_condition(f"ecbf:sampling_margin={0.5}", (1 / 3,) * count).chain_rates(count)
+        == (1 / 3,) * count
+    )
 
 
 def test_texts_are_never_run(tmp_path):
     target = tmp_path / "owned"
-    for text in ("ecbf:poles={}", "ecbf:k={}", "cbf:alpha={}", "hocbf:p={}", "rcbf:gamma={}", "rcbf:form={}", "scbf:sampling_margin={}"):
+    for text in (
+        "ecbf:poles={}",
+        "ecbf:k={}",
+        "cbf:alpha={}",
+        "hocbf:p={}",
+        "rcbf:gamma={}",
+        "rcbf:form={}",
+        "scbf:sampling_margin={}",
+    ):
         with pytest.raises(ConfigurationError):
             parse_condition(text.format(f"__import__('pathlib').Path('{target}').touch()"), (1.0,))
     for wrong in (("-1",), (f"__import__('pathlib').Path('{target}').touch()",)):
@@ -124,7 +172,9 @@ def test_barriers_with_kinks_are_refused_where_the_chain_meets_them():
             with pytest.raises(SystemDefinitionError, match="cannot be differentiated"):
                 condition.constraint(noisy, Barrier(h))
     chain = ControlAffineSDE((x, y), (u,), [y, 0], [0, 1], [0, 0])
-    with pytest.raises(SystemDefinitionError, match="cannot be differentiated as often as is needed"):
+    with pytest.raises(
+        SystemDefinitionError, match="cannot be differentiated as often as is needed"
+    ):
         HOCBF((1.0, 1.0)).constraint(chain, Barrier(1 - sp.Abs(x)))
 
 
@@ -163,7 +213,10 @@ def test_ecbf_by_poles_has_the_gains_of_their_polynomial_and_keeps_the_sets_of_t
     problem, placed = constraint(ecbf, "safe_envs/DubinsDisk-v0")
     _, hocbf = constraint(HOCBF((2.0, 8.0)), "safe_envs/DubinsDisk-v0")
     difference = problem.model.numeric(placed.chain[1] - hocbf.chain[1])
-    assert abs(float(difference.subs(dict(zip(problem.model.states, (0.3, -0.4, 1.1), strict=True))))) < 1e-9
+    assert (
+        abs(float(difference.subs(dict(zip(problem.model.states, (0.3, -0.4, 1.1), strict=True)))))
+        < 1e-9
+    )
 
 
 def test_szcbf_has_the_corrected_chain():
@@ -180,7 +233,8 @@ def test_szcbf_has_the_corrected_chain():
 
 @pytest.mark.parametrize(("corrected", "stays"), [(True, True), (False, False)])
 def test_the_printed_szcbf_leaves_the_set_without_any_noise(corrected, stays):
-    # x' = y, y' = u, h = 1 - x. The printed h_2 = A h_1 + alpha_2 h gives x'' + a_1 x' + a_2 x <= a_2: an oscillator.
+    # x' = y, y' = u, h = 1 - x. The printed h_2 = A h_1 + alpha_2 h gives x'' + a_1 x' + a_2 x <=
+    # a_2: an oscillator.
     a_1, a_2, dt = 1.0, 4.0, 1e-3
     x, y, highest = 0.0, 0.5, 0.0
     for _ in range(10_000):
@@ -201,7 +255,10 @@ def test_several_barriers_take_one_text_or_one_each():
     assert parse_conditions(spec_of(each), problem) == each
     by_gains = parse_conditions("hocbf", problem)
     assert [c.p for c in by_gains] == [problem.gains_of(i) for i in range(3)]
-    with pytest.raises(ConfigurationError, match="has 2 conditions; QuadrotorLimits takes one for all 3 barriers, or one for each"):
+    with pytest.raises(
+        ConfigurationError,
+        match="has 2 conditions; QuadrotorLimits takes one for all 3 barriers, or one for each",
+    ):
         parse_conditions("hocbf+scbf", problem)
 
 
@@ -251,7 +308,10 @@ def test_parameters_default_to_the_gains():
         ("szcbf:alphas=s", "alphas = s; give positive numbers"),
         ("srcbf:gamma=0", "gamma = 0.0; give positive numbers"),
         ("rcbf:form=exp", "form = 'exp'; allowed: inverse, log"),
-        ("cbf:sampling_margin=second-order", "sampling_margin = 'second-order'; allowed: none, first-order, or a number >= 0"),
+        (
+            "cbf:sampling_margin=second-order",
+            "sampling_margin = 'second-order'; allowed: none, first-order, or a number >= 0",
+        ),
         ("cbf:sampling_margin=-1", "sampling_margin = -1.0"),
         ("ecbf:poles=-1+1j,-1-1j", "place real negative ones"),
         ("scbf+scbf", "unknown filter 'scbf\\+scbf'|has 2 conditions"),

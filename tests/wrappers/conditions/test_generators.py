@@ -1,7 +1,8 @@
-"""Every chain against a derivation by another route: the mean change of a function over a short step, by quadrature.
+"""Every chain against a derivation by another route: the mean change of a function over a short
+step, by quadrature.
 
-E[phi(x + (f + g u) t + sigma sqrt(t) W)] is a Gauss-Hermite sum; its rate of change at t = 0, extrapolated from three small
-steps, is the generator. Nothing here differentiates.
+E[phi(x + (f + g u) t + sigma sqrt(t) W)] is a Gauss-Hermite sum; its rate of change at t = 0,
+extrapolated from three small steps, is the generator. Nothing here differentiates.
 """
 
 from __future__ import annotations
@@ -35,10 +36,15 @@ class Motion:
         self._noisy = noisy
 
     def rate(self, phi, x, u):
-        """(A phi)(x, u) at states of shape (n, ...), for a function from such states to numbers of shape (...)."""
+        """(A phi)(x, u) at states of shape (n, ...), for a function from such states to numbers of
+        shape (...)."""
         shape = x.shape[1:]
         values = np.array([np.broadcast_to(value, shape) for value in self._read(*x)])
-        drift = values[: self.n] + np.einsum("ij...,j->i...", values[self.n : self.n * (1 + self.m)].reshape(self.n, self.m, *shape), u)
+        drift = values[: self.n] + np.einsum(
+            "ij...,j->i...",
+            values[self.n : self.n * (1 + self.m)].reshape(self.n, self.m, *shape),
+            u,
+        )
         sigma = values[self.n * (1 + self.m) :].reshape(self.n, -1, *shape) * self._noisy
         live = sigma[:, [bool(np.any(column != 0)) for column in np.moveaxis(sigma, 1, 0)]]
         grid = list(itertools.product(range(len(_NODES)), repeat=live.shape[1]))
@@ -61,9 +67,15 @@ def states_of(problem, rng):
     high = np.array([min(s.high, 1.0) for s in problem.states])
     h = compile_function(problem.plant.states, [b.expression for b in problem.barriers], "floats")
     found = []
-    start = {"safe_envs/ACC-v0": (15.0, 20.0, 60.0), "safe_envs/ACCGap-v0": (10.0, 12.0)}.get(problem_id(problem))
+    start = {"safe_envs/ACC-v0": (15.0, 20.0, 60.0), "safe_envs/ACCGap-v0": (10.0, 12.0)}.get(
+        problem_id(problem)
+    )
     for _ in range(10_000):
-        x = rng.uniform(low, high) if start is None else np.array(start) + rng.uniform(-1, 1, len(start))
+        x = (
+            rng.uniform(low, high)
+            if start is None
+            else np.array(start) + rng.uniform(-1, 1, len(start))
+        )
         if "z" in {str(s) for s in problem.plant.states} and start is None:
             x[[str(s) for s in problem.plant.states].index("z")] = rng.uniform(3.5, 6.5)
         if min(h(*x)) > 0.05:
@@ -79,7 +91,9 @@ def problem_id(problem):
 
 OF_ANY_DEGREE = ("hocbf", "ecbf", "szcbf", "scbf")
 OF_DEGREE_1 = ("cbf", "rcbf", "rcbf:form=log", "srcbf", "srcbf:form=log")
-IDS_OF_DEGREE_1 = [f"safe_envs/{name}-v0" for name in ("ACC", "Pendulum", "CubicSDE", "CubicSDEDisk", "Scalar")]
+IDS_OF_DEGREE_1 = [
+    f"safe_envs/{name}-v0" for name in ("ACC", "Pendulum", "CubicSDE", "CubicSDEDisk", "Scalar")
+]
 # Twelve states take long: one condition without noise and one with it cover the two that have them.
 TWELVE = {"safe_envs/Quadrotor-v0": ("szcbf",), "safe_envs/QuadrotorLimits-v0": ("ecbf",)}
 CASES = [(i, text) for i in safe_envs.ENV_IDS for text in TWELVE.get(i, OF_ANY_DEGREE)]
@@ -101,7 +115,11 @@ def test_rows_equal_the_mean_change_of_their_chain(env_id, text):
     u = rng.normal(size=model.m)
     for x in states_of(problem, rng)[: 1 if env_id in TWELVE else 2]:
         values = compiled(*x)
-        ours = np.dot(values[: model.m], u) + values[model.m] - (values[model.m + 1] if found.demand is not None else 0.0)
+        ours = (
+            np.dot(values[: model.m], u)
+            + values[model.m]
+            - (values[model.m + 1] if found.demand is not None else 0.0)
+        )
         theirs, size = by_quadrature(condition, text, motion, lambda y: h(*y)[0], x, u, problem)
         assert ours == pytest.approx(theirs, abs=2e-6 * max(1.0, size))
 
@@ -115,7 +133,13 @@ def by_quadrature(condition, text, motion, h, x, u, problem):
         return (rate - condition.gamma / beta(h(x))) / slope, abs(rate / slope)
     gains = problem.gains_of(0)
     degree = relative_degree(problem.plant, problem.barriers[0].expression)
-    alphas = {"cbf": gains[:1], "hocbf": gains, "ecbf": gains, "szcbf": gains, "scbf": (0.0,) * degree}[text.partition(":")[0]]
+    alphas = {
+        "cbf": gains[:1],
+        "hocbf": gains,
+        "ecbf": gains,
+        "szcbf": gains,
+        "scbf": (0.0,) * degree,
+    }[text.partition(":")[0]]
     rest = np.zeros(motion.m)  # below the last level the input has no effect
     chain = [h]
     for alpha in alphas[:-1]:

@@ -1,4 +1,5 @@
-"""Texts of filters by whoever wants to do harm: each is read, or refused with a message, in no time and without running anything."""
+"""Texts of filters by whoever wants to do harm: each is read, or refused with a message, in no time
+and without running anything."""
 
 from __future__ import annotations
 
@@ -21,15 +22,36 @@ SCALAR = problem_of("safe_envs/Scalar-v0")
 _SECONDS = 2.0
 """Of the processor, that an answer may take; it takes a hundredth of that mostly."""
 
-names = st.sampled_from(["s", "s", "s", "1", "9", "99", "0", "2", "0.5", "1e300", "1e-300", "pi", "E"])
-functions = st.sampled_from(["Abs", "asinh", "atan", "cos", "cosh", "exp", "log", "sin", "sinh", "sqrt", "tanh", "erf", "gamma"])
+names = st.sampled_from(
+    ["s", "s", "s", "1", "9", "99", "0", "2", "0.5", "1e300", "1e-300", "pi", "E"]
+)
+functions = st.sampled_from(
+    [
+        "Abs",
+        "asinh",
+        "atan",
+        "cos",
+        "cosh",
+        "exp",
+        "log",
+        "sin",
+        "sinh",
+        "sqrt",
+        "tanh",
+        "erf",
+        "gamma",
+    ]
+)
 
 
 def combined(parts):
-    """Arithmetic of smaller parts; the last way makes functions that increase of whatever is real and finite."""
+    """Arithmetic of smaller parts; the last way makes functions that increase of whatever is real
+    and finite."""
     return st.one_of(
         st.builds("({}{}{})".format, parts, st.sampled_from(["+", "-", "*", "/", "**"]), parts),
-        st.builds("({})**{}".format, parts, st.sampled_from(["2", "3", "99", "(1/3)", "-2", "0.5"])),
+        st.builds(
+            "({})**{}".format, parts, st.sampled_from(["2", "3", "99", "(1/3)", "-2", "0.5"])
+        ),
         st.builds("{}({})".format, functions, parts),
         st.builds("s*(1+({})**2)".format, parts),
     )
@@ -100,7 +122,14 @@ def test_bombs_and_texts_that_only_python_takes_are_refused(text):
 
 
 @pytest.mark.parametrize(
-    "text", ["log(1+exp(s))-log(2)", "exp(exp(s))-E", "tanh(exp(exp(s)))-tanh(E)+s", "s*Abs(s)**(1/3)", "sinh(sinh(s))"]
+    "text",
+    [
+        "log(1+exp(s))-log(2)",
+        "exp(exp(s))-E",
+        "tanh(exp(exp(s)))-tanh(E)+s",
+        "s*Abs(s)**(1/3)",
+        "sinh(sinh(s))",
+    ],
 )
 def test_functions_that_grow_far_are_still_taken(text):
     assert alpha_of(text) is not None
@@ -113,7 +142,26 @@ def test_expressions_of_sympy_are_as_small_as_texts():
 
 
 pieces = st.sampled_from(
-    ["cbf", "hocbf", "ecbf", "rcbf", "scbf", "szcbf", "none", ":", "+", ",", "=", "alpha", "p", "k", "poles", "1", "-2", "1_0"]
+    [
+        "cbf",
+        "hocbf",
+        "ecbf",
+        "rcbf",
+        "scbf",
+        "szcbf",
+        "none",
+        ":",
+        "+",
+        ",",
+        "=",
+        "alpha",
+        "p",
+        "k",
+        "poles",
+        "1",
+        "-2",
+        "1_0",
+    ]
 )
 
 

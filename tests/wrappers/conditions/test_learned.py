@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from safe_envs import Barrier, ConfigurationError, NumericalError
-from safe_envs.wrappers import DDSCBF, HOCBF, SCBF, SRCBF, BayesianSCBF, LearnedHOCBF, SafetyFilter, parse_conditions
+from safe_envs.wrappers import (
+    DDSCBF,
+    HOCBF,
+    SCBF,
+    SRCBF,
+    BayesianSCBF,
+    LearnedHOCBF,
+    SafetyFilter,
+    parse_conditions,
+)
 from tests.conftest import problem_of
 from tests.wrappers.learned import (
     Undefined,
@@ -29,9 +38,19 @@ pytestmark = pytest.mark.slow
 def test_exact_generators_make_the_filter_of_the_known_noise(request, name, degree):
     problem = request.getfixturevalue(name)
     ours, known = DDSCBF(generator_of(problem, degree)), SCBF()
-    assert_same_decisions(problem, SafetyFilter.for_problem(problem, ours), SafetyFilter.for_problem(problem, known, "plant"))
-    size = abs(values(problem.plant, [problem.barriers[0].expression], situations(problem, 300)[0])).max()
-    for more in ({"margin": 0.01 * size}, {"sampling_margin": 0.01 * size}, {"margin": 0.004 * size, "sampling_margin": 0.006 * size}):
+    assert_same_decisions(
+        problem,
+        SafetyFilter.for_problem(problem, ours),
+        SafetyFilter.for_problem(problem, known, "plant"),
+    )
+    size = abs(
+        values(problem.plant, [problem.barriers[0].expression], situations(problem, 300)[0])
+    ).max()
+    for more in (
+        {"margin": 0.01 * size},
+        {"sampling_margin": 0.01 * size},
+        {"margin": 0.004 * size, "sampling_margin": 0.006 * size},
+    ):
         stricter = SafetyFilter.for_problem(problem, replace(ours, **more))
         known = SafetyFilter.for_problem(problem, SCBF(sampling_margin=0.01 * size), "plant")
         assert_same_decisions(problem, stricter, known)
@@ -41,13 +60,20 @@ def test_exact_generators_make_the_filter_of_the_known_noise(request, name, degr
 def test_the_direct_way_is_the_learned_noise(gap, diffusion, margin):
     found = diffusion.diffusion.system(gap.model)
     for sampled in (margin, "first-order") if margin == 0.0 else (margin,):
-        ours = DDSCBF(diffusion, sampling_margin=sampled) if sampled == "first-order" else DDSCBF(diffusion, margin=margin)
-        known = SafetyFilter(found, [(gap.barriers[0], SCBF(sampling_margin=sampled))], gap.box, dt=gap.dt)
+        ours = (
+            DDSCBF(diffusion, sampling_margin=sampled)
+            if sampled == "first-order"
+            else DDSCBF(diffusion, margin=margin)
+        )
+        known = SafetyFilter(
+            found, [(gap.barriers[0], SCBF(sampling_margin=sampled))], gap.box, dt=gap.dt
+        )
         assert_same_decisions(gap, SafetyFilter.for_problem(gap, ours), known, tolerance=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("name", "way", "change"), [("top", "network", {"sigma": 0.0}), ("gap", "diffusion", {"sigma_1": 0.0, "sigma_2": 3.0})]
+    ("name", "way", "change"),
+    [("top", "network", {"sigma": 0.0}), ("gap", "diffusion", {"sigma_1": 0.0, "sigma_2": 3.0})],
 )
 def test_what_the_model_says_of_the_noise_does_not_matter(request, tmp_path, name, way, change):
     problem, learned = request.getfixturevalue(name), request.getfixturevalue(way)
@@ -83,7 +109,10 @@ def with_two_barriers(disk):
 @pytest.mark.parametrize("errors", [[0.0] * 3, [0.05, 0.1, 0.2]])
 def test_a_learned_row_stands_beside_a_plain_one(disk, errors):
     both = with_two_barriers(disk)
-    learned, plain = LearnedHOCBF(residual_of(both, errors), p=both.gains_of(0)), HOCBF(both.gains_of(1))
+    learned, plain = (
+        LearnedHOCBF(residual_of(both, errors), p=both.gains_of(0)),
+        HOCBF(both.gains_of(1)),
+    )
     x, u = situations(both, 40)
     for conditions in (
         (learned, plain),
@@ -93,14 +122,18 @@ def test_a_learned_row_stands_beside_a_plain_one(disk, errors):
         found = assert_floats_are_arrays(SafetyFilter.for_problem(both, conditions), x, u)
         assert found.active.any(axis=0).all()
         one = replace(both, barriers=both.barriers[:1], gains=both.gains_of(0))
-        np.testing.assert_allclose(found.margin[:, 0], worst_row(one, x, found.action, errors), atol=1e-10)
+        np.testing.assert_allclose(
+            found.margin[:, 0], worst_row(one, x, found.action, errors), atol=1e-10
+        )
         if conditions[1] is plain:
             row = plain.constraint(both.model, both.barriers[1])
             a, b = values(both.model, [*row.coefficient, row.offset], x).T
             np.testing.assert_allclose(found.margin[:, 1], a * found.action[:, 0] + b, atol=1e-10)
         if conditions[1].name == "learned-hocbf":
             two = replace(both, barriers=both.barriers[1:], gains=both.gains_of(1))
-            np.testing.assert_allclose(found.margin[:, 1], worst_row(two, x, found.action, errors), atol=1e-10)
+            np.testing.assert_allclose(
+                found.margin[:, 1], worst_row(two, x, found.action, errors), atol=1e-10
+            )
     if not any(errors):
         known = SafetyFilter.for_problem(both, [HOCBF(both.gains_of(i)) for i in (0, 1)], "plant")
         ours = [replace(learned, p=both.gains_of(i)) for i in (0, 1)]
@@ -111,15 +144,22 @@ def test_a_learned_row_stands_beside_a_plain_one(disk, errors):
 @pytest.mark.parametrize("name", ["network", "posterior"])
 def test_learned_rows_stand_beside_reciprocal_ones(request, top, cubic, name):
     model = request.getfixturevalue(name)
-    problem, learned = (top, DDSCBF(model)) if name == "network" else (cubic, BayesianSCBF(model, confidence=0.9))
+    problem, learned = (
+        (top, DDSCBF(model)) if name == "network" else (cubic, BayesianSCBF(model, confidence=0.9))
+    )
     first = problem.barriers[0]
     second = Barrier(1.2 * first.expression - 0.1, "second")
     both, turned = (replace(problem, barriers=pair) for pair in ((first, second), (second, first)))
     rng = np.random.default_rng(0)
-    x, u = rng.uniform(*np.array(problem.exploration.region).T, (25, 2)), rng.uniform(-9, 9, (25, 1))  # on both sides of the edge
+    x, u = (
+        rng.uniform(*np.array(problem.exploration.region).T, (25, 2)),
+        rng.uniform(-9, 9, (25, 1)),
+    )  # on both sides of the edge
     alone = SafetyFilter.for_problem(problem, learned).filter(x, u)
     for other in (SRCBF(), SRCBF(sampling_margin="first-order")):
-        found = assert_floats_are_arrays(SafetyFilter.for_problem(both, (learned, other)), x, u, 1e-8)
+        found = assert_floats_are_arrays(
+            SafetyFilter.for_problem(both, (learned, other)), x, u, 1e-8
+        )
         free = ~found.active[:, 1]
         assert 0 < np.count_nonzero(free) < 25
         np.testing.assert_allclose(found.action[free], alone.action[free], atol=1e-9)
@@ -130,7 +170,9 @@ def test_learned_rows_stand_beside_reciprocal_ones(request, top, cubic, name):
 def test_a_goal_stands_beside_a_learned_row():
     problem = problem_of("safe_envs/ACCGap-v0")
     ours = SafetyFilter.for_problem(problem, DDSCBF(generator_of(problem, 2)), objective="clf")
-    assert_same_decisions(problem, ours, SafetyFilter.for_problem(problem, SCBF(), objective="clf"), tolerance=1e-6)
+    assert_same_decisions(
+        problem, ours, SafetyFilter.for_problem(problem, SCBF(), objective="clf"), tolerance=1e-6
+    )
 
 
 @pytest.mark.parametrize("which", [0, 1, 2])
@@ -143,7 +185,9 @@ def test_a_network_without_a_value_is_told_with_the_state(disk, which, eps):
     for state in (x[0], x[2]):
         assert np.isfinite(safety_filter.filter(state, u[0]).action).all()
     for states, inputs in ((x, u), (x[1], u[1])):
-        with pytest.raises(NumericalError, match=r"h has no finite value at x = 0\.41, y = 0\.1, theta = 0\.2"):
+        with pytest.raises(
+            NumericalError, match=r"h has no finite value at x = 0\.41, y = 0\.1, theta = 0\.2"
+        ):
             safety_filter.filter(states, inputs)
 
 

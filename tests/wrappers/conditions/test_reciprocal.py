@@ -27,10 +27,15 @@ def test_the_motivating_example_of_sec_4_2_2():
     states = np.linspace(-2.0, 0.99, 30)
     h = 1 - states
     np.testing.assert_allclose(upper_limits(RCBF(), 0.0, states), h**3 - states, rtol=1e-12)
-    np.testing.assert_allclose(upper_limits(SRCBF(), 0.4, states), h**3 - states - 0.16 / h, rtol=1e-12)
-    np.testing.assert_allclose(upper_limits(SRCBF(0.1), 0.4, states), 0.1 * h**3 - states - 0.16 / h, rtol=1e-12)
+    np.testing.assert_allclose(
+        upper_limits(SRCBF(), 0.4, states), h**3 - states - 0.16 / h, rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        upper_limits(SRCBF(0.1), 0.4, states), 0.1 * h**3 - states - 0.16 / h, rtol=1e-12
+    )
     np.testing.assert_allclose(upper_limits(SCBF(), 0.4, states), -states, rtol=1e-12)
-    # The deterministic one needs bounded control at the edge, the stochastic one does not: it knows no noise.
+    # The deterministic one needs bounded control at the edge, the stochastic one does not: it knows
+    # no noise.
     np.testing.assert_allclose(upper_limits(RCBF(), 0.4, states), h**3 - states, rtol=1e-12)
 
 
@@ -39,9 +44,15 @@ def test_the_logarithmic_form():
     states = np.linspace(-2.0, 0.99, 30)
     h = 1 - states
     b = -np.log(h / (1 + h))
-    np.testing.assert_allclose(upper_limits(RCBF(0.5, "log"), 0.0, states), 0.5 * h * (1 + h) / b - states, rtol=1e-9)
+    np.testing.assert_allclose(
+        upper_limits(RCBF(0.5, "log"), 0.0, states), 0.5 * h * (1 + h) / b - states, rtol=1e-9
+    )
     spread = 0.5 * 0.16 * (1 + 2 * h) / (h * (1 + h))
-    np.testing.assert_allclose(upper_limits(SRCBF(0.5, "log"), 0.4, states), 0.5 * h * (1 + h) / b - states - spread, rtol=1e-9)
+    np.testing.assert_allclose(
+        upper_limits(SRCBF(0.5, "log"), 0.4, states),
+        0.5 * h * (1 + h) / b - states - spread,
+        rtol=1e-9,
+    )
 
 
 def test_control_of_the_stochastic_one_is_unbounded_near_the_edge_and_a_box_breaks_it():
@@ -59,7 +70,10 @@ def test_control_of_the_stochastic_one_is_unbounded_near_the_edge_and_a_box_brea
 @pytest.mark.parametrize("state", [1.0, 1.0 + 1e-13, 1.5, 40.0])
 def test_outside_the_action_raises_h_most_and_is_flagged(condition, state):
     safety_filter = SafetyFilter(scalar(0.4), [(Barrier(1 - x), condition)], [(-3.0, 4.0)])
-    for result in (safety_filter.filter([state], [2.0]), safety_filter.filter([[state], [0.0]], [[2.0], [0.1]])):
+    for result in (
+        safety_filter.filter([state], [2.0]),
+        safety_filter.filter([[state], [0.0]], [[2.0], [0.1]]),
+    ):
         first = [np.asarray(part).reshape(-1)[0] for part in result]
         action, barrier, margin, active, feasible, slack, cause = first
         assert action == -3.0
@@ -82,7 +96,8 @@ def test_outside_with_several_inputs_and_flat_ones():
 
 
 def test_beside_another_barrier():
-    # Outside the first, which asks for all it can get; the second one still has its say, by least squares.
+    # Outside the first, which asks for all it can get; the second one still has its say, by least
+    # squares.
     rows = [(Barrier(1 - x), RCBF()), (Barrier(x + 3), CBF(1.0))]
     safety_filter = SafetyFilter(scalar(0.0), rows, [(-3.0, 3.0)])
     inside = safety_filter.filter([0.5], [3.0])
@@ -97,6 +112,8 @@ def test_beside_another_barrier():
 def test_relative_degree_1_is_asked_for():
     problem = problem_of("safe_envs/StochasticDubins-v0")
     for condition in (RCBF(), SRCBF()):
-        with pytest.raises(RelativeDegreeError, match=r"is for relative degree 1\. Use hocbf, scbf or szcbf"):
+        with pytest.raises(
+            RelativeDegreeError, match=r"is for relative degree 1\. Use hocbf, scbf or szcbf"
+        ):
             condition.constraint(problem.model, problem.barriers[0])
     assert HOCBF((1.0, 1.0)).constraint(problem.model, problem.barriers[0]).demand is None

@@ -1,4 +1,5 @@
-"""How often the robust rows are below the truth, over repeated identifications of systems that are known here."""
+"""How often the robust rows are below the truth, over repeated identifications of systems that are
+known here."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ from tests.conftest import problem_of
 pytestmark = pytest.mark.slow
 
 TIMES = 40
-# The share of so many that are right with the probability .95 is within three standard deviations of it.
+# The share of so many that are right with the probability .95 is within three standard deviations
+# of it.
 LEAST = 0.95 - 3 * math.sqrt(0.05 * 0.95 / TIMES)
 DISK = problem_of("safe_envs/CubicSDEDisk-v0")
 BARRIER = DISK.barriers[0]
@@ -36,16 +38,23 @@ def changed(**parts):
 def true_row(system, x, u):
     """A h under an input."""
     closed = replace(system, drift=system.drift + system.input_matrix * u)
-    return compile_function(system.states, [system.numeric(generator(closed, BARRIER.expression))], "floats")(*x)[0]
+    return compile_function(
+        system.states, [system.numeric(generator(closed, BARRIER.expression))], "floats"
+    )(*x)[0]
 
 
 def robust_row(posterior, condition, x, u):
-    """The row of a condition under an input, from the numbers of the posterior; the symbolic one takes far longer to derive."""
+    """The row of a condition under an input, from the numbers of the posterior; the symbolic one
+    takes far longer to derive."""
     phi, slopes = posterior.features.matrix(np.array([x])), -2.0 * np.array(x)
     mean = slopes @ (posterior.mean @ np.hstack((phi, posterior.input_scale * u * phi)).ravel())
     (v,) = posterior.drift_variance(np.array([x]))
     variance = (condition.variance_factors(slopes != 0) * slopes**2) @ (v @ [1.0, u] @ [1.0, u])
-    return mean - float((posterior.diffusion.matrix() * posterior.diffusion.matrix().T).trace()) - math.sqrt(variance)
+    return (
+        mean
+        - float((posterior.diffusion.matrix() * posterior.diffusion.matrix().T).trace())
+        - math.sqrt(variance)
+    )
 
 
 def share_below(problem, x, u, **design):
@@ -59,12 +68,19 @@ def share_below(problem, x, u, **design):
 @pytest.mark.slow
 def test_the_numbers_are_those_of_the_symbols():
     posterior = identify(DISK, starts=100, repetitions=30, degree=3)
-    for condition in (BayesianSCBF(posterior, confidence=0.95), BayesianSCBF(posterior, confidence=0.3)):
+    for condition in (
+        BayesianSCBF(posterior, confidence=0.95),
+        BayesianSCBF(posterior, confidence=0.3),
+    ):
         found = condition.constraint(DISK.model, BARRIER)
-        row = compile_function(DISK.plant.states, [*found.coefficient, found.offset, *found.uncertainty], "floats")
+        row = compile_function(
+            DISK.plant.states, [*found.coefficient, found.offset, *found.uncertainty], "floats"
+        )
         for x, u in (((0.8, 0.2), 10.0), ((-0.1, 0.7), -3.0)):
             a, b, q0, q1, q2 = row(*x)
-            assert a * u + b - math.sqrt(q0 + 2 * q1 * u + q2 * u * u) == pytest.approx(robust_row(posterior, condition, x, u), abs=1e-7)
+            assert a * u + b - math.sqrt(q0 + 2 * q1 * u + q2 * u * u) == pytest.approx(
+                robust_row(posterior, condition, x, u), abs=1e-7
+            )
 
 
 @pytest.mark.slow
@@ -89,7 +105,12 @@ def test_what_the_features_miss_is_no_noise_and_has_no_bound():
         posterior = identify(problem, degree=2)
     sure, plain = (BayesianSCBF(posterior, confidence=c) for c in (0.95, 0.5))
     states = np.random.default_rng(0).uniform(-0.7, 0.7, (60, 2)).tolist()
-    above = {c: np.mean([robust_row(posterior, c, x, 0.0) > true_row(problem.plant, x, 0.0) for x in states]) for c in (sure, plain)}
+    above = {
+        c: np.mean(
+            [robust_row(posterior, c, x, 0.0) > true_row(problem.plant, x, 0.0) for x in states]
+        )
+        for c in (sure, plain)
+    }
     assert above[sure] <= 0.1 < above[plain]
     with pytest.raises(ConfigurationError, match=r"miss .* % of the rate of x_1"):
         posterior_bound(problem, [BayesianSCBF(posterior, simultaneous=0.9)])
@@ -113,14 +134,17 @@ def test_intervals_of_sigma_hold_it_whatever_its_unit(sigma, count):
     assert hits / times == pytest.approx(0.9, abs=4 * math.sqrt(0.09 / times))
 
 
-@pytest.mark.filterwarnings("ignore::safe_envs.wrappers.learning.identifiability.IdentifiabilityWarning")
+@pytest.mark.filterwarnings(
+    "ignore::safe_envs.wrappers.learning.identifiability.IdentifiabilityWarning"
+)
 def test_few_data_make_both_regions_wider():
     sizes = {}
     for repetitions in (4, 50):
         posterior = identify(DISK, starts=30, repetitions=repetitions, degree=1, prior=100.0)
         noise, outputs = posterior.diffusion, np.array([True, True])
         sizes[repetitions] = [
-            BayesianSCBF(posterior, **{kind: 0.9}).variance_factors(outputs)[0] for kind in ("confidence", "simultaneous")
+            BayesianSCBF(posterior, **{kind: 0.9}).variance_factors(outputs)[0]
+            for kind in ("confidence", "simultaneous")
         ]
         assert noise.count == len(DISK.exploration.inputs) * 30 * (repetitions - 1)
     assert (np.array(sizes[4]) > np.array(sizes[50])).all()

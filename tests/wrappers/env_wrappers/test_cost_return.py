@@ -22,13 +22,21 @@ def vectors(mode, native):
     """The same envs twice, with few steps and a start that soon is unsafe."""
     settings = {"max_episode_steps": 4, "barrier": {"radius": 1.0}}
     if native:
-        return [gym.make_vec(ENV_ID, NUM_ENVS, "vector_entry_point", autoreset_mode=mode, **settings) for _ in range(2)]
+        return [
+            gym.make_vec(ENV_ID, NUM_ENVS, "vector_entry_point", autoreset_mode=mode, **settings)
+            for _ in range(2)
+        ]
     wanted = {"autoreset_mode": AutoresetMode(mode)}
-    return [gym.make_vec(ENV_ID, NUM_ENVS, "sync", vector_kwargs=wanted, **settings) for _ in range(2)]
+    return [
+        gym.make_vec(ENV_ID, NUM_ENVS, "sync", vector_kwargs=wanted, **settings) for _ in range(2)
+    ]
 
 
 def test_scalar_step_has_six_values():
-    plain, env = gym.make(ENV_ID, barrier={"radius": 1.0}), CostReturnWrapper(gym.make(ENV_ID, barrier={"radius": 1.0}))
+    plain, env = (
+        gym.make(ENV_ID, barrier={"radius": 1.0}),
+        CostReturnWrapper(gym.make(ENV_ID, barrier={"radius": 1.0})),
+    )
     first, second = plain.reset(seed=3), env.reset(seed=3)
     np.testing.assert_array_equal(first[0], second[0])
     costs = 0.0
@@ -94,7 +102,9 @@ def test_costs_of_vector_envs_are_those_of_the_steps(mode, native):
 
 
 def test_masked_resets_of_filtered_vector_envs():
-    inner = gym.make_vec(ENV_ID, 3, "vector_entry_point", autoreset_mode="Disabled", max_episode_steps=2)
+    inner = gym.make_vec(
+        ENV_ID, 3, "vector_entry_point", autoreset_mode="Disabled", max_episode_steps=2
+    )
     env = CostReturnWrapper(SafetyFilterVectorWrapper(inner, "scbf"))
     env.reset(seed=0)
     for _ in range(2):

@@ -19,7 +19,13 @@ from safe_envs import (
     SystemDefinitionError,
     SystemDefinitionWarning,
 )
-from safe_envs.wrappers import ActionMap, FilterSpec, SafetyFilterVectorWrapper, SafetyFilterWrapper, SafetyMonitor
+from safe_envs.wrappers import (
+    ActionMap,
+    FilterSpec,
+    SafetyFilterVectorWrapper,
+    SafetyFilterWrapper,
+    SafetyMonitor,
+)
 
 theta, rate, torque = sp.symbols("theta rate torque", real=True)
 x, v, force = sp.symbols("x v force", real=True)
@@ -69,7 +75,10 @@ def test_the_executed_action_is_the_filters_in_the_models_units():
     env = car()
     env.reset(seed=0)
     seen = []
-    env.unwrapped.step = lambda action, step=env.unwrapped.step: (seen.append(action), step(action))[1]  # pyright: ignore
+    env.unwrapped.step = lambda action, step=env.unwrapped.step: (
+        seen.append(action),
+        step(action),
+    )[1]  # pyright: ignore
     for _ in range(150):
         _, _, _, _, info = env.step(np.ones(1, dtype=np.float32))
     executed = np.array(seen)
@@ -82,7 +91,10 @@ def test_the_executed_action_is_the_filters_in_the_models_units():
 def test_info_is_that_of_this_projects_envs():
     ours = SafetyFilterWrapper(gym.make("safe_envs/Pendulum-v0"), "scbf")
     theirs = SafetyFilterWrapper(gym.make("Pendulum-v1"), FILTER, **PENDULUM)
-    for wanted, found in ((ours.reset(seed=0)[1], theirs.reset(seed=0)[1]), (ours.step([0.0])[4], theirs.step([0.0])[4])):
+    for wanted, found in (
+        (ours.reset(seed=0)[1], theirs.reset(seed=0)[1]),
+        (ours.step([0.0])[4], theirs.step([0.0])[4]),
+    ):
         assert {key: (type(value), np.shape(value)) for key, value in wanted.items()} == {
             key: (type(value), np.shape(value)) for key, value in found.items()
         }
@@ -90,7 +102,10 @@ def test_info_is_that_of_this_projects_envs():
 
 @pytest.mark.filterwarnings("ignore:.*WARN")
 def test_gymnasium_s_checker_is_content():
-    check_env(SafetyFilterWrapper(gym.make("Pendulum-v1", disable_env_checker=True), FILTER, **PENDULUM), skip_render_check=True)
+    check_env(
+        SafetyFilterWrapper(gym.make("Pendulum-v1", disable_env_checker=True), FILTER, **PENDULUM),
+        skip_render_check=True,
+    )
 
 
 def test_the_env_can_be_made_again_from_its_spec():
@@ -108,7 +123,9 @@ def test_a_batch_is_what_its_envs_are(mode):
         return gym.make("Pendulum-v1", max_episode_steps=7)
 
     seeds = [5, 6, 7]
-    batch = SafetyFilterVectorWrapper(gym.vector.SyncVectorEnv([make] * 3, autoreset_mode=mode), FILTER, **PENDULUM)
+    batch = SafetyFilterVectorWrapper(
+        gym.vector.SyncVectorEnv([make] * 3, autoreset_mode=mode), FILTER, **PENDULUM
+    )
     singles = [SafetyFilterWrapper(make(), FILTER, **PENDULUM) for _ in seeds]
     observations, infos = batch.reset(seed=seeds)
     alone = [env.reset(seed=seed) for env, seed in zip(singles, seeds, strict=True)]
@@ -130,14 +147,18 @@ def test_a_batch_is_what_its_envs_are(mode):
                 last = alone[i]
                 assert np.array_equal(infos["final_obs"][i], last[0])
                 for key, value in last[-1].items():
-                    assert np.allclose(infos["final_info"][key][i], value, rtol=1e-12, atol=1e-12), key
+                    assert np.allclose(
+                        infos["final_info"][key][i], value, rtol=1e-12, atol=1e-12
+                    ), key
                 alone[i] = env.reset()
         ended = terminated | truncated
     assert batch.num_envs == 3
 
 
 def test_a_batch_may_run_in_other_processes():
-    batch = SafetyFilterVectorWrapper(gym.make_vec("Pendulum-v1", 2, "async"), FILTER, **PENDULUM, dt=0.05)
+    batch = SafetyFilterVectorWrapper(
+        gym.make_vec("Pendulum-v1", 2, "async"), FILTER, **PENDULUM, dt=0.05
+    )
     observations, _ = batch.reset(seed=0)
     for _ in range(30):
         observations, *_, infos = batch.step(spun(observations))
@@ -159,7 +180,9 @@ def test_wrappers_that_change_what_the_filter_sees_or_does_are_doubtful(wrap, pa
 
 
 def test_wrappers_that_only_watch_may_lie_below():
-    env = SafetyFilterWrapper(gym.wrappers.RecordEpisodeStatistics(gym.make("Pendulum-v1")), FILTER, **PENDULUM)
+    env = SafetyFilterWrapper(
+        gym.wrappers.RecordEpisodeStatistics(gym.make("Pendulum-v1")), FILTER, **PENDULUM
+    )
     env.reset(seed=0)
     assert env.step([1.0])[4]["barrier"].shape == (1,)
 
@@ -167,7 +190,10 @@ def test_wrappers_that_only_watch_may_lie_below():
 @pytest.mark.parametrize("kind", [gym.vector.SyncVectorEnv, gym.vector.AsyncVectorEnv])
 def test_a_masked_reset_leaves_the_records_of_the_others(kind):
     batch = SafetyFilterVectorWrapper(
-        kind([lambda: gym.make("Pendulum-v1")] * 3, autoreset_mode=AutoresetMode.DISABLED), FILTER, **PENDULUM, dt=0.05
+        kind([lambda: gym.make("Pendulum-v1")] * 3, autoreset_mode=AutoresetMode.DISABLED),
+        FILTER,
+        **PENDULUM,
+        dt=0.05,
     )
     observations, _ = batch.reset(seed=0)
     for _ in range(20):
@@ -185,7 +211,9 @@ def test_a_masked_reset_leaves_the_records_of_the_others(kind):
 
 def test_what_a_caller_does_to_an_observation_does_not_reach_the_state():
     view = {**CAR, "barriers": 5 - v, "state_fn": lambda o: o}
-    batch = SafetyFilterVectorWrapper(gym.make_vec("MountainCarContinuous-v0", 1, "sync"), "cbf", **view)
+    batch = SafetyFilterVectorWrapper(
+        gym.make_vec("MountainCarContinuous-v0", 1, "sync"), "cbf", **view
+    )
     observations, _ = batch.reset(seed=0)
     before = [float(c[0]) for c in batch.env.components]
     observations -= 100
@@ -194,7 +222,10 @@ def test_what_a_caller_does_to_an_observation_does_not_reach_the_state():
 
 def test_rounding_of_actions_is_no_change():
     offset = {"action_map": ActionMap.scaled(1.0, -1.4), "barriers": 100 - rate**2}
-    env = SafetyFilterWrapper(_Watched(SafetyMonitor(gym.make("Pendulum-v1"), FilterSpec(**{**PENDULUM, **offset}))), "cbf")
+    env = SafetyFilterWrapper(
+        _Watched(SafetyMonitor(gym.make("Pendulum-v1"), FilterSpec(**{**PENDULUM, **offset}))),
+        "cbf",
+    )
     env.reset(seed=0)
     for action in np.linspace(-2, 2, 40, dtype=np.float32):
         env.step([action])
@@ -210,13 +241,21 @@ class _Watched(gym.Wrapper):
         ({"state_fn": lambda o: o[..., :1]}, InvalidInputError, "the model needs"),
         ({"state_fn": lambda o: o * np.nan}, InvalidInputError, "finite"),
         ({"state_fn": 3}, ConfigurationError, "give a function"),
-        ({"action_map": ActionMap(lambda a: 2 * a, lambda u: u)}, ConfigurationError, "to undo to_input"),
+        (
+            {"action_map": ActionMap(lambda a: 2 * a, lambda u: u)},
+            ConfigurationError,
+            "to undo to_input",
+        ),
         ({"action_map": 2.0}, ConfigurationError, "ActionMap.scaled"),
         ({"dt": None}, ConfigurationError, "give dt"),
         ({"barriers": sp.Integer(1)}, RelativeDegreeError, "no relative degree"),
         ({"barriers": []}, SystemDefinitionError, "barriers is empty"),
         ({"state_fn": lambda o: o["x"]}, InvalidInputError, "state_fn failed"),
-        ({"action_map": ActionMap(lambda a: a + 3 * np.sin(np.pi * a), lambda u: u)}, ConfigurationError, "to undo to_input"),
+        (
+            {"action_map": ActionMap(lambda a: a + 3 * np.sin(np.pi * a), lambda u: u)},
+            ConfigurationError,
+            "to undo to_input",
+        ),
         ({"model": None}, ConfigurationError, "give a ControlAffineSDE"),
         ({"modell": None}, ConfigurationError, "did you mean 'model'"),
         ({"knowledge": "plant"}, ConfigurationError, "nothing is known but the model"),
@@ -231,7 +270,9 @@ def test_what_cannot_be_filtered_is_refused():
     with pytest.raises(ConfigurationError, match="give model, barriers, state_fn"):
         SafetyFilterWrapper(gym.make("Pendulum-v1"), FILTER)
     with pytest.raises(ConfigurationError, match="needs state_fn too"):
-        SafetyFilterWrapper(gym.make("Pendulum-v1"), FILTER, model=PENDULUM["model"], barriers=PENDULUM["barriers"])
+        SafetyFilterWrapper(
+            gym.make("Pendulum-v1"), FILTER, model=PENDULUM["model"], barriers=PENDULUM["barriers"]
+        )
     with pytest.raises(ConfigurationError, match="a bounded Box"):
         SafetyFilterWrapper(gym.make("CartPole-v1"), FILTER, **PENDULUM, dt=0.02)
     with pytest.raises(ConfigurationError, match="has a model and barriers of its own"):
@@ -242,7 +283,9 @@ def test_the_right_wrapper_is_named():
     with pytest.raises(ConfigurationError, match="put SafetyFilterVectorWrapper over it"):
         SafetyFilterWrapper(gym.make_vec("safe_envs/Scalar-v0", num_envs=2), "scbf")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ConfigurationError, match="make them by gym"):
-        SafetyFilterVectorWrapper(gym.vector.SyncVectorEnv([lambda: gym.make("safe_envs/Scalar-v0")]), "scbf")
+        SafetyFilterVectorWrapper(
+            gym.vector.SyncVectorEnv([lambda: gym.make("safe_envs/Scalar-v0")]), "scbf"
+        )
 
 
 class _Whole(gym.Env):

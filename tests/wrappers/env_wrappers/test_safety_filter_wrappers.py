@@ -1,4 +1,5 @@
-"""The gym wrappers: they execute what the filter decides, from the model alone, and report it by the contract."""
+"""The gym wrappers: they execute what the filter decides, from the model alone, and report it by
+the contract."""
 
 from __future__ import annotations
 
@@ -14,7 +15,13 @@ from safe_envs.agents.policies.clf import CLFController
 from safe_envs.wrappers import HOCBF, SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
 
-BASE = {"cost": float, "violation": bool, "barrier": np.ndarray, "h_min": float, "episode_cost": float}
+BASE = {
+    "cost": float,
+    "violation": bool,
+    "barrier": np.ndarray,
+    "h_min": float,
+    "episode_cost": float,
+}
 FILTER = {
     "nominal_action": np.ndarray,
     "safe_action": np.ndarray,
@@ -43,7 +50,9 @@ def test_info_has_every_key_with_one_type_at_reset_and_at_each_step(env_id, filt
         assert {key: type(value) for key, value in info.items()} == contract
         for value in info.values():
             assert np.isfinite(value).all()
-    infos = [vector.reset(seed=0)[1]] + [vector.step(vector.action_space.sample())[4] for _ in range(5)]
+    infos = [vector.reset(seed=0)[1]] + [
+        vector.step(vector.action_space.sample())[4] for _ in range(5)
+    ]
     count = len(env.unwrapped.problem.barriers)
     shapes = dict.fromkeys(("barrier", "slacks"), (3, count))
     shapes |= dict.fromkeys(("nominal_action", "safe_action"), vector.action_space.shape)
@@ -66,7 +75,9 @@ def test_executed_action_is_the_safe_one():
         replayed, *_ = bare.step(bare.unwrapped.normalized_action(info["safe_action"]))
         np.testing.assert_allclose(observation, replayed, rtol=1e-6, atol=1e-7)
         np.testing.assert_allclose(info["nominal_action"], [3.0], rtol=1e-6)
-        assert info["intervention"] == (abs(info["safe_action"][0] - info["nominal_action"][0]) > 1e-7)
+        assert info["intervention"] == (
+            abs(info["safe_action"][0] - info["nominal_action"][0]) > 1e-7
+        )
         assert -10.0 <= info["safe_action"][0] <= 10.0
         interventions += info["intervention"]
         assert info["episode_interventions"] == interventions
@@ -77,7 +88,9 @@ def test_filter_sees_the_model_and_never_the_plant():
     env_id, start = "safe_envs/DubinsDisk-v0", {"start": [0.5, 0.0, 0.4], "box": [-50.0, 50.0]}
 
     def first(knowledge="model", **arguments):
-        env = SafetyFilterWrapper(gym.make(env_id, **start, **arguments), "hocbf:p=0.5,0.5", knowledge)
+        env = SafetyFilterWrapper(
+            gym.make(env_id, **start, **arguments), "hocbf:p=0.5,0.5", knowledge
+        )
         env.reset(seed=2)
         return env.step(np.zeros(1, dtype=np.float32))[4]["safe_action"][0]
 
@@ -90,7 +103,13 @@ def test_filter_sees_the_model_and_never_the_plant():
 
 def test_vector_filter_sees_the_model_and_never_the_plant():
     def first(knowledge="model", **arguments):
-        env = gym.make_vec("safe_envs/DubinsDisk-v0", num_envs=2, start=[0.5, 0.0, 0.4], box=[-50.0, 50.0], **arguments)
+        env = gym.make_vec(
+            "safe_envs/DubinsDisk-v0",
+            num_envs=2,
+            start=[0.5, 0.0, 0.4],
+            box=[-50.0, 50.0],
+            **arguments,
+        )
         env = SafetyFilterVectorWrapper(env, HOCBF((0.5, 0.5)), knowledge)
         env.reset(seed=0)
         return env.step(np.zeros((2, 1), dtype=np.float32))[4]["safe_action"][0, 0]
@@ -101,39 +120,62 @@ def test_vector_filter_sees_the_model_and_never_the_plant():
 
 def test_what_is_reported_at_a_reset_does_not_change_what_was_executed():
     envs = SafetyFilterVectorWrapper(
-        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.1, autoreset_mode="SameStep"), "scbf"
+        gym.make_vec(
+            "safe_envs/StochasticDubins-v0", num_envs=3, horizon=0.1, autoreset_mode="SameStep"
+        ),
+        "scbf",
     )
     envs.reset(seed=0)
     for _ in range(2):
         _, _, _, truncated, info = envs.step(np.full((3, 1), 0.9, dtype=np.float32))
     assert truncated.all()
     assert (info["final_info"]["safe_action"] != 0).all()
-    np.testing.assert_array_equal(envs.unwrapped.executed[0], info["final_info"]["safe_action"][:, 0])
+    np.testing.assert_array_equal(
+        envs.unwrapped.executed[0], info["final_info"]["safe_action"][:, 0]
+    )
 
 
 def test_filter_draws_no_random_numbers():
-    bare, filtered = gym.make("safe_envs/StochasticDubins-v0"), SafetyFilterWrapper(gym.make("safe_envs/StochasticDubins-v0"), "scbf")
+    bare, filtered = (
+        gym.make("safe_envs/StochasticDubins-v0"),
+        SafetyFilterWrapper(gym.make("safe_envs/StochasticDubins-v0"), "scbf"),
+    )
     bare.reset(seed=4)
     filtered.reset(seed=4)
     for _ in range(20):
         bare.step(np.zeros(1, dtype=np.float32))
         filtered.step(np.zeros(1, dtype=np.float32))
-    assert bare.unwrapped.np_random.bit_generator.state == filtered.unwrapped.np_random.bit_generator.state
+    assert (
+        bare.unwrapped.np_random.bit_generator.state
+        == filtered.unwrapped.np_random.bit_generator.state
+    )
 
 
 def test_infeasible_steps_are_counted_and_flagged():
-    env = SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0", start=[0.9], box=[-0.5, 0.5], noise=0.0), "cbf:alpha=1")
+    env = SafetyFilterWrapper(
+        gym.make("safe_envs/Scalar-v0", start=[0.9], box=[-0.5, 0.5], noise=0.0), "cbf:alpha=1"
+    )
     env.reset(seed=0)
     for step in range(1, 4):
         *_, info = env.step(np.ones(1, dtype=np.float32))
-        assert (info["feasible"], info["episode_infeasible"], info["safe_action"][0]) == (False, step, -0.5)
+        assert (info["feasible"], info["episode_infeasible"], info["safe_action"][0]) == (
+            False,
+            step,
+            -0.5,
+        )
         assert info["slack"] > 0
     _, info = env.reset()
-    assert (info["feasible"], info["episode_infeasible"], info["episode_interventions"], info["slack"]) == (True, 0, 0, 0.0)
+    assert (
+        info["feasible"],
+        info["episode_infeasible"],
+        info["episode_interventions"],
+        info["slack"],
+    ) == (True, 0, 0, 0.0)
 
 
 def test_wrong_speed_settles_where_theory_says():
-    # A model with speed v_hat settles at h = -2 v_hat (v - v_hat)/(p_1 p_2): thesis-notes, for equal rates.
+    # A model with speed v_hat settles at h = -2 v_hat (v - v_hat)/(p_1 p_2): thesis-notes, for
+    # equal rates.
     p, v, v_hat = 2.0, 0.8, 0.5
     arguments = {"start": "valid", "box": [-50.0, 50.0], "dt": 0.005, "horizon": 40.0}
     env = SafetyFilterWrapper(gym.make("safe_envs/DubinsDisk-v0", **arguments), f"hocbf:p={p},{p}")
@@ -144,7 +186,11 @@ def test_wrong_speed_settles_where_theory_says():
 
 
 def test_known_speed_keeps_the_disk():
-    env = SafetyFilterWrapper(gym.make("safe_envs/DubinsDisk-v0", start="valid", dt=0.01, horizon=20.0), "hocbf:p=2,2", knowledge="plant")
+    env = SafetyFilterWrapper(
+        gym.make("safe_envs/DubinsDisk-v0", start="valid", dt=0.01, horizon=20.0),
+        "hocbf:p=2,2",
+        knowledge="plant",
+    )
     env.reset(seed=0)
     for _ in range(2000):
         *_, info = env.step(np.zeros(1, dtype=np.float32))
@@ -176,9 +222,13 @@ def test_bad_actions_and_bad_arguments_are_errors():
 
 
 def test_wrapping_under_other_wrappers_works():
-    vector = gym.wrappers.vector.RecordEpisodeStatistics(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=2, horizon=0.2))
+    vector = gym.wrappers.vector.RecordEpisodeStatistics(
+        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=2, horizon=0.2)
+    )
     over = SafetyFilterVectorWrapper(vector, "scbf")
-    under = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=2, horizon=0.2), "scbf")
+    under = SafetyFilterVectorWrapper(
+        gym.make_vec("safe_envs/StochasticDubins-v0", num_envs=2, horizon=0.2), "scbf"
+    )
     for env in (over, under):
         env.reset(seed=0)
     for _ in range(4):
@@ -195,10 +245,14 @@ def test_wrapper_that_changes_the_safe_action_is_an_error():
     env.reset(seed=0)
     with pytest.raises(ConfigurationError, match="changed the safe action"):
         env.step(np.ones(1))
-    outside = gym.wrappers.RescaleAction(SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0"), "scbf"), -2.0, 2.0)
+    outside = gym.wrappers.RescaleAction(
+        SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0"), "scbf"), -2.0, 2.0
+    )
     outside.reset(seed=0)
     np.testing.assert_allclose(outside.step(np.array([1.0]))[4]["nominal_action"], [5.0])
-    vector = gym.wrappers.vector.RescaleAction(gym.make_vec("safe_envs/Scalar-v0", num_envs=2), -2.0, 2.0)
+    vector = gym.wrappers.vector.RescaleAction(
+        gym.make_vec("safe_envs/Scalar-v0", num_envs=2), -2.0, 2.0
+    )
     batch = SafetyFilterVectorWrapper(vector, "scbf")
     batch.reset(seed=0)
     with pytest.raises(ConfigurationError, match="changed the safe action"):
@@ -215,15 +269,23 @@ def test_copies_and_processes():
 
 
 def test_joint_program_reports_what_the_goal_alone_asks_for():
-    env = SafetyFilterWrapper(gym.make("safe_envs/ACC-v0", start=[21.0, 20.0, 37.9]), "cbf", objective="clf")
-    vector = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/ACC-v0", num_envs=2, start=[21.0, 20.0, 37.9]), "cbf", objective="clf")
+    env = SafetyFilterWrapper(
+        gym.make("safe_envs/ACC-v0", start=[21.0, 20.0, 37.9]), "cbf", objective="clf"
+    )
+    vector = SafetyFilterVectorWrapper(
+        gym.make_vec("safe_envs/ACC-v0", num_envs=2, start=[21.0, 20.0, 37.9]),
+        "cbf",
+        objective="clf",
+    )
     observation, _ = env.reset(seed=0)
     vector.reset(seed=0)
     goal, _ = CLFController(env.unwrapped.problem).predict(observation.astype(np.float64))
     for proposal in (0.7, -0.4):  # the policy has no say
         env.reset(seed=0)
         info = env.step(np.array([proposal]))[-1]
-        np.testing.assert_allclose(info["nominal_action"], goal * env.unwrapped.problem.box[0][1], rtol=1e-4)
+        np.testing.assert_allclose(
+            info["nominal_action"], goal * env.unwrapped.problem.box[0][1], rtol=1e-4
+        )
         assert info["intervention"]
         assert info["safe_action"][0] < info["nominal_action"][0] - 1.0
     infos = vector.step(np.zeros((2, 1)))[-1]
@@ -234,10 +296,17 @@ def test_joint_program_reports_what_the_goal_alone_asks_for():
 def test_priorities_and_slacks_reach_the_gym_wrappers():
     problem = problem_of("safe_envs/QuadrotorLimits-v0")
     state = [0.0] * 12
-    state[2], state[5], state[6], state[9] = 3.2, -6.0, 0.49, 1.0  # too fast towards the floor, and tilting further
+    state[2], state[5], state[6], state[9] = (
+        3.2,
+        -6.0,
+        0.49,
+        1.0,
+    )  # too fast towards the floor, and tilting further
     slacks = []
     for priorities in (None, [1.0, 1.0, 1e4]):
-        env = SafetyFilterWrapper(gym.make("safe_envs/QuadrotorLimits-v0", start=state), "hocbf", priorities=priorities)
+        env = SafetyFilterWrapper(
+            gym.make("safe_envs/QuadrotorLimits-v0", start=state), "hocbf", priorities=priorities
+        )
         env.reset(seed=0)
         info = env.step(np.zeros(4))[-1]
         assert info["slacks"].shape == (len(problem.barriers),)
@@ -254,9 +323,11 @@ def test_priorities_and_slacks_reach_the_gym_wrappers():
 
 
 def test_an_action_that_is_the_least_violating_one_already_is_no_intervention():
-    # Infeasible, and the proposal is the end of the box that the filter wants: active, but nothing is changed.
+    # Infeasible, and the proposal is the end of the box that the filter wants: active, but nothing
+    # is changed.
     vector = SafetyFilterVectorWrapper(
-        gym.make_vec("safe_envs/Scalar-v0", num_envs=2, start=[1.9], noise=0.0, box=[-1.0, 1.0]), "cbf:alpha=5"
+        gym.make_vec("safe_envs/Scalar-v0", num_envs=2, start=[1.9], noise=0.0, box=[-1.0, 1.0]),
+        "cbf:alpha=5",
     )
     vector.reset(seed=0)
     info = vector.step(np.array([[-1.0], [1.0]]))[-1]
@@ -268,5 +339,7 @@ def test_an_action_that_is_the_least_violating_one_already_is_no_intervention():
 
 @pytest.mark.parametrize("condition", [None, 3, [None], ("scbf",)])
 def test_what_is_no_condition_is_explained(condition):
-    with pytest.raises(ConfigurationError, match="give a Condition, one for each barrier, or their text"):
+    with pytest.raises(
+        ConfigurationError, match="give a Condition, one for each barrier, or their text"
+    ):
         SafetyFilterWrapper(gym.make("safe_envs/Scalar-v0"), condition)

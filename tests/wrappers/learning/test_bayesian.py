@@ -58,7 +58,9 @@ def repeated_fits(times: int, points: int, repetitions: int):
 
 def test_the_paired_form_of_the_thesis_is_the_same_posterior():
     size, repetitions, dt = 2.0, 8, CUBIC.dt
-    found = identify(CUBIC, degree=3, data=collect(CUBIC, 100, repetitions, inputs=[[-size], [size]]))
+    found = identify(
+        CUBIC, degree=3, data=collect(CUBIC, 100, repetitions, inputs=[[-size], [size]])
+    )
     data = collect(CUBIC, 100, repetitions, inputs=[[-size], [size]])
     rate = (data.successors.mean(axis=1) - data.x) / dt
     first, second, phi = rate[::2], rate[1::2], found.features.matrix(data.x[::2])
@@ -84,10 +86,16 @@ def test_credible_intervals_cover_and_those_of_the_print_do_not():
     truth = PLACES[:, 0] ** 3
     for rows, design, _, found in repeated_fits(200, 40, 5):
         error = abs(phi @ found.learned.mean[1] - truth)
-        covered.append(error <= level * np.sqrt(((phi @ found.learned.covariance[1]) * phi).sum(axis=1)))
-        without_dt = posterior(design, rows.rate, found.diffusion.squares / found.diffusion.count / 5, 1e4)
+        covered.append(
+            error <= level * np.sqrt(((phi @ found.learned.covariance[1]) * phi).sum(axis=1))
+        )
+        without_dt = posterior(
+            design, rows.rate, found.diffusion.squares / found.diffusion.count / 5, 1e4
+        )
         error = abs(phi @ without_dt.mean[1] - truth)
-        printed.append(error <= level * np.sqrt(((phi @ without_dt.covariance[1]) * phi).sum(axis=1)))
+        printed.append(
+            error <= level * np.sqrt(((phi @ without_dt.covariance[1]) * phi).sum(axis=1))
+        )
     # 3 standard deviations of a share of 200.
     assert np.mean(covered, axis=0) == pytest.approx([0.9] * 3, abs=0.065)
     assert np.mean(printed) < 0.25
@@ -110,7 +118,13 @@ def test_errors_follow_the_time_that_was_observed():
 
 def test_a_log_with_repetitions_is_what_a_collector_gives():
     data = collect(CUBIC, 50, 6)
-    flat = Transitions.from_log(CUBIC, data.x.repeat(6, axis=0), data.u.repeat(6, axis=0), data.successors.reshape(-1, 2), CUBIC.dt)
+    flat = Transitions.from_log(
+        CUBIC,
+        data.x.repeat(6, axis=0),
+        data.u.repeat(6, axis=0),
+        data.successors.reshape(-1, 2),
+        CUBIC.dt,
+    )
     mine, logged = identify(CUBIC, data=data), identify(CUBIC, data=flat)
     for name, array in mine.arrays().items():
         assert np.array_equal(array, logged.arrays()[name]), name
@@ -137,10 +151,17 @@ def test_a_log_without_repetitions():
 def test_too_short_a_log():
     x = draw_states(CUBIC, 8, np.random.default_rng(0))
     with pytest.raises(ConfigurationError, match="nothing of the noise"):
-        identify(CUBIC, data=Transitions.from_log(CUBIC, x, np.linspace(-1, 1, 8)[:, None], x + 0.01, 0.01), degree=2)
+        identify(
+            CUBIC,
+            data=Transitions.from_log(CUBIC, x, np.linspace(-1, 1, 8)[:, None], x + 0.01, 0.01),
+            degree=2,
+        )
 
 
-@pytest.mark.parametrize(("name", "problem", "degree", "pruned"), [("cubic", CUBIC, 1, [[1], [0]]), ("gap", acc_gap(), 2, [[0], [1]])])
+@pytest.mark.parametrize(
+    ("name", "problem", "degree", "pruned"),
+    [("cubic", CUBIC, 1, [[1], [0]]), ("gap", acc_gap(), 2, [[0], [1]])],
+)
 def test_the_identified_system(request, name: str, problem: SafetyProblem, degree: int, pruned):
     found: Posterior = request.getfixturevalue(name)
     assert isinstance(found.system, ControlAffineSDE)
@@ -185,7 +206,9 @@ def test_variances_of_the_drift_are_those_of_draws(gap: Posterior):
         symbolic = values(expressions[i], gap.features.states, x).reshape(3, 2, 2)
         assert symbolic == pytest.approx(variance[:, i], rel=1e-6)
     rng, phi = np.random.default_rng(1), gap.features.matrix(x)
-    draws = np.array([gap.weights.sample(rng)[1, : gap.features.count] @ phi.T for _ in range(2000)])
+    draws = np.array(
+        [gap.weights.sample(rng)[1, : gap.features.count] @ phi.T for _ in range(2000)]
+    )
     assert draws.var(axis=0) == pytest.approx(variance[:, 1, 0, 0], rel=0.15)
 
 
@@ -194,7 +217,12 @@ def test_what_is_pruned_is_left_out_of_the_rest():
     found = identify(CUBIC, data=collect(CUBIC, 300, 10, inputs=[[1.0], [2.0]]), degree=1)
     assert found.pruned[0, 0]
     rows = Rows.of(collect(CUBIC, 300, 10, inputs=[[1.0], [2.0]]))
-    alone = posterior(rows.design(found.features, found.input_scale)[:, :3], rows.rate, found.diffusion.variances(rows.x) / 0.1, 10.0)
+    alone = posterior(
+        rows.design(found.features, found.input_scale)[:, :3],
+        rows.rate,
+        found.diffusion.variances(rows.x) / 0.1,
+        10.0,
+    )
     assert found.weights.mean[0, :3] == pytest.approx(alone.mean[0], rel=1e-6)
     assert found.weights.covariance[0, :3, :3] == pytest.approx(alone.covariance[0], rel=1e-5)
 
@@ -220,11 +248,14 @@ def test_noise_that_varies_with_the_state(tmp_path: Path):
     again = Posterior.from_content(load(tmp_path / "file"), problem)
     assert again.system == found.system
     drawn = found.sample(np.random.default_rng(0))
-    assert values([drawn.diffusion[1, 1] ** 2], drawn.states, x)[:, 0] == pytest.approx(truth, abs=1e-3)
+    assert values([drawn.diffusion[1, 1] ** 2], drawn.states, x)[:, 0] == pytest.approx(
+        truth, abs=1e-3
+    )
 
 
 def test_rounding_is_no_noise():
-    # Of the two states x_2 has noise. But the mean of three equal numbers is rounded, and they deviate from it.
+    # Of the two states x_2 has noise. But the mean of three equal numbers is rounded, and they
+    # deviate from it.
     problem = cubic_sde()
     assert problem.plant.diffusion.row(0).is_zero_matrix
     rows = Rows.of(collect(problem, 200, 3))
@@ -239,7 +270,9 @@ def test_noise_that_drives_two_states_together():
     after = x + 0.01 * u * x + 0.1 * np.column_stack((0.2 * w, -0.3 * w))
     found = identify(CUBIC, data=Transitions.from_log(CUBIC, x, u, after, 0.01), degree=1)
     covariance = found.system.diffusion * found.system.diffusion.T
-    assert np.array(covariance, dtype=float) == pytest.approx(np.array([[0.04, -0.06], [-0.06, 0.09]]), rel=0.06)
+    assert np.array(covariance, dtype=float) == pytest.approx(
+        np.array([[0.04, -0.06], [-0.06, 0.09]]), rel=0.06
+    )
 
 
 def test_saved_and_loaded(cubic: Posterior, tmp_path: Path):
@@ -270,7 +303,9 @@ def test_the_degree_fits_the_data(cubic: Posterior):
 
 def test_the_record_and_the_progress():
     parts: list[float] = []
-    found = identify(CUBIC, starts=20, steps=2, repetitions=3, seed=4, prior=1e4, progress=parts.append)
+    found = identify(
+        CUBIC, starts=20, steps=2, repetitions=3, seed=4, prior=1e4, progress=parts.append
+    )
     assert parts == sorted(parts)
     assert parts[-1] == 1.0
     assert (found.record.transitions, found.record.seed) == (240, 4)

@@ -27,19 +27,28 @@ def made_up(diffusion):
 
 
 def learned(problem, points=300, repetitions=1000, inputs=None, seed=0):
-    data = collect(problem, points, repetitions, inputs or [tuple(np.zeros(len(problem.inputs)))], seed=seed)
+    data = collect(
+        problem, points, repetitions, inputs or [tuple(np.zeros(len(problem.inputs)))], seed=seed
+    )
     return LearnedDiffusion.learn(problem, data, rates(problem.model, data))
 
 
 def entry_at(problem, expression, x):
-    return np.broadcast_to(compile_function(problem.plant.states, [expression], "arrays")(*x.T)[0], len(x))
+    return np.broadcast_to(
+        compile_function(problem.plant.states, [expression], "arrays")(*x.T)[0], len(x)
+    )
 
 
 def largest_error(problem, diffusion):
     """Of each entry over the region, as part of the largest entry there."""
-    x = np.random.default_rng(5).uniform(*np.array(problem.exploration.region).T, (500, problem.plant.n))
+    x = np.random.default_rng(5).uniform(
+        *np.array(problem.exploration.region).T, (500, problem.plant.n)
+    )
     truth = problem.plant.numeric(problem.plant.diffusion * problem.plant.diffusion.T)
-    pairs = [(entry_at(problem, a, x), entry_at(problem, b, x)) for a, b in zip(truth, diffusion.covariance, strict=True)]
+    pairs = [
+        (entry_at(problem, a, x), entry_at(problem, b, x))
+        for a, b in zip(truth, diffusion.covariance, strict=True)
+    ]
     return max(np.abs(a - b).max() for a, b in pairs) / max(np.abs(a).max() for a, _ in pairs)
 
 
@@ -57,7 +66,8 @@ def largest_error(problem, diffusion):
 def test_the_covariance_is_recovered_with_its_degree(problem, degrees):
     diffusion, errors = learned(problem)
     assert {(e.row, e.column): e.features.degree for e in diffusion.entries} == degrees
-    # An estimate has a relative deviation of sqrt(2/999) = 4.5 %; the corner of a quadratic in 300 points a few tenths of it.
+    # An estimate has a relative deviation of sqrt(2/999) = 4.5 %; the corner of a quadratic in 300
+    # points a few tenths of it.
     assert largest_error(problem, diffusion) < 0.03
     assert len(errors) == len(degrees)
     assert all(0 < error < 0.1 for error in errors.values())
@@ -69,14 +79,19 @@ def test_constant_entries_are_the_mean_of_the_estimates():
     rate = rates(problem.model, data)
     diffusion, _ = LearnedDiffusion.learn(problem, data, rate)
     np.testing.assert_allclose(
-        np.array(diffusion.covariance, dtype=float), np.diag(np.diag(covariances(data, rate).mean(axis=0))), rtol=1e-12
+        np.array(diffusion.covariance, dtype=float),
+        np.diag(np.diag(covariances(data, rate).mean(axis=0))),
+        rtol=1e-12,
     )
 
 
 def test_covariances_have_their_law():
     problem = made_up(CORRELATED)
     data = collect(problem, 400, 100, [(-1.0,)], seed=4)
-    found, truth = covariances(data, rates(problem.model, data)), np.array(CORRELATED) @ np.array(CORRELATED).T
+    found, truth = (
+        covariances(data, rates(problem.model, data)),
+        np.array(CORRELATED) @ np.array(CORRELATED).T,
+    )
     law = np.sqrt((truth**2 + np.outer(truth.diagonal(), truth.diagonal())) / 100)
     scores = (found - truth) / law
     assert (np.abs(scores.mean(axis=0)) < 5 / 20).all()
@@ -85,12 +100,19 @@ def test_covariances_have_their_law():
 
 def test_covariances_of_repeated_steps_are_those_of_the_sample():
     data = collect(made_up(CORRELATED), 20, 3, [(-1.0,)])
-    expected = [np.cov(successors.T, ddof=1) / dt for successors, dt in zip(data.successors, data.dt, strict=True)]
+    expected = [
+        np.cov(successors.T, ddof=1) / dt
+        for successors, dt in zip(data.successors, data.dt, strict=True)
+    ]
     # What is subtracted is about a hundred times as large as what is left.
-    np.testing.assert_allclose(covariances(data, np.zeros_like(data.x)), expected, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(
+        covariances(data, np.zeros_like(data.x)), expected, rtol=1e-11, atol=1e-13
+    )
 
 
-@pytest.mark.parametrize("diffusion", [CORRELATED, VARYING, [[0.3], [0.2]]], ids=["constant", "varying", "one channel"])
+@pytest.mark.parametrize(
+    "diffusion", [CORRELATED, VARYING, [[0.3], [0.2]]], ids=["constant", "varying", "one channel"]
+)
 def test_the_factor_of_the_system_returns_the_covariance(diffusion):
     problem = made_up(diffusion)
     found, _ = learned(problem, 100, 100)
@@ -132,8 +154,8 @@ def test_passive_logs_are_enough():
     problem = made_up(VARYING)
     data = collect(problem, 200, 1, steps=100, seed=2)
     found, _ = LearnedDiffusion.learn(problem, data, rates(problem.model, data))
-    # 40000 single squares, each with a relative deviation of sqrt(2): under 1 % for a constant, some ten times that at the corner of a
-    # quadratic.
+    # 40000 single squares, each with a relative deviation of sqrt(2): under 1 % for a constant,
+    # some ten times that at the corner of a quadratic.
     assert largest_error(problem, found) < 0.1
 
 
@@ -154,7 +176,8 @@ def test_restored_is_the_same():
 
 
 def test_a_step_without_noise_is_not_taken_for_noise():
-    """Runge and Kutta's step, finer than that of the estimator here, is not Euler's: the difference is no covariance."""
+    """Runge and Kutta's step, finer than that of the estimator here, is not Euler's: the difference
+    is no covariance."""
     problem = problem_of("safe_envs/QuadrotorLimits-v0").configured(substeps=3)
     for data in (collect(problem, 30, 5), collect(problem, 30, 1)):
         rate = rates(problem.model, data)
@@ -166,7 +189,9 @@ def test_a_step_without_noise_is_not_taken_for_noise():
 def test_with_repetitions_a_wrong_drift_is_not_taken_for_noise():
     problem = made_up(CORRELATED)
     data = collect(problem, 20, 50, [(-1.0,)])
-    np.testing.assert_array_equal(covariances(data, rates(problem.model, data)), covariances(data, np.full((20, 2), 10.0)))
+    np.testing.assert_array_equal(
+        covariances(data, rates(problem.model, data)), covariances(data, np.full((20, 2), 10.0))
+    )
 
 
 def test_errors_are_told_at_start_states_that_are_held_out():

@@ -1,4 +1,5 @@
-"""The estimates against their sampling laws; tolerances are five standard deviations of the statistic that is compared."""
+"""The estimates against their sampling laws; tolerances are five standard deviations of the
+statistic that is compared."""
 
 from __future__ import annotations
 
@@ -12,7 +13,15 @@ from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.estimators import drift_score, drift_warnings, in_bulk, ito_part, mean_rates, rates, region_warnings
+from safe_envs.wrappers.learning.estimators import (
+    drift_score,
+    drift_warnings,
+    in_bulk,
+    ito_part,
+    mean_rates,
+    rates,
+    region_warnings,
+)
 from safe_envs.wrappers.learning.models.network import Network
 from tests.conftest import problem_of
 
@@ -32,8 +41,13 @@ def data(pendulum):
 
 def estimated(problem, data, estimator):
     h = problem.barriers[0].expression
-    value, slopes = (compile_function(problem.model.states, e, "arrays") for e in ([h], list(gradient(problem.model, h))))
-    return ito_part(data, rates(problem.model, data), lambda x: value(*x)[0], lambda x: slopes(*x), estimator)
+    value, slopes = (
+        compile_function(problem.model.states, e, "arrays")
+        for e in ([h], list(gradient(problem.model, h)))
+    )
+    return ito_part(
+        data, rates(problem.model, data), lambda x: value(*x)[0], lambda x: slopes(*x), estimator
+    )
 
 
 def warned(model, data):
@@ -50,7 +64,9 @@ def near_one(squares):
 
 
 def test_rates_are_those_of_the_model_under_the_input(pendulum, data):
-    expected = np.column_stack((data.x[:, 1], 10 / 0.7 * np.sin(data.x[:, 0]) + data.u[:, 0] / 0.49))
+    expected = np.column_stack(
+        (data.x[:, 1], 10 / 0.7 * np.sin(data.x[:, 0]) + data.u[:, 0] / 0.49)
+    )
     np.testing.assert_allclose(rates(pendulum.model, data), expected, rtol=1e-13)
 
 
@@ -62,7 +78,8 @@ def test_martingale_has_a_relative_deviation_of_sqrt_two_over_n(pendulum, data):
     assert seen.mean() > 0.9
     relative = relative[seen] / np.sqrt(2 / K)
     assert abs(relative.mean()) < 5 / np.sqrt(len(relative))
-    # The fourth moment of a mean of K squares of normals exceeds that of a normal by 12/K of its own.
+    # The fourth moment of a mean of K squares of normals exceeds that of a normal by 12/K of its
+    # own.
     assert near_one(relative**2)
 
 
@@ -81,7 +98,8 @@ def test_standard_errors_are_those_of_the_sample(pendulum, data, estimator):
     found = estimated(pendulum, data, estimator)
     seen = np.abs(truth(data)) > 1e-5
     scores = (found.values - truth(data))[seen] / found.deviations[seen]
-    # A mean of K squares of normals is skewed, and its deviation estimated from itself: up to 20/K more than of a t-score.
+    # A mean of K squares of normals is skewed, and its deviation estimated from itself: up to 20/K
+    # more than of a t-score.
     assert abs((scores**2).mean() - 1) < 5 * np.sqrt(2 / seen.sum()) + 20 / K
 
 
@@ -110,7 +128,9 @@ def test_a_single_successor_gives_no_standard_error(pendulum):
 
 
 def test_parts_do_not_matter(pendulum, data):
-    some = replace(data, x=data.x[300:], u=data.u[300:], successors=data.successors[300:], dt=data.dt[300:])
+    some = replace(
+        data, x=data.x[300:], u=data.u[300:], successors=data.successors[300:], dt=data.dt[300:]
+    )
     whole, part = (estimated(pendulum, d, "martingale").values for d in (data, some))
     np.testing.assert_array_equal(whole[300:], part)
 
@@ -138,7 +158,15 @@ def test_bulk_evaluation_of_a_network_is_the_network():
     sizes = (2, 100, 30, 1)
     weights = tuple(rng.normal(size=(b, a)) / np.sqrt(a) for a, b in itertools.pairwise(sizes))
     biases = tuple(rng.normal(size=len(w)) for w in weights)
-    network = Network(weights, biases, "tanh", np.array([3.0, -1.0]), np.array([2.0, 0.5]), np.array([10.0]), np.array([50.0]))
+    network = Network(
+        weights,
+        biases,
+        "tanh",
+        np.array([3.0, -1.0]),
+        np.array([2.0, 0.5]),
+        np.array([10.0]),
+        np.array([50.0]),
+    )
     x = [3 + 2 * rng.normal(size=10_001), -1 + 0.5 * rng.normal(size=10_001)]
     np.testing.assert_allclose(in_bulk(network, x), network.arrays(x)[0], atol=1e-5 * 50)
 
@@ -151,7 +179,8 @@ def test_mean_rates_follow_the_integrator(noise):
     mean = mean_rates(problem.model, data, rate)
     moved = (data.successors.mean(axis=1) - data.x) / data.dt[:, None]
     if noise:
-        # An Euler step is told from the noise by far less than what the curvature of the path makes.
+        # An Euler step is told from the noise by far less than what the curvature of the path
+        # makes.
         assert np.abs(mean - rate).max() < 0.02 * np.abs(rate).max() * data.dt[0]
     else:
         np.testing.assert_allclose(mean, moved, atol=1e-11)

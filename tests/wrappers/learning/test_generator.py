@@ -37,16 +37,30 @@ def direct(gap):
 
 
 def states_in(problem, count=300):
-    x = np.random.default_rng(9).uniform(*np.array(problem.exploration.region).T, (count, problem.plant.n))
-    return x[np.broadcast_to(compile_function(problem.plant.states, [problem.barriers[0].expression], "arrays")(*x.T)[0], count) > 0]
+    x = np.random.default_rng(9).uniform(
+        *np.array(problem.exploration.region).T, (count, problem.plant.n)
+    )
+    return x[
+        np.broadcast_to(
+            compile_function(problem.plant.states, [problem.barriers[0].expression], "arrays")(
+                *x.T
+            )[0],
+            count,
+        )
+        > 0
+    ]
 
 
 def at(problem, system, expression, x):
-    return np.broadcast_to(compile_function(problem.plant.states, [system.numeric(expression)], "arrays")(*x.T)[0], len(x))
+    return np.broadcast_to(
+        compile_function(problem.plant.states, [system.numeric(expression)], "arrays")(*x.T)[0],
+        len(x),
+    )
 
 
 def limit(problem, system, x):
-    """Acceleration -b/(a M) at which the row a u + b >= 0 of the second order has its edge, in m/s^2."""
+    """Acceleration -b/(a M) at which the row a u + b >= 0 of the second order has its edge, in
+    m/s^2."""
     first, second = derivatives(system, problem.barriers[0].expression, 2, generator)[1:]
     coefficient = lie_derivative_g(system, first)[0, 0]
     return -at(problem, system, second, x) / at(problem, system, coefficient, x) / 1650
@@ -57,7 +71,9 @@ def learned_limit(problem, model, x):
     system, terms = problem.model, model.generators[0].arrays(tuple(np.ascontiguousarray(x.T)))
     first, second = derivatives(system, problem.barriers[0].expression, 2, lie_derivative_f)[1:]
     g = [float(e) for e in system.numeric(system.input_matrix)]
-    coefficient = at(problem, system, lie_derivative_g(system, first)[0, 0], x) + sum(t * e for t, e in zip(terms[1:], g, strict=True))
+    coefficient = at(problem, system, lie_derivative_g(system, first)[0, 0], x) + sum(
+        t * e for t, e in zip(terms[1:], g, strict=True)
+    )
     return -(at(problem, system, second, x) + terms[0]) / coefficient / 1650
 
 
@@ -80,7 +96,8 @@ def test_first_order_is_learned(top, first_order):
 def test_recursion_is_the_second_order_generator(gap, recursion):
     x = states_in(gap)
     ((truth, estimate),) = recursion.compare(gap, x).values()
-    # M_2 goes with the second differences of a network that was fitted to 500 transitions from each of 150 points: 7 to 15 %.
+    # M_2 goes with the second differences of a network that was fitted to 500 transitions from each
+    # of 150 points: 7 to 15 %.
     assert np.sqrt(np.mean((estimate - truth) ** 2)) < 0.2 * np.sqrt(np.mean(truth**2))
     assert np.median(np.abs(learned_limit(gap, recursion, x) - limit(gap, gap.plant, x))) < 0.05
 
@@ -107,7 +124,9 @@ def test_floats_are_arrays(name, request):
     terms, x = model.generators[0], states_in(problem, 40)
     whole = np.column_stack(terms.arrays(tuple(np.ascontiguousarray(x.T))))
     assert whole.shape == (len(x), len(terms.symbols))
-    np.testing.assert_allclose([terms.floats(row) for row in x.tolist()], whole, rtol=1e-5, atol=1e-9 * np.abs(whole).max())
+    np.testing.assert_allclose(
+        [terms.floats(row) for row in x.tolist()], whole, rtol=1e-5, atol=1e-9 * np.abs(whole).max()
+    )
 
 
 def test_slopes_are_derivatives(gap, recursion):
@@ -117,7 +136,9 @@ def test_slopes_are_derivatives(gap, recursion):
         ahead, behind = x.copy(), x.copy()
         ahead[:, i] += step
         behind[:, i] -= step
-        difference = (first.arrays(tuple(ahead.T))[0] - first.arrays(tuple(behind.T))[0]) / (2 * step)
+        difference = (first.arrays(tuple(ahead.T))[0] - first.arrays(tuple(behind.T))[0]) / (
+            2 * step
+        )
         np.testing.assert_allclose(slope, difference, rtol=1e-4, atol=1e-5 * np.abs(slope).max())
 
 
@@ -133,7 +154,10 @@ def test_angles_go_through_the_chain_rule():
 
 def test_every_barrier_has_its_generator():
     problem = problem_of("safe_envs/Pendulum-v0")
-    problem = replace(problem, barriers=(*problem.barriers, replace(pendulum(level=0.1).barriers[0], name="inner")))
+    problem = replace(
+        problem,
+        barriers=(*problem.barriers, replace(pendulum(level=0.1).barriers[0], name="inner")),
+    )
     model = learn_generator(problem, points=30, repetitions=30)
     assert list(model.compare(problem, states_in(problem))) == ["M_1(h)", "M_1(inner)"]
     assert len(model.generators) == 2
@@ -142,7 +166,9 @@ def test_every_barrier_has_its_generator():
 def test_noise_that_adds_nothing_to_a_barrier_is_learned_as_nothing():
     scalar = problem_of("safe_envs/Scalar-v0")
     (x,) = scalar.plant.states
-    model = learn_generator(replace(scalar, barriers=(Barrier(x),)), points=20, repetitions=20, way="network")
+    model = learn_generator(
+        replace(scalar, barriers=(Barrier(x),)), points=20, repetitions=20, way="network"
+    )
     (generator_of_x,) = model.generators
     assert not np.any(generator_of_x.arrays((np.linspace(-3.0, 3.0, 50),)))
     assert set(model.record.errors.values()) == {0.0}
@@ -157,14 +183,19 @@ def test_saved_and_loaded_are_equal(name, request, tmp_path):
     assert again.sha256 == model.sha256
     assert again.record == model.record
     x = states_in(problem)
-    for old, new in zip(model.compare(problem, x).values(), again.compare(problem, x).values(), strict=True):
+    for old, new in zip(
+        model.compare(problem, x).values(), again.compare(problem, x).values(), strict=True
+    ):
         np.testing.assert_array_equal(old, new)
 
 
 def test_only_noise_may_differ_from_what_was_learned_of(top, gap, first_order, direct, tmp_path):
     first_order.save(tmp_path / "model.npz")
     believed = top.configured(model={"sigma": 0.0})
-    assert GeneratorModel.from_content(load(tmp_path / "model.npz"), believed).sha256 == first_order.sha256
+    assert (
+        GeneratorModel.from_content(load(tmp_path / "model.npz"), believed).sha256
+        == first_order.sha256
+    )
     for other in (top.configured(model={"l": 0.6}), pendulum(level=0.1), gap):
         with pytest.raises(LearnedFileError, match="another problem"):
             GeneratorModel.check(first_order.signature, other)
@@ -191,7 +222,9 @@ def test_a_passive_log_is_learned_directly(top):
 
 
 def test_equal_seeds_learn_equal_models(top):
-    one, other, third = (learn_generator(top, points=30, repetitions=30, seed=seed) for seed in (1, 1, 2))
+    one, other, third = (
+        learn_generator(top, points=30, repetitions=30, seed=seed) for seed in (1, 1, 2)
+    )
     x = tuple(states_in(top).T)
     np.testing.assert_array_equal(one.generators[0].arrays(x), other.generators[0].arrays(x))
     assert (one.generators[0].arrays(x)[0] != third.generators[0].arrays(x)[0]).any()
@@ -222,7 +255,9 @@ def test_what_cannot_be_learned_from_is_refused(top, gap):
         learn_generator(top, data=collect(gap, 5))
     log = collect(top, 5)
     with pytest.raises(InvalidInputError, match="not finite"):
-        Transitions(Signature.of(top), log.x, log.u, np.where(log.successors > 0, np.nan, 0.0), log.dt)
+        Transitions(
+            Signature.of(top), log.x, log.u, np.where(log.successors > 0, np.nan, 0.0), log.dt
+        )
 
 
 def test_no_noise_is_told(top):
@@ -235,7 +270,9 @@ def test_the_plant_is_that_of_the_data(top):
     model = learn_generator(top, data=collect(other, 30, 5), way="direct")
     assert model.signature.differences(top) == ("l = 0.6 (here 0.7)",)
     log = collect(top, 30)
-    model = learn_generator(top, data=Transitions.from_log(top, log.x, log.u, log.successors[:, 0], log.dt))
+    model = learn_generator(
+        top, data=Transitions.from_log(top, log.x, log.u, log.successors[:, 0], log.dt)
+    )
     assert model.signature.plant == ()
 
 

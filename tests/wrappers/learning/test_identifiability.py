@@ -64,7 +64,9 @@ def test_a_state_that_never_varies():
 
 
 def test_too_few_rows():
-    _, text = told(data=data_at(draw_states(PROBLEM, 8, np.random.default_rng(0)), (-1.0, 1.0)), degree=3)
+    _, text = told(
+        data=data_at(draw_states(PROBLEM, 8, np.random.default_rng(0)), (-1.0, 1.0)), degree=3
+    )
     assert "16 different rows of data are too few for 20 weights" in text
 
 
@@ -92,6 +94,15 @@ def test_noise_that_varies_with_the_state():
 
 def test_names_of_terms():
     features = Features.of(PROBLEM, 2)
-    assert term_names(features, ["u"])[:8] == ("1", "x_1", "x_2", "x_1^2", "x_1 x_2", "x_2^2", "u", "u x_1")
+    assert term_names(features, ["u"])[:8] == (
+        "1",
+        "x_1",
+        "x_2",
+        "x_1^2",
+        "x_1 x_2",
+        "x_2^2",
+        "u",
+        "u x_1",
+    )
     shifted = Features.of(quadrotor_altitude(), 1)
     assert term_names(shifted, ["U"]) == ("1", "z", "zdot", "U", "U z", "U zdot")

@@ -9,7 +9,13 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import kstest, norm
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.learning.regression import Gaussian, posterior, sigma_map, sigma_quantile, sigma_samples
+from safe_envs.wrappers.learning.regression import (
+    Gaussian,
+    posterior,
+    sigma_map,
+    sigma_quantile,
+    sigma_samples,
+)
 
 
 @pytest.fixture
@@ -20,8 +26,12 @@ def rng() -> np.random.Generator:
 def brute_force(design, y, variance, prior):
     """Thesis Eq. (6.7) output by output, with any diagonal noise."""
     eye = np.eye(design.shape[1])
-    covariances = [np.linalg.inv(design.T @ (design / v[:, None]) + eye / prior) for v in variance.T]
-    return [c @ design.T @ (y[:, i] / variance[:, i]) for i, c in enumerate(covariances)], covariances
+    covariances = [
+        np.linalg.inv(design.T @ (design / v[:, None]) + eye / prior) for v in variance.T
+    ]
+    return [
+        c @ design.T @ (y[:, i] / variance[:, i]) for i, c in enumerate(covariances)
+    ], covariances
 
 
 @pytest.mark.parametrize("rows", [3, 40])
@@ -59,7 +69,9 @@ def test_what_is_not_seen_keeps_the_prior_even_without_noise(rng):
     assert found.mean[0] == pytest.approx([1.0, 0.0, 0.0, 0.0], abs=1e-7)
 
 
-@pytest.mark.parametrize(("variance", "prior"), [(0.0, 1.0), (-1.0, 1.0), (np.nan, 1.0), (1.0, 0.0), (1.0, np.inf)])
+@pytest.mark.parametrize(
+    ("variance", "prior"), [(0.0, 1.0), (-1.0, 1.0), (np.nan, 1.0), (1.0, 0.0), (1.0, np.inf)]
+)
 def test_a_variance_that_is_none_is_refused(rng, variance, prior):
     with pytest.raises(ConfigurationError, match="positive and finite"):
         posterior(rng.normal(size=(5, 2)), rng.normal(size=(5, 1)), np.array([variance]), prior)
@@ -95,7 +107,8 @@ def test_the_most_probable_sigma_maximises_its_density(count, level, alpha, beta
 
 
 @pytest.mark.parametrize(
-    ("squares", "count", "alpha", "beta"), [(0.4, 10, 1.0, 1.0), (40.0, 1000, 1.0, 1.0), (0.0, 10, 1.0, 1.0), (0.3, 1, 1.0, 0.0)]
+    ("squares", "count", "alpha", "beta"),
+    [(0.4, 10, 1.0, 1.0), (40.0, 1000, 1.0, 1.0), (0.0, 10, 1.0, 1.0), (0.3, 1, 1.0, 0.0)],
 )
 def test_quantiles_of_sigma_are_those_of_its_density(squares, count, alpha, beta):
     mode = float(sigma_map(np.array(squares), np.array(count), alpha, beta))
@@ -106,7 +119,13 @@ def test_quantiles_of_sigma_are_those_of_its_density(squares, count, alpha, beta
         def height(t):
             return np.exp(log_density(np.exp(t), squares, count, alpha, beta) - top + t)
 
-        return quad(height, np.log(low), np.log(high), limit=500, points=[np.log(mode)] if low < mode < high else None)[0]
+        return quad(
+            height,
+            np.log(low),
+            np.log(high),
+            limit=500,
+            points=[np.log(mode)] if low < mode < high else None,
+        )[0]
 
     whole = mass(mode * 1e-2, mode * 1e5)
     for level in (0.01, 0.3, 0.5, 0.9, 0.999):
@@ -117,14 +136,23 @@ def test_quantiles_of_sigma_are_those_of_its_density(squares, count, alpha, beta
 @pytest.mark.parametrize("count", [10, 10**4, 10**7])
 def test_draws_of_sigma_spread_as_the_data_allow(rng, count):
     draws = sigma_samples(0.04 * count, count, 1.0, 1.0, 4000, rng)
-    assert np.median(draws) == pytest.approx(float(sigma_quantile(np.array(0.5), 0.04 * count, count)), rel=0.1)
+    assert np.median(draws) == pytest.approx(
+        float(sigma_quantile(np.array(0.5), 0.04 * count, count)), rel=0.1
+    )
     if count > 10:
         assert draws.std() == pytest.approx(0.2 / np.sqrt(2 * count), rel=0.05)
         assert kstest(draws, "norm", args=(0.2, 0.2 / np.sqrt(2 * count))).statistic < 0.05
 
 
 @pytest.mark.parametrize(
-    "arguments", [(1.0, 10, -1.0, 1.0), (1.0, 10, 1.0, np.nan), (0.0, 10, 1.0, 0.0), (-1.0, 10, 1.0, 1.0), (1.0, 0, 0.0, 1.0)]
+    "arguments",
+    [
+        (1.0, 10, -1.0, 1.0),
+        (1.0, 10, 1.0, np.nan),
+        (0.0, 10, 1.0, 0.0),
+        (-1.0, 10, 1.0, 1.0),
+        (1.0, 0, 0.0, 1.0),
+    ],
 )
 def test_no_distribution_of_sigma(arguments):
     with pytest.raises(ConfigurationError, match="sigma"):

@@ -29,8 +29,15 @@ def exact_residuals(problem, barrier, degree, x):
         chain = [barrier.expression]
         for _ in range(degree):
             chain.append(lie_derivative_f(system, chain[-1]))
-        expressions = [system.numeric(e) for e in (*chain[1:], *lie_derivative_g(system, chain[-2]))]
-        found.append(stacked(compile_function(system.states, expressions, "arrays")(*np.ascontiguousarray(x.T)), len(x)))
+        expressions = [
+            system.numeric(e) for e in (*chain[1:], *lie_derivative_g(system, chain[-2]))
+        ]
+        found.append(
+            stacked(
+                compile_function(system.states, expressions, "arrays")(*np.ascontiguousarray(x.T)),
+                len(x),
+            )
+        )
     return found[0] - found[1]
 
 
@@ -45,10 +52,13 @@ def test_the_labels_are_the_exact_residuals(name):
     x = draw_states(problem, 300, np.random.default_rng(1))
     ((labels, sizes),), transitions = residual_labels(problem, x, _DT)
     exact = exact_residuals(problem, problem.barriers[0], 2, x)
-    # Derivative j errs by less than dt^(5 - j) h^(5), with h^(5) below (10/s)^(5 - j) times derivative j in these systems, and by
-    # the rounding of h over dt^j; Sigma by the error of derivative 2 over the range of an input, Delta_2 by that brought to u = 0.
+    # Derivative j errs by less than dt^(5 - j) h^(5), with h^(5) below (10/s)^(5 - j) times
+    # derivative j in these systems, and by the rounding of h over dt^j; Sigma by the error of
+    # derivative 2 over the range of an input, Delta_2 by that brought to u = 0.
     inputs = np.array(problem.exploration.inputs)
-    (h,) = compile_function(problem.plant.states, [problem.barriers[0].expression], "arrays")(*np.ascontiguousarray(x.T))
+    (h,) = compile_function(problem.plant.states, [problem.barriers[0].expression], "arrays")(
+        *np.ascontiguousarray(x.T)
+    )
     rounding = 1e-14 * np.abs(h).max() / _DT ** np.arange(1, 3)
     second = sizes[1] + np.abs(inputs).max(axis=0) @ sizes[2:]
     error = np.array([sizes[0], second]) * (10 * _DT) ** np.array([4, 3]) + rounding
@@ -62,14 +72,20 @@ def test_halving_the_step_divides_the_error_by_what_the_order_says():
     problem = problem_of("safe_envs/QuadrotorAltitude-v0")
     x = draw_states(problem, 300, np.random.default_rng(1))
     exact = exact_residuals(problem, problem.barriers[0], 2, x)
-    coarse, fine = (np.abs(residual_labels(problem, x, dt)[0][0][0] - exact).max(axis=0) for dt in (4e-3, 2e-3))
+    coarse, fine = (
+        np.abs(residual_labels(problem, x, dt)[0][0][0] - exact).max(axis=0) for dt in (4e-3, 2e-3)
+    )
     np.testing.assert_allclose(np.log2(coarse / fine), [4.0, 3.0, 3.0], atol=0.3)
 
 
 def test_barriers_of_several_degrees_are_labelled_together():
     problem = problem_of("safe_envs/QuadrotorAltitude-v0")
     z, climb = problem.plant.states
-    problem = replace(problem, barriers=(*problem.barriers, Barrier(25 - climb**2 + 0 * z, "speed")), gains=((1.0, 1.0), (1.0,)))
+    problem = replace(
+        problem,
+        barriers=(*problem.barriers, Barrier(25 - climb**2 + 0 * z, "speed")),
+        gains=((1.0, 1.0), (1.0,)),
+    )
     x = draw_states(problem, 100, np.random.default_rng(1))
     labels, _ = residual_labels(problem, x, _DT)
     for barrier, degree, (found, sizes) in zip(problem.barriers, (2, 1), labels, strict=True):
@@ -78,7 +94,8 @@ def test_barriers_of_several_degrees_are_labelled_together():
 
 
 def test_the_printed_central_difference_gives_half_of_the_gain(disk):
-    """Eq. (3.28): the sample before was reached under another input than the one whose effect is asked for."""
+    """Eq. (3.28): the sample before was reached under another input than the one whose effect is
+    asked for."""
     x = draw_states(disk, 200, np.random.default_rng(2))
     (h,) = (compile_function(disk.plant.states, [disk.barriers[0].expression], "arrays"),)
     before, first, second = 0.0, -1.5, 1.5
@@ -86,7 +103,9 @@ def test_the_printed_central_difference_gives_half_of_the_gain(disk):
     def run(states, input_, dt):
         return collect_paths(disk, states, np.full((200, 1), input_), 1, dt)[:, 1]
 
-    gain = exact_residuals(replace(disk, model=disk.model.with_parameters(v=1e-9)), disk.barriers[0], 2, x)[:, 2]
+    gain = exact_residuals(
+        replace(disk, model=disk.model.with_parameters(v=1e-9)), disk.barriers[0], 2, x
+    )[:, 2]
     for dt in (1e-2, 1e-3):
         here = run(x, before, dt)
         rates = []
@@ -128,7 +147,11 @@ def test_the_record_says_how_it_was_learned(learned):
     assert record.observed == pytest.approx(16.0)
     assert 0 < record.seconds < 60
     assert record.settings == {"states": 2000, "label_dt": 1e-3, "hidden": [100, 30], "epochs": 200}
-    assert set(record.errors) == {f"h {name} {kind}" for name in ("Delta_1", "Delta_2", "Sigma_omega") for kind in ("rms", "q95")}
+    assert set(record.errors) == {
+        f"h {name} {kind}"
+        for name in ("Delta_1", "Delta_2", "Sigma_omega")
+        for kind in ("rms", "q95")
+    }
     assert record.errors["h Sigma_omega q95"] == learned.parts[0].eps(0.95)[2]
 
 
@@ -152,7 +175,9 @@ def test_a_saved_model_is_the_same_again(tmp_path, disk, learned):
     assert again.sha256 == learned.sha256
     assert again.record == learned.record
     x = draw_states(disk, 100, np.random.default_rng(5))
-    for (_, mine), (_, other) in zip(learned.compare(disk, x).values(), again.compare(disk, x).values(), strict=True):
+    for (_, mine), (_, other) in zip(
+        learned.compare(disk, x).values(), again.compare(disk, x).values(), strict=True
+    ):
         assert np.array_equal(mine, other)
     assert np.array_equal(learned.parts[0].eps(0.5), again.parts[0].eps(0.5))
 
@@ -175,13 +200,17 @@ def test_a_model_of_something_else_is_refused(tmp_path, disk, learned):
     with pytest.raises(LearnedFileError, match="incomplete"):
         ResidualModel.from_content(replace(content, arrays={}), disk)
     with pytest.raises(LearnedFileError, match="incomplete"):
-        ResidualModel.from_content(replace(content, arrays={**content.arrays, "part_0_heldout": np.zeros((5, 2))}), disk)
+        ResidualModel.from_content(
+            replace(content, arrays={**content.arrays, "part_0_heldout": np.zeros((5, 2))}), disk
+        )
 
 
 def test_the_same_seed_learns_the_same(disk):
     first, second, other = (learn_residual(disk, **_SMALL, seed=seed) for seed in (3, 3, 4))
     assert all(np.array_equal(a, second.arrays()[name]) for name, a in first.arrays().items())
-    assert not np.array_equal(first.arrays()["part_0_weights_0"], other.arrays()["part_0_weights_0"])
+    assert not np.array_equal(
+        first.arrays()["part_0_weights_0"], other.arrays()["part_0_weights_0"]
+    )
 
 
 def test_a_step_of_ones_own_takes_the_place_of_the_plant(disk):
@@ -192,7 +221,11 @@ def test_a_step_of_ones_own_takes_the_place_of_the_plant(disk):
 
 
 def test_progress_is_told_to_the_end_over_all_barriers(disk):
-    twice = replace(disk, barriers=(disk.barriers[0], Barrier(2 * disk.barriers[0].expression, "twice")), gains=((1.0, 2.0), (1.0, 2.0)))
+    twice = replace(
+        disk,
+        barriers=(disk.barriers[0], Barrier(2 * disk.barriers[0].expression, "twice")),
+        gains=((1.0, 2.0), (1.0, 2.0)),
+    )
     told = []
     model = learn_residual(twice, **_SMALL, progress=told.append)
     assert told == sorted(told)
@@ -215,7 +248,12 @@ def test_inputs_that_tell_nothing_apart_are_refused(disk):
     quadrotor = problem_of("safe_envs/Quadrotor-v0")
     four = quadrotor.exploration.inputs[:4]
     for problem, inputs in ((disk, ((1.0,),)), (disk, ((1.0,), (1.0,))), (quadrotor, four)):
-        poor = replace(problem, explored=SamplingDomain(problem.exploration.region, inputs, problem.exploration.coordinates))
+        poor = replace(
+            problem,
+            explored=SamplingDomain(
+                problem.exploration.region, inputs, problem.exploration.coordinates
+            ),
+        )
         with pytest.raises(ConfigurationError, match="apart"):
             learn_residual(poor, **_SMALL)
 
@@ -249,14 +287,20 @@ def test_the_level_is_that_of_split_conformal_prediction(learned):
     np.testing.assert_array_equal(part.eps(0.95), [19.0, 38.0, 57.0])
     np.testing.assert_array_equal(part.eps(0.9), [18.0, 36.0, 54.0])
     np.testing.assert_array_equal(part.eps(0.01), part.eps(0.0))
-    with pytest.raises(ConfigurationError, match=r"0\.99 is more than 19 .* about 534 more states, of which 80 .* a level up to 0\.95$"):
+    with pytest.raises(
+        ConfigurationError,
+        match=(
+            r"0\.99 is more than 19 .* about 534 more states, of which 80 .* a level up to 0\.95$"
+        ),
+    ):
         part.eps(0.99)
     with pytest.raises(ConfigurationError, match=r"up to 0\.95: no number of states"):
         part.eps(1.0)
 
 
 def test_the_quantile_covers_a_fresh_error_as_often_as_it_says(learned):
-    """On average over held-out sets, however few: here 19 errors, of which the empirical quantile would cover less."""
+    """On average over held-out sets, however few: here 19 errors, of which the empirical quantile
+    would cover less."""
     rng = np.random.default_rng(0)
     covered = []
     for _ in range(2000):
@@ -271,6 +315,8 @@ def test_a_plant_of_somebody_else_is_not_known(disk, learned):
 
 
 def test_settings_of_numpy_are_kept(tmp_path, disk):
-    model = learn_residual(disk, states=np.int64(60), hidden=(np.int64(4),), epochs=np.int64(2), seed=np.int64(1))
+    model = learn_residual(
+        disk, states=np.int64(60), hidden=(np.int64(4),), epochs=np.int64(2), seed=np.int64(1)
+    )
     model.save(tmp_path / "model.npz")
     assert ResidualModel.from_content(load(tmp_path / "model.npz"), disk).sha256 == model.sha256

@@ -1,4 +1,5 @@
-"""The dispatcher, and three and more inputs through ProxQP: exact where the rows can be met, least-violating and flagged where not."""
+"""The dispatcher, and three and more inputs through ProxQP: exact where the rows can be met,
+least-violating and flagged where not."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ from safe_envs.wrappers.qp.dispatch import project_arrays, project_floats
 
 
 def active_set_oracle(a, b, v, low, high, w):
-    """The minimiser by trying every set of active constraints (rows and ends of the box); None if there is none."""
+    """The minimiser by trying every set of active constraints (rows and ends of the box); None if
+    there is none."""
     m = len(v)
     rows, offsets = np.vstack([a, np.eye(m), -np.eye(m)]), np.concatenate([b, -low, high])
     best, best_cost = (v, 0.0) if np.all(rows @ v + offsets >= 0.0) else (None, np.inf)
@@ -41,7 +43,15 @@ def random_batch(rng, size, k, m):
 
 def solve(a, b, v, low, high, w, priority=None):
     rows = [[a[:, i, j] for j in range(a.shape[2])] for i in range(a.shape[1])]
-    *parts, feasible = project_arrays(rows, list(b.T), list(v.T), list(low.T), list(high.T), list(w.T), priority or [1.0] * a.shape[1])
+    *parts, feasible = project_arrays(
+        rows,
+        list(b.T),
+        list(v.T),
+        list(low.T),
+        list(high.T),
+        list(w.T),
+        priority or [1.0] * a.shape[1],
+    )
     u, margin, active = [np.array(part).T for part in parts]
     assert np.all((u >= low) & (u <= high))
     return u, margin, active, feasible
@@ -125,14 +135,17 @@ def test_duplicate_rows_and_opposite_rows_of_three_inputs():
 
 def test_row_of_higher_priority_gives_way_by_as_much_less():
     rows = [[1.0, 0.3, 0.0], [-1.0, -0.3, 0.0]]
-    _, margin, _, feasible = project_floats(rows, [-0.5, 0.0], [0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1e4, 1.0])
+    _, margin, _, feasible = project_floats(
+        rows, [-0.5, 0.0], [0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1e4, 1.0]
+    )
     assert not feasible
     assert margin[0] / margin[1] == pytest.approx(1e-4, rel=0.01)
 
 
 @pytest.mark.parametrize("m", [2, 3])
 def test_units_of_very_different_size(m):
-    # Forces of thousands of newtons against rows of thousandths: the thesis' cruise control has these.
+    # Forces of thousands of newtons against rows of thousandths: the thesis' cruise control has
+    # these.
     rest = [0.0] * (m - 2)
     found = project_floats(
         [[-1.1e-3, 0.0, *rest], [2.0e-4, 1.0, *rest]],
@@ -157,7 +170,13 @@ def test_endless_boxes_of_three_inputs_hide_no_row(half):
     np.testing.assert_allclose(found[0], best, atol=1e-5)
     assert found[2:] == ([True, True], True)
     contradicting = project_floats(
-        [[1.0, 0.5, 0.0], [-1.0, -0.5, 0.0]], [-3.0, 1.0], [0.0] * 3, [-half] * 3, [half] * 3, [1.0] * 3, [1.0, 1.0]
+        [[1.0, 0.5, 0.0], [-1.0, -0.5, 0.0]],
+        [-3.0, 1.0],
+        [0.0] * 3,
+        [-half] * 3,
+        [half] * 3,
+        [1.0] * 3,
+        [1.0, 1.0],
     )
     np.testing.assert_allclose(contradicting[0], [1.6, 0.8, 0.0], atol=1e-4)
     assert not contradicting[3]
@@ -165,21 +184,29 @@ def test_endless_boxes_of_three_inputs_hide_no_row(half):
 
 def test_flat_rows_of_many_inputs_are_exact():
     # Met or not by their sign alone, beside rows that the solver meets to its precision only.
-    rows, box = [[1.0, 0.2, 0.0], [0.3, 1.0, 0.1], [0.0, 0.0, 0.0]], ([0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3)
+    rows, box = (
+        [[1.0, 0.2, 0.0], [0.3, 1.0, 0.1], [0.0, 0.0, 0.0]],
+        ([0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0] * 3),
+    )
     for flat, met in ((-1e-12, False), (0.0, True), (1e-12, True), (-5.0, False)):
         u, margin, active, feasible = project_floats(rows, [-0.5, -0.5, flat], *box)
         assert feasible is met
         assert (margin[2], active[2]) == (flat, not met)
-        np.testing.assert_allclose(u, project_floats(rows[:2], [-0.5, -0.5], *box[:4], [1.0] * 2)[0], atol=1e-9)
+        np.testing.assert_allclose(
+            u, project_floats(rows[:2], [-0.5, -0.5], *box[:4], [1.0] * 2)[0], atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("gap", [1e-6, 1.0, 100.0])
 def test_rows_that_contradict_are_not_handed_to_the_general_solver(gap, monkeypatch):
     monkeypatch.setattr(proxqp, "_solve", lambda _: pytest.fail("ProxQP was asked"))
-    # s >= gap and -2 s >= 2 gap for s = u_1 + u_2, with the priorities 1 and 3/4, beside an input on which no row depends.
+    # s >= gap and -2 s >= 2 gap for s = u_1 + u_2, with the priorities 1 and 3/4, beside an input
+    # on which no row depends.
     a, b = np.array([[[1.0, 1.0, 0.0], [-2.0, -2.0, 0.0]]]), np.array([[-gap, -2.0 * gap]])
     ends = np.full((1, 3), 1000.0)
-    u, margin, _, feasible = proxqp.project(a, b, np.array([[0.0, 0.0, 5.0]]), -ends, ends, np.ones((1, 3)), np.array([1.0, 0.75]))
+    u, margin, _, feasible = proxqp.project(
+        a, b, np.array([[0.0, 0.0, 5.0]]), -ends, ends, np.ones((1, 3)), np.array([1.0, 0.75])
+    )
     # The sum (gap - s)^2 + 3 (gap + s)^2 is least at s = -gap/2.
     np.testing.assert_allclose(u, [[-gap / 4, -gap / 4, 5.0]], rtol=1e-12)
     np.testing.assert_allclose(margin, [[-1.5 * gap, -gap]], rtol=1e-12)

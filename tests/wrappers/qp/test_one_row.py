@@ -16,7 +16,8 @@ EPS = float(np.finfo(float).eps)
 
 
 def oracle(a, b, v, low, high, w):
-    """The minimiser by enumeration: each component at an end of its interval or free, with the row active or not.
+    """The minimiser by enumeration: each component at an end of its interval or free, with the row
+    active or not.
 
     Among all candidates that satisfy the constraints, the nearest one; None if there is none.
     """
@@ -34,7 +35,11 @@ def oracle(a, b, v, low, high, w):
                 multiplier = -(b + a @ u) / slope
                 u = np.where(free, u + multiplier * a / w, u)
             scale = abs(b) + np.abs(a) @ np.abs(u)
-            if np.all(u >= low - 1e-12) and np.all(u <= high + 1e-12) and b + a @ u >= -1e-12 * (1 + scale):
+            if (
+                np.all(u >= low - 1e-12)
+                and np.all(u <= high + 1e-12)
+                and b + a @ u >= -1e-12 * (1 + scale)
+            ):
                 cost = np.sum(w * (u - v) ** 2)
                 if cost < best_cost:
                     best, best_cost = u, cost
@@ -46,7 +51,14 @@ def random_problem(rng, m):
     a[rng.random(m) < 0.15] = 0.0
     low, high = np.sort(rng.normal(size=(2, m)) * 3, axis=0)
     high += 0.05
-    return a, rng.normal() * 3 * (np.abs(a).sum() + 0.1), rng.normal(size=m) * 4, low, high, rng.uniform(0.2, 5.0, m)
+    return (
+        a,
+        rng.normal() * 3 * (np.abs(a).sum() + 0.1),
+        rng.normal(size=m) * 4,
+        low,
+        high,
+        rng.uniform(0.2, 5.0, m),
+    )
 
 
 @pytest.mark.parametrize("size", [100, pytest.param(5000, marks=pytest.mark.oracle)])
@@ -113,11 +125,15 @@ def test_peers_case_returns_the_least_violating_action_and_says_so():
 
 def test_flat_row_leaves_the_action_and_decides_by_its_offset():
     for b, feasible in ((0.0, True), (1e-300, True), (-1e-300, False), (-2.0, False)):
-        u, _, _, met = project_floats([0.0, 0.0], b, [3.0, 0.5], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0])
+        u, _, _, met = project_floats(
+            [0.0, 0.0], b, [3.0, 0.5], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0]
+        )
         assert (u, met) == ([1.0, 0.5], feasible)
         u, _, _, met = project_floats([0.0], b, [0.5], [-1.0], [1.0], [1.0])
         assert (u, met) == ([0.5], feasible)
-        arrays = project_arrays([np.zeros(2)], np.full(2, b), [np.array([0.5, 3.0])], [-1.0], [1.0], [1.0])
+        arrays = project_arrays(
+            [np.zeros(2)], np.full(2, b), [np.array([0.5, 3.0])], [-1.0], [1.0], [1.0]
+        )
         np.testing.assert_array_equal(arrays[0][0], [0.5, 1.0])
         assert arrays[3].tolist() == [feasible, feasible]
 
@@ -130,7 +146,9 @@ def test_tiny_gain_saturates_without_overflow_warnings():
 
 
 def test_row_that_only_the_corner_meets_is_feasible():
-    u, _, _, feasible = project_floats([1.0, 1.0], -2.0, [0.0, 0.3], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0])
+    u, _, _, feasible = project_floats(
+        [1.0, 1.0], -2.0, [0.0, 0.3], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0]
+    )
     np.testing.assert_allclose(u, [1.0, 1.0], atol=4 * EPS)
     assert feasible
 
@@ -157,7 +175,14 @@ def test_size_of_a_row_does_not_matter(size):
     assert feasible
     np.testing.assert_allclose(u, [0.18, 0.66], rtol=1e-12)
     v, low, high, w = arguments
-    arrays = project_arrays([np.array([size]), np.array([2 * size])], np.array([-1.5 * size]), [np.array([c]) for c in v], low, high, w)
+    arrays = project_arrays(
+        [np.array([size]), np.array([2 * size])],
+        np.array([-1.5 * size]),
+        [np.array([c]) for c in v],
+        low,
+        high,
+        w,
+    )
     np.testing.assert_allclose([c[0] for c in arrays[0]], u, rtol=1e-12)
     assert arrays[3].tolist() == [True]
 
@@ -168,7 +193,9 @@ def test_weights_and_bounds_of_each_state():
     a, b, v, low, high, w = [np.array(part) for part in zip(*problems, strict=True)]
     found = project_arrays(list(a.T), b, list(v.T), list(low.T), list(high.T), list(w.T))
     for i, problem in enumerate(problems):
-        u, margin, active, feasible = project_floats(*[part.tolist() if isinstance(part, np.ndarray) else part for part in problem])
+        u, margin, active, feasible = project_floats(
+            *[part.tolist() if isinstance(part, np.ndarray) else part for part in problem]
+        )
         np.testing.assert_allclose([c[i] for c in found[0]], u, rtol=1e-12, atol=1e-12)
         assert found[1][i] == pytest.approx(margin, rel=1e-12, abs=1e-12 * (1 + np.abs(a[i]).max()))
         assert (found[2][i], found[3][i]) == (active, feasible)

@@ -1,4 +1,5 @@
-"""Rows with an uncertainty that depends on the input: one input against a grid, several against the root at points of the box."""
+"""Rows with an uncertainty that depends on the input: one input against a grid, several against the
+root at points of the box."""
 
 from __future__ import annotations
 
@@ -14,18 +15,35 @@ EPS = float(np.finfo(float).eps)
 LOW, HIGH = -2.0, 1.5
 GRID = np.linspace(LOW, HIGH, 1751)
 NOTHING = (0.0, 0.0, 0.0)
-KINDS = ["plain", "singular", "sizes", "no slope", "parabola", "integers", "input alone", "certain", "far"]
+KINDS = [
+    "plain",
+    "singular",
+    "sizes",
+    "no slope",
+    "parabola",
+    "integers",
+    "input alone",
+    "certain",
+    "far",
+]
 
 
 def random_rows(rng, k, size, kind):
     """a, b (k, size), q (3, k, size), positive semidefinite up to rounding, and v (size,)."""
-    a, b = rng.normal(size=(k, size)), rng.normal(size=(k, size)) + rng.choice([0.0, 1.0, 4.0], (k, size))
-    factor = rng.normal(size=(k, size, 2, 2)) * rng.choice([0.0, 1e-3, 0.1, 0.5, 2.0], (k, size, 1, 1))
+    a, b = (
+        rng.normal(size=(k, size)),
+        rng.normal(size=(k, size)) + rng.choice([0.0, 1.0, 4.0], (k, size)),
+    )
+    factor = rng.normal(size=(k, size, 2, 2)) * rng.choice(
+        [0.0, 1e-3, 0.1, 0.5, 2.0], (k, size, 1, 1)
+    )
     v = rng.normal(size=size) * 2
     if kind == "singular":
         factor[..., 1] = 0.0
     if kind == "integers":  # edges, ends and touching rows that coincide exactly
-        a, b, factor = (rng.integers(-2, end, part.shape) * 1.0 for part, end in ((a, 3), (b, 6), (factor, 2)))
+        a, b, factor = (
+            rng.integers(-2, end, part.shape) * 1.0 for part, end in ((a, 3), (b, 6), (factor, 2))
+        )
         v = rng.integers(-3, 4, size) * 0.5
     form = factor @ factor.swapaxes(2, 3)
     q = np.stack([form[..., 0, 0], form[..., 0, 1], form[..., 1, 1]])
@@ -47,7 +65,9 @@ def random_rows(rng, k, size, kind):
 
 
 def solve(a, b, q, v, priority, low=LOW, high=HIGH):
-    return project_arrays(list(a), list(b), [tuple(q[:, i]) for i in range(len(a))], v, low, high, priority)
+    return project_arrays(
+        list(a), list(b), [tuple(q[:, i]) for i in range(len(a))], v, low, high, priority
+    )
 
 
 def spread(q, u):
@@ -60,9 +80,12 @@ def sizes(a, b, q, u):
 
 
 def rounding(a, b, q, u):
-    """Of a margin: some eps of its terms; of the root r of a sum of size s^2, eps s^2/r, which is not more than sqrt(eps) s."""
+    """Of a margin: some eps of its terms; of the root r of a sum of size s^2, eps s^2/r, which is
+    not more than sqrt(eps) s."""
     size = sizes(a, b, q, u)
-    return 64 * EPS * size * (1.0 + size / np.maximum(spread(q, u), np.sqrt(64 * EPS) * size + 1e-300))
+    return (
+        64 * EPS * size * (1.0 + size / np.maximum(spread(q, u), np.sqrt(64 * EPS) * size + 1e-300))
+    )
 
 
 @pytest.mark.parametrize("size", [100, pytest.param(600, marks=pytest.mark.oracle)])
@@ -95,12 +118,18 @@ def test_equals_a_grid(kind, k, size):
     assert not active[:, kept].any()
 
     units = sizes(a, b, q, HIGH - LOW).max(axis=0)
-    missed = [(priority[:, None] * np.minimum(part / units, 0.0) ** 2).sum(axis=0) for part in (margin, *np.moveaxis(tried, 2, 0))]
-    blurred = (priority[:, None] * tolerance / units * (abs(margin) + tolerance) / units).sum(axis=0)
+    missed = [
+        (priority[:, None] * np.minimum(part / units, 0.0) ** 2).sum(axis=0)
+        for part in (margin, *np.moveaxis(tried, 2, 0))
+    ]
+    blurred = (priority[:, None] * tolerance / units * (abs(margin) + tolerance) / units).sum(
+        axis=0
+    )
     least = np.array(missed[1:])
     beaten = (missed[0] > least * (1 + 1e-12) + 4 * blurred) & ~feasible
     for j, i in np.argwhere(beaten).tolist():
-        # The point of the grid is near a kink, where one bit of the form is far more of its root than at u.
+        # The point of the grid is near a kink, where one bit of the form is far more of its root
+        # than at u.
         there = rounding(a[:, i], b[:, i], q[:, :, i], GRID[j])
         blur = (priority * there / units[i] * (abs(tried[:, i, j]) + there) / units[i]).sum()
         assert missed[0][i] <= least[j, i] * (1 + 1e-12) + 4 * (blurred[i] + blur)
@@ -128,20 +157,29 @@ def test_certain_rows_are_those_of_the_interval_solver():
         a, b, q, v = random_rows(rng, k, 2000, "certain")
         a[rng.random(a.shape) < 0.1] = 0.0
         priority = (10.0 ** rng.uniform(-2, 2, k)).tolist()
-        found, known = solve(a, b, q, v, priority), interval.project_arrays(list(a), list(b), v, LOW, HIGH, priority)
+        found, known = (
+            solve(a, b, q, v, priority),
+            interval.project_arrays(list(a), list(b), v, LOW, HIGH, priority),
+        )
         assert (found[3] == known[3]).all()
-        # A sum of squares s^2 with the curvature c is as large to rounding within sqrt(eps) s/c of its minimum, its slope is not.
+        # A sum of squares s^2 with the curvature c is as large to rounding within sqrt(eps) s/c of
+        # its minimum, its slope is not.
         np.testing.assert_allclose(found[0], known[0], rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(found[1], known[1], rtol=1e-11, atol=1e-11)
         assert (found[2] == known[2])[:, found[3]].all()
 
 
 def test_the_form_of_an_input_alone_bounds_its_size():
-    # 1 - 2 |u| >= 0, beside u >= .2, and u >= .6, which contradicts: slacks 1 - 2u and u - .6 with the priorities 1 and 9.
+    # 1 - 2 |u| >= 0, beside u >= .2, and u >= .6, which contradicts: slacks 1 - 2u and u - .6 with
+    # the priorities 1 and 9.
     form, none = (0.0, 0.0, 4.0), (0.0, 0.0, 0.0)
     assert project_floats([0.0], [1.0], [form], 3.0, LOW, HIGH, [1.0]) == (0.5, [0.0], [True], True)
-    assert project_floats([0.0, 1.0], [1.0, -0.2], [form, none], -3.0, LOW, HIGH, [1.0, 1.0])[0] == pytest.approx(0.2, rel=4 * EPS)
-    u, margin, active, feasible = project_floats([0.0, 1.0], [1.0, -0.6], [form, none], -3.0, LOW, HIGH, [1.0, 9.0])
+    assert project_floats([0.0, 1.0], [1.0, -0.2], [form, none], -3.0, LOW, HIGH, [1.0, 1.0])[
+        0
+    ] == pytest.approx(0.2, rel=4 * EPS)
+    u, margin, active, feasible = project_floats(
+        [0.0, 1.0], [1.0, -0.6], [form, none], -3.0, LOW, HIGH, [1.0, 9.0]
+    )
     assert u == pytest.approx((2 * 1 + 9 * 0.6) / (4 + 9))
     assert margin == pytest.approx([1 - 2 * u, u - 0.6])
     assert (active, feasible) == ([True, True], False)
@@ -149,12 +187,19 @@ def test_the_form_of_an_input_alone_bounds_its_size():
 
 def test_of_equally_bad_inputs_the_nearest_is_taken():
     for v, expected in ((0.3, 0.3), (9.0, HIGH), (-9.0, LOW)):
-        assert project_floats([0.0], [-1.0], [NOTHING], v, LOW, HIGH, [1.0])[0] == pytest.approx(expected, abs=1e-15)
+        assert project_floats([0.0], [-1.0], [NOTHING], v, LOW, HIGH, [1.0])[0] == pytest.approx(
+            expected, abs=1e-15
+        )
         # Beside a row that is met everywhere, they are searched.
-        assert project_floats([0.0, 0.0], [-1.0, 1.0], [NOTHING] * 2, v, LOW, HIGH, [1.0] * 2)[0] == pytest.approx(expected, abs=1e-15)
-    # u + 1 - |u + 2|: -1 from -2 on, and less before it. Near -2 the root of a square is known to sqrt(eps).
+        assert project_floats([0.0, 0.0], [-1.0, 1.0], [NOTHING] * 2, v, LOW, HIGH, [1.0] * 2)[
+            0
+        ] == pytest.approx(expected, abs=1e-15)
+    # u + 1 - |u + 2|: -1 from -2 on, and less before it. Near -2 the root of a square is known to
+    # sqrt(eps).
     for v in (0.3, 9.0, -2.5):
-        u, margin, _, feasible = project_floats([1.0], [1.0], [(4.0, 2.0, 1.0)], v, -3.0, 1.5, [1.0])
+        u, margin, _, feasible = project_floats(
+            [1.0], [1.0], [(4.0, 2.0, 1.0)], v, -3.0, 1.5, [1.0]
+        )
         assert -2.0 - 1e-6 <= u <= 1.5
         assert (margin, feasible) == ([pytest.approx(-1.0)], False)
 
@@ -170,7 +215,9 @@ def test_a_state_is_solved_alike_in_every_batch():
 
 
 def test_what_changes_the_input_is_active():
-    u, _, active, feasible = project_floats([-1.07], [-0.21], [(0.09, 0.3 * 1.5, 2.25)], 3.7, LOW, HIGH, [1.0])
+    u, _, active, feasible = project_floats(
+        [-1.07], [-0.21], [(0.09, 0.3 * 1.5, 2.25)], 3.7, LOW, HIGH, [1.0]
+    )
     assert feasible
     assert u < HIGH
     assert active == [True]
@@ -178,13 +225,17 @@ def test_what_changes_the_input_is_active():
 
 def test_the_least_violating_input_of_an_endless_box():
     # u - 1 - 2 |u| is at most -1, at 0.
-    u, margin, _, feasible = project_floats([1.0], [-1.0], [(0.0, 0.0, 4.0)], 3.0, -1e100, 1.3e100, [1.0])
+    u, margin, _, feasible = project_floats(
+        [1.0], [-1.0], [(0.0, 0.0, 4.0)], 3.0, -1e100, 1.3e100, [1.0]
+    )
     assert not feasible
     assert (u, margin) == (pytest.approx(0.0, abs=1e-6), [pytest.approx(-1.0)])
 
 
 def test_the_least_violating_input_of_an_endless_box_beside_another_row():
-    u, margin, _, feasible = project_floats([1.0, 0.0], [-1.0, 1.0], [(0.0, 0.0, 4.0), NOTHING], 3.0, -1e100, 1.3e100, [1.0] * 2)
+    u, margin, _, feasible = project_floats(
+        [1.0, 0.0], [-1.0, 1.0], [(0.0, 0.0, 4.0), NOTHING], 3.0, -1e100, 1.3e100, [1.0] * 2
+    )
     assert not feasible
     assert (u, margin) == (pytest.approx(0.0, abs=1e-6), [pytest.approx(-1.0), 1.0])
 
@@ -208,7 +259,12 @@ def test_a_form_that_hardly_bends_has_a_maximiser_in_both_flavours(q2):
         u, margin, active, feasible = project_floats(*row, 0.5, LOW, HIGH, [1.0])
         found = project_arrays(*row, np.array([0.5]), LOW, HIGH, [1.0])
         assert LOW <= u <= HIGH
-        assert (u, margin, active, feasible) == (found[0][0], found[1][:, 0].tolist(), found[2][:, 0].tolist(), found[3][0])
+        assert (u, margin, active, feasible) == (
+            found[0][0],
+            found[1][:, 0].tolist(),
+            found[2][:, 0].tolist(),
+            found[3][0],
+        )
         assert not feasible
 
 
@@ -220,13 +276,17 @@ def test_rows_that_meet_in_one_point_are_feasible_whatever_their_scale():
 
 
 def random_forms(rng, m, size, rank=None):
-    factor = rng.normal(size=(size, m + 1, rank or m + 1)) * 10.0 ** rng.uniform(-2, 2, (size, 1, 1))
+    factor = rng.normal(size=(size, m + 1, rank or m + 1)) * 10.0 ** rng.uniform(
+        -2, 2, (size, 1, 1)
+    )
     return factor @ factor.swapaxes(1, 2)
 
 
 def plane_of(form, low, high):
     m = len(low)
-    slopes, constant = majorant([[form[:, i, j] for j in range(m + 1)] for i in range(m + 1)], low, high)
+    slopes, constant = majorant(
+        [[form[:, i, j] for j in range(m + 1)] for i in range(m + 1)], low, high
+    )
     return np.stack(slopes, axis=1), constant
 
 
@@ -244,7 +304,12 @@ def test_the_plane_is_above_the_root_and_touches_it(m, bounds):
     form[::2, 1:] /= bounds[1] - bounds[0]
     form[::2, :, 1:] /= bounds[1] - bounds[0]
     slopes, constant = plane_of(form, low, high)
-    points = np.concatenate([rng.uniform(low, high, (300, m)), np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, m)])
+    points = np.concatenate(
+        [
+            rng.uniform(low, high, (300, m)),
+            np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, m),
+        ]
+    )
     gap = constant[:, None] + slopes @ points.T - roots_at(form, points)
     size = roots_at(abs(form), abs(points)).max(axis=1)
     assert (gap.min(axis=1) >= -1e-13 * size).all()

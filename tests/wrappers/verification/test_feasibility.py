@@ -46,7 +46,8 @@ def test_radial_headings_leave_the_dubins_disk_without_control():
     assert abs(x * math.sin(theta) - y * math.cos(theta)) < 1e-6
     assert 0.0 < barrier.small < 0.02
     assert barrier.small_infeasible > 0.1
-    # Outward and radial on b_1 = 0 it is missed most: rho solves 1 - rho^2 = 2 v rho, and the row is -2 v (v + rho).
+    # Outward and radial on b_1 = 0 it is missed most: rho solves 1 - rho^2 = 2 v rho, and the row
+    # is -2 v (v + rho).
     v = 0.5
     rho = -v + math.sqrt(v * v + 1)
     assert found.kept is not None
@@ -72,13 +73,18 @@ def test_a_narrow_box_leaves_a_shortfall():
 def test_conflicting_barriers_are_found_to_be_infeasible_together():
     problem = system_in_a_box()
     (x,) = problem.plant.states
-    apart = replace(problem, barriers=(Barrier(1 - x, "right"), Barrier(1 + x, "left")), gains=(0.1,))
-    # -u + .1 (1 - x) >= m and u + .1 (1 + x) >= m add up to .2 >= 2 m: for m = .5 each can be met, but not both.
+    apart = replace(
+        problem, barriers=(Barrier(1 - x, "right"), Barrier(1 + x, "left")), gains=(0.1,)
+    )
+    # -u + .1 (1 - x) >= m and u + .1 (1 + x) >= m add up to .2 >= 2 m: for m = .5 each can be met,
+    # but not both.
     margin = parse_conditions("cbf:alpha=0.1:sampling_margin=0.5", apart)
     found = verify(apart, margin, samples=500)
     assert found.safe.infeasible == 1.0
     assert found.safe.shortfall >= 0.4 - 1e-6
-    assert verify(apart, parse_conditions("cbf:alpha=0.1", apart), samples=500).safe.infeasible == 0.0
+    assert (
+        verify(apart, parse_conditions("cbf:alpha=0.1", apart), samples=500).safe.infeasible == 0.0
+    )
 
 
 def test_every_id_is_verified_and_has_a_bound_or_a_note(env_id, monkeypatch):
@@ -129,13 +135,19 @@ def test_infeasibility_and_shortfall_are_those_of_the_filter():
 def test_results_depend_on_the_seed_alone():
     problem = problem_of(CUBIC_DISK)
     conditions = parse_conditions("scbf", problem)
-    first, again, other = (verify(problem, conditions, samples=256, seed=seed) for seed in (1, 1, 2))
+    first, again, other = (
+        verify(problem, conditions, samples=256, seed=seed) for seed in (1, 1, 2)
+    )
     assert first.safe.infeasible == again.safe.infeasible
     np.testing.assert_array_equal(first.safe.worst, again.safe.worst)
-    assert first.safe.points != other.safe.points or not np.array_equal(first.safe.worst, other.safe.worst)
+    assert first.safe.points != other.safe.points or not np.array_equal(
+        first.safe.worst, other.safe.worst
+    )
 
 
-@pytest.mark.parametrize("arguments", [{"samples": 0}, {"samples": 1.5}, {"seed": -1}, {"knowledge": "guess"}])
+@pytest.mark.parametrize(
+    "arguments", [{"samples": 0}, {"samples": 1.5}, {"seed": -1}, {"knowledge": "guess"}]
+)
 def test_arguments_out_of_range_are_refused(arguments):
     problem = problem_of(CUBIC_DISK)
     with pytest.raises(ConfigurationError):
@@ -144,10 +156,13 @@ def test_arguments_out_of_range_are_refused(arguments):
 
 @pytest.mark.parametrize(("exponent", "seed"), [(2, 0), (4, 1), (8, 2), (12, 3)])
 def test_a_wide_box_hides_no_state_without_control(exponent, seed):
-    # Outward and radial on b_1 = 0, as above, with p_1 = p_2 = .5; at the centre b_2 is p_1 p_2 - 2 v^2.
+    # Outward and radial on b_1 = 0, as above, with p_1 = p_2 = .5; at the centre b_2 is p_1 p_2 - 2
+    # v^2.
     v, p = 0.5, 0.5
     problem = problem_of(DUBINS, plant={"v": v}, box=[-(10.0**exponent), 10.0**exponent])
-    found = SafeSetAnalysis(Formulas(problem, parse_conditions("hocbf:p=.5,.5", problem), "model"), 2048, seed)
+    found = SafeSetAnalysis(
+        Formulas(problem, parse_conditions("hocbf:p=.5,.5", problem), "model"), 2048, seed
+    )
     rho = (-2 * v + math.sqrt(4 * v * v + 4 * p * p)) / (2 * p)
     assert found.missed[0] == pytest.approx(2 * v * (v + p * rho), rel=1e-6)
 
@@ -155,7 +170,13 @@ def test_a_wide_box_hides_no_state_without_control(exponent, seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("exponent", [12])
 def test_a_wide_box_does_not_help_at_the_centre(exponent):
-    (barrier,) = findings(DUBINS, "hocbf:p=.5,.5", samples=1024, plant={"v": 0.5}, box=[-(10.0**exponent), 10.0**exponent]).barriers
+    (barrier,) = findings(
+        DUBINS,
+        "hocbf:p=.5,.5",
+        samples=1024,
+        plant={"v": 0.5},
+        box=[-(10.0**exponent), 10.0**exponent],
+    ).barriers
     assert barrier.vanishes
     assert barrier.deepest_shortfall == pytest.approx(2 * 0.5**2 - 0.5**2, abs=1e-6)
 
@@ -163,7 +184,9 @@ def test_a_wide_box_does_not_help_at_the_centre(exponent):
 @pytest.mark.parametrize("seed", range(2))
 def test_moderately_wide_boxes_do_not_depend_on_the_seed(seed):
     problem = problem_of(STOCHASTIC, box=[-1e4, 1e4])
-    found = SafeSetAnalysis(Formulas(problem, parse_conditions("szcbf:alphas=5,5", problem), "model"), 2048, seed)
+    found = SafeSetAnalysis(
+        Formulas(problem, parse_conditions("szcbf:alphas=5,5", problem), "model"), 2048, seed
+    )
     assert found.missed[0] == pytest.approx(60.878095, rel=1e-6)
 
 
@@ -186,7 +209,9 @@ def pockets(width, depth, offset):
 def test_a_pocket_of_conflict_is_found(width):
     # At the edge of both the best common margin is the mean of the two offsets, less the depth.
     problem = pockets(width, 5.0, (0.2, 0.2))
-    found = SafeSetAnalysis(Formulas(problem, parse_conditions("szcbf:alphas=.1", problem), "model"))
+    found = SafeSetAnalysis(
+        Formulas(problem, parse_conditions("szcbf:alphas=.1", problem), "model")
+    )
     missed, state = found.missed
     assert missed == pytest.approx(4.8, rel=1e-3)
     np.testing.assert_allclose(state, [0.0, 0.0, 0.3, -0.2], atol=1e-3)
@@ -209,7 +234,7 @@ def test_states_where_a_condition_is_undefined_are_reported():
     problem = problem_with([-sp.sqrt(x)], [1 - x**2], noise=(0.05,))
     found = made(problem, samples=1024)
     assert found.undefined == pytest.approx(0.5, abs=0.01)
-    (bound, *_) = promise(found, np.array([[0.5]]), 1.0)
+    bound, *_ = promise(found, np.array([[0.5]]), 1.0)
     assert bound.status == "hypothesis fails"
     assert "no finite value at x = -" in bound.reason
     assert "no finite value at x = -" in (made_bound(problem).note or "")
@@ -226,7 +251,8 @@ def test_a_tiny_unit_of_a_barrier_is_no_matter():
     ("slowest", "rates", "share"),
     [
         (0.0, "1,1", 1.0),
-        # Of [0, 1] x [-1, 1] the part above v = -x is (1 + 1/2)/2, and that above v = -2 x is (1 + 3/4)/2.
+        # Of [0, 1] x [-1, 1] the part above v = -x is (1 + 1/2)/2, and that above v = -2 x is (1 +
+        # 3/4)/2.
         (-1.0, "1,1", 3 / 4),
         (-1.0, "2,1", 7 / 8),
     ],
@@ -234,7 +260,13 @@ def test_a_tiny_unit_of_a_barrier_is_no_matter():
 def test_the_intersection_is_a_part_of_c(slowest, rates, share):
     v = sp.Symbol("v", real=True)
     problem = problem_with(
-        [v, 0 * v], [x], noise=(0.0, 0.0), states=(x, v), inputs=((0.0,), (1.0,)), ranges=((-1.0, 1.0), (slowest, 1.0)), start=0.5
+        [v, 0 * v],
+        [x],
+        noise=(0.0, 0.0),
+        states=(x, v),
+        inputs=((0.0,), (1.0,)),
+        ranges=((-1.0, 1.0), (slowest, 1.0)),
+        start=0.5,
     )
     found = made(problem, f"hocbf:p={rates}", samples=4096)
     assert found.kept is not None

@@ -43,7 +43,10 @@ def test_scbf_fails_near_the_centre_of_the_cubic_disk():
     np.testing.assert_allclose(found.safe.worst, 0.0, atol=1e-4)
     assert found.kept is not None
     # C is one with the intersection: the worst of both is the same.
-    assert (found.safe.shortfall, found.safe.infeasible) == (found.kept.shortfall, found.kept.infeasible)
+    assert (found.safe.shortfall, found.safe.infeasible) == (
+        found.kept.shortfall,
+        found.kept.infeasible,
+    )
     assert found.kept.share == 1.0
     assert found.safe.share == pytest.approx(math.pi / 16, abs=0.01)
     assert found.safe.shortfall == pytest.approx(0.08)
@@ -57,7 +60,9 @@ def test_scbf_fails_near_the_centre_of_the_cubic_disk():
 def endless(env_id):
     """A registered problem whose workspace has no end."""
     problem = problem_of(env_id)
-    return replace(problem, states=tuple(replace(s, low=-math.inf, high=math.inf) for s in problem.states))
+    return replace(
+        problem, states=tuple(replace(s, low=-math.inf, high=math.inf) for s in problem.states)
+    )
 
 
 @pytest.mark.parametrize("name", ["ACC", "CubicSDE", "Scalar"])
@@ -72,7 +77,11 @@ def test_unbounded_barriers_have_no_bound_where_no_workspace_ends_them(name):
 
 @pytest.mark.parametrize(
     ("name", "deepest"),
-    [("Scalar", {"x": "low"}), ("CubicSDE", {"x_1": "low", "x_2": 0.0}), ("ACC", {"x_1": "low", "x_3": "high"})],
+    [
+        ("Scalar", {"x": "low"}),
+        ("CubicSDE", {"x_1": "low", "x_2": 0.0}),
+        ("ACC", {"x_1": "low", "x_3": "high"}),
+    ],
 )
 def test_a_supremum_is_that_of_the_workspace(name, deepest):
     # To leave the workspace ends an episode: what h would be beyond does not matter.
@@ -81,15 +90,20 @@ def test_a_supremum_is_that_of_the_workspace(name, deepest):
     ranges = {s.symbol: s for s in problem.states}
     state = {s: deepest.get(s.name, 0.0) for s in ranges}
     h = problem.plant.numeric(problem.barriers[0].expression)
-    highest = h.subs({s: getattr(ranges[s], end) if isinstance(end, str) else end for s, end in state.items()})
+    highest = h.subs(
+        {s: getattr(ranges[s], end) if isinstance(end, str) else end for s, end in state.items()}
+    )
     assert found.beyond
     assert found.survey.suprema[0] == pytest.approx(float(highest), rel=1e-9)
     assert found.barriers[0].supremum == pytest.approx(float(highest), rel=1e-9)
 
 
 def test_leaving_the_workspace_counts_as_it_is_evaluated():
-    """Brownian motion in [0, 2] with h = x: the bound x/2 is attained, for h is a martingale that ends at one of the two edges."""
-    problem = problem_with([0 * x], [x], noise=(1.0,), ranges=((-1.0, 2.0),), box=(-1e-9, 1e-9), start=0.5)
+    """Brownian motion in [0, 2] with h = x: the bound x/2 is attained, for h is a martingale that
+    ends at one of the two edges."""
+    problem = problem_with(
+        [0 * x], [x], noise=(1.0,), ranges=((-1.0, 2.0),), box=(-1e-9, 1e-9), start=0.5
+    )
     bound = made_bound(replace(problem, horizon=20.0))
     assert bound.at(np.array([[0.5]]), 20.0)[0] == pytest.approx(0.25, abs=1e-6)
 
@@ -115,7 +129,9 @@ def test_the_attained_bound_is_estimated():
     found = verify(problem, conditions, samples=1024)
     assert found.safe.shortfall == found.safe.infeasible == 0.0
     starts = np.array([[0.0], [0.5], [-0.9]])
-    np.testing.assert_allclose(estimated_bound(problem, conditions).at(starts, 7.0), 1 - starts[:, 0] ** 2, rtol=1e-9)
+    np.testing.assert_allclose(
+        estimated_bound(problem, conditions).at(starts, 7.0), 1 - starts[:, 0] ** 2, rtol=1e-9
+    )
     (bound,) = promise(found, starts, 7.0)
     assert (bound.status, bound.forever) == ("estimated", True)
     assert bound.value == pytest.approx((1 - starts**2).mean())
@@ -126,7 +142,9 @@ def test_bounds_of_several_barriers_are_put_together_by_the_union():
     conditions = parse_conditions("scbf", problem)
     starts = np.array([[0.1, 0.2], [0.7, 0.8], [0.1, 1.1]])
     expected = np.maximum(0.0, (1 - starts**2).sum(axis=1) - 1) * (abs(starts) < 1).all(axis=1)
-    np.testing.assert_allclose(estimated_bound(problem, conditions).at(starts, 3.0), expected, atol=1e-8)
+    np.testing.assert_allclose(
+        estimated_bound(problem, conditions).at(starts, 3.0), expected, atol=1e-8
+    )
     (bound,) = promise(verify(problem, conditions, samples=500), starts, 3.0)
     assert (bound.status, bound.value) == ("estimated", pytest.approx(expected.mean(), abs=1e-8))
     assert "33.3 % of the starts" in bound.reason
@@ -171,7 +189,8 @@ def test_conditions_without_noise_keep_every_path_if_they_can_be_met():
     weak = findings("safe_envs/Scalar-v0", "cbf:alpha=0.5", noise=0, box=[-0.8, 0.8])
     near, far = promise(weak, np.array([[0.99]]), 1.0), promise(weak, np.array([[0.0]]), 1.0)
     assert by_name(near, "no path leaves").status == "hypothesis fails"
-    # Missed by .2 at the edge at most: h >= h_0 e^(-t/2) - .4 (1 - e^(-t/2)) is positive up to 1 s from the middle only.
+    # Missed by .2 at the edge at most: h >= h_0 e^(-t/2) - .4 (1 - e^(-t/2)) is positive up to 1 s
+    # from the middle only.
     assert weak.safe.shortfall == pytest.approx(0.2)
     assert (by_name(near, "in spite").value, by_name(far, "in spite").value) == (0.0, 1.0)
 
@@ -196,8 +215,11 @@ def test_suprema_and_the_product_bound_of_the_stochastic_dubins():
     found = findings(STOCHASTIC)
     (barrier,) = found.barriers
     r, v, sigma = 3.0, 2.0, 0.2
-    # On b_1 >= 0 the centre is just out of reach: -2 v rho cos - 2 sigma^2 >= 0 keeps rho above sigma^2/v.
-    np.testing.assert_allclose(barrier.suprema, [r**2 - (sigma**2 / v) ** 2, 2 * v * r - 2 * sigma**2], rtol=1e-6)
+    # On b_1 >= 0 the centre is just out of reach: -2 v rho cos - 2 sigma^2 >= 0 keeps rho above
+    # sigma^2/v.
+    np.testing.assert_allclose(
+        barrier.suprema, [r**2 - (sigma**2 / v) ** 2, 2 * v * r - 2 * sigma**2], rtol=1e-6
+    )
     assert barrier.supremum == pytest.approx(r**2)
     assert found.kept is not None
     assert found.kept.shortfall == pytest.approx(2 * v**2, rel=1e-4)
@@ -211,7 +233,9 @@ def test_suprema_and_the_product_bound_of_the_stochastic_dubins():
     assert by_name(bounds, "repaired").value == 0.0
 
 
-@pytest.mark.parametrize(("width", "scale"), [(50.0, 1.0), (1e8, 1.0), (1e8, 1e-6), (50.0, 1e-6), (1e12, 1e-6)])
+@pytest.mark.parametrize(
+    ("width", "scale"), [(50.0, 1.0), (1e8, 1.0), (1e8, 1e-6), (50.0, 1e-6), (1e12, 1e-6)]
+)
 def test_no_box_holds_an_srcbf_under_noise(width, scale):
     problem = problem_with([x], [scale * (1 - x)], noise=(0.2,), box=(-width, width))
     found = made(problem, "srcbf", samples=1024)
@@ -221,9 +245,13 @@ def test_no_box_holds_an_srcbf_under_noise(width, scale):
     assert "unbounded control towards the edge" in (made_bound(problem, "srcbf").note or "")
 
 
-@pytest.mark.parametrize(("noise", "kept"), [(1 - x**2, True), (sp.sqrt(1 - x**2), True), ((1 - x**2) ** sp.Rational(1, 4), False)])
+@pytest.mark.parametrize(
+    ("noise", "kept"),
+    [(1 - x**2, True), (sp.sqrt(1 - x**2), True), ((1 - x**2) ** sp.Rational(1, 4), False)],
+)
 def test_an_srcbf_is_kept_where_the_noise_fades_at_the_edge(noise, kept):
-    # |sigma' grad h|^2/h is 4 x^2 sigma^2/h, which stays finite for a sigma^2 that falls at least like h.
+    # |sigma' grad h|^2/h is 4 x^2 sigma^2/h, which stays finite for a sigma^2 that falls at least
+    # like h.
     problem = problem_with([0 * x], [1 - x**2], noise=(noise,), box=(-1e6, 1e6))
     assert made(problem, "srcbf", samples=512).survey.runaway is not kept
 
@@ -255,10 +283,15 @@ def test_a_range_that_was_chosen_establishes_nothing():
 def test_conditions_that_share_several_inputs_have_no_bound():
     problem = system_in_a_box(count=2)
     x_1, x_2 = problem.plant.states
-    coupled = replace(problem, barriers=(Barrier(1 - x_1**2 - x_2**2 / 2, "h_1"), Barrier(1 - x_2**2 - x_1**2 / 2, "h_2")))
+    coupled = replace(
+        problem,
+        barriers=(Barrier(1 - x_1**2 - x_2**2 / 2, "h_1"), Barrier(1 - x_2**2 - x_1**2 / 2, "h_2")),
+    )
     reason = "the shortfall of several conditions together is not established"
     assert estimated_bound(coupled, parse_conditions("scbf", coupled)).note == reason
-    bounds = promise(verify(coupled, parse_conditions("scbf", coupled), samples=256), np.array([[0.1, 0.1]]), 1.0)
+    bounds = promise(
+        verify(coupled, parse_conditions("scbf", coupled), samples=256), np.array([[0.1, 0.1]]), 1.0
+    )
     assert all(reason in b.reason and b.status != "estimated" for b in bounds)
 
 
@@ -271,13 +304,22 @@ def test_the_estimated_bound_is_the_best_of_them(env_id, text):
     found = findings(env_id, text)
     starts, bound = draw_starts(found.formulas.problem, 64), estimated(env_id, text)
     for horizon in (0.1, 1.0):
-        best = max((b.value for b in promise(found, starts, horizon) if b.status == "estimated" and b.value is not None), default=0.0)
+        best = max(
+            (
+                b.value
+                for b in promise(found, starts, horizon)
+                if b.status == "estimated" and b.value is not None
+            ),
+            default=0.0,
+        )
         assert bound.at(starts, horizon).mean() == pytest.approx(best, rel=1e-12)
 
 
 def test_what_only_seems_infinite_is_said_to():
     problem = problem_with([0 * x], [x / (x + 50)], noise=(0.1,), ranges=((0.0, math.inf),))
-    assert made_bound(problem).note == "sup h_1 seems infinite: it grows with the box that is searched"
+    assert (
+        made_bound(problem).note == "sup h_1 seems infinite: it grows with the box that is searched"
+    )
 
 
 def test_starts_that_are_inside_of_one_set_each_are_said_to_be():

@@ -44,7 +44,8 @@ def looser(cubic, posterior):
 
 
 def best_rows(problem, posterior, simultaneous, x):
-    """The most over the inputs of the box of the least that A h may be, at states of a disk, without the filter or its rows."""
+    """The most over the inputs of the box of the least that A h may be, at states of a disk,
+    without the filter or its rows."""
     share = 0.5 * (1.0 - simultaneous)
     levels = posterior.diffusion.sigma_intervals(share)[:, 1]
     widest = levels**2 * posterior.diffusion.count / posterior.diffusion.squares
@@ -54,7 +55,12 @@ def best_rows(problem, posterior, simultaneous, x):
     def row(u):
         design = np.hstack((phi, posterior.input_scale[0] * u[:, None] * phi))
         mean = (slopes * (design @ posterior.mean.T)).sum(axis=1) - (levels**2).sum()
-        variance = sum(factors[i] * slopes[:, i] ** 2 * ((design @ posterior.covariance[i]) * design).sum(axis=1) for i in range(2))
+        variance = sum(
+            factors[i]
+            * slopes[:, i] ** 2
+            * ((design @ posterior.covariance[i]) * design).sum(axis=1)
+            for i in range(2)
+        )
         return mean - np.sqrt(variance)
 
     # The row is concave in the input, so that the best one is a step from the best that was tried.
@@ -79,11 +85,17 @@ def test_the_shortfall_is_the_worst_of_a_dense_grid(cubic, posterior, found, loo
     searched = found if simultaneous == 0.95 else looser
     # Where the input does little, and everywhere.
     axis = np.linspace(-1, 1, 81)
-    grid = np.concatenate([np.stack(np.meshgrid(axis, along), -1).reshape(-1, 2) for along in (np.linspace(-0.1, 0.1, 21), axis[::2])])
+    grid = np.concatenate(
+        [
+            np.stack(np.meshgrid(axis, along), -1).reshape(-1, 2)
+            for along in (np.linspace(-0.1, 0.1, 21), axis[::2])
+        ]
+    )
     grid = grid[(grid**2).sum(axis=1) <= 1.0]
     worst = -best_rows(cubic, posterior, simultaneous, grid).min()
     assert worst > 0.05
-    # The inputs of the last grid are less than .01 from the best one: its slope is that of the row, a few units.
+    # The inputs of the last grid are less than .01 from the best one: its slope is that of the row,
+    # a few units.
     assert searched.shortfall >= worst - 1e-4
     assert searched.shortfall <= 1.05 * worst
 
@@ -113,7 +125,9 @@ def test_plant_and_model_do_not_matter(cubic, posterior, found):
 
 @pytest.mark.slow
 def test_more_data_give_a_larger_bound(cubic, found):
-    few = posterior_bound(cubic, [BayesianSCBF(identify(cubic, starts=200, repetitions=50), simultaneous=0.95)])
+    few = posterior_bound(
+        cubic, [BayesianSCBF(identify(cubic, starts=200, repetitions=50), simultaneous=0.95)]
+    )
     assert few.shortfall > 1.2 * found.shortfall
     assert few.at(np.array([START]), 0.5) < found.at(np.array([START]), 0.5)
 
@@ -125,7 +139,9 @@ def test_a_smaller_probability_of_the_regions_asks_for_less(found, looser):
 
 def test_what_has_no_bound_is_refused(cubic, posterior):
     robust = BayesianSCBF(posterior, simultaneous=0.9)
-    twice = replace(cubic, barriers=(cubic.barriers[0], Barrier(2 * cubic.barriers[0].expression, "twice")))
+    twice = replace(
+        cubic, barriers=(cubic.barriers[0], Barrier(2 * cubic.barriers[0].expression, "twice"))
+    )
     for problem, conditions in (
         (twice, [robust, robust]),
         (cubic, [BayesianSCBF(posterior)]),
@@ -133,7 +149,9 @@ def test_what_has_no_bound_is_refused(cubic, posterior):
         (cubic, [SCBF()]),
         (cubic, []),
     ):
-        with pytest.raises(ConfigurationError, match="one barrier with bayesian-scbf:simultaneous=P"):
+        with pytest.raises(
+            ConfigurationError, match="one barrier with bayesian-scbf:simultaneous=P"
+        ):
             posterior_bound(problem, conditions)
 
 
@@ -146,23 +164,34 @@ def test_an_unbounded_set_has_none(cubic, posterior):
         posterior_bound(problem, [BayesianSCBF(varying, simultaneous=0.9)])
     # The same set with the noise of the disk, which is constant.
     parabola = replace(cubic, barriers=problem.barriers)
-    endless = replace(parabola, states=tuple(replace(s, low=-np.inf, high=np.inf) for s in cubic.states))
+    endless = replace(
+        parabola, states=tuple(replace(s, low=-np.inf, high=np.inf) for s in cubic.states)
+    )
     with pytest.raises(ConfigurationError, match="beyond the states that are searched"):
         posterior_bound(endless, [BayesianSCBF(posterior, simultaneous=0.9)])
-    # To leave a workspace ends an episode, so that h counts inside of it only: 1 - x_1 - x_2^2 is largest at x_1 = -2.
-    assert posterior_bound(parabola, [BayesianSCBF(posterior, simultaneous=0.9)]).supremum == pytest.approx(3.0, rel=1e-9)
+    # To leave a workspace ends an episode, so that h counts inside of it only: 1 - x_1 - x_2^2 is
+    # largest at x_1 = -2.
+    assert posterior_bound(
+        parabola, [BayesianSCBF(posterior, simultaneous=0.9)]
+    ).supremum == pytest.approx(3.0, rel=1e-9)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("identifications", [3, pytest.param(12, marks=pytest.mark.oracle)])
 def test_the_bound_is_below_what_happens(cubic, monkeypatch, identifications):
-    """From one start, with identifications that know little; a shorter search finds less of the shortfall, and promises more."""
+    """From one start, with identifications that know little; a shorter search finds less of the
+    shortfall, and promises more."""
     monkeypatch.setattr("safe_envs.wrappers.verification.search._ROUNDS", (30, 10))
     envs, horizon, promised = 100, 0.5, []
     for seed in range(identifications):
-        condition = BayesianSCBF(identify(cubic, starts=800, repetitions=50, degree=3, seed=seed), simultaneous=0.9)
+        condition = BayesianSCBF(
+            identify(cubic, starts=800, repetitions=50, degree=3, seed=seed), simultaneous=0.9
+        )
         (bound,) = posterior_bound(cubic, [condition]).at(np.array([START]), horizon)
-        env = SafetyFilterVectorWrapper(gym.make_vec("safe_envs/CubicSDEDisk-v0", num_envs=envs, start=START, horizon=horizon), condition)
+        env = SafetyFilterVectorWrapper(
+            gym.make_vec("safe_envs/CubicSDEDisk-v0", num_envs=envs, start=START, horizon=horizon),
+            condition,
+        )
         env.reset(seed=seed)
         safe = np.ones(envs, dtype=bool)
         for _ in range(round(horizon / cubic.dt)):
@@ -178,20 +207,38 @@ def unstable(**options):
     """dx = (3 x + u) dt + .05 dW, inside of |x| < 1."""
     x, u = sp.symbols("x u", real=True)
     system = ControlAffineSDE.from_rate((x,), (u,), [3 * x + u], diffusion=[0.05])
-    return state_problem(system, [1 - x**2], box=(-10, 10), workspace={x: (-2, 2)}, start=(0.5,), horizon=1.0, nominal=0, **options)
+    return state_problem(
+        system,
+        [1 - x**2],
+        box=(-10, 10),
+        workspace={x: (-2, 2)},
+        start=(0.5,),
+        horizon=1.0,
+        nominal=0,
+        **options,
+    )
 
 
 @pytest.mark.parametrize("identifications", [2, pytest.param(8, marks=pytest.mark.oracle)])
 def test_long_steps_bias_what_is_identified_and_are_allowed_for(identifications):
-    """Data of .05 s that are integrated finely: the posterior is surer of the wrong rates than its probability says."""
-    problem, (x, u) = unstable(dt=0.05, substeps=10), np.meshgrid(np.linspace(-1.0, 1.0, 21), [-10.0, 0.0, 10.0])
+    """Data of .05 s that are integrated finely: the posterior is surer of the wrong rates than its
+    probability says."""
+    problem, (x, u) = (
+        unstable(dt=0.05, substeps=10),
+        np.meshgrid(np.linspace(-1.0, 1.0, 21), [-10.0, 0.0, 10.0]),
+    )
     truth = -2 * x * (3 * x + u) - 0.05**2
     covered = allowed = 0
     for seed in range(identifications):
         posterior = identify(problem, starts=200, repetitions=50, degree=1, seed=seed)
         condition = BayesianSCBF(posterior, simultaneous=0.9)
         row = SafetyFilter.for_problem(problem, condition).constraints[0]
-        parts = [np.broadcast_to(e, x.shape) for e in compile_function(problem.plant.states, [*row.coefficient, row.offset], "arrays")(x)]
+        parts = [
+            np.broadcast_to(e, x.shape)
+            for e in compile_function(
+                problem.plant.states, [*row.coefficient, row.offset], "arrays"
+            )(x)
+        ]
         q0, q1, q2 = compile_function(problem.plant.states, row.uncertainty, "arrays")(x)
         robust = parts[0] * u + parts[1] - np.sqrt(q0 + 2 * q1 * u + q2 * u**2)
         found = posterior_bound(problem, [condition])
@@ -200,7 +247,8 @@ def test_long_steps_bias_what_is_identified_and_are_allowed_for(identifications)
         assert "steps of 0.05 s in the data may shift the rate of h by up to" in found.remark
     assert covered == 0
     assert allowed == identifications
-    # dt/2 times h' L F + 1/2 h'' 2 J S, with F = 3 x + u, J = 3, L F = 3 F and h = 1 - x^2: largest at x = 1 and u = 10.
+    # dt/2 times h' L F + 1/2 h'' 2 J S, with F = 3 x + u, J = 3, L F = 3 F and h = 1 - x^2: largest
+    # at x = 1 and u = 10.
     expected = 0.025 * (2 * 3 * 13 + 2 * 3 * 0.05**2)
     assert found.bias == pytest.approx(expected, rel=0.2)
     assert found.at(np.array([[0.1]]), 0.2)[0] < 0.9 * (1 - 0.1**2 - found.bias * 0.2) + 1e-9

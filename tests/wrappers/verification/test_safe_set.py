@@ -19,11 +19,20 @@ from safe_envs.wrappers.verification.safe_set import region_of, repeats, sample
 from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
 from safe_envs.wrappers.verification.search import largest, towards_zero
 from tests.conftest import problem_of
-from tests.wrappers.verification.verified import CUBIC_DISK, STOCHASTIC, problem_with, system_in_a_box, x, y
+from tests.wrappers.verification.verified import (
+    CUBIC_DISK,
+    STOCHASTIC,
+    problem_with,
+    system_in_a_box,
+    x,
+    y,
+)
 
 
 def test_a_tiny_safe_set_is_found():
-    problem = replace(system_in_a_box(count=3, half_width=0.004), starts={"middle": Start.at((0.0, 0.0, 0.0))})
+    problem = replace(
+        system_in_a_box(count=3, half_width=0.004), starts={"middle": Start.at((0.0, 0.0, 0.0))}
+    )
     formulas = Formulas(problem, parse_conditions("scbf", problem), "model")
     region = region_of(problem, formulas.system, formulas.expressions)
     found = sample("C", formulas.barrier_level, region, 256, np.random.default_rng(0))
@@ -125,5 +134,7 @@ def test_a_narrow_peak_is_found_by_the_survey(seed):
         ranges=((-2.0, 2.0),) * 3,
         box=(-1000.0, 1000.0),
     )
-    survey = SafeSetAnalysis(Formulas(problem, parse_conditions("szcbf", problem), "model"), 8192, seed)
+    survey = SafeSetAnalysis(
+        Formulas(problem, parse_conditions("szcbf", problem), "model"), 8192, seed
+    )
     assert survey.suprema[0] == pytest.approx(5.91, abs=0.01)

@@ -33,7 +33,10 @@ def test_an_edge_is_where_its_base_is_zero(expression, smooth, rough):
     assert all(abs(complex(base.subs(x, smooth))) > 1e-3 for base in found)
 
 
-@pytest.mark.parametrize("expression", [x**3 - x, sp.sin(x) * sp.exp(x), sp.tanh(x), (1 + x**2) ** 2, 2**x, sp.Integer(3)])
+@pytest.mark.parametrize(
+    "expression",
+    [x**3 - x, sp.sin(x) * sp.exp(x), sp.tanh(x), (1 + x**2) ** 2, 2**x, sp.Integer(3)],
+)
 def test_what_is_smooth_everywhere_has_no_edges(expression):
     assert not list(edges(sp.sympify(expression)))
 
@@ -41,7 +44,10 @@ def test_what_is_smooth_everywhere_has_no_edges(expression):
 @pytest.mark.parametrize(
     ("barrier", "note"),
     [
-        (0.5 - sp.sqrt(2 - 2 * sp.cos(x)), "h_1 is not twice differentiable, which Ito's formula asks for, near x = "),
+        (
+            0.5 - sp.sqrt(2 - 2 * sp.cos(x)),
+            "h_1 is not twice differentiable, which Ito's formula asks for, near x = ",
+        ),
         (1 / x - 0.6, "h_1 has a pole near x = "),
         # Beyond the edge of C, and beyond the workspace, nothing matters.
         (sp.sqrt((x + 1) ** 2 + 1e-9) - 0.5 - (x - 2) ** 2 / 4, None),
@@ -50,13 +56,21 @@ def test_what_is_smooth_everywhere_has_no_edges(expression):
 )
 def test_only_what_is_in_the_safe_set_counts(barrier, note):
     found = made_bound(problem_with([0 * x], [barrier], noise=(0.3,)), "szcbf:alphas=0.1")
-    assert (found.note or "").startswith(note or "") if note else "differentiable" not in (found.note or "") + found.remark
+    assert (
+        (found.note or "").startswith(note or "")
+        if note
+        else "differentiable" not in (found.note or "") + found.remark
+    )
 
 
 def test_without_noise_a_kink_is_no_matter_and_a_pole_is():
-    kink = problem_with([(x**2 + 1e-4) ** sp.Rational(1, 4) * (1 - x) ** sp.Rational(3, 2)], [1 - x**2])
+    kink = problem_with(
+        [(x**2 + 1e-4) ** sp.Rational(1, 4) * (1 - x) ** sp.Rational(3, 2)], [1 - x**2]
+    )
     assert made(kink, "cbf", samples=512).survey.rough == ""
     pole = problem_with([0 * x], [1 / x - 0.6])
     assert made(pole, "cbf", samples=512).survey.rough.startswith("h_1 has a pole near x = ")
     drift = problem_with([1 / (x - 0.3)], [1 - x**2])
-    assert made(drift, "cbf", samples=512).survey.rough.startswith("the condition on h_1 has a pole near x = 0.3")
+    assert made(drift, "cbf", samples=512).survey.rough.startswith(
+        "the condition on h_1 has a pole near x = 0.3"
+    )

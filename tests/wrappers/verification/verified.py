@@ -22,7 +22,17 @@ _FOUND = {}
 x, y, u = sp.symbols("x y u", real=True)
 
 
-def problem_with(drift, barriers, *, noise=(0.0,), states=(x,), inputs=((1.0,),), ranges=((-2.0, 2.0),), box=(-10.0, 10.0), start=0.5):
+def problem_with(
+    drift,
+    barriers,
+    *,
+    noise=(0.0,),
+    states=(x,),
+    inputs=((1.0,),),
+    ranges=((-2.0, 2.0),),
+    box=(-10.0, 10.0),
+    start=0.5,
+):
     """One input u: dX = (drift + inputs u) dt + noise dW."""
     system = ControlAffineSDE(states, (u,), drift, inputs, [[s] for s in noise], {})
     return SafetyProblem(
@@ -60,11 +70,14 @@ def made_bound(problem, text="scbf"):
 def findings(env_id, text=None, knowledge="model", samples=safe_set_analysis.SAMPLES, **options):
     """What is found of a registered id, once for all tests."""
     problem = problem_of(env_id, **options)
-    return verify_once(problem, parse_conditions(text or problem.filter, problem), knowledge, samples)
+    return verify_once(
+        problem, parse_conditions(text or problem.filter, problem), knowledge, samples
+    )
 
 
 def hurried(env_id):
-    """What is found of a registered id by a search that was hurried, once for all tests; of many obstacles, with two."""
+    """What is found of a registered id by a search that was hurried, once for all tests; of many
+    obstacles, with two."""
     problem = problem_of(env_id, **({"num_obstacles": 2} if "DubinsObstacles" in env_id else {}))
     return verify_once(problem, parse_conditions(problem.filter, problem), samples=128)
 
@@ -72,7 +85,16 @@ def hurried(env_id):
 def verify_once(problem, conditions, knowledge="model", samples=safe_set_analysis.SAMPLES, seed=0):
     """`verify`, once for all tests that ask for the same."""
     start = problem.starts[problem.start]
-    of_problem = (problem.name, problem.plant, problem.model, problem.barriers, problem.states, problem.box, problem.start, repr(start))
+    of_problem = (
+        problem.name,
+        problem.plant,
+        problem.model,
+        problem.barriers,
+        problem.states,
+        problem.box,
+        problem.start,
+        repr(start),
+    )
     key = (of_problem, problem.dt, problem.horizon, tuple(conditions), knowledge, samples, seed)
     if key not in _FOUND:
         _FOUND[key] = verify(problem, conditions, knowledge, samples, seed)
@@ -93,7 +115,9 @@ def system_in_a_box(count=1, high=5.0, noise=0.6, half_width=1.0):
     """dx_i = u_i dt + s x_i dW_i with h_i = 1 - x_i^2: the bound h/c is attained."""
     x, u = sp.symbols(f"x_1:{count + 1}", real=True), sp.symbols(f"u_1:{count + 1}", real=True)
     s = sp.Symbol("s", real=True)
-    system = ControlAffineSDE(x, u, [0] * count, sp.eye(count), sp.diag(*[s * xi for xi in x]), {s: noise})
+    system = ControlAffineSDE(
+        x, u, [0] * count, sp.eye(count), sp.diag(*[s * xi for xi in x]), {s: noise}
+    )
     return SafetyProblem(
         name="box",
         plant=system,

@@ -41,17 +41,28 @@ OBSTACLE_RADIUS, GOAL, GOAL_RADIUS = 0.5, (3.0, 1.5), 0.3  # m
 AT_REST = "a model that takes the obstacle for at rest, as the printed derivatives do"
 _ROUNDING = 1e-9  # m/s
 
-Ways = Mapping[str, Sequence[Run]]  # by what the filter knows: one run for each learning, one each without learning
+Ways = Mapping[
+    str, Sequence[Run]
+]  # by what the filter knows: one run for each learning, one each without learning
 
 
 @lru_cache(maxsize=2)
 def passages(sample: Sample, **model: float) -> dict[str, list[Run]]:
-    """Trajectories around the obstacle: with learned derivatives for each learning, one each with others and without a filter."""
+    """Trajectories around the obstacle: with learned derivatives for each learning, one each with
+    others and without a filter."""
     problem = load_problem(OBSTACLE, {"start": "thesis", "model": model or None})
     exact = f"hocbf:p={OBSTACLE_RATES}"
     nominal, none = runs(problem, [exact, "none"])
-    learned = [runs(problem, [f"learned-hocbf:p={OBSTACLE_RATES}"], each)[0] for each in residuals(OBSTACLE, sample, **model)]
-    return {"learned": learned, "nominal": [nominal], "true": runs(problem, [exact], knowledge="plant"), "none": [none]}
+    learned = [
+        runs(problem, [f"learned-hocbf:p={OBSTACLE_RATES}"], each)[0]
+        for each in residuals(OBSTACLE, sample, **model)
+    ]
+    return {
+        "learned": learned,
+        "nominal": [nominal],
+        "true": runs(problem, [exact], knowledge="plant"),
+        "none": [none],
+    }
 
 
 def compute_passage(sample: Sample) -> Outcome:
@@ -61,8 +72,13 @@ def compute_passage(sample: Sample) -> Outcome:
     return Outcome(
         numbers=[
             Number.mean("path, learned", _paths(learned), "m", 0.0),
-            *(Number(f"path, {kind}", _paths(found[kind])[0], unit="m") for kind in ("nominal", "true", "none")),
-            Number.mean("time to the goal, learned", [run.steps * problem.dt for run in learned], "s", 0.0),
+            *(
+                Number(f"path, {kind}", _paths(found[kind])[0], unit="m")
+                for kind in ("nominal", "true", "none")
+            ),
+            Number.mean(
+                "time to the goal, learned", [run.steps * problem.dt for run in learned], "s", 0.0
+            ),
             Number("time to the goal, none", none.steps * problem.dt, unit="s"),
             Number("lowest speed, learned", float(_speeds(learned, problem.dt).min()), unit="m/s"),
             *rates_around(problem, sample, residuals(OBSTACLE, sample), OBSTACLE_RATES),
@@ -81,13 +97,25 @@ def passage_claims(found: Ways, problem: SafetyProblem) -> list[Claim]:
     learned, bare = found["learned"], _paths(found["none"])[0]
     misses = [_miss(run) for run in learned]
     return [
-        Claim("With the learned derivatives the vehicle avoids the moving obstacle", *_stays_positive(learned)),
-        Claim("With the learned derivatives it reaches the goal", max(misses) <= GOAL_RADIUS, f"ends {max(misses):.3g} m from its centre"),
-        Claim("With the nominal derivatives it collides with the obstacle", *_falls_below(found["nominal"][0])),
         Claim(
-            "With the learned derivatives the way is longer than without a filter, at the same speed",
+            "With the learned derivatives the vehicle avoids the moving obstacle",
+            *_stays_positive(learned),
+        ),
+        Claim(
+            "With the learned derivatives it reaches the goal",
+            max(misses) <= GOAL_RADIUS,
+            f"ends {max(misses):.3g} m from its centre",
+        ),
+        Claim(
+            "With the nominal derivatives it collides with the obstacle",
+            *_falls_below(found["nominal"][0]),
+        ),
+        Claim(
+            "With the learned derivatives the way is longer than without a filter, at the same"
+            " speed",
             min(_paths(learned)) > bare and not any(_slows(run, problem) for run in learned),
-            f"path {min(_paths(learned)):.2f} to {max(_paths(learned)):.2f} m, without a filter {bare:.2f} m; {_told(learned, problem)}",
+            f"path {min(_paths(learned)):.2f} to {max(_paths(learned)):.2f} m, without a filter"
+            f" {bare:.2f} m; {_told(learned, problem)}",
             printed=False,
         ),
     ]
@@ -117,7 +145,8 @@ def _speeds(each: Sequence[Run], dt: float) -> np.ndarray:
 
 
 def _chord_speed(problem: SafetyProblem) -> float:
-    """Distance over time between control instants in the sharpest turn at full speed, in m/s: a chord is shorter than its arc."""
+    """Distance over time between control instants in the sharpest turn at full speed, in m/s: a
+    chord is shorter than its arc."""
     return float(SPEED * np.sinc(problem.box[0][1] * problem.dt / (2 * math.pi)))
 
 
@@ -128,7 +157,10 @@ def _slows(run: Run, problem: SafetyProblem) -> bool:
 
 def _told(each: Sequence[Run], problem: SafetyProblem) -> str:
     speeds = _speeds(each, problem.dt)
-    return f"speed {speeds.min():.4f} to {speeds.max():.4f} m/s, of which a chord of the sharpest turn has {_chord_speed(problem):.4f}"
+    return (
+        f"speed {speeds.min():.4f} to {speeds.max():.4f} m/s, of which a chord of the sharpest turn"
+        f" has {_chord_speed(problem):.4f}"
+    )
 
 
 def _at(run: Run, time: float, dt: float) -> dict[str, Any]:
@@ -151,13 +183,25 @@ def compute_clearance(sample: Sample) -> Outcome:
             Number("smallest h, true", blind.smallest, unit="m^2"),
         ],
         data={
-            **{kind: {"time": thinned(problem.dt * np.arange(len(run.h))), "h": thinned(run.h)} for kind, (run, *_) in found.items()},
-            "printed": {"time": thinned(problem.dt * np.arange(len(blind.h))), "h": thinned(blind.h)},
+            **{
+                kind: {"time": thinned(problem.dt * np.arange(len(run.h))), "h": thinned(run.h)}
+                for kind, (run, *_) in found.items()
+            },
+            "printed": {
+                "time": thinned(problem.dt * np.arange(len(blind.h))),
+                "h": thinned(blind.h),
+            },
         },
         notes=[
-            f"with the true speed but the obstacle's velocity forgotten, as printed, the smallest h is {blind.smallest:.3g} m^2; with it, "
-            f"{found['true'][0].smallest:.3g} m^2",
-            f"of the printed claims hold {_held(found, problem)} here, and {_held(at_rest, problem)} with {AT_REST}",
+            (
+                "with the true speed but the obstacle's velocity forgotten, as printed, the"
+                f" smallest h is {blind.smallest:.3g} m^2; with it,"
+                f" {found['true'][0].smallest:.3g} m^2"
+            ),
+            (
+                f"of the printed claims hold {_held(found, problem)} here, and"
+                f" {_held(at_rest, problem)} with {AT_REST}"
+            ),
         ],
     )
 
@@ -170,10 +214,12 @@ def clearance_claims(found: Ways, problem: SafetyProblem) -> list[Claim]:
         Claim("With the learned derivatives h is always positive", *_stays_positive(learned)),
         Claim("With the nominal derivatives h falls below 0", *_falls_below(nominal)),
         Claim(
-            "The run with the learned derivatives takes more time steps than that with the nominal ones",
+            "The run with the learned derivatives takes more time steps than that with the nominal"
+            " ones",
             min(steps) > nominal.steps,
-            f"{min(steps)} to {max(steps)} steps, nominal {nominal.steps}, without a filter {found['none'][0].steps}; they end up to "
-            f"{max(map(_miss, learned)):.3g}, {_miss(nominal):.3g} and {_miss(found['none'][0]):.3g} m from the goal's centre",
+            f"{min(steps)} to {max(steps)} steps, nominal {nominal.steps}, without a filter"
+            f" {found['none'][0].steps}; they end up to {max(map(_miss, learned)):.3g},"
+            f" {_miss(nominal):.3g} and {_miss(found['none'][0]):.3g} m from the goal's centre",
         ),
         Claim(
             "The vehicle slows down with the learned derivatives",
@@ -210,13 +256,41 @@ def draw_passage(figure: Figure, outcome: Outcome) -> None:
     axes.add_patch(Circle(GOAL, GOAL_RADIUS, facecolor="#56B4E9", alpha=0.45, linewidth=0))
     axes.text(GOAL[0], GOAL[1] + 0.38, "goal", ha="center", color=QUIET)
     for kind, color, dash in (("nominal", NOMINAL_COLOR, "--"), ("learned", LEARNED_COLOR, "-")):
-        axes.plot(outcome.data[kind]["x"], outcome.data[kind]["y"], dash, color=color, linewidth=1.8, label=f"{kind} derivatives")
-    for instant, color in zip(outcome.data["instants"], (COLORS[2], "black", COLORS[1]), strict=True):
-        axes.add_patch(Circle(instant["obstacle"], OBSTACLE_RADIUS, facecolor=UNSAFE, alpha=0.45, linewidth=0, zorder=0))
-        axes.add_patch(Circle(instant["obstacle"], OBSTACLE_RADIUS, fill=False, edgecolor=color, linewidth=1.5))
+        axes.plot(
+            outcome.data[kind]["x"],
+            outcome.data[kind]["y"],
+            dash,
+            color=color,
+            linewidth=1.8,
+            label=f"{kind} derivatives",
+        )
+    for instant, color in zip(
+        outcome.data["instants"], (COLORS[2], "black", COLORS[1]), strict=True
+    ):
+        axes.add_patch(
+            Circle(
+                instant["obstacle"],
+                OBSTACLE_RADIUS,
+                facecolor=UNSAFE,
+                alpha=0.45,
+                linewidth=0,
+                zorder=0,
+            )
+        )
+        axes.add_patch(
+            Circle(instant["obstacle"], OBSTACLE_RADIUS, fill=False, edgecolor=color, linewidth=1.5)
+        )
         (x, y), (x_o, y_o) = instant["vehicle"], instant["obstacle"]
         axes.text(x_o, y_o, f"{instant['time']:g} s", ha="center", va="center", color=QUIET)
-        axes.plot(x, y, "*", color=color, markersize=12, zorder=3, label=f"learned, t = {instant['time']:g} s")
+        axes.plot(
+            x,
+            y,
+            "*",
+            color=color,
+            markersize=12,
+            zorder=3,
+            label=f"learned, t = {instant['time']:g} s",
+        )
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", xlim=(-2.4, 5.2), ylim=(-2.4, 2.2))
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
@@ -231,10 +305,25 @@ def draw_clearance(figure: Figure, outcome: Outcome) -> None:
         ("printed", PRINTED_COLOR, ":", "true speed, derivatives as printed"),
     )
     for kind, color, dash, label in kinds:
-        axes.plot(outcome.data[kind]["time"], outcome.data[kind]["h"], dash, color=color, linewidth=1.8, label=label)
-    lowest, last = (end(v for kind, *_ in kinds for v in outcome.data[kind][key]) for end, key in ((min, "h"), (max, "time")))
+        axes.plot(
+            outcome.data[kind]["time"],
+            outcome.data[kind]["h"],
+            dash,
+            color=color,
+            linewidth=1.8,
+            label=label,
+        )
+    lowest, last = (
+        end(v for kind, *_ in kinds for v in outcome.data[kind][key])
+        for end, key in ((min, "h"), (max, "time"))
+    )
     # The fall from the far start would flatten what matters.
-    axes.set(xlim=(0.0, last), ylim=(min(lowest, 0.0) - 0.15, 2.5), xlabel="time (s)", ylabel="barrier h (m$^2$)")
+    axes.set(
+        xlim=(0.0, last),
+        ylim=(min(lowest, 0.0) - 0.15, 2.5),
+        xlabel="time (s)",
+        ylabel="barrier h (m$^2$)",
+    )
     axes.axhspan(axes.get_ylim()[0], 0.0, color=UNSAFE, alpha=0.35, linewidth=0, zorder=0)
     axes.axhline(0.0, color="black", linewidth=1.2)
     axes.text(0.01, 0.02, "collision", transform=axes.transAxes, va="bottom", color=QUIET)
@@ -246,8 +335,11 @@ def setting(sample: Sample) -> tuple[str, ...]:
     problem = load_problem(OBSTACLE)
     plant, model = parameters(problem.plant), parameters(problem.model)
     return (
-        f"{OBSTACLE}: plant {plant['v']:g} m/s, model {model['v']:g} m/s, obstacle {plant['v_o']:g} m/s; p_1, p_2 = {OBSTACLE_RATES} 1/s; "
-        f"dt {problem.dt:g} s, up to {problem.horizon:g} s",
+        (
+            f"{OBSTACLE}: plant {plant['v']:g} m/s, model {model['v']:g} m/s, obstacle"
+            f" {plant['v_o']:g} m/s; p_1, p_2 = {OBSTACLE_RATES} 1/s; dt {problem.dt:g} s, up to"
+            f" {problem.horizon:g} s"
+        ),
         learning(sample),
     )
 
@@ -259,11 +351,17 @@ def setting_passage(sample: Sample) -> tuple[str, ...]:
 
 
 _CHOSEN = (
-    f"goal {GOAL}, radius {GOAL_RADIUS:g} m; a heading gain of 2 1/s, where the print has a PID controller without its gains",
+    (
+        f"goal {GOAL}, radius {GOAL_RADIUS:g} m; a heading gain of 2 1/s, where the print has a PID"
+        " controller without its gains"
+    ),
     f"p_1, p_2 = {OBSTACLE_RATES} 1/s, |omega| <= pi rad/s, the time step of the first case",
     "layers of 100 and 30 nodes, which the print gives for the quadrotor",
 )
-_RELATIVE = "Sec. 3.5.1: a network with 3 inputs; the obstacle is missing among them: here x_o - x, y_o - y, cos(theta) and sin(theta)"
+_RELATIVE = (
+    "Sec. 3.5.1: a network with 3 inputs; the obstacle is missing among them: here x_o - x, y_o -"
+    " y, cos(theta) and sin(theta)"
+)
 
 ARTEFACTS: tuple[Artefact, ...] = (
     DISK_FIGURE,
@@ -275,7 +373,10 @@ ARTEFACTS: tuple[Artefact, ...] = (
         setting=setting_passage,
         chosen=_CHOSEN,
         corrections=(
-            "Sec. 3.5.1: hdot lacks -2 v_o (x - x_o), and hddot the terms that follow; the obstacle is a state here",
+            (
+                "Sec. 3.5.1: hdot lacks -2 v_o (x - x_o), and hddot the terms that follow; the"
+                " obstacle is a state here"
+            ),
             _RELATIVE,
             *CORRECTED,
         ),
@@ -289,8 +390,14 @@ ARTEFACTS: tuple[Artefact, ...] = (
         setting=setting,
         chosen=_CHOSEN,
         corrections=(
-            "Sec. 3.5.1: hdot lacks -2 v_o (x - x_o), and hddot the terms that follow; beside ours as a model with v_o = 0",
-            "Sec. 3.5.1: the vehicle is said to take longer since it slows down; its v is constant, and its way longer",
+            (
+                "Sec. 3.5.1: hdot lacks -2 v_o (x - x_o), and hddot the terms that follow; beside"
+                " ours as a model with v_o = 0"
+            ),
+            (
+                "Sec. 3.5.1: the vehicle is said to take longer since it slows down; its v is"
+                " constant, and its way longer"
+            ),
             _RELATIVE,
             *CORRECTED,
         ),

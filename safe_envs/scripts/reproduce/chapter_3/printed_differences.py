@@ -17,8 +17,11 @@ from safe_envs.wrappers.learning.models.files import Signature
 from safe_envs.wrappers.learning.residual import LearnedResidual, ResidualModel
 
 
-def printed_residuals(problem: SafetyProblem, sample: Sample, seed: int) -> tuple[ResidualModel, float]:
-    """What is learned from differences over control periods, and the median share of the input's gain in them.
+def printed_residuals(
+    problem: SafetyProblem, sample: Sample, seed: int
+) -> tuple[ResidualModel, float]:
+    """What is learned from differences over control periods, and the median share of the input's
+    gain in them.
 
     The backward period is driven straight on, the forward one under either of two inputs.
 
@@ -28,17 +31,26 @@ def printed_residuals(problem: SafetyProblem, sample: Sample, seed: int) -> tupl
     before = draw_states(problem, count, np.random.default_rng(seed))
     x = _stepped(problem, before, 0.0)
     first, second = problem.exploration.inputs[0][0], problem.exploration.inputs[-1][0]
-    known, true = (_lie_derivatives(system, problem, x) for system in (problem.model, problem.plant))
+    known, true = (
+        _lie_derivatives(system, problem, x) for system in (problem.model, problem.plant)
+    )
     slope = (_barrier(problem, x) - _barrier(problem, before)) / problem.dt
-    excess = [_second_difference(problem, before, x, u) - known[2] - known[3] * u for u in (first, second)]
+    excess = [
+        _second_difference(problem, before, x, u) - known[2] - known[3] * u for u in (first, second)
+    ]
     gain = (excess[1] - excess[0]) / (second - first)
     targets = np.stack([slope - known[1], excess[0] - gain * first, gain], axis=1)
     coordinates = problem.exploration.coordinates
-    inputs = stacked(compile_function(problem.plant.states, coordinates, "arrays")(*np.ascontiguousarray(x.T)), count)
+    inputs = stacked(
+        compile_function(problem.plant.states, coordinates, "arrays")(*np.ascontiguousarray(x.T)),
+        count,
+    )
     trained = train(inputs, targets, epochs=epochs, seed=seed)
     part = LearnedResidual(problem.plant.states, coordinates, 2, trained.network, trained.heldout)
     record = Record(3 * count, 3 * count * problem.dt, 0.0, seed)
-    return ResidualModel(Signature.of(problem), record, (part,)), float(np.median((gain + known[3]) / true[3]))
+    return ResidualModel(Signature.of(problem), record, (part,)), float(
+        np.median((gain + known[3]) / true[3])
+    )
 
 
 def _stepped(problem: SafetyProblem, states: np.ndarray, u: float) -> np.ndarray:
@@ -46,17 +58,28 @@ def _stepped(problem: SafetyProblem, states: np.ndarray, u: float) -> np.ndarray
     return collect_paths(problem, states, np.full((len(states), 1), u), 1, problem.dt)[:, 1]
 
 
-def _second_difference(problem: SafetyProblem, before: np.ndarray, x: np.ndarray, u: float) -> np.ndarray:
-    h_before, h, h_after = (_barrier(problem, states) for states in (before, x, _stepped(problem, x, u)))
+def _second_difference(
+    problem: SafetyProblem, before: np.ndarray, x: np.ndarray, u: float
+) -> np.ndarray:
+    h_before, h, h_after = (
+        _barrier(problem, states) for states in (before, x, _stepped(problem, x, u))
+    )
     return (h_after + h_before - 2 * h) / problem.dt**2
 
 
 def _barrier(problem: SafetyProblem, states: np.ndarray) -> np.ndarray:
-    return compile_function(problem.plant.states, [problem.barriers[0].expression], "arrays")(*np.ascontiguousarray(states.T))[0]
+    return compile_function(problem.plant.states, [problem.barriers[0].expression], "arrays")(
+        *np.ascontiguousarray(states.T)
+    )[0]
 
 
-def _lie_derivatives(system: ControlAffineSDE, problem: SafetyProblem, states: np.ndarray) -> np.ndarray:
+def _lie_derivatives(
+    system: ControlAffineSDE, problem: SafetyProblem, states: np.ndarray
+) -> np.ndarray:
     """h, L_f h, L_f^2 h and L_g L_f h at states, shape (4, B)."""
     along = derivatives(system, problem.barriers[0].expression, 2, lie_derivative_f)
     expressions = [system.numeric(e) for e in (*along, *lie_derivative_g(system, along[1]))]
-    return stacked(compile_function(system.states, expressions, "arrays")(*np.ascontiguousarray(states.T)), len(states)).T
+    return stacked(
+        compile_function(system.states, expressions, "arrays")(*np.ascontiguousarray(states.T)),
+        len(states),
+    ).T

@@ -1,4 +1,5 @@
-"""Figure 3.3: the altitude of a quadrotor of unknown mass, under learned derivatives of the HOCBF and under Eq. (3.33) as printed."""
+"""Figure 3.3: the altitude of a quadrotor of unknown mass, under learned derivatives of the HOCBF
+and under Eq. (3.33) as printed."""
 
 from __future__ import annotations
 
@@ -40,15 +41,20 @@ from safe_envs.wrappers.learning.residual import ResidualModel
 QUADROTOR = "QuadrotorAltitude-v0"
 GAINS = (2.0, 8.0)  # p_1, p_2, 1/s
 CENTER, HALF_WIDTH = 5.0, 2.0  # c and p of the band, m
-LEAST_STEPS = 140  # control periods: past the first time that the nominal derivatives leave the band
+LEAST_STEPS = (
+    140  # control periods: past the first time that the nominal derivatives leave the band
+)
 _GAINS = ",".join(f"{gain:g}" for gain in GAINS)
 
-Altitudes = Mapping[str, Sequence[Run]]  # by what the filter knows: one run for each learning, one each without learning
+Altitudes = Mapping[
+    str, Sequence[Run]
+]  # by what the filter knows: one run for each learning, one each without learning
 
 
 @dataclass(frozen=True)
 class PrintedHOCBF(Condition):
-    """The HOCBF of the altitude with the Lie derivatives as they are printed, two signs and a square of which are wrong.
+    """The HOCBF of the altitude with the Lie derivatives as they are printed, two signs and a
+    square of which are wrong.
 
     Attributes:
         p: rates p_1, p_2 in 1/s.
@@ -62,10 +68,17 @@ class PrintedHOCBF(Condition):
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """The row as printed, for the mass of a model."""
         first, second = self.p
-        cubed, squared = 4 * (z - CENTER) ** 3 / HALF_WIDTH**4, 12 * (z - CENTER) ** 2 / HALF_WIDTH**4
+        cubed, squared = (
+            4 * (z - CENTER) ** 3 / HALF_WIDTH**4,
+            12 * (z - CENTER) ** 2 / HALF_WIDTH**4,
+        )
         h, slope = barrier.expression, -cubed * zdot
         bend = -cubed * g - squared * zdot
-        return AffineConstraint((cubed / m,), bend + (first + second) * slope + first * second * h, (h, slope + first * h))
+        return AffineConstraint(
+            (cubed / m,),
+            bend + (first + second) * slope + first * second * h,
+            (h, slope + first * h),
+        )
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> PrintedHOCBF:
@@ -90,7 +103,10 @@ def compute(sample: Sample) -> Outcome:
     return Outcome(
         numbers=[
             Number.mean("smallest h, learned", [run.smallest for run in found["learned"]], ""),
-            *(Number(f"smallest h, {kind}", found[kind][0].smallest) for kind in ("nominal", "true", "none")),
+            *(
+                Number(f"smallest h, {kind}", found[kind][0].smallest)
+                for kind in ("nominal", "true", "none")
+            ),
             Number("time in the workspace, true", found["true"][0].steps * problem.dt, unit="s"),
             *rates_around(problem, sample, models, _GAINS),
         ],
@@ -100,11 +116,18 @@ def compute(sample: Sample) -> Outcome:
         ],
         claims=altitude_claims(found),
         data={
-            kind: {"time": thinned(problem.dt * np.arange(len(run.h))), "z": thinned(run.states[:, 0])} for kind, run in pictures.items()
+            kind: {
+                "time": thinned(problem.dt * np.arange(len(run.h))),
+                "z": thinned(run.states[:, 0]),
+            }
+            for kind, run in pictures.items()
         },
         notes=[
             f"Eq. (3.33) as printed, with the true mass: {fate(printed['true'], problem)}",
-            f"without a filter the altitude goes from {_range(found['none'])}, for the thrust law, too, believes in the wrong mass",
+            (
+                f"without a filter the altitude goes from {_range(found['none'])}, for the thrust"
+                " law, too, believes in the wrong mass"
+            ),
         ],
     )
 
@@ -116,11 +139,17 @@ def hover(sample: Sample) -> SafetyProblem:
 
 
 def altitudes(problem: SafetyProblem, models: Sequence[ResidualModel]) -> dict[str, list[Run]]:
-    """Trajectories: with learned derivatives for each learning, one each with others and without a filter."""
+    """Trajectories: with learned derivatives for each learning, one each with others and without a
+    filter."""
     exact = f"hocbf:p={_GAINS}"
     nominal, none = runs(problem, [exact, "none"])
     learned = [runs(problem, [f"learned-hocbf:p={_GAINS}"], model)[0] for model in models]
-    return {"nominal": [nominal], "true": runs(problem, [exact], knowledge="plant"), "none": [none], "learned": learned}
+    return {
+        "nominal": [nominal],
+        "true": runs(problem, [exact], knowledge="plant"),
+        "none": [none],
+        "learned": learned,
+    }
 
 
 def altitude_claims(found: Altitudes) -> list[Claim]:
@@ -143,11 +172,21 @@ def altitude_claims(found: Altitudes) -> list[Claim]:
 def fate(run: Run, problem: SafetyProblem) -> str:
     """When a run leaves the band and the workspace, if it does."""
     low, high = problem.states[0].low, problem.states[0].high
-    first = f"h < 0 from t = {problem.dt * int(np.argmax(run.h < 0)):.3g} s" if run.smallest < 0 else "h stays at 0 or above"
+    first = (
+        f"h < 0 from t = {problem.dt * int(np.argmax(run.h < 0)):.3g} s"
+        if run.smallest < 0
+        else "h stays at 0 or above"
+    )
     if run.steps >= problem.steps:
         return f"smallest h {run.smallest:.3g}; {first}"
-    end = f"after {run.steps * problem.dt:.3g} s of {problem.horizon:g} s, at {run.states[-1, 0]:.3g} m"
-    return f"{first}, and the state leaves the workspace, of which the altitudes are [{low:g}, {high:g}] m, {end}"
+    end = (
+        f"after {run.steps * problem.dt:.3g} s of {problem.horizon:g} s, at"
+        f" {run.states[-1, 0]:.3g} m"
+    )
+    return (
+        f"{first}, and the state leaves the workspace, of which the altitudes are [{low:g},"
+        f" {high:g}] m, {end}"
+    )
 
 
 def _range(each: Sequence[Run]) -> str:
@@ -159,7 +198,9 @@ def draw(figure: Figure, outcome: Outcome) -> None:
     """The altitude over time."""
     axes = figure.add_subplot()
     time = np.array(outcome.data["learned"]["time"])
-    axes.plot(time, CENTER + 2.5 * np.sin(time), color=QUIET, linewidth=0.9, alpha=0.7, label="reference")
+    axes.plot(
+        time, CENTER + 2.5 * np.sin(time), color=QUIET, linewidth=0.9, alpha=0.7, label="reference"
+    )
     # The true derivatives lie below the learned ones: the two are nearly the same.
     lines = (
         ("true", TRUE_COLOR, "-", 3.2, "true derivatives"),
@@ -168,10 +209,19 @@ def draw(figure: Figure, outcome: Outcome) -> None:
         ("printed", PRINTED_COLOR, ":", 2.2, "true mass, Eq. (3.33) as printed"),
     )
     for kind, color, dash, width, label in lines:
-        axes.plot(outcome.data[kind]["time"], outcome.data[kind]["z"], dash, color=color, linewidth=width, label=label)
+        axes.plot(
+            outcome.data[kind]["time"],
+            outcome.data[kind]["z"],
+            dash,
+            color=color,
+            linewidth=width,
+            label=label,
+        )
     low, high = 1.5, 8.5
     for edge, end in ((CENTER - HALF_WIDTH, low), (CENTER + HALF_WIDTH, high)):
-        axes.axhspan(min(edge, end), max(edge, end), color=UNSAFE, alpha=0.35, linewidth=0, zorder=0)
+        axes.axhspan(
+            min(edge, end), max(edge, end), color=UNSAFE, alpha=0.35, linewidth=0, zorder=0
+        )
         axes.axhline(edge, color="black", linewidth=1.2, linestyle="--")
     axes.text(0.99, 0.02, "unsafe", transform=axes.transAxes, ha="right", va="bottom", color=QUIET)
     axes.set(xlim=(0.0, time[-1]), ylim=(low, high), xlabel="time (s)", ylabel="altitude z (m)")
@@ -183,8 +233,11 @@ def setting(sample: Sample) -> tuple[str, ...]:
     problem = hover(sample)
     plant, model = parameters(problem.plant), parameters(problem.model)
     return (
-        f"{QUADROTOR}: plant {plant['m']:g} kg, model {model['m']:g} kg, band {CENTER:g} +- {HALF_WIDTH:g} m, p_1 = {GAINS[0]:g}, p_2 = "
-        f"{GAINS[1]:g} 1/s, reference 5 + 2.5 sin(t) m, start (5 m, 0), dt {problem.dt:g} s, {problem.horizon:g} s",
+        (
+            f"{QUADROTOR}: plant {plant['m']:g} kg, model {model['m']:g} kg, band {CENTER:g} +-"
+            f" {HALF_WIDTH:g} m, p_1 = {GAINS[0]:g}, p_2 = {GAINS[1]:g} 1/s, reference 5 + 2.5"
+            f" sin(t) m, start (5 m, 0), dt {problem.dt:g} s, {problem.horizon:g} s"
+        ),
         learning(sample),
         f"rates from {sample.size(EPISODES)} starts within .5 m and .5 m/s of the printed one",
         "the picture shows the first learning",
@@ -199,14 +252,29 @@ ARTEFACTS: tuple[Artefact, ...] = (
         draw=draw,
         setting=setting,
         chosen=(
-            "c = 5 m, the middle of the reference; g = 9.81 m/s^2, level flight, at rest at first; 0 <= U <= 12 N, dt and duration",
-            "thrust U = m_model (g + 6 e + 4 edot), where the print has a PID controller without its gains",
+            (
+                "c = 5 m, the middle of the reference; g = 9.81 m/s^2, level flight, at rest at"
+                " first; 0 <= U <= 12 N, dt and duration"
+            ),
+            (
+                "thrust U = m_model (g + 6 e + 4 edot), where the print has a PID controller"
+                " without its gains"
+            ),
             "network inputs z and zdot",
         ),
         corrections=(
-            "Eq. (3.33): L_f^2 h is +4 (z-c)^3 g/p^4 - 12 (z-c)^2 zdot^2/p^4, and L_g L_f h has a minus; nothing here is derived by hand",
-            "Eq. (3.34), (3.36): E stands inside its own argument, and hats are missing; E = hddot - hddot of the model",
-            "Sec. 3.5.2: the two inputs that are learned from come of two PID controllers; here 3 and 9 N in every state, always far apart",
+            (
+                "Eq. (3.33): L_f^2 h is +4 (z-c)^3 g/p^4 - 12 (z-c)^2 zdot^2/p^4, and L_g L_f h has"
+                " a minus; nothing here is derived by hand"
+            ),
+            (
+                "Eq. (3.34), (3.36): E stands inside its own argument, and hats are missing; E ="
+                " hddot - hddot of the model"
+            ),
+            (
+                "Sec. 3.5.2: the two inputs that are learned from come of two PID controllers; here"
+                " 3 and 9 N in every state, always far apart"
+            ),
             *CORRECTED,
         ),
         size=(7.0, 4.0),

@@ -60,7 +60,8 @@ class Run:
 
     @property
     def peaks(self) -> np.ndarray:
-        """Largest effort of each episode where the filter acts, 0 where it never does, shape (episodes,)."""
+        """Largest effort of each episode where the filter acts, 0 where it never does, shape
+        (episodes,)."""
         return np.nan_to_num(self.acting).max(axis=0)
 
 
@@ -71,7 +72,9 @@ Runs = Mapping[str, Run]
 def run(setting: CruiseSettings, text: str, episodes: int, seed: int) -> Run:
     """Simulate a filter over the goal's controller, and keep what it does."""
     problem = setting.problem(UNBOUNDED)
-    env = SafetyFilterVectorWrapper(SafeVectorEnv(problem, episodes), parse_conditions(text, problem))
+    env = SafetyFilterVectorWrapper(
+        SafeVectorEnv(problem, episodes), parse_conditions(text, problem)
+    )
     policy = NominalController(problem)
     observation, info = env.reset(seed=[episode_seed(seed, i) for i in range(episodes)])
     effort, acting, barrier = (np.full((problem.steps, episodes), np.nan) for _ in range(3))
@@ -81,7 +84,11 @@ def run(setting: CruiseSettings, text: str, episodes: int, seed: int) -> Run:
         counts &= h > 0.0
         observation, _, terminated, _, info = env.step(policy.predict(observation)[0])
         square = info["safe_action"][:, 0] ** 2
-        for kept, values, where in ((effort, square, counts), (acting, square, counts & info["intervention"]), (barrier, h, counts)):
+        for kept, values, where in (
+            (effort, square, counts),
+            (acting, square, counts & info["intervention"]),
+            (barrier, h, counts),
+        ):
             np.copyto(kept[k], values, where=where)
         counts &= ~terminated
     return Run(effort, acting, barrier)
@@ -90,19 +97,36 @@ def run(setting: CruiseSettings, text: str, episodes: int, seed: int) -> Run:
 def needed(setting: CruiseSettings, text: str) -> np.ndarray:
     """Force at equal speeds, at each of `DISTANCES`, in N."""
     problem = setting.problem(UNBOUNDED)
-    states = np.stack([np.full_like(DISTANCES, NEAR), np.full_like(DISTANCES, NEAR), setting.tau * NEAR + DISTANCES], axis=1)
+    states = np.stack(
+        [
+            np.full_like(DISTANCES, NEAR),
+            np.full_like(DISTANCES, NEAR),
+            setting.tau * NEAR + DISTANCES,
+        ],
+        axis=1,
+    )
     wanted = NominalController(problem).predict(states)[0] * UNBOUNDED
-    return SafetyFilter.for_problem(problem, parse_conditions(text, problem)).filter(states, wanted).action[:, 0]
+    return (
+        SafetyFilter.for_problem(problem, parse_conditions(text, problem))
+        .filter(states, wanted)
+        .action[:, 0]
+    )
 
 
 def compute_figure(sample: Sample) -> Outcome:
     """Figure 4.1: effort over time, and against the distance to the edge."""
     episodes = sample.size(EPISODES)
     runs, forces = simulated(TAKEN, episodes, sample.seed)
-    others = {AS_PRINTED: PRINTED_PROGRAM, "the goal, tau and gamma that we fitted to Table 4.1, not to this figure": FITTED}
+    others = {
+        AS_PRINTED: PRINTED_PROGRAM,
+        "the goal, tau and gamma that we fitted to Table 4.1, not to this figure": FITTED,
+    }
     return replace(
         outcome_of(runs, forces),
-        elsewhere={name: _by_the_print(outcome_of(*simulated(setting, episodes, sample.seed))) for name, setting in others.items()},
+        elsewhere={
+            name: _by_the_print(outcome_of(*simulated(setting, episodes, sample.seed)))
+            for name, setting in others.items()
+        },
         data={
             "time": (np.arange(len(runs["SCBF"].effort) // BLOCK) * BLOCK * STEP).tolist(),
             "h": DISTANCES.tolist(),
@@ -117,7 +141,9 @@ def _by_the_print(outcome: Outcome) -> Outcome:
     return replace(outcome, claims=[claim for claim in outcome.claims if claim.printed])
 
 
-def simulated(setting: CruiseSettings, episodes: int, seed: int) -> tuple[Runs, Mapping[str, np.ndarray]]:
+def simulated(
+    setting: CruiseSettings, episodes: int, seed: int
+) -> tuple[Runs, Mapping[str, np.ndarray]]:
     """Runs of both conditions, and the forces that they need at the edge."""
     runs = {name: run(setting, text, episodes, seed) for name, text in setting.filters.items()}
     return runs, {name: needed(setting, text) for name, text in setting.filters.items()}
@@ -125,7 +151,9 @@ def simulated(setting: CruiseSettings, episodes: int, seed: int) -> tuple[Runs, 
 
 def outcome_of(runs: Runs, forces: Mapping[str, np.ndarray]) -> Outcome:
     """Numbers and claims of the figure."""
-    larger, smaller = (share_of_time(runs[a], runs[b]) for a, b in (("SRCBF", "SCBF"), ("SCBF", "SRCBF")))
+    larger, smaller = (
+        share_of_time(runs[a], runs[b]) for a, b in (("SRCBF", "SCBF"), ("SCBF", "SRCBF"))
+    )
     shares = [
         Number.mean(f"time in which J of SRCBF is the {word} one", 100 * share, "%", 0.0, 100.0)
         for word, share in (("larger", larger), ("smaller", smaller))
@@ -144,17 +172,29 @@ def outcome_of(runs: Runs, forces: Mapping[str, np.ndarray]) -> Outcome:
 
 
 def share_of_time(first: Run, second: Run) -> np.ndarray:
-    """Share of the instants, in each episode, in which the first effort is the larger one, as long as both runs are safe and under way."""
+    """Share of the instants, in each episode, in which the first effort is the larger one, as long
+    as both runs are safe and under way."""
     both = np.isfinite(first.effort) & np.isfinite(second.effort)
     return (both & (first.effort > second.effort)).sum(axis=0) / np.maximum(both.sum(axis=0), 1)
 
 
 def median_peak(name: str, peaks: np.ndarray) -> Number:
-    """Median over episodes of the largest force, between the order statistics that hold it with 95 %."""
+    """Median over episodes of the largest force, between the order statistics that hold it with 95
+    %."""
     force, count = np.sqrt(np.sort(peaks)), len(peaks)
     reach = math.ceil(0.98 * math.sqrt(count))
-    low, middle, high = force[max(count // 2 - reach - 1, 0)], np.median(force), force[min(count // 2 + reach, count - 1)]
-    return Number(f"peak force of {name} where it acts, median", float(middle), float(low), float(high), unit="N")
+    low, middle, high = (
+        force[max(count // 2 - reach - 1, 0)],
+        np.median(force),
+        force[min(count // 2 + reach, count - 1)],
+    )
+    return Number(
+        f"peak force of {name} where it acts, median",
+        float(middle),
+        float(low),
+        float(high),
+        unit="N",
+    )
 
 
 def claim_on_time(larger: np.ndarray, smaller: np.ndarray) -> Claim:
@@ -163,21 +203,32 @@ def claim_on_time(larger: np.ndarray, smaller: np.ndarray) -> Claim:
     return Claim(
         "SRCBF requires the higher control effort J = u^2 over time",
         is_above(ahead),
-        f"on average over the pairs with the same noise its J is the larger one in {100 * larger.mean():.1f} % of the time and the smaller "
-        f"one in {100 * smaller.mean():.1f} %; it is the larger one most of the time in {(larger > smaller).sum()} of {larger.size} pairs",
+        "on average over the pairs with the same noise its J is the larger one in"
+        f" {100 * larger.mean():.1f} % of the time and the smaller one in"
+        f" {100 * smaller.mean():.1f} %; it is the larger one most of the time in"
+        f" {(larger > smaller).sum()} of {larger.size} pairs",
     )
 
 
 def claim_on_edge(force: np.ndarray) -> Claim:
     """Sec. 4.2.1 says it of reciprocal functions, and that the experiments show it."""
     power = _power(force)
-    return Claim("SRCBF's effort has no bound towards the edge (Sec. 4.2.1)", round(power) < 0, _growth(power, force))
+    return Claim(
+        "SRCBF's effort has no bound towards the edge (Sec. 4.2.1)",
+        round(power) < 0,
+        _growth(power, force),
+    )
 
 
 def claim_on_bounded(force: np.ndarray) -> Claim:
     """The thesis calls the SCBF milder, and names no bound."""
     power = _power(force)
-    return Claim("SCBF's effort has a bound towards the edge", round(power) == 0, _growth(power, force), printed=False)
+    return Claim(
+        "SCBF's effort has a bound towards the edge",
+        round(power) == 0,
+        _growth(power, force),
+        printed=False,
+    )
 
 
 def _power(force: np.ndarray) -> float:
@@ -187,18 +238,24 @@ def _power(force: np.ndarray) -> float:
 
 
 def _growth(power: float, force: np.ndarray) -> str:
-    return f"at equal speeds J goes like h^{round(power, 2) + 0.0:.2f}, and |u| is {abs(force[0]):.3g} N at h = {DISTANCES[0]:g} m"
+    return (
+        f"at equal speeds J goes like h^{round(power, 2) + 0.0:.2f}, and |u| is {abs(force[0]):.3g}"
+        f" N at h = {DISTANCES[0]:g} m"
+    )
 
 
 def claim_on_total(runs: Runs) -> Claim:
     """The other reading of a higher effort, which rare peaks decide."""
     both = np.isfinite(runs["SRCBF"].effort) & np.isfinite(runs["SCBF"].effort)
-    srcbf, scbf = (np.where(both, runs[name].effort, 0.0).sum(axis=0) * STEP for name in ("SRCBF", "SCBF"))
+    srcbf, scbf = (
+        np.where(both, runs[name].effort, 0.0).sum(axis=0) * STEP for name in ("SRCBF", "SCBF")
+    )
     larger = srcbf > scbf
     return Claim(
         "SRCBF's effort is the higher one as an integral over time",
         bool(larger.mean() > 0.5),
-        f"in {larger.sum()} of {larger.size} pairs; median {np.median(srcbf):.2g} against {np.median(scbf):.2g} N^2 s",
+        f"in {larger.sum()} of {larger.size} pairs; median {np.median(srcbf):.2g} against"
+        f" {np.median(scbf):.2g} N^2 s",
         printed=False,
     )
 
@@ -209,8 +266,9 @@ def claim_on_peaks(srcbf: np.ndarray, scbf: np.ndarray) -> Claim:
     return Claim(
         "SRCBF's effort has the higher peak where it acts",
         bool(larger.mean() > 0.5),
-        f"in {larger.sum()} of {larger.size} pairs; median {np.median(srcbf):.2g} against {np.median(scbf):.2g} N^2, largest of all "
-        f"{srcbf.max():.2g} against {scbf.max():.2g} N^2",
+        f"in {larger.sum()} of {larger.size} pairs; median {np.median(srcbf):.2g} against"
+        f" {np.median(scbf):.2g} N^2, largest of all {srcbf.max():.2g} against"
+        f" {scbf.max():.2g} N^2",
         printed=False,
     )
 
@@ -218,29 +276,40 @@ def claim_on_peaks(srcbf: np.ndarray, scbf: np.ndarray) -> Claim:
 def claim_on_growth(srcbf: Run) -> Claim:
     """The same as at the edge, in closed loop."""
     acted = np.isfinite(srcbf.acting)
-    close, away = (srcbf.acting[acted & where] for where in (srcbf.barrier < CLOSE, srcbf.barrier > FAR))
+    close, away = (
+        srcbf.acting[acted & where] for where in (srcbf.barrier < CLOSE, srcbf.barrier > FAR)
+    )
     grows = bool(close.size and away.size and np.median(close) > np.median(away))
     each = [
         f"median J {np.median(part):.2g} N^2 {where}" if part.size else f"never {where}"
         for part, where in ((close, f"below h = {CLOSE} m"), (away, f"above h = {FAR} m"))
     ]
-    return Claim("SRCBF's effort grows as the edge is neared", grows, "where it acts: " + ", ".join(each), printed=False)
+    return Claim(
+        "SRCBF's effort grows as the edge is neared",
+        grows,
+        "where it acts: " + ", ".join(each),
+        printed=False,
+    )
 
 
 def _strict_note() -> str:
     return (
-        "SRCBF asks for A h >= (tau sigma_1)^2/h - gamma h^3, so that it is the stricter one only below h = "
-        f"sqrt(tau sigma_1)/gamma^(1/4): {TAKEN.stricter_below():.3g} m, and {FITTED.stricter_below():.3g} m with what we fitted to "
-        f"Table 4.1, {FITTED_GOAL}"
+        "SRCBF asks for A h >= (tau sigma_1)^2/h - gamma h^3, so that it is the stricter one only"
+        f" below h = sqrt(tau sigma_1)/gamma^(1/4): {TAKEN.stricter_below():.3g} m, and"
+        f" {FITTED.stricter_below():.3g} m with what we fitted to Table 4.1, {FITTED_GOAL}"
     )
 
 
 def _ends_note(runs: Runs) -> str:
-    kept = ", ".join(f"{name} {np.isfinite(r.effort[-1]).sum()} of {r.effort.shape[1]}" for name, r in runs.items())
+    kept = ", ".join(
+        f"{name} {np.isfinite(r.effort[-1]).sum()} of {r.effort.shape[1]}"
+        for name, r in runs.items()
+    )
     first, other = (float(np.median(runs[name].effort[0])) for name in ("SRCBF", "SCBF"))
     return (
-        f"episodes that are safe and under way at the end: {kept}; effort counts up to an episode's first violation, of either in a pair. "
-        f"At the start J of SRCBF is {first:.2g} N^2, that of SCBF {other:.2g}"
+        f"episodes that are safe and under way at the end: {kept}; effort counts up to an episode's"
+        f" first violation, of either in a pair. At the start J of SRCBF is {first:.2g} N^2, that"
+        f" of SCBF {other:.2g}"
     )
 
 
@@ -260,20 +329,53 @@ def draw_figure(figure: Figure, outcome: Outcome) -> None:
     for name, color in {"SRCBF": COLORS[3], "SCBF": COLORS[0]}.items():
         low, middle, high = np.array(data["effort"][name])
         left.fill_between(data["time"], low, high, color=color, alpha=0.2, linewidth=0)
-        left.plot(data["time"], middle, color=color, linewidth=1.3, label=f"{name}: median, and 5 to 95 %")
+        left.plot(
+            data["time"], middle, color=color, linewidth=1.3, label=f"{name}: median, and 5 to 95 %"
+        )
         right.plot(data["h"], np.square(data["forces"][name]), color=color, linewidth=2)
     for axes in (left, right):
-        axes.axhline(TAKEN.limit**2, color=QUIET, linestyle=":", label="|u| = .3 M g" if axes is left else None)
-    left.set(yscale="log", xlabel="time (s)", ylabel=r"effort J = u$^2$ (N$^2$)", xlim=(0, HORIZON), title="(a)")
-    right.set(xscale="log", yscale="log", xlabel="barrier h (m), edge at the left", xlim=(DISTANCES[0], DISTANCES[-1]), title="(b)")
+        axes.axhline(
+            TAKEN.limit**2,
+            color=QUIET,
+            linestyle=":",
+            label="|u| = .3 M g" if axes is left else None,
+        )
+    left.set(
+        yscale="log",
+        xlabel="time (s)",
+        ylabel=r"effort J = u$^2$ (N$^2$)",
+        xlim=(0, HORIZON),
+        title="(a)",
+    )
+    right.set(
+        xscale="log",
+        yscale="log",
+        xlabel="barrier h (m), edge at the left",
+        xlim=(DISTANCES[0], DISTANCES[-1]),
+        title="(b)",
+    )
     _mark_step(right)
     add_legend(figure, left.get_legend_handles_labels()[0])
 
 
 def _mark_step(axes: Axes) -> None:
     """Shade the distances that the noise of one control period crosses."""
-    axes.axvspan(DISTANCES[0], TAKEN.tau * NOISE * math.sqrt(STEP), color=UNSAFE, alpha=0.35, linewidth=0, zorder=0)
-    axes.text(0.03, 0.2, "within the noise\nof one step", transform=axes.transAxes, color=QUIET, fontsize=8)
+    axes.axvspan(
+        DISTANCES[0],
+        TAKEN.tau * NOISE * math.sqrt(STEP),
+        color=UNSAFE,
+        alpha=0.35,
+        linewidth=0,
+        zorder=0,
+    )
+    axes.text(
+        0.03,
+        0.2,
+        "within the noise\nof one step",
+        transform=axes.transAxes,
+        color=QUIET,
+        fontsize=8,
+    )
 
 
 FIGURE = Artefact(
@@ -281,7 +383,10 @@ FIGURE = Artefact(
     title="Effort of SRCBF and SCBF in adaptive cruise control",
     compute=compute_figure,
     setting=lambda sample: describe(sample.size(EPISODES), STEP),
-    chosen=(*CHOSEN, "the force has no bound: of which control its curves are, the print does not say"),
+    chosen=(
+        *CHOSEN,
+        "the force has no bound: of which control its curves are, the print does not say",
+    ),
     corrections=CORRECTIONS,
     draw=draw_figure,
     size=(7.0, 3.8),

@@ -1,4 +1,5 @@
-"""Thesis Sec. 4.3.2: safety of SCBF and SZCBF for a Dubins vehicle against its noise (Figure 4.2), and that section's artefacts."""
+"""Thesis Sec. 4.3.2: safety of SCBF and SZCBF for a Dubins vehicle against its noise (Figure 4.2),
+and that section's artefacts."""
 
 from __future__ import annotations
 
@@ -32,7 +33,12 @@ from safe_envs.scripts.reproduce.chapter_4.dubins_runs import (
     step_of,
     turning_time,
 )
-from safe_envs.scripts.reproduce.chapter_4.paired_episodes import Exits, is_above, is_below, with_interval
+from safe_envs.scripts.reproduce.chapter_4.paired_episodes import (
+    Exits,
+    is_above,
+    is_below,
+    with_interval,
+)
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 
 NOISES = (0.0, 0.05, 0.1, 0.15, 0.2)
@@ -48,9 +54,15 @@ def compute_noises(sample: Sample) -> Outcome:
     """Figure 4.2: safety against noise, from random starts."""
     episodes, seed = sample.size(EPISODES), sample.seed
     levels = sorted((*NOISES, *(() if sample.quick else BETWEEN)))
-    runs = {start: {level: simulate(FILTERS, level, start, episodes, seed) for level in levels} for start in STARTS}
+    runs = {
+        start: {level: simulate(FILTERS, level, start, episodes, seed) for level in levels}
+        for start in STARTS
+    }
     main = runs["uniform"]
-    printed = {level: simulate(PRINTED_FORM, level, "uniform", episodes, seed) | scbf_of(main[level]) for level in NOISES}
+    printed = {
+        level: simulate(PRINTED_FORM, level, "uniform", episodes, seed) | scbf_of(main[level])
+        for level in NOISES
+    }
     beyond = {level: simulate(SCBF_ONLY, level, "uniform", episodes, seed) for level in BEYOND}
     named = {STARTS[start]: _at(runs[start], NOISES) for start in STARTS}
     elsewhere = elsewhere_of(named, printed, claim_on_noises)
@@ -58,17 +70,26 @@ def compute_noises(sample: Sample) -> Outcome:
         numbers=[*_rates(main, NOISES), *_rates(beyond, BEYOND), *_differences(main)],
         claims=[claim_on_noises(named[STARTS["uniform"]], HORIZON)],
         elsewhere=elsewhere,
-        as_printed=[number for number in _rates(printed, NOISES) if not number.name.startswith("SCBF")],
+        as_printed=[
+            number for number in _rates(printed, NOISES) if not number.name.startswith("SCBF")
+        ],
         data={
             "noises": levels,
             "beyond": [levels[-1], *BEYOND],
             "horizons": list(HORIZONS),
             "horizon": HORIZON,
-            "rates": {STARTS[s]: {n: bands_of([runs[s][level][n] for level in levels]) for n in FILTERS} for s in STARTS},
+            "rates": {
+                STARTS[s]: {n: bands_of([runs[s][level][n] for level in levels]) for n in FILTERS}
+                for s in STARTS
+            },
             "further": bands_of([r["SCBF"] for r in (main[levels[-1]], *beyond.values())]),
-            "printed": {n: [r[n].rate("", step_of(HORIZON)).ours for r in printed.values()] for n in ALPHAS},
+            "printed": {
+                n: [r[n].rate("", step_of(HORIZON)).ours for r in printed.values()] for n in ALPHAS
+            },
             "levels": list(NOISES),
-            "curves": {STARTS[s]: {n: _curve(runs[s][max(NOISES)][n]) for n in FILTERS} for s in STARTS},
+            "curves": {
+                STARTS[s]: {n: _curve(runs[s][max(NOISES)][n]) for n in FILTERS} for s in STARTS
+            },
         },
         notes=[holds_note(elsewhere), _beyond_note(), *_turns(runs), *_infeasible(main)],
     )
@@ -79,11 +100,19 @@ def _at(runs: Mapping[float, Runs], levels: Sequence[float]) -> dict[float, Runs
 
 
 def _rates(runs: Mapping[float, Runs], levels: Sequence[float]) -> list[Number]:
-    return [run.rate(f"{name}, sigma = {level:g}", step_of(HORIZON)) for level in levels for name, run in runs[level].items()]
+    return [
+        run.rate(f"{name}, sigma = {level:g}", step_of(HORIZON))
+        for level in levels
+        for name, run in runs[level].items()
+    ]
 
 
 def _differences(runs: Mapping[float, Runs]) -> list[Number]:
-    return [ahead_of(rival, runs[level], HORIZON, f", sigma = {level:g}") for rival in ALPHAS for level in NOISES]
+    return [
+        ahead_of(rival, runs[level], HORIZON, f", sigma = {level:g}")
+        for rival in ALPHAS
+        for level in NOISES
+    ]
 
 
 def claim_on_noises(runs: Mapping[float, Runs], horizon: float) -> Claim:
@@ -93,12 +122,24 @@ def claim_on_noises(runs: Mapping[float, Runs], horizon: float) -> Claim:
         runs: of SCBF and the SZCBFs at each noise level.
         horizon: in s.
     """
-    gaps = {rival: {level: ahead_of(rival, at, horizon) for level, at in runs.items()} for rival in ALPHAS}
+    gaps = {
+        rival: {level: ahead_of(rival, at, horizon) for level, at in runs.items()}
+        for rival in ALPHAS
+    }
     # Nothing can be better than a filter that never fails.
-    perfect = {rival: [level for level, at in runs.items() if _never_fail(("SCBF", rival), at, horizon)] for rival in ALPHAS}
-    ahead = [is_above(gap) for rival, each in gaps.items() for level, gap in each.items() if level not in perfect[rival]]
+    perfect = {
+        rival: [level for level, at in runs.items() if _never_fail(("SCBF", rival), at, horizon)]
+        for rival in ALPHAS
+    }
+    ahead = [
+        is_above(gap)
+        for rival, each in gaps.items()
+        for level, gap in each.items()
+        if level not in perfect[rival]
+    ]
     return Claim(
-        f"SCBF has a better safety probability than SZCBF for sigma within [{min(NOISES):g}, {max(NOISES):g}]",
+        f"SCBF has a better safety probability than SZCBF for sigma within [{min(NOISES):g},"
+        f" {max(NOISES):g}]",
         bool(ahead) and all(ahead),
         "; ".join(_against(rival, each, len(perfect[rival])) for rival, each in gaps.items()),
     )
@@ -113,13 +154,16 @@ def _against(rival: str, gaps: Mapping[float, Number], perfect: int) -> str:
     above, below = (sum(map(beyond, gaps.values())) for beyond in (is_above, is_below))
     each = ", ".join(f"{with_interval(gap)} at {level:g}" for level, gap in gaps.items())
     both = f", both without a failure at {perfect}" if perfect else ""
-    return f"ahead of {rival} at {above} of {len(gaps)} noise levels, behind at {below}{both}: in points {each}"
+    return (
+        f"ahead of {rival} at {above} of {len(gaps)} noise levels, behind at {below}{both}: in"
+        f" points {each}"
+    )
 
 
 def _beyond_note() -> str:
     return (
-        f"Sec. 4.3.2 tests the SCBF alone within [0, {max(BEYOND):g}] as well and shows nothing of it; ours are in the table and in the "
-        "picture, from the same random starts"
+        f"Sec. 4.3.2 tests the SCBF alone within [0, {max(BEYOND):g}] as well and shows nothing of"
+        " it; ours are in the table and in the picture, from the same random starts"
     )
 
 
@@ -139,15 +183,25 @@ def _as_text(time: float | None) -> str:
 
 
 def _infeasible(runs: Mapping[float, Runs]) -> list[str]:
-    shares = ", ".join(f"{name} {100 * run.infeasible:.2g} %" for name, run in runs[max(NOISES)].items())
-    return [f"steps in which no turn rate in the box meets the condition, sigma = {max(NOISES):g}, {STARTS['uniform']}: {shares}"]
+    shares = ", ".join(
+        f"{name} {100 * run.infeasible:.2g} %" for name, run in runs[max(NOISES)].items()
+    )
+    return [
+        f"steps in which no turn rate in the box meets the condition, sigma = {max(NOISES):g},"
+        f" {STARTS['uniform']}: {shares}"
+    ]
 
 
 def _curve(run: Exits) -> dict[str, list[float]]:
     safe, episodes = counts(run), len(run.instant)
     low, high = rate_band(safe, episodes)
     time = STEP * np.arange(len(safe))
-    return {"time": time.tolist(), "low": (100 * low).tolist(), "rate": (100 * safe / episodes).tolist(), "high": (100 * high).tolist()}
+    return {
+        "time": time.tolist(),
+        "low": (100 * low).tolist(),
+        "rate": (100 * safe / episodes).tolist(),
+        "high": (100 * high).tolist(),
+    }
 
 
 ARTEFACTS: tuple[Artefact, ...] = (
@@ -155,7 +209,10 @@ ARTEFACTS: tuple[Artefact, ...] = (
         name="figure-4.2",
         title="Safety of SCBF and SZCBF against the noise",
         compute=compute_noises,
-        setting=lambda sample: (*SETTING, f"random starts at each noise level, an episode from each: {sample.size(EPISODES)}"),
+        setting=lambda sample: (
+            *SETTING,
+            f"random starts at each noise level, an episode from each: {sample.size(EPISODES)}",
+        ),
         chosen=CHOSEN,
         corrections=CORRECTIONS,
         draw=draw_noises,

@@ -15,28 +15,62 @@ from safe_envs.scripts.reproduce.chapter_4.dubins_runs import ALPHAS, FILTERS, R
 from safe_envs.scripts.reproduce.framework.artefact import Outcome
 
 _COLOR = dict(zip(FILTERS, COLORS, strict=False))
-_LABEL = {"SCBF": "SCBF", **{name: rf"SZCBF, $\alpha$ = {a:g}, {b:g}" for name, (a, b) in ALPHAS.items()}}
+_LABEL = {
+    "SCBF": "SCBF",
+    **{name: rf"SZCBF, $\alpha$ = {a:g}, {b:g}" for name, (a, b) in ALPHAS.items()},
+}
 
 
 def draw_noises(figure: Figure, outcome: Outcome) -> None:
-    """Left: safety against noise. Right: over time at the largest noise. Full lines: all starts; dashed: those with A h > 0."""
+    """Left: safety against noise. Right: over time at the largest noise. Full lines: all starts;
+    dashed: those with A h > 0."""
     left, right = figure.subplots(1, 2, sharey=True)
     data = outcome.data
     for (kind, rates), dashes in zip(data["rates"].items(), ("-", "--"), strict=True):
         for name, bands in rates.items():
             label = _LABEL[name] if dashes == "-" else None
-            _draw_band(left, data["noises"], np.array(bands).T, dashes, color=_COLOR[name], label=label, marker="o", markersize=3)
+            _draw_band(
+                left,
+                data["noises"],
+                np.array(bands).T,
+                dashes,
+                color=_COLOR[name],
+                label=label,
+                marker="o",
+                markersize=3,
+            )
             curve = data["curves"][kind][name]
-            _draw_band(right, curve["time"], [curve[key] for key in ("low", "rate", "high")], dashes, color=_COLOR[name])
+            _draw_band(
+                right,
+                curve["time"],
+                [curve[key] for key in ("low", "rate", "high")],
+                dashes,
+                color=_COLOR[name],
+            )
         left.plot([], [], dashes, color="black", label=kind)
-    _draw_band(left, data["beyond"], np.array(data["further"]).T, "-", color=_COLOR["SCBF"], marker="o", markersize=3)
+    _draw_band(
+        left,
+        data["beyond"],
+        np.array(data["further"]).T,
+        "-",
+        color=_COLOR["SCBF"],
+        marker="o",
+        markersize=3,
+    )
     for name, rates in data["printed"].items():
         left.plot(data["levels"], rates, ":", color=_COLOR[name], marker="x", markersize=4)
-    left.plot([], [], ":", color="black", marker="x", markersize=4, label="printed $h_2$, all starts")
+    left.plot(
+        [], [], ":", color="black", marker="x", markersize=4, label="printed $h_2$, all starts"
+    )
     for horizon in data["horizons"]:
         right.axvline(horizon, color=UNSAFE, linewidth=0.8, zorder=0)
     title = f"(a) T = {data['horizon']:g} s"
-    left.set(xlabel=r"noise $\sigma_1 = \sigma_2$ (m/$\sqrt{\mathrm{s}}$)", ylabel="safe (%)", ylim=(-3, 103), title=title)
+    left.set(
+        xlabel=r"noise $\sigma_1 = \sigma_2$ (m/$\sqrt{\mathrm{s}}$)",
+        ylabel="safe (%)",
+        ylim=(-3, 103),
+        title=title,
+    )
     title = rf"(b) $\sigma$ = {max(data['levels']):g} m/$\sqrt{{\mathrm{{s}}}}$"
     right.set(xlabel="horizon T (s)", xlim=(0, max(data["horizons"])), title=title)
     add_legend(figure, left.get_legend_handles_labels()[0])
@@ -49,7 +83,8 @@ def _draw_band(axes: Axes, along: Any, band: Any, dashes: str, **line: Any) -> N
 
 
 def draw_points(figure: Figure, outcome: Outcome) -> None:
-    """Left: safety from each start, filled at the short horizon, hollow at the long one. Right: the starts."""
+    """Left: safety from each start, filled at the short horizon, hollow at the long one. Right: the
+    starts."""
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
     data = outcome.data
     index = np.arange(1, len(data["starts"]) + 1)
@@ -58,15 +93,43 @@ def draw_points(figure: Figure, outcome: Outcome) -> None:
         style: Any = {"fmt": "os^"[i], "color": _COLOR[name], "markersize": 4.5, "linewidth": 1}
         for horizon, face, label in ((short, _COLOR[name], _LABEL[name]), (long, "white", None)):
             low, rate, high = np.array(data["rates"][name][f"{horizon:g}"]).T
-            left.errorbar(index + 0.22 * (i - 1), rate, (rate - low, high - rate), markerfacecolor=face, label=label, **style)
+            left.errorbar(
+                index + 0.22 * (i - 1),
+                rate,
+                (rate - low, high - rate),
+                markerfacecolor=face,
+                label=label,
+                **style,
+            )
     product = np.array(data["product"])
-    left.plot(index[product > 0], 100 * product[product > 0], "_", color="black", markersize=14, label="product of Thm. 4.2.10")
+    left.plot(
+        index[product > 0],
+        100 * product[product > 0],
+        "_",
+        color="black",
+        markersize=14,
+        label="product of Thm. 4.2.10",
+    )
     for horizon, face in ((short, "black"), (long, "white")):
-        left.plot([], [], "o", color="black", markerfacecolor=face, markersize=4.5, label=f"T = {horizon:g} s")
+        left.plot(
+            [],
+            [],
+            "o",
+            color="black",
+            markerfacecolor=face,
+            markersize=4.5,
+            label=f"T = {horizon:g} s",
+        )
     left.set(xlabel="start", ylabel="safe (%)", xticks=index, ylim=(-3, 103), title="(a)")
     _draw_starts(right, np.array(data["starts"]))
     handles, labels = left.get_legend_handles_labels()
-    add_legend(figure, [handles[labels.index(label)] for label in sorted(labels, key=lambda label: label not in _LABEL.values())])
+    add_legend(
+        figure,
+        [
+            handles[labels.index(label)]
+            for label in sorted(labels, key=lambda label: label not in _LABEL.values())
+        ],
+    )
 
 
 def _draw_starts(axes: Axes, starts: np.ndarray) -> None:
@@ -79,4 +142,11 @@ def _draw_starts(axes: Axes, starts: np.ndarray) -> None:
     for i, place in enumerate(zip(x - 0.28 * along, y - 0.28 * up, strict=True), 1):
         axes.text(*place, str(i), ha="center", va="center", fontsize=8)
     edge = 1.12 * RADIUS
-    axes.set(xlabel="x (m)", ylabel="y (m)", xlim=(-edge, edge), ylim=(-edge, edge), aspect="equal", title="(b)")
+    axes.set(
+        xlabel="x (m)",
+        ylabel="y (m)",
+        xlim=(-edge, edge),
+        ylim=(-edge, edge),
+        aspect="equal",
+        title="(b)",
+    )

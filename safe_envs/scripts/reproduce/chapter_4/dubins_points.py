@@ -1,4 +1,5 @@
-"""Thesis Sec. 4.3.2: safety of SCBF and SZCBF for a Dubins vehicle with noise, from ten random starts (Figure 4.3)."""
+"""Thesis Sec. 4.3.2: safety of SCBF and SZCBF for a Dubins vehicle with noise, from ten random
+starts (Figure 4.3)."""
 
 from __future__ import annotations
 
@@ -47,35 +48,61 @@ def compute_points(sample: Sample) -> Outcome:
     """Figure 4.3: safety from ten random starts, many episodes each."""
     episodes = sample.size(EPISODES_OF_POINT)
     seeds = [episode_seed(sample.seed, i) for i in range(POINTS)]
-    starts = {kind: random_starts(kind, NOISE, POINTS, sample.seed) for kind in STARTS if kind == "uniform" or not sample.quick}
+    starts = {
+        kind: random_starts(kind, NOISE, POINTS, sample.seed)
+        for kind in STARTS
+        if kind == "uniform" or not sample.quick
+    }
 
     def from_each(kind: str, filters: Mapping[str, Any]) -> list[dict[str, Exits]]:
-        return [simulate(filters, NOISE, x.tolist(), episodes, seed) for x, seed in zip(starts[kind], seeds, strict=True)]
+        return [
+            simulate(filters, NOISE, x.tolist(), episodes, seed)
+            for x, seed in zip(starts[kind], seeds, strict=True)
+        ]
 
     runs = {STARTS[kind]: from_each(kind, FILTERS) for kind in starts}
     main = runs[STARTS["uniform"]]
-    printed = [found | scbf_of(of_start) for found, of_start in zip(from_each("uniform", PRINTED_FORM), main, strict=True)]
+    printed = [
+        found | scbf_of(of_start)
+        for found, of_start in zip(from_each("uniform", PRINTED_FORM), main, strict=True)
+    ]
     elsewhere = elsewhere_of(runs, printed, claim_on_points)
     together, step = pooled(main), step_of(HORIZON)
     return Outcome(
         numbers=[
             *(run.rate(f"{name}, all ten starts", step) for name, run in together.items()),
             *(ahead_of(rival, together, HORIZON, ", all ten starts") for rival in ALPHAS),
-            *(run.rate(f"{name}, start {i}", step) for i, each in enumerate(main, 1) for name, run in each.items()),
+            *(
+                run.rate(f"{name}, start {i}", step)
+                for i, each in enumerate(main, 1)
+                for name, run in each.items()
+            ),
         ],
         claims=[claim_on_points(main, HORIZON)],
         elsewhere=elsewhere,
-        as_printed=[run.rate(f"{name}, all ten starts", step) for name, run in pooled(printed).items() if name in ALPHAS],
+        as_printed=[
+            run.rate(f"{name}, all ten starts", step)
+            for name, run in pooled(printed).items()
+            if name in ALPHAS
+        ],
         data={
             "starts": starts["uniform"].tolist(),
             "horizons": [HORIZON, max(HORIZONS)],
-            "rates": {n: {f"{t:g}": bands_of([r[n] for r in main], t) for t in (HORIZON, max(HORIZONS))} for n in FILTERS},
+            "rates": {
+                n: {f"{t:g}": bands_of([r[n] for r in main], t) for t in (HORIZON, max(HORIZONS))}
+                for n in FILTERS
+            },
             "product": printed_and_union_bound(starts["uniform"])[0].tolist(),
         },
         notes=[
             holds_note(elsewhere),
             *_drawn_anew(main),
-            *(bound_note(STARTS[k], [r["SCBF"] for r in runs[STARTS[k]]], *printed_and_union_bound(x)) for k, x in starts.items()),
+            *(
+                bound_note(
+                    STARTS[k], [r["SCBF"] for r in runs[STARTS[k]]], *printed_and_union_bound(x)
+                )
+                for k, x in starts.items()
+            ),
         ],
     )
 
@@ -83,7 +110,13 @@ def compute_points(sample: Sample) -> Outcome:
 def pooled(runs: Sequence[Runs]) -> dict[str, Exits]:
     """All episodes of all starts, with the average share of infeasible steps."""
     names = runs[0].keys()
-    return {n: Exits(np.concatenate([r[n].instant for r in runs]), float(np.mean([r[n].infeasible for r in runs]))) for n in names}
+    return {
+        n: Exits(
+            np.concatenate([r[n].instant for r in runs]),
+            float(np.mean([r[n].infeasible for r in runs])),
+        )
+        for n in names
+    }
 
 
 def claim_on_points(runs: Sequence[Runs], horizon: float) -> Claim:
@@ -96,36 +129,52 @@ def claim_on_points(runs: Sequence[Runs], horizon: float) -> Claim:
     overall = {rival: ahead_of(rival, pooled(runs), horizon) for rival in ALPHAS}
     each = {rival: [ahead_of(rival, run, horizon).ours for run in runs] for rival in ALPHAS}
     evidence = [
-        f"SCBF - {rival}: {with_interval(gap)} points on average, above 0 from {sum(g > 0 for g in each[rival])} of {len(runs)} starts, "
-        f"between {min(each[rival]):.1f} and {max(each[rival]):.1f}"
+        f"SCBF - {rival}: {with_interval(gap)} points on average, above 0 from"
+        f" {sum(g > 0 for g in each[rival])} of {len(runs)} starts, between {min(each[rival]):.1f}"
+        f" and {max(each[rival]):.1f}"
         for rival, gap in overall.items()
     ]
     holds = all(is_above(gap) for gap in overall.values())
-    return Claim("SCBF has an overall better performance than SZCBF from the random starts", holds, "; ".join(evidence))
+    return Claim(
+        "SCBF has an overall better performance than SZCBF from the random starts",
+        holds,
+        "; ".join(evidence),
+    )
 
 
 def _drawn_anew(runs: Sequence[Runs]) -> list[str]:
     """What ten starts say of others."""
     notes = []
     for rival in ALPHAS:
-        gap = Number.mean("", [ahead_of(rival, run, HORIZON).ours for run in runs], "points", -100.0, 100.0)
-        notes.append(f"the print's starts are not given; over random starts anew SCBF - {rival} is {with_interval(gap)} points on average")
+        gap = Number.mean(
+            "", [ahead_of(rival, run, HORIZON).ours for run in runs], "points", -100.0, 100.0
+        )
+        notes.append(
+            f"the print's starts are not given; over random starts anew SCBF - {rival} is"
+            f" {with_interval(gap)} points on average"
+        )
     return notes
 
 
 def printed_and_union_bound(starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thm. 4.2.10's product and the union bound for ever, at each start, shape (2, starts): 0 where A h <= 0."""
+    """Thm. 4.2.10's product and the union bound for ever, at each start, shape (2, starts): 0 where
+    A h <= 0."""
     formulas = Formulas(dubins_problem(NOISE, "uniform"), [SCBF()], "model")
-    speed = next(value for symbol, value in formulas.system.parameters.items() if symbol.name == "v")
+    speed = next(
+        value for symbol, value in formulas.system.parameters.items() if symbol.name == "v"
+    )
     # A h = -2 v (x cos + y sin) - 2 sigma^2 is largest at the edge, straight inwards.
     suprema = [RADIUS**2, 2 * speed * RADIUS - 2 * NOISE**2]
     b = formulas.chain(starts)
     inside = (b > 0.0).all(axis=-1)
-    return np.where(inside, theorem_4_2_10_printed(b, suprema), 0.0), np.where(inside, union_bound(b, suprema), 0.0)
+    return np.where(inside, theorem_4_2_10_printed(b, suprema), 0.0), np.where(
+        inside, union_bound(b, suprema), 0.0
+    )
 
 
 def bound_note(name: str, runs: Sequence[Exits], product: np.ndarray, union: np.ndarray) -> str:
-    """How the bounds compare with what is simulated; only a start with A h > 0 has one that is positive.
+    """How the bounds compare with what is simulated; only a start with A h > 0 has one that is
+    positive.
 
     Args:
         name: of the starts.
@@ -138,9 +187,11 @@ def bound_note(name: str, runs: Sequence[Exits], product: np.ndarray, union: np.
     below = sum((last[i].high or 0.0) < 100 * product[i] for i in inside)
     share = 100 * np.mean([run.infeasible for run in runs])
     return (
-        f"{name}: A h > 0, as Thm. 4.2.10 presumes, holds at {len(inside)} of {len(runs)}. Its product b_0 b_1/(c_0 c_1) is at "
-        f"most {100 * product.max():.1f} % there, and contradicted at {below} by T = {max(HORIZONS):g} s; the union bound is at most "
-        f"{100 * union.max():.1f} %. Both presume the condition, which no turn rate meets in {share:.1f} % of the steps"
+        f"{name}: A h > 0, as Thm. 4.2.10 presumes, holds at {len(inside)} of {len(runs)}. Its"
+        f" product b_0 b_1/(c_0 c_1) is at most {100 * product.max():.1f} % there, and contradicted"
+        f" at {below} by T = {max(HORIZONS):g} s; the union bound is at most"
+        f" {100 * union.max():.1f} %. Both presume the condition, which no turn rate meets in"
+        f" {share:.1f} % of the steps"
     )
 
 
@@ -150,7 +201,10 @@ FIGURE_POINTS = Artefact(
     compute=compute_points,
     setting=lambda sample: (
         *SETTING,
-        f"sigma = {NOISE:g} m/sqrt(s), {POINTS} random starts, episodes from each: {sample.size(EPISODES_OF_POINT)}",
+        (
+            f"sigma = {NOISE:g} m/sqrt(s), {POINTS} random starts, episodes from each:"
+            f" {sample.size(EPISODES_OF_POINT)}"
+        ),
     ),
     chosen=CHOSEN,
     corrections=CORRECTIONS,

@@ -1,4 +1,5 @@
-"""Thesis Sec. 4.3.2, a Dubins vehicle with noise in a disk: what is simulated, and how SCBF and SZCBF compare."""
+"""Thesis Sec. 4.3.2, a Dubins vehicle with noise in a disk: what is simulated, and how SCBF and
+SZCBF compare."""
 
 from __future__ import annotations
 
@@ -37,19 +38,40 @@ AS_PRINTED = f"SZCBF by the printed h_2, {STARTS['uniform']}"
 ALPHAS = {"SZCBF(1, 1)": (1.0, 1.0), "SZCBF(.5, .5)": (0.5, 0.5)}
 """Rates of the zeroing form, in 1/s."""
 SETTING = (
-    f"v = 2 m/s, disk of radius {RADIUS:g} m, control period {STEP} s, min omega^2 subject to the row and |omega| <= {BOX[1]:g} rad/s",
-    "SZCBF with the rates in brackets, h_2 = A h_1 + alpha_2 h_1; safe: h > 0 at every control instant up to T",
-    "starts uniform in the disk and in heading; the same starts and the same noise for all filters, which are compared pair by pair",
+    (
+        f"v = 2 m/s, disk of radius {RADIUS:g} m, control period {STEP} s, min omega^2 subject to"
+        f" the row and |omega| <= {BOX[1]:g} rad/s"
+    ),
+    (
+        "SZCBF with the rates in brackets, h_2 = A h_1 + alpha_2 h_1; safe: h > 0 at every control"
+        " instant up to T"
+    ),
+    (
+        "starts uniform in the disk and in heading; the same starts and the same noise for all"
+        " filters, which are compared pair by pair"
+    ),
 )
 CHOSEN = (
-    f"T is not printed: {HORIZON:g} s for the numbers, the others of {', '.join(f'{t:g}' for t in HORIZONS)} s as other settings",
+    (
+        f"T is not printed: {HORIZON:g} s for the numbers, the others of"
+        f" {', '.join(f'{t:g}' for t in HORIZONS)} s as other settings"
+    ),
     "the rates of the SZCBF are not printed: a claim about it has to hold for both pairs of rates",
-    "Thm. 4.2.10 presumes starts with A h > 0, Sec. 4.3.2 names random ones: those with A h > 0 are another setting",
+    (
+        "Thm. 4.2.10 presumes starts with A h > 0, Sec. 4.3.2 names random ones: those with A h > 0"
+        " are another setting"
+    ),
     "nominal turn rate 0, and the box of the turn rate",
 )
 CORRECTIONS = (
-    "Sec. 4.3.2: h_2 = A h_1 + alpha_2 h_1, not alpha_2 h; by the print even paths without noise can leave the set",
-    "Thm. 4.2.10: the product is no valid bound for degree 2, since Eq. (4.23) conditions on the future; the union bound is",
+    (
+        "Sec. 4.3.2: h_2 = A h_1 + alpha_2 h_1, not alpha_2 h; by the print even paths without"
+        " noise can leave the set"
+    ),
+    (
+        "Thm. 4.2.10: the product is no valid bound for degree 2, since Eq. (4.23) conditions on"
+        " the future; the union bound is"
+    ),
 )
 Runs = Mapping[str, Exits]
 """Of the same episodes, by the name of the filter."""
@@ -57,7 +79,8 @@ Runs = Mapping[str, Exits]
 
 @dataclass(frozen=True)
 class PrintedSZCBF(Condition):
-    """h_1 = A h + alpha_1 h, h_2 = A h_1 + alpha_2 h >= 0, as it is printed: with h in place of h_1 in the second term."""
+    """h_1 = A h + alpha_1 h, h_2 = A h_1 + alpha_2 h >= 0, as it is printed: with h in place of h_1
+    in the second term."""
 
     alphas: tuple[float, float] = (1.0, 1.0)
     name = "printed-szcbf"
@@ -67,7 +90,9 @@ class PrintedSZCBF(Condition):
         """The row by hand."""
         h = barrier.expression
         first = generator(model, h) + self.alphas[0] * h
-        return AffineConstraint.after(model, (h, first), generator(model, first) + self.alphas[1] * h)
+        return AffineConstraint.after(
+            model, (h, first), generator(model, first) + self.alphas[1] * h
+        )
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> PrintedSZCBF:
@@ -86,10 +111,15 @@ def dubins_problem(noise: float, start: Any) -> SafetyProblem:
     return load_problem(DUBINS, {**options, "barrier": {"radius": RADIUS}})
 
 
-def simulate(filters: Mapping[str, str | Condition], noise: float, start: Any, episodes: int, seed: int) -> dict[str, Exits]:
+def simulate(
+    filters: Mapping[str, str | Condition], noise: float, start: Any, episodes: int, seed: int
+) -> dict[str, Exits]:
     """The same episodes under each of some filters, without a wish to turn."""
     problem = dubins_problem(noise, start)
-    return {name: exits(problem, condition, ZeroController(problem), episodes, seed) for name, condition in filters.items()}
+    return {
+        name: exits(problem, condition, ZeroController(problem), episodes, seed)
+        for name, condition in filters.items()
+    }
 
 
 def random_starts(start: str, noise: float, count: int, seed: int) -> np.ndarray:
@@ -116,7 +146,8 @@ def ahead_of(rival: str, runs: Runs, horizon: float, where: str = "") -> Number:
 
 
 def turning_time(better: Exits, other: Exits) -> float | None:
-    """From when on more episodes are safe with the first than with the other, in s; None if not at the end."""
+    """From when on more episodes are safe with the first than with the other, in s; None if not at
+    the end."""
     ahead = counts(better) > counts(other)
     if not ahead[-1]:
         return None
@@ -129,7 +160,9 @@ def scbf_of(runs: Runs) -> dict[str, Exits]:
     return {"SCBF": runs["SCBF"]}
 
 
-def elsewhere_of(named: Mapping[str, Any], printed: Any, claim: Callable[[Any, float], Claim]) -> dict[str, Outcome]:
+def elsewhere_of(
+    named: Mapping[str, Any], printed: Any, claim: Callable[[Any, float], Claim]
+) -> dict[str, Outcome]:
     """The claim by the printed SZCBF, for the other horizons, and from the other starts.
 
     Args:
@@ -139,16 +172,24 @@ def elsewhere_of(named: Mapping[str, Any], printed: Any, claim: Callable[[Any, f
     """
     horizons = (HORIZON, *(t for t in HORIZONS if t != HORIZON))
     found = {AS_PRINTED: printed, **named}
-    claims = {f"{name}, T = {t:g} s": Outcome(claims=[claim(runs, t)]) for name, runs in found.items() for t in horizons}
+    claims = {
+        f"{name}, T = {t:g} s": Outcome(claims=[claim(runs, t)])
+        for name, runs in found.items()
+        for t in horizons
+    }
     del claims[f"{STARTS['uniform']}, T = {HORIZON:g} s"]
     return claims
 
 
 def holds_note(elsewhere: Mapping[str, Outcome]) -> str:
     """In which of the other settings all holds."""
-    yes, no = ([name for name, found in elsewhere.items() if all(c.holds for c in found.claims) == holds] for holds in (True, False))
+    yes, no = (
+        [name for name, found in elsewhere.items() if all(c.holds for c in found.claims) == holds]
+        for holds in (True, False)
+    )
     return (
-        f"what is printed holds with: {'; '.join(yes) or 'none of the other settings'}. It does not with: {'; '.join(no) or 'none of them'}"
+        f"what is printed holds with: {'; '.join(yes) or 'none of the other settings'}. It does not"
+        f" with: {'; '.join(no) or 'none of them'}"
     )
 
 

@@ -1,4 +1,5 @@
-"""Thesis Sec. 4.2.2 and Prop. 4.2.8: what a reciprocal condition asks for under noise, and a bound that is attained."""
+"""Thesis Sec. 4.2.2 and Prop. 4.2.8: what a reciprocal condition asks for under noise, and a bound
+that is attained."""
 
 from __future__ import annotations
 
@@ -43,7 +44,8 @@ EPISODES = 2000
 ROUNDING = 1e-6
 """Relative difference up to which two inputs are the same."""
 SHIFT = 0.5826
-"""By so many standard deviations of a step a boundary that is watched at the steps only seems to be further away."""
+"""By so many standard deviations of a step a boundary that is watched at the steps only seems to be
+further away."""
 DISTANCES = np.logspace(0, -6, 61)
 """h at which the conditions are asked for the largest input that they allow."""
 CHOSEN = (
@@ -55,17 +57,25 @@ CHOSEN = (
 def setting(sample: Sample) -> tuple[str, ...]:
     """What is computed and simulated."""
     return (
-        f"largest input that each condition allows, from the filter itself: dx = (x + u) dt + sigma dW, h = 1 - x, gamma = {GAMMA:g}",
-        f"the same system with sigma = {NOISE} from x = 0, bounds on the input, control period {STEP} s, {HORIZON:g} s, nominal "
-        "u = 1 - 2 x",
-        f"P >= h/c: dx = u dt + s x dW, s = {SCALE:g}, h = 1 - x^2, c = 1, nominal u = 0, start x_0, {HORIZON:g} s; there the SCBF's "
-        "action is u = -s^2 x/2, so that A h = 0",
+        (
+            "largest input that each condition allows, from the filter itself: dx = (x + u) dt +"
+            f" sigma dW, h = 1 - x, gamma = {GAMMA:g}"
+        ),
+        (
+            f"the same system with sigma = {NOISE} from x = 0, bounds on the input, control period"
+            f" {STEP} s, {HORIZON:g} s, nominal u = 1 - 2 x"
+        ),
+        (
+            f"P >= h/c: dx = u dt + s x dW, s = {SCALE:g}, h = 1 - x^2, c = 1, nominal u = 0, start"
+            f" x_0, {HORIZON:g} s; there the SCBF's action is u = -s^2 x/2, so that A h = 0"
+        ),
         f"episodes of each rate under noise: {sample.size(EPISODES)}",
     )
 
 
 def largest_inputs(text: str, noise: float) -> np.ndarray:
-    """The largest u that a condition allows at each of `DISTANCES`: a filter's answer to a far larger one."""
+    """The largest u that a condition allows at each of `DISTANCES`: a filter's answer to a far
+    larger one."""
     problem = load_problem(SCALAR, {"noise": noise, "box": [-UNBOUNDED, UNBOUNDED]})
     answer = SafetyFilter.for_problem(problem, parse_conditions(text, problem))
     state = (1.0 - DISTANCES)[:, None]
@@ -73,9 +83,17 @@ def largest_inputs(text: str, noise: float) -> np.ndarray:
 
 
 def attaining_problem(start: float) -> SafetyProblem:
-    """The system dx = u dt + s x dW with h = 1 - x^2, from a start: without a wish of its own, h is a martingale under the SCBF."""
+    """The system dx = u dt + s x dW with h = 1 - x^2, from a start: without a wish of its own, h is
+    a martingale under the SCBF."""
     x, u, s = sp.symbols("x u s", real=True)
-    system = ControlAffineSDE(states=(x,), inputs=(u,), drift=[0], input_matrix=[1], diffusion=[s * x], parameters={s: SCALE})
+    system = ControlAffineSDE(
+        states=(x,),
+        inputs=(u,),
+        drift=[0],
+        input_matrix=[1],
+        diffusion=[s * x],
+        parameters={s: SCALE},
+    )
     return SafetyProblem(
         name="Martingale",
         plant=system,
@@ -93,7 +111,8 @@ def attaining_problem(start: float) -> SafetyProblem:
 
 
 def safe_up_to(start: float, horizon: float, step: float = 0.0) -> float:
-    """P(|x| < 1 up to the horizon) for dx = -s^2 x/2 dt + s x dW: log |x| is a Brownian motion with drift -s^2.
+    """P(|x| < 1 up to the horizon) for dx = -s^2 x/2 dt + s x dW: log |x| is a Brownian motion with
+    drift -s^2.
 
     Args:
         start: x_0.
@@ -111,18 +130,37 @@ def safe_up_to(start: float, horizon: float, step: float = 0.0) -> float:
 def compute(sample: Sample) -> Outcome:
     """Both parts: what the conditions ask for, and how safe they are."""
     episodes = sample.size(EPISODES)
-    asked = {"RCBF": largest_inputs(f"rcbf:gamma={GAMMA}", 0.0), "SRCBF": largest_inputs(f"srcbf:gamma={GAMMA}", NOISE)}
-    limited = [_limited(limit, episodes, sample.seed) for limit in (*LIMITS[: 1 if sample.quick else None], UNBOUNDED)]
-    calm = evaluate(SCALAR, filters=["rcbf"], options={"noise": 0.0, "box": [-LIMITS[0], LIMITS[0]]}, episodes=1, bounds=False).rows[0]
-    attained = [_attained(start, episodes, episode_seed(sample.seed, i)) for i, start in enumerate(STARTS)]
+    asked = {
+        "RCBF": largest_inputs(f"rcbf:gamma={GAMMA}", 0.0),
+        "SRCBF": largest_inputs(f"srcbf:gamma={GAMMA}", NOISE),
+    }
+    limited = [
+        _limited(limit, episodes, sample.seed)
+        for limit in (*LIMITS[: 1 if sample.quick else None], UNBOUNDED)
+    ]
+    calm = evaluate(
+        SCALAR,
+        filters=["rcbf"],
+        options={"noise": 0.0, "box": [-LIMITS[0], LIMITS[0]]},
+        episodes=1,
+        bounds=False,
+    ).rows[0]
+    attained = [
+        _attained(start, episodes, episode_seed(sample.seed, i)) for i, start in enumerate(STARTS)
+    ]
     numbers = [
-        *(Number.rate(f"SCBF where h/c is attained, x_0 = {s:g}", r["safe"], episodes) for s, r in zip(STARTS, attained, strict=True)),
+        *(
+            Number.rate(f"SCBF where h/c is attained, x_0 = {s:g}", r["safe"], episodes)
+            for s, r in zip(STARTS, attained, strict=True)
+        ),
         *(number for pair in limited for number in pair),
         Number(f"RCBF without noise, |u| <= {LIMITS[0]:g}", 100 * calm["safety_rate"], unit="%"),
     ]
     rates = numbers[: len(STARTS)]
     bounds = [float(proposition_4_2_8(1.0 - s**2, 1.0)) for s in STARTS]
-    closed = [[safe_up_to(s, t, step) for s in STARTS] for t, step in ((math.inf, 0.0), (HORIZON, STEP))]
+    closed = [
+        [safe_up_to(s, t, step) for s in STARTS] for t, step in ((math.inf, 0.0), (HORIZON, STEP))
+    ]
     return Outcome(
         numbers=numbers,
         claims=[
@@ -135,14 +173,18 @@ def compute(sample: Sample) -> Outcome:
             "h": DISTANCES.tolist(),
             "asked": {name: values.tolist() for name, values in asked.items()},
             "curves": [
-                {key: r["curve"][key] for key in ("time", "rate", "ci_low", "ci_high")} | {"bound": b, "start": s}
+                {key: r["curve"][key] for key in ("time", "rate", "ci_low", "ci_high")}
+                | {"bound": b, "start": s}
                 for s, r, b in zip(STARTS, attained, bounds, strict=True)
             ],
-            "closed": [[safe_up_to(s, t, STEP) for t in attained[0]["curve"]["time"][1:]] for s in STARTS],
+            "closed": [
+                [safe_up_to(s, t, STEP) for t in attained[0]["curve"]["time"][1:]] for s in STARTS
+            ],
         },
         notes=[
-            f"x_0 = {s:g}: h/c = {100 * b:.2f} %, closed form for ever {100 * e:.2f} %, for {HORIZON:g} s looked at every {STEP:g} s "
-            f"{100 * f:.2f} %, simulated {100 * r['safety_rate']:.2f} %"
+            f"x_0 = {s:g}: h/c = {100 * b:.2f} %, closed form for ever {100 * e:.2f} %, for"
+            f" {HORIZON:g} s looked at every {STEP:g} s {100 * f:.2f} %, simulated"
+            f" {100 * r['safety_rate']:.2f} %"
             for s, b, e, f, r in zip(STARTS, bounds, *closed, attained, strict=True)
         ]
         + [_held_note(limited[-1][0])],
@@ -150,7 +192,9 @@ def compute(sample: Sample) -> Outcome:
 
 
 def _attained(start: float, episodes: int, seed: int) -> dict[str, Any]:
-    return evaluate(attaining_problem(start), filters=["scbf"], episodes=episodes, seed=seed, bounds=False).rows[0]
+    return evaluate(
+        attaining_problem(start), filters=["scbf"], episodes=episodes, seed=seed, bounds=False
+    ).rows[0]
 
 
 def _together(row: Mapping[str, Any]) -> Number:
@@ -161,10 +205,26 @@ def _together(row: Mapping[str, Any]) -> Number:
 
 def _limited(limit: float, episodes: int, seed: int) -> list[Number]:
     """Safety of both conditions in the scalar system with a bound on the input."""
-    options = {"noise": NOISE, "start": [0.0], "box": [-limit, limit], "dt": STEP, "horizon": HORIZON}
-    rows = evaluate(SCALAR, filters=["srcbf", "scbf"], options=options, episodes=episodes, seed=seed, bounds=False).rows
+    options = {
+        "noise": NOISE,
+        "start": [0.0],
+        "box": [-limit, limit],
+        "dt": STEP,
+        "horizon": HORIZON,
+    }
+    rows = evaluate(
+        SCALAR,
+        filters=["srcbf", "scbf"],
+        options=options,
+        episodes=episodes,
+        seed=seed,
+        bounds=False,
+    ).rows
     where = "unbounded" if limit == UNBOUNDED else f"|u| <= {limit:g}"
-    return [Number.rate(f"{name}, {where}", row["safe"], episodes) for name, row in zip(("SRCBF", "SCBF"), rows, strict=True)]
+    return [
+        Number.rate(f"{name}, {where}", row["safe"], episodes)
+        for name, row in zip(("SRCBF", "SCBF"), rows, strict=True)
+    ]
 
 
 def claims_on_inputs(asked: Mapping[str, np.ndarray]) -> list[Claim]:
@@ -175,23 +235,47 @@ def claims_on_inputs(asked: Mapping[str, np.ndarray]) -> list[Claim]:
     """
     h, x = DISTANCES, 1.0 - DISTANCES
     printed = {"RCBF": h**3 - x, "SRCBF": h**3 - x - NOISE**2 / h}
-    away = {name: float(np.max(np.abs(asked[name] - printed[name]) / np.maximum(np.abs(printed[name]), 1.0))) for name in asked}
+    away = {
+        name: float(
+            np.max(np.abs(asked[name] - printed[name]) / np.maximum(np.abs(printed[name]), 1.0))
+        )
+        for name in asked
+    }
     return [
-        Claim("both inequalities on u are right", max(away.values()) < ROUNDING, f"largest relative difference {max(away.values()):.1e}"),
-        _claim_on_edge("without noise the RCBF asks for bounded control at the edge", asked["RCBF"], bounded=True),
-        _claim_on_edge("under noise the SRCBF asks for unbounded control at the edge", asked["SRCBF"], bounded=False),
+        Claim(
+            "both inequalities on u are right",
+            max(away.values()) < ROUNDING,
+            f"largest relative difference {max(away.values()):.1e}",
+        ),
+        _claim_on_edge(
+            "without noise the RCBF asks for bounded control at the edge",
+            asked["RCBF"],
+            bounded=True,
+        ),
+        _claim_on_edge(
+            "under noise the SRCBF asks for unbounded control at the edge",
+            asked["SRCBF"],
+            bounded=False,
+        ),
     ]
 
 
 def _claim_on_edge(sentence: str, asked: np.ndarray, bounded: bool) -> Claim:
-    """By the power of h, to the nearest whole one, that the effort asked for goes with: 0 for a bound, less for none."""
+    """By the power of h, to the nearest whole one, that the effort asked for goes with: 0 for a
+    bound, less for none."""
     power = float(np.polyfit(np.log(DISTANCES[-20:]), np.log(np.abs(asked[-20:])), 1)[0])
-    evidence = f"it allows u = {asked[-1]:.6g} at h = {DISTANCES[-1]:g}; |u| goes like h^{round(power, 3) + 0.0:.3f} there"
+    evidence = (
+        f"it allows u = {asked[-1]:.6g} at h = {DISTANCES[-1]:g}; |u| goes like"
+        f" h^{round(power, 3) + 0.0:.3f} there"
+    )
     return Claim(sentence, (round(power) >= 0) == bounded, evidence)
 
 
 def _held_note(unbounded: Number) -> str:
-    return f"Prop. 4.2.2 promises 100 % with unbounded SRCBF; with an input that is held for {STEP:g} s it is {unbounded.ours:.1f} %"
+    return (
+        f"Prop. 4.2.2 promises 100 % with unbounded SRCBF; with an input that is held for {STEP:g}"
+        f" s it is {unbounded.ours:.1f} %"
+    )
 
 
 def claim_on_limits(bounded: Number, unbounded: Number) -> Claim:
@@ -199,36 +283,47 @@ def claim_on_limits(bounded: Number, unbounded: Number) -> Claim:
     return Claim(
         "with bounded control the SRCBF is less safe",
         _upper(bounded) < _lower(unbounded),
-        f"{bounded.ours:.1f} % with {bounded.name.split(', ')[1]}, {unbounded.ours:.1f} % without a bound",
+        f"{bounded.ours:.1f} % with {bounded.name.split(', ')[1]}, {unbounded.ours:.1f} % without a"
+        " bound",
         printed=False,
     )
 
 
 def claim_on_bound(attained: Sequence[Number], bounds: Sequence[float]) -> Claim:
-    """Whether a rate is below the bound by more than chance; it is of a finite time, so that it may be above."""
+    """Whether a rate is below the bound by more than chance; it is of a finite time, so that it may
+    be above."""
     below = sum(100 * b > _upper(n) for n, b in zip(attained, bounds, strict=True))
-    each = "; ".join(f"{_with_interval(n)} against {100 * b:.1f} %" for n, b in zip(attained, bounds, strict=True))
+    each = "; ".join(
+        f"{_with_interval(n)} against {100 * b:.1f} %"
+        for n, b in zip(attained, bounds, strict=True)
+    )
     return Claim(
         "Prop. 4.2.8: P(safe for ever) >= h/c",
         below == 0,
-        f"up to {HORIZON:g} s: {each}; below it by more than chance at {below} of {len(bounds)} starts",
+        f"up to {HORIZON:g} s: {each}; below it by more than chance at {below} of {len(bounds)}"
+        " starts",
     )
 
 
 def claim_on_attaining(attained: Sequence[Number], closed: Sequence[float]) -> Claim:
-    """For ever the closed form is 1 - x_0^2 = h/c; what can be simulated is another value of the same form.
+    """For ever the closed form is 1 - x_0^2 = h/c; what can be simulated is another value of the
+    same form.
 
     Args:
         attained: rates with 95 % intervals for all of them together.
         closed: the form for the horizon and the instants that are simulated.
     """
     inside = sum(_lower(n) <= 100 * p <= _upper(n) for n, p in zip(attained, closed, strict=True))
-    each = "; ".join(f"{_with_interval(n)} against {100 * p:.1f} %" for n, p in zip(attained, closed, strict=True))
+    each = "; ".join(
+        f"{_with_interval(n)} against {100 * p:.1f} %"
+        for n, p in zip(attained, closed, strict=True)
+    )
     return Claim(
         "h/c is the worst case: on this system it is attained",
         inside == len(closed),
-        f"1 - x_0^2 = h/c is its probability for ever. The same form for {HORIZON:g} s, looked at every {STEP:g} s, is inside the interval "
-        f"of the simulation at {inside} of {len(closed)} starts, by intervals that hold all of them with 95 %: {each}",
+        f"1 - x_0^2 = h/c is its probability for ever. The same form for {HORIZON:g} s, looked at"
+        f" every {STEP:g} s, is inside the interval of the simulation at {inside} of {len(closed)}"
+        f" starts, by intervals that hold all of them with 95 %: {each}",
         printed=False,
     )
 
@@ -246,18 +341,35 @@ def _with_interval(rate: Number) -> str:
 
 
 def draw(figure: Figure, outcome: Outcome) -> None:
-    """Left: what the conditions allow towards the edge. Right: safety over time with its 95 % band, and the bound that is attained."""
+    """Left: what the conditions allow towards the edge. Right: safety over time with its 95 % band,
+    and the bound that is attained."""
     left, right = figure.subplots(1, 2)
     _draw_inputs(left, outcome.data)
     _draw_bound(right, outcome.data)
-    add_legend(figure, [*left.get_legend_handles_labels()[0], *right.get_legend_handles_labels()[0]])
+    add_legend(
+        figure, [*left.get_legend_handles_labels()[0], *right.get_legend_handles_labels()[0]]
+    )
 
 
 def _draw_inputs(axes: Axes, data: dict[str, Any]) -> None:
     h = np.array(data["h"])
-    for (name, values), color, what in zip(data["asked"].items(), COLORS[:2], ("no noise", rf"$\sigma$ = {NOISE:g}"), strict=True):
-        axes.plot(h[h < 0.5], -np.array(values)[h < 0.5], color=color, linewidth=2, label=f"{name}, {what}")
-    axes.set(xscale="log", yscale="log", xlabel="h = 1 - x, edge at the left", ylabel="least effort -u asked for (1/s)", title="(a)")
+    for (name, values), color, what in zip(
+        data["asked"].items(), COLORS[:2], ("no noise", rf"$\sigma$ = {NOISE:g}"), strict=True
+    ):
+        axes.plot(
+            h[h < 0.5],
+            -np.array(values)[h < 0.5],
+            color=color,
+            linewidth=2,
+            label=f"{name}, {what}",
+        )
+    axes.set(
+        xscale="log",
+        yscale="log",
+        xlabel="h = 1 - x, edge at the left",
+        ylabel="least effort -u asked for (1/s)",
+        title="(a)",
+    )
 
 
 def _draw_bound(axes: Axes, data: dict[str, Any]) -> None:
@@ -270,7 +382,9 @@ def _draw_bound(axes: Axes, data: dict[str, Any]) -> None:
         axes.axhline(100 * curve["bound"], color=color, linestyle="--", linewidth=1)
     axes.plot([], [], color="black", linewidth=1, linestyle=":", label="closed form")
     axes.plot([], [], color="black", linewidth=1, linestyle="--", label="h/c of the same colour")
-    axes.set(xlabel="time (s)", ylabel="safe so far (%)", ylim=(35, 101), xlim=(0, HORIZON), title="(b)")
+    axes.set(
+        xlabel="time (s)", ylabel="safe so far (%)", ylim=(35, 101), xlim=(0, HORIZON), title="(b)"
+    )
 
 
 ARTEFACTS: tuple[Artefact, ...] = (
@@ -280,7 +394,12 @@ ARTEFACTS: tuple[Artefact, ...] = (
         compute=compute,
         setting=setting,
         chosen=CHOSEN,
-        corrections=("Prop. 4.2.8 needs c = sup h to be finite: on the half-line of the example h is unbounded, and h/c promises nothing",),
+        corrections=(
+            (
+                "Prop. 4.2.8 needs c = sup h to be finite: on the half-line of the example h is"
+                " unbounded, and h/c promises nothing"
+            ),
+        ),
         draw=draw,
         size=(7.0, 4.0),
     ),

@@ -1,4 +1,5 @@
-"""The same episodes under several filters: when each is first unsafe, and by how much two filters differ."""
+"""The same episodes under several filters: when each is first unsafe, and by how much two filters
+differ."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ class Exits:
     """When the episodes of a filter are first unsafe.
 
     Attributes:
-        instant: first control instant with h <= 0 of each episode, past the last one if there is none, shape (episodes,).
+        instant: first control instant with h <= 0 of each episode, past the last one if there is
+            none, shape (episodes,).
         infeasible: share of the steps before it in which no action meets the condition.
     """
 
@@ -38,7 +40,9 @@ class Exits:
         return Number.rate(name, int(self.safe(step).sum()), len(self.instant))
 
 
-def exits(problem: SafetyProblem, condition: str | Condition, policy: Policy, episodes: int, seed: int) -> Exits:
+def exits(
+    problem: SafetyProblem, condition: str | Condition, policy: Policy, episodes: int, seed: int
+) -> Exits:
     """Simulate a filter over a policy; episode i has the same start and noise under every filter.
 
     Args:
@@ -60,16 +64,22 @@ def exits(problem: SafetyProblem, condition: str | Condition, policy: Policy, ep
 
 
 def difference(name: str, first: np.ndarray, second: np.ndarray) -> Number:
-    """By how much the rate of one filter is above another's on the same episodes, in points, with its paired interval.
+    """By how much the rate of one filter is above another's on the same episodes, in points, with
+    its paired interval.
 
     Args:
         name: of the number.
         first: which episodes are safe with the one, shape (episodes,).
         second: with the other.
     """
-    table = [int(both.sum()) for both in (first & second, first & ~second, ~first & second, ~first & ~second)]
+    table = [
+        int(both.sum())
+        for both in (first & second, first & ~second, ~first & second, ~first & ~second)
+    ]
     low, high = paired_difference_interval(*table)
-    return Number(name, 100 * (table[1] - table[2]) / len(first), 100 * low, 100 * high, unit="points")
+    return Number(
+        name, 100 * (table[1] - table[2]) / len(first), 100 * low, 100 * high, unit="points"
+    )
 
 
 def is_above(number: Number, value: float = 0.0) -> bool:

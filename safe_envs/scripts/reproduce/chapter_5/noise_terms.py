@@ -1,4 +1,5 @@
-"""What the noise adds to the generator of a barrier, learned by Algorithm 2 of the thesis (Figures 5.1, 5.2)."""
+"""What the noise adds to the generator of a barrier, learned by Algorithm 2 of the thesis (Figures
+5.1, 5.2)."""
 
 from __future__ import annotations
 
@@ -30,7 +31,10 @@ CLOSE = 0.1
 """Largest rms error of a learned term, as part of the term: a limit of ours."""
 
 FIT_ERRATA = (
-    "Eq. (5.17), (5.18): the change of h is taken from where the known drift leads, less its linear part in the noise",
+    (
+        "Eq. (5.17), (5.18): the change of h is taken from where the known drift leads, less its"
+        " linear part in the noise"
+    ),
     "Eq. (5.17): j = 1..n in place of 0..n",
 )
 
@@ -40,7 +44,8 @@ _NETWORK = "rms error of the network"
 
 @dataclass(frozen=True)
 class Lesson:
-    """What an identification learned: models by estimator, and of a whole lesson the labels at the states x of its data."""
+    """What an identification learned: models by estimator, and of a whole lesson the labels at the
+    states x of its data."""
 
     seed: int
     learned: dict[str, GeneratorModel]
@@ -50,7 +55,8 @@ class Lesson:
 
 @dataclass(frozen=True)
 class _Errors:
-    """How far the networks of several identifications are from the true term, each at states of its own, shape (K, P)."""
+    """How far the networks of several identifications are from the true term, each at states of its
+    own, shape (K, P)."""
 
     truth: np.ndarray
     estimates: np.ndarray
@@ -62,23 +68,35 @@ class _Errors:
 
     @property
     def number(self) -> Number:
-        """Their mean. The states at which one network is looked at are not independent of each other: only networks are."""
+        """Their mean. The states at which one network is looked at are not independent of each
+        other: only networks are."""
         return Number.mean(_NETWORK, self.each, "1/s", least=0.0)
 
 
 @lru_cache(maxsize=16)
-def lesson(env_id: str, noise: float, points: int, repetitions: int, seed: int, whole: bool) -> Lesson:
-    """Follow Algorithm 2 at one noise level, by the repaired and by the printed estimator; `whole` adds all labels."""
+def lesson(
+    env_id: str, noise: float, points: int, repetitions: int, seed: int, whole: bool
+) -> Lesson:
+    """Follow Algorithm 2 at one noise level, by the repaired and by the printed estimator; `whole`
+    adds all labels."""
     problem = load_problem(env_id, {"noise": noise})
     data = collect(problem, points, repetitions, [[0.0]], seed=seed)
     estimators: tuple[Estimator, ...] = ("martingale", "printed")
-    learned = {name: learn_generator(problem, data=data, estimator=name, seed=seed) for name in estimators}
+    learned = {
+        name: learn_generator(problem, data=data, estimator=name, seed=seed) for name in estimators
+    }
     if not whole:
         return Lesson(seed, learned, data.x, {})
     h, plant = problem.barriers[0].expression, problem.plant
-    value, slopes = (compile_function(plant.states, tuple(plant.numeric(e) for e in part), "arrays") for part in ([h], gradient(plant, h)))
+    value, slopes = (
+        compile_function(plant.states, tuple(plant.numeric(e) for e in part), "arrays")
+        for part in ([h], gradient(plant, h))
+    )
     rate = rates(problem.model, data)
-    labels = {e: ito_part(data, rate, lambda x: value(*x)[0], lambda x: slopes(*x), e).values for e in get_args(Estimator)}
+    labels = {
+        e: ito_part(data, rate, lambda x: value(*x)[0], lambda x: slopes(*x), e).values
+        for e in get_args(Estimator)
+    }
     return Lesson(seed, learned, data.x, labels)
 
 
@@ -89,9 +107,15 @@ def identifications(sample: Sample) -> int:
 
 def lessons(env_id: str, noise: float, sample: Sample) -> list[Lesson]:
     """Several identifications, the first of them whole."""
-    children = (np.random.SeedSequence(sample.seed, spawn_key=(r, 0)).generate_state(1)[0] for r in range(1, identifications(sample)))
+    children = (
+        np.random.SeedSequence(sample.seed, spawn_key=(r, 0)).generate_state(1)[0]
+        for r in range(1, identifications(sample))
+    )
     seeds = [sample.seed, *map(int, children)]
-    return [lesson(env_id, noise, sample.work(POINTS), sample.work(REPETITIONS), seed, r == 0) for r, seed in enumerate(seeds)]
+    return [
+        lesson(env_id, noise, sample.work(POINTS), sample.work(REPETITIONS), seed, r == 0)
+        for r, seed in enumerate(seeds)
+    ]
 
 
 def models(learned: Sequence[Lesson], estimator: Estimator = "martingale") -> list[GeneratorModel]:
@@ -102,13 +126,20 @@ def models(learned: Sequence[Lesson], estimator: Estimator = "martingale") -> li
 def learning_setting(sample: Sample, where: str, noise: str) -> tuple[str, ...]:
     """How a term is learned, and its error measured."""
     return (
-        f"{sample.work(POINTS)} states uniform in {where}, {sample.work(REPETITIONS)} Euler steps of 10 ms from each, u = 0, {noise}",
-        f"network 100-30, 500 epochs at most; {identifications(sample)} identifications, each with data of its own; the error of each at "
-        f"{VALIDATION} other states",
+        (
+            f"{sample.work(POINTS)} states uniform in {where}, {sample.work(REPETITIONS)} Euler"
+            f" steps of 10 ms from each, u = 0, {noise}"
+        ),
+        (
+            f"network 100-30, 500 epochs at most; {identifications(sample)} identifications, each"
+            f" with data of its own; the error of each at {VALIDATION} other states"
+        ),
     )
 
 
-def learning_outcome(env_id: str, noise: float, state: int, said: str, formula: Callable[[Any], Any], sample: Sample) -> Outcome:
+def learning_outcome(
+    env_id: str, noise: float, state: int, said: str, formula: Callable[[Any], Any], sample: Sample
+) -> Outcome:
     """How near the learned term is to the true one, which depends on one state alone.
 
     Args:
@@ -122,8 +153,12 @@ def learning_outcome(env_id: str, noise: float, state: int, said: str, formula: 
     problem, learned = load_problem(env_id, {"noise": noise}), lessons(env_id, noise, sample)
     first = learned[0]
     x = [draw_states(problem, VALIDATION, np.random.default_rng(each.seed)) for each in learned]
-    repaired, printed = (_errors(problem, models(learned, name), x) for name in ("martingale", "printed"))
-    expression = problem.plant.numeric(ito_correction(problem.plant, problem.barriers[0].expression))
+    repaired, printed = (
+        _errors(problem, models(learned, name), x) for name in ("martingale", "printed")
+    )
+    expression = problem.plant.numeric(
+        ito_correction(problem.plant, problem.barriers[0].expression)
+    )
     term = compile_function((problem.plant.states[state],), (expression,), "arrays")
     missed = {name: values - term(first.x[:, state])[0] for name, values in first.labels.items()}
     grid = np.linspace(*problem.exploration.region[state], 200)
@@ -147,33 +182,53 @@ def learning_outcome(env_id: str, noise: float, state: int, said: str, formula: 
             "term": term(grid)[0].tolist(),
             "points": first.x[:, state].tolist(),
             "validation": x[0][:, state].tolist(),
-            "repaired": {"labels": first.labels["martingale"].tolist(), "network": repaired.estimates[0].tolist()},
-            "printed": {"labels": first.labels["printed"].tolist(), "network": printed.estimates[0].tolist()},
+            "repaired": {
+                "labels": first.labels["martingale"].tolist(),
+                "network": repaired.estimates[0].tolist(),
+            },
+            "printed": {
+                "labels": first.labels["printed"].tolist(),
+                "network": printed.estimates[0].tolist(),
+            },
         },
         notes=_why_printed_fails(problem, first, missed["printed"], sample.work(REPETITIONS)),
     )
 
 
-def _errors(problem: SafetyProblem, learned: Sequence[GeneratorModel], x: Sequence[np.ndarray]) -> _Errors:
-    pairs = [next(iter(model.compare(problem, states).values())) for model, states in zip(learned, x, strict=True)]
+def _errors(
+    problem: SafetyProblem, learned: Sequence[GeneratorModel], x: Sequence[np.ndarray]
+) -> _Errors:
+    pairs = [
+        next(iter(model.compare(problem, states).values()))
+        for model, states in zip(learned, x, strict=True)
+    ]
     return _Errors(*(np.array(part) for part in zip(*pairs, strict=True)))
 
 
 def as_derived(said: str, term: np.ndarray, printed: np.ndarray) -> Claim:
-    """Whether the printed formula of the term is that which follows from the system and h, at some states."""
+    """Whether the printed formula of the term is that which follows from the system and h, at some
+    states."""
     largest = float(np.abs(term - printed).max())
     return Claim(
-        f"the analytic term is {said}", bool(np.allclose(printed, term, rtol=1e-9, atol=1e-15)), f"off by {largest:.1g} 1/s at most"
+        f"the analytic term is {said}",
+        bool(np.allclose(printed, term, rtol=1e-9, atol=1e-15)),
+        f"off by {largest:.1g} 1/s at most",
     )
 
 
 def learnable(errors: Sequence[float], truth: np.ndarray) -> Claim:
-    """Whether networks are nearer to the term than the best constant: then they learned something of its shape."""
+    """Whether networks are nearer to the term than the best constant: then they learned something
+    of its shape."""
     constant = float(np.std(truth))
     found = Number.mean("", errors, least=0.0)
     holds = found.high is not None and found.high < constant
-    evidence = f"rms error of the network {found.ours:.2g} 1/s [{found.low:.2g}, {found.high:.2g}], of the best constant {constant:.2g} 1/s"
-    return Claim("what the noise adds to the generator of h can be learned from data", holds, evidence)
+    evidence = (
+        f"rms error of the network {found.ours:.2g} 1/s [{found.low:.2g}, {found.high:.2g}], of the"
+        f" best constant {constant:.2g} 1/s"
+    )
+    return Claim(
+        "what the noise adds to the generator of h can be learned from data", holds, evidence
+    )
 
 
 def near(errors: Sequence[float], truth: np.ndarray) -> Claim:
@@ -183,19 +238,36 @@ def near(errors: Sequence[float], truth: np.ndarray) -> Claim:
     return Claim(sentence, share < CLOSE, f"it is {share:.1%} of it", printed=False)
 
 
-def _why_printed_fails(problem: SafetyProblem, first: Lesson, missed: np.ndarray, repetitions: int) -> list[str]:
+def _why_printed_fails(
+    problem: SafetyProblem, first: Lesson, missed: np.ndarray, repetitions: int
+) -> list[str]:
     """The printed estimator's error, its bias in closed form, and its noise."""
     plant, h = problem.plant, problem.barriers[0].expression
-    bias = (plant.drift.T * gradient(plant, h).jacobian(plant.states) * plant.drift)[0, 0] / 2 * problem.dt
+    bias = (
+        (plant.drift.T * gradient(plant, h).jacobian(plant.states) * plant.drift)[0, 0]
+        / 2
+        * problem.dt
+    )
     read = compile_function(plant.states, (plant.numeric(bias), plant.numeric(h)), "arrays")
     predicted, level = read(*np.ascontiguousarray(first.x.T))
-    noise = next(value for name, value in first.learned["printed"].record.errors.items() if "standard error" in name)
+    noise = next(
+        value
+        for name, value in first.learned["printed"].record.errors.items()
+        if "standard error" in name
+    )
     signal, added = _rms(first.labels["martingale"]), _rms(level / (repetitions * problem.dt))
     return [
-        f"Eq. (5.17), (5.18) miss by {_rms(missed):.2g} 1/s rms, {_rms(missed) / signal:.3g} times the term itself: the bias "
-        f"dt/2 f' h_xx f is {_rms(predicted):.2g} 1/s, {_rms(predicted) / signal:.3g} times the term, and the noise of {repetitions} "
-        f"transitions {noise:.2g} 1/s, {noise / signal:.2g} of it; the bias is proportional to dt, the noise to 1/sqrt(dt)",
-        f"the sum of Eq. (5.17) from j = 0 would add h/(n dt), {added:.2g} 1/s rms: not in these numbers",
+        (
+            f"Eq. (5.17), (5.18) miss by {_rms(missed):.2g} 1/s rms, {_rms(missed) / signal:.3g}"
+            f" times the term itself: the bias dt/2 f' h_xx f is {_rms(predicted):.2g} 1/s,"
+            f" {_rms(predicted) / signal:.3g} times the term, and the noise of {repetitions}"
+            f" transitions {noise:.2g} 1/s, {noise / signal:.2g} of it; the bias is proportional to"
+            " dt, the noise to 1/sqrt(dt)"
+        ),
+        (
+            f"the sum of Eq. (5.17) from j = 0 would add h/(n dt), {added:.2g} 1/s rms: not in"
+            " these numbers"
+        ),
     ]
 
 
@@ -207,21 +279,47 @@ def root_mean_square(name: str, values: np.ndarray) -> Number:
     """Of independent values in 1/s, with the normal interval of their mean square."""
     square = np.square(values)
     mean, half = float(square.mean()), 1.96 * float(square.std(ddof=1)) / math.sqrt(len(square))
-    return Number(name, math.sqrt(mean), math.sqrt(max(mean - half, 0.0)), math.sqrt(mean + half), unit="1/s")
+    return Number(
+        name, math.sqrt(mean), math.sqrt(max(mean - half, 0.0)), math.sqrt(mean + half), unit="1/s"
+    )
 
 
 def draw_learning(figure: Figure, outcome: Outcome) -> None:
-    """The learned term over the state that it depends on: by the repaired estimator, and by the printed one."""
+    """The learned term over the state that it depends on: by the repaired estimator, and by the
+    printed one."""
     data = outcome.data
     panels = list(figure.subplots(1, 2))
     for axes, key in zip(panels, ("repaired", "printed"), strict=True):
-        axes.plot(data["grid"], data["term"], color=COLORS[3], linewidth=5.0, alpha=0.7, label="analytic term")
-        axes.plot(data["points"], data[key]["labels"], ".", color="black", markersize=5, label="training data")
-        axes.plot(data["validation"], data[key]["network"], ".", color=COLORS[0], markersize=2.2, label="network, other states")
+        axes.plot(
+            data["grid"],
+            data["term"],
+            color=COLORS[3],
+            linewidth=5.0,
+            alpha=0.7,
+            label="analytic term",
+        )
+        axes.plot(
+            data["points"],
+            data[key]["labels"],
+            ".",
+            color="black",
+            markersize=5,
+            label="training data",
+        )
+        axes.plot(
+            data["validation"],
+            data[key]["network"],
+            ".",
+            color=COLORS[0],
+            markersize=2.2,
+            label="network, other states",
+        )
         axes.axhline(0.0, color=QUIET, linewidth=0.6, zorder=0)
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-2, 2))
         axes.set_xlabel(data["state"])
     low, high = (float(np.ptp(axes.get_ylim())) for axes in panels)
     panels[0].set(title="(a) repaired estimator", ylabel="noise part of the generator of h (1/s)")
-    panels[1].set_title(f"(b) estimator as printed\n(other scale: {high / low:.3g} times that of (a))")
+    panels[1].set_title(
+        f"(b) estimator as printed\n(other scale: {high / low:.3g} times that of (a))"
+    )
     add_legend(figure, panels[0].get_legend_handles_labels()[0])

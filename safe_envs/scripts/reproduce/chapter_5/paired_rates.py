@@ -39,17 +39,23 @@ class Runs:
     @property
     def curve(self) -> dict[str, list[float]]:
         """Rate in % over time in s."""
-        return {"time": self.row["curve"]["time"], "rate": [100 * rate for rate in self.row["curve"]["rate"]]}
+        return {
+            "time": self.row["curve"]["time"],
+            "rate": [100 * rate for rate in self.row["curve"]["rate"]],
+        }
 
     def number(self, name: str, printed: float | None = None) -> Number:
         """The rate, beside a printed one of 1000 runs."""
         low, high = (100 * self.row[key] for key in ("ci_low", "ci_high"))
-        return Number(name, self.rate, low, high, printed, None if printed is None else EPISODES, "%")
+        return Number(
+            name, self.rate, low, high, printed, None if printed is None else EPISODES, "%"
+        )
 
 
 @dataclass(frozen=True)
 class Difference:
-    """Of two rates on the same episodes, in points, with its 95 % interval over identifications and episodes."""
+    """Of two rates on the same episodes, in points, with its 95 % interval over identifications and
+    episodes."""
 
     mean: float
     low: float
@@ -60,15 +66,29 @@ class Difference:
 
 
 def measured(
-    env_id: str, options: dict[str, Any], filters: Sequence[str], models: Sequence[GeneratorModel], sample: Sample
+    env_id: str,
+    options: dict[str, Any],
+    filters: Sequence[str],
+    models: Sequence[GeneratorModel],
+    sample: Sample,
 ) -> dict[str, Runs]:
     """Run filters that learn nothing, and the learned one, "ddscbf", with each of several models."""
-    how: dict[str, Any] = {"options": options, "episodes": sample.size(EPISODES), "seed": sample.seed, "bounds": False}
+    how: dict[str, Any] = {
+        "options": options,
+        "episodes": sample.size(EPISODES),
+        "seed": sample.seed,
+        "bounds": False,
+    }
     found = {name: [evaluate(env_id, filters=[name], **how)] for name in filters}
     if models:
-        found["ddscbf"] = [evaluate(env_id, filters=["ddscbf"], learned=[model], **how) for model in models]
+        found["ddscbf"] = [
+            evaluate(env_id, filters=["ddscbf"], learned=[model], **how) for model in models
+        ]
     return {
-        name: Runs(pooled([run.rows[0] for run in each], 0.95), [flags for run in each for flags in run.flags[name]])
+        name: Runs(
+            pooled([run.rows[0] for run in each], 0.95),
+            [flags for run in each for flags in run.flags[name]],
+        )
         for name, each in found.items()
     }
 
@@ -82,27 +102,38 @@ def difference(first: Runs, second: Runs) -> Difference:
 def safer(sentence: str, first: Runs, second: Runs, *, printed: bool) -> Claim:
     """Whether the first rate is above the second one by more than chance."""
     apart = difference(first, second)
-    return Claim(sentence, apart.low > 0.0, f"{first.rate:.1f} % less {second.rate:.1f} %: {apart}", printed)
+    return Claim(
+        sentence, apart.low > 0.0, f"{first.rate:.1f} % less {second.rate:.1f} %: {apart}", printed
+    )
 
 
 def resolution(first: float, second: float) -> float:
-    """What separate samples of the printed size can tell apart with 95 %, in points, by the two rates in %."""
+    """What separate samples of the printed size can tell apart with 95 %, in points, by the two
+    rates in %."""
     return 196 * math.sqrt(sum(p / 100 * (1 - p / 100) for p in (first, second)) / EPISODES)
 
 
 def close(runs: dict[str, Runs], scbf: float, ddscbf: float, where: str = "") -> Claim:
-    """Whether learning costs less than the print could have told apart, by the two printed rates in %: a check of ours."""
+    """Whether learning costs less than the print could have told apart, by the two printed rates in
+    %: a check of ours."""
     limit, apart = resolution(scbf, ddscbf), difference(runs["ddscbf"], runs["scbf"])
     evidence = (
-        f"DDSCBF - SCBF = {apart}, over identifications and episodes; limit {limit:.1f} points, what two samples of {EPISODES} tell apart"
+        f"DDSCBF - SCBF = {apart}, over identifications and episodes; limit {limit:.1f} points,"
+        f" what two samples of {EPISODES} tell apart"
     )
-    return Claim(f"DDSCBF is as safe as SCBF{where}", -limit <= apart.low and apart.high <= limit, evidence, printed=False)
+    return Claim(
+        f"DDSCBF is as safe as SCBF{where}",
+        -limit <= apart.low and apart.high <= limit,
+        evidence,
+        printed=False,
+    )
 
 
 def gap(runs: dict[str, Runs], cbf: str, where: str) -> str:
     """Where the gap between SCBF and CBF comes from."""
     without = runs[f"cbf:alpha={NO_RATE}"]
     return (
-        f"{where}, SCBF - CBF is {difference(runs['scbf'], runs[cbf])}: the class-K term (CBF with alpha = 0 less CBF) makes "
-        f"{difference(without, runs[cbf])} of it, and the noise part (SCBF less CBF with alpha = 0) {difference(runs['scbf'], without)}"
+        f"{where}, SCBF - CBF is {difference(runs['scbf'], runs[cbf])}: the class-K term (CBF with"
+        f" alpha = 0 less CBF) makes {difference(without, runs[cbf])} of it, and the noise part"
+        f" (SCBF less CBF with alpha = 0) {difference(runs['scbf'], without)}"
     )

@@ -22,7 +22,15 @@ from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
     lessons,
     models,
 )
-from safe_envs.scripts.reproduce.chapter_5.paired_rates import EPISODES, NO_RATE, Runs, close, gap, measured, safer
+from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
+    EPISODES,
+    NO_RATE,
+    Runs,
+    close,
+    gap,
+    measured,
+    safer,
+)
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
 from safe_envs.wrappers import DDSCBF, SCBF, SafetyFilter
@@ -71,7 +79,10 @@ class Setting:
     def told(self, sample: Sample) -> str:
         """In words."""
         where = {"near-origin": "from (.1 rad, .1 rad/s)", "uniform": "uniform in C"}[self.start]
-        return f"{self.name}: {where}, {self.options(sample)['horizon']:g} s, CBF with alpha(h) = {self.alpha:g} h 1/s"
+        return (
+            f"{self.name}: {where}, {self.options(sample)['horizon']:g} s, CBF with alpha(h) ="
+            f" {self.alpha:g} h 1/s"
+        )
 
 
 A = Setting("A", "uniform", 2.0, 5.0, 5.0)
@@ -80,8 +91,15 @@ B = Setting("B", "near-origin", 20.0, 1.0, 40.0)
 
 def _table(sample: Sample) -> Outcome:
     learned = lessons(ENV, NOISE, sample)
-    found = {each: measured(ENV, each.options(sample), [each.cbf, WITHOUT, "scbf"], models(learned), sample) for each in (B, A)}
-    (main, runs), (other, others) = ((outcome_of(each, found[each], _quiet(each, sample)), found[each]) for each in (B, A))
+    found = {
+        each: measured(
+            ENV, each.options(sample), [each.cbf, WITHOUT, "scbf"], models(learned), sample
+        )
+        for each in (B, A)
+    }
+    (main, runs), (other, others) = (
+        (outcome_of(each, found[each], _quiet(each, sample)), found[each]) for each in (B, A)
+    )
     literal = measured(ENV, B.options(sample), [], models(learned, "printed"), sample)["ddscbf"]
     return Outcome(
         numbers=main.numbers,
@@ -103,7 +121,9 @@ def _table(sample: Sample) -> Outcome:
 
 def _quiet(setting: Setting, sample: Sample) -> Runs:
     """The CBF on the same episodes without noise."""
-    return measured(ENV, {**setting.options(sample), "noise": 0.0}, [setting.cbf], [], sample)[setting.cbf]
+    return measured(ENV, {**setting.options(sample), "noise": 0.0}, [setting.cbf], [], sample)[
+        setting.cbf
+    ]
 
 
 def outcome_of(setting: Setting, runs: dict[str, Runs], quiet: Runs) -> Outcome:
@@ -116,14 +136,29 @@ def outcome_of(setting: Setting, runs: dict[str, Runs], quiet: Runs) -> Outcome:
     """
     cbf, ddscbf = runs[setting.cbf], runs["ddscbf"]
     numbers = [
-        *(runs[text].number(name, PRINTED[name]) for name, text in (("SCBF", "scbf"), ("DDSCBF", "ddscbf"), ("CBF", setting.cbf))),
+        *(
+            runs[text].number(name, PRINTED[name])
+            for name, text in (("SCBF", "scbf"), ("DDSCBF", "ddscbf"), ("CBF", setting.cbf))
+        ),
         runs[WITHOUT].number("CBF with alpha = 0"),
     ]
     low, high = (100 * ddscbf.row[key] for key in ("ci_low", "ci_high"))
-    above = f"DDSCBF is safe in more than {THRESHOLD:g} % of the episodes, as counted, whatever its interval"
+    above = (
+        f"DDSCBF is safe in more than {THRESHOLD:g} % of the episodes, as counted, whatever its"
+        " interval"
+    )
     claims = [
-        Claim("every trajectory is unsafe with the CBF", cbf.row["safe"] == 0, f"{cbf.row['safe']} of {cbf.row['episodes']} are safe"),
-        safer("the noise makes trajectories unsafe with the CBF that are safe without it", quiet, cbf, printed=True),
+        Claim(
+            "every trajectory is unsafe with the CBF",
+            cbf.row["safe"] == 0,
+            f"{cbf.row['safe']} of {cbf.row['episodes']} are safe",
+        ),
+        safer(
+            "the noise makes trajectories unsafe with the CBF that are safe without it",
+            quiet,
+            cbf,
+            printed=True,
+        ),
         Claim(above, ddscbf.rate > THRESHOLD, f"{ddscbf.rate:.1f} % [{low:.1f}, {high:.1f}]"),
         close(runs, PRINTED["SCBF"], PRINTED["DDSCBF"]),
     ]
@@ -133,8 +168,15 @@ def outcome_of(setting: Setting, runs: dict[str, Runs], quiet: Runs) -> Outcome:
 def in_other_setting(other: Outcome) -> str:
     """What would be said of the print, had the other setting been taken as the main one."""
     apart = [text for number in other.numbers if (text := disagreement(number))]
-    failed = [f"it does not hold that {claim.sentence}" for claim in other.claims if claim.printed and not claim.holds]
-    return f"A and B had both been computed before B was taken for the main one; in A: {'; '.join([*apart, *failed]) or 'all as printed'}"
+    failed = [
+        f"it does not hold that {claim.sentence}"
+        for claim in other.claims
+        if claim.printed and not claim.holds
+    ]
+    return (
+        "A and B had both been computed before B was taken for the main one; in A:"
+        f" {'; '.join([*apart, *failed]) or 'all as printed'}"
+    )
 
 
 def _by_printed_estimator(learned: list[Lesson], sample: Sample) -> str:
@@ -142,8 +184,9 @@ def _by_printed_estimator(learned: list[Lesson], sample: Sample) -> str:
     options = ({**A.options(sample), **box} for box in ({}, {"box": UNBOUNDED}))
     boxed, free = (measured(ENV, each, [], printed, sample)["ddscbf"].rate for each in options)
     return (
-        f"DDSCBF by the printed estimator in A: {boxed:.1f} % safe with a torque within 5 N m, {free:.1f} % with an unbounded one. "
-        "The bias of that estimator, -dt f' P f, is never positive: it asks for more control"
+        f"DDSCBF by the printed estimator in A: {boxed:.1f} % safe with a torque within 5 N m,"
+        f" {free:.1f} % with an unbounded one. The bias of that estimator, -dt f' P f, is never"
+        " positive: it asks for more control"
     )
 
 
@@ -154,20 +197,36 @@ def _sampled(sample: Sample) -> str:
     for where, noise in (("without noise", 0.0), ("with it", NOISE)):
         found = measured(ENV, {**A.options(sample), "noise": noise}, [A.cbf, ahead], [], sample)
         bare, least = found[A.cbf], found[A.cbf].row["min_h_median"]
-        said.append(f"{where} {bare.rate:.1f} % (median of the least h {least:.1g}), with a margin for it {found[ahead].rate:.1f} %")
+        said.append(
+            f"{where} {bare.rate:.1f} % (median of the least h {least:.1g}), with a margin for it"
+            f" {found[ahead].rate:.1f} %"
+        )
     return f"the CBF is held for 10 ms; safe in A: {'; '.join(said)}"
 
 
 def _horizons(setting: Setting, sample: Sample) -> str:
     """Up to which horizons the printed rates of SCBF and CBF come out."""
-    found = measured(ENV, {"start": setting.start, "horizon": setting.longest}, [setting.cbf, "scbf"], [], sample)
+    found = measured(
+        ENV, {"start": setting.start, "horizon": setting.longest}, [setting.cbf, "scbf"], [], sample
+    )
     agreeing = []
     for name, text in (("SCBF", "scbf"), ("CBF", setting.cbf)):
         row = found[text].row
-        numbers = [Number.rate("", safe, row["episodes"], PRINTED[name], EPISODES) for safe in row["curve"]["safe"]]
-        agreeing.append({t for t, n in zip(row["curve"]["time"], numbers, strict=True) if disagreement(n) is None})
+        numbers = [
+            Number.rate("", safe, row["episodes"], PRINTED[name], EPISODES)
+            for safe in row["curve"]["safe"]
+        ]
+        agreeing.append(
+            {
+                t
+                for t, n in zip(row["curve"]["time"], numbers, strict=True)
+                if disagreement(n) is None
+            }
+        )
     both, tried = sorted(agreeing[0] & agreeing[1]), len(found["scbf"].row["curve"]["time"])
-    said = f"{len(both)} of {tried} horizons up to {setting.longest:g} s" + (f", from {both[0]:.3g} to {both[-1]:.3g} s" if both else "")
+    said = f"{len(both)} of {tried} horizons up to {setting.longest:g} s" + (
+        f", from {both[0]:.3g} to {both[-1]:.3g} s" if both else ""
+    )
     return f"{setting.name}: the printed rates of SCBF and of CBF both come out at {said}"
 
 
@@ -175,18 +234,34 @@ def _bounds(first: Lesson, scbf: Runs, sample: Sample) -> list[str]:
     """What Prop. 4.2.8 gives, and what Prop. 5.2.2 asks for at the origin."""
     problem, model = load_problem(ENV, B.options(sample)), first.learned["martingale"]
     margin = next(iter(model.record.errors.values()))
-    slack = float(np.max(SafetyFilter.for_problem(problem, DDSCBF(model, margin=margin)).filter([0.0, 0.0], [0.0]).slack))
-    met = f"misses the condition by {slack:.2g} 1/s, so that h/sup h does not apply to DDSCBF" if slack > 0.0 else "meets the condition"
+    slack = float(
+        np.max(
+            SafetyFilter.for_problem(problem, DDSCBF(model, margin=margin))
+            .filter([0.0, 0.0], [0.0])
+            .slack
+        )
+    )
+    met = (
+        f"misses the condition by {slack:.2g} 1/s, so that h/sup h does not apply to DDSCBF"
+        if slack > 0.0
+        else "meets the condition"
+    )
     notes = [
-        "Prop. 5.2.2 asks for a positive margin on all of C: at the origin, where h is largest, with the median error of the network, "
-        f"{margin:.2g} 1/s, for it the best torque {met}"
+        "Prop. 5.2.2 asks for a positive margin on all of C: at the origin, where h is largest,"
+        f" with the median error of the network, {margin:.2g} 1/s, for it the best torque {met}"
     ]
     if sample.quick:
         return notes
     bound = promise(verify(problem, (SCBF(),)), starts_of(problem), problem.duration)[0]
     bound = bound.without(by_rate(bound.value, scbf.row["ci_high"]))
     value = f"none, {bound.reason}" if bound.value is None else f"{100 * bound.value:.1f} %"
-    return [*notes, f"SCBF knows the noise and needs no margin: {bound.name} = {value} ({bound.status}); measured: see SCBF"]
+    return [
+        *notes,
+        (
+            f"SCBF knows the noise and needs no margin: {bound.name} = {value} ({bound.status});"
+            " measured: see SCBF"
+        ),
+    ]
 
 
 def printed_term(theta: Any) -> Any:
@@ -197,8 +272,10 @@ def printed_term(theta: Any) -> Any:
 def _table_setting(sample: Sample) -> tuple[str, ...]:
     return (
         f"{B.told(sample)}; no violation at any control instant, dt = 10 ms",
-        f"{sample.size(EPISODES)} episodes, the same for all filters, with no nominal torque; DDSCBF over {identifications(sample)} "
-        "identifications",
+        (
+            f"{sample.size(EPISODES)} episodes, the same for all filters, with no nominal torque;"
+            f" DDSCBF over {identifications(sample)} identifications"
+        ),
     )
 
 
@@ -208,7 +285,12 @@ ARTEFACTS: tuple[Artefact, ...] = (
         title="Learned noise part of the generator, pendulum",
         compute=partial(learning_outcome, ENV, NOISE, 0, "-sqrt(3) (.1 theta)^2", printed_term),
         setting=partial(learning_setting, where="C", noise=f"sigma = {NOISE:g} theta"),
-        chosen=("tanh, Adam 1e-3, batches of 32, standardised inputs and targets; 70 % of the states train",),
+        chosen=(
+            (
+                "tanh, Adam 1e-3, batches of 32, standardised inputs and targets; 70 % of the"
+                " states train"
+            ),
+        ),
         corrections=(*FIT_ERRATA, "Eq. (5.19): the trace is malformed, its value is right"),
         draw=draw_learning,
         size=(7.5, 3.8),
@@ -220,11 +302,17 @@ ARTEFACTS: tuple[Artefact, ...] = (
         setting=_table_setting,
         chosen=(
             "mass 1 kg, torque within 5 N m",
-            "start, horizon and the rate of the CBF: both A and B were computed before B was taken for the main one; A is beside it",
+            (
+                "start, horizon and the rate of the CBF: both A and B were computed before B was"
+                " taken for the main one; A is beside it"
+            ),
             "CBF with alpha = 0 beside the others",
         ),
         corrections=(
-            "Eq. (5.17), (5.18): the estimator without its bias and with far less noise, see Figure 5.1",
+            (
+                "Eq. (5.17), (5.18): the estimator without its bias and with far less noise, see"
+                " Figure 5.1"
+            ),
             "Prop. 5.2.2: no margin, which cannot be met where h is largest",
         ),
     ),

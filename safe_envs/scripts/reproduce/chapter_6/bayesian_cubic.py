@@ -1,4 +1,5 @@
-"""Chapter 6, the cubic system in a disk: the posterior of its noise, and how safe a controller is that rests on an identification."""
+"""Chapter 6, the cubic system in a disk: the posterior of its noise, and how safe a controller is
+that rests on an identification."""
 
 from __future__ import annotations
 
@@ -22,8 +23,19 @@ from safe_envs.scripts.reproduce.chapter_6.identifications import (
     noise_setting,
     seeds,
 )
-from safe_envs.scripts.reproduce.chapter_6.learned_controllers import ONE_IDENTIFICATION, Learned, known, printed_totals, rate, similar
-from safe_envs.scripts.reproduce.chapter_6.worst_case import above_worst, at_one_horizon, worst_for_ever
+from safe_envs.scripts.reproduce.chapter_6.learned_controllers import (
+    ONE_IDENTIFICATION,
+    Learned,
+    known,
+    printed_totals,
+    rate,
+    similar,
+)
+from safe_envs.scripts.reproduce.chapter_6.worst_case import (
+    above_worst,
+    at_one_horizon,
+    worst_for_ever,
+)
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Number, Outcome, Sample
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
@@ -55,7 +67,11 @@ def _noise_picture(sample: Sample) -> Outcome:
 
 def printed_generator(problem: SafetyProblem) -> Any:
     """A h as Sec. 6.3.1 prints it, with the numbers of the plant."""
-    (x_1, x_2), (u,), values = problem.plant.states, problem.plant.inputs, {p.name: v for p, v in problem.plant.parameters.items()}
+    (x_1, x_2), (u,), values = (
+        problem.plant.states,
+        problem.plant.inputs,
+        {p.name: v for p, v in problem.plant.parameters.items()},
+    )
     noise = 2 * values["sigma_2"] ** 2
     return 2 * values["a"] * x_1**2 + x_1 * x_2 - 2 * x_1**3 * x_2 - 2 * x_2**2 * u - noise
 
@@ -85,7 +101,10 @@ class _Models:
         """Learn all; a quick sample does without what is only shown beside the table."""
         chosen = seeds(sample, CONTROLLERS)
         beside = () if sample.quick else chosen
-        sizes: dict[str, Any] = {"points": sample.work(GENERATOR_POINTS), "repetitions": sample.work(GENERATOR_REPETITIONS)}
+        sizes: dict[str, Any] = {
+            "points": sample.work(GENERATOR_POINTS),
+            "repetitions": sample.work(GENERATOR_REPETITIONS),
+        }
         return cls(
             [identified(world, REPETITIONS[-1], seed, PRIOR) for seed in chosen],
             [identified(world, REPETITIONS[0], seed, PRIOR) for seed in beside],
@@ -132,16 +151,23 @@ class _Place:
     late: Number
 
     @classmethod
-    def run(cls, i: int, world: SafetyProblem, models: _Models, worst: _Worst, sample: Sample) -> _Place:
+    def run(
+        cls, i: int, world: SafetyProblem, models: _Models, worst: _Worst, sample: Sample
+    ) -> _Place:
         """Evaluate all controllers from the i-th start."""
         name, start = list(PLACES.items())[i]
         problem = world.configured(start=start)
         scbf = known(problem, sample.size(EPISODES), sample.seed)
-        late = known(replace(problem, horizon=float(_long(sample))), sample.size(LONG_EPISODES), sample.seed)
+        late = known(
+            replace(problem, horizon=float(_long(sample))), sample.size(LONG_EPISODES), sample.seed
+        )
         return cls(
             name,
             problem,
-            {row: rates[i] for row, rates in (PRINTED_RATES | {_ANALYTICAL: _PRINTED_BOUND}).items()},
+            {
+                row: rates[i]
+                for row, rates in (PRINTED_RATES | {_ANALYTICAL: _PRINTED_BOUND}).items()
+            },
             scbf,
             Learned.run(problem, "ddscbf", models.generators, scbf),
             Learned.run(problem, "bayesian-scbf", models.systems, scbf),
@@ -158,7 +184,9 @@ class _Place:
     def repaired(self) -> float:
         """The estimated bound (h - m T)/c."""
         h = _barrier_at_start(self.problem)
-        return float(shortfall_repaired(h, self.worst.supremum, self.worst.missed, self.problem.horizon))
+        return float(
+            shortfall_repaired(h, self.worst.supremum, self.worst.missed, self.problem.horizon)
+        )
 
     @property
     def withheld(self) -> str:
@@ -177,17 +205,31 @@ class _Place:
 
     def as_printed(self, sample: Sample, dull: Learned | None) -> list[Number]:
         """The column by the printed formulas, and from the printed inputs."""
-        totals = printed_totals(self.problem, printed_generator(self.problem), sample.size(EPISODES), sample.seed)
+        totals = printed_totals(
+            self.problem, printed_generator(self.problem), sample.size(EPISODES), sample.seed
+        )
         return [
             Number.rate(f"SCBF {self.name}", totals.safe, totals.episodes),
             *([] if dull is None else [dull.number(f"Bayesian SCBF {self.name}")]),
-            Number(f"{_ANALYTICAL} {self.name}", self.bound, printed=self.printed[_ANALYTICAL], unit="%"),
+            Number(
+                f"{_ANALYTICAL} {self.name}",
+                self.bound,
+                printed=self.printed[_ANALYTICAL],
+                unit="%",
+            ),
         ]
 
     def dull(self, models: Sequence[Posterior], sample: Sample) -> Learned:
         """The SCBF with identifications of which all weights are kept, as in print."""
-        how: dict[str, Any] = {"episodes": sample.size(EPISODES), "seed": sample.seed, "bounds": False}
-        found = [evaluate(replace(self.problem, model=model.mean_system), filters=["scbf"], **how) for model in models]
+        how: dict[str, Any] = {
+            "episodes": sample.size(EPISODES),
+            "seed": sample.seed,
+            "bounds": False,
+        }
+        found = [
+            evaluate(replace(self.problem, model=model.mean_system), filters=["scbf"], **how)
+            for model in models
+        ]
         return Learned([e.rows[0]["safety_rate"] for e in found], how["episodes"], (0.0, 0.0, 0.0))
 
 
@@ -197,30 +239,58 @@ def _rates(sample: Sample) -> Outcome:
     worst = _Worst(float(found.survey.suprema[0]), float(found.survey.missed[0]))
     places = [_Place.run(i, world, models, worst, sample) for i in range(len(PLACES))]
     # A quick sample learns nothing of what is only shown beside the table.
-    rough = {place.name: Learned.run(place.problem, "bayesian-scbf", models.rough, place.scbf) for place in places if models.rough}
+    rough = {
+        place.name: Learned.run(place.problem, "bayesian-scbf", models.rough, place.scbf)
+        for place in places
+        if models.rough
+    }
     dull = {place.name: place.dull(models.feeble, sample) for place in places if models.feeble}
     few = [number for place in places if rough for number in place.numbers(rough[place.name])]
     return Outcome(
         numbers=[number for place in places for number in place.numbers(place.bayesian)],
         claims=[
             similar({place.name: place.bayesian for place in places}),
-            above_worst(world.horizon, {place.name: (place.numbers(place.bayesian)[:3], place.bound) for place in places}),
-            worst_for_ever(_long(sample), {place.name: (place.late, place.bound) for place in places}),
+            above_worst(
+                world.horizon,
+                {place.name: (place.numbers(place.bayesian)[:3], place.bound) for place in places},
+            ),
+            worst_for_ever(
+                _long(sample), {place.name: (place.late, place.bound) for place in places}
+            ),
         ],
-        elsewhere={f"K = {REPETITIONS[0]} in the identification": Outcome(few, [similar(rough)])} if few else {},
-        as_printed=[number for place in places for number in place.as_printed(sample, dull.get(place.name))],
+        elsewhere=(
+            {f"K = {REPETITIONS[0]} in the identification": Outcome(few, [similar(rough)])}
+            if few
+            else {}
+        ),
+        as_printed=[
+            number for place in places for number in place.as_printed(sample, dull.get(place.name))
+        ],
         notes=[
-            f"The hypothesis of h/c fails: no input keeps A h >= 0 near the centre: it is missed by up to {worst.missed:.3f}. What holds "
-            f"is (h - {worst.missed:.3f} T)/{worst.supremum:g}: the row '{_ANALYTICAL}' of ours is this repaired bound, estimated with the "
-            f"m and c found, at T = {world.horizon:g} s. The thesis has no number for it; h/c is in that row by the printed formula.",
-            *(f"{place.name}: the repaired bound is withheld: {place.withheld}" for place in places if place.withheld),
+            (
+                "The hypothesis of h/c fails: no input keeps A h >= 0 near the centre: it is"
+                f" missed by up to {worst.missed:.3f}. What holds is (h - {worst.missed:.3f}"
+                f" T)/{worst.supremum:g}: the row '{_ANALYTICAL}' of ours is this repaired bound,"
+                f" estimated with the m and c found, at T = {world.horizon:g} s. The thesis has no"
+                " number for it; h/c is in that row by the printed formula."
+            ),
+            *(
+                f"{place.name}: the repaired bound is withheld: {place.withheld}"
+                for place in places
+                if place.withheld
+            ),
             at_one_horizon(places[0].scbf.rows[0], places[1].scbf.rows[0], PRINTED_RATES["SCBF"]),
             *(
-                f"{place.name}: with f and g known DDSCBF differs from the SCBF by {place.ddscbf.told}; in print by "
-                f"{place.printed['DDSCBF'] - place.printed['SCBF']:+g} points."
+                f"{place.name}: with f and g known DDSCBF differs from the SCBF by"
+                f" {place.ddscbf.told}; in print by"
+                f" {place.printed['DDSCBF'] - place.printed['SCBF']:+g} points."
                 for place in places
             ),
-            *(f"{name}: identified under 0 and .1, with all weights kept, the rates are {_range(each)}." for name, each in dull.items()),
+            *(
+                f"{name}: identified under 0 and .1, with all weights kept, the rates are"
+                f" {_range(each)}."
+                for name, each in dull.items()
+            ),
         ],
     )
 
@@ -238,9 +308,16 @@ def _barrier_at_start(problem: SafetyProblem) -> float:
 def _setting(sample: Sample) -> tuple[str, ...]:
     systems = len(seeds(sample, CONTROLLERS))
     return (
-        f"{ENV}, sigma = .2, nominal input 0, abs(u) <= 10, control period .01 s, 1 s, {sample.size(EPISODES)} episodes",
-        f"Bayesian: {systems} identifications from {DATA}, K = {REPETITIONS[-1]}, inputs -1 and 1; DDSCBF: {min(systems, GENERATORS)} "
-        f"identifications from {sample.work(GENERATOR_POINTS)} states, {sample.work(GENERATOR_REPETITIONS)} steps from each",
+        (
+            f"{ENV}, sigma = .2, nominal input 0, abs(u) <= 10, control period .01 s, 1 s,"
+            f" {sample.size(EPISODES)} episodes"
+        ),
+        (
+            f"Bayesian: {systems} identifications from {DATA}, K = {REPETITIONS[-1]}, inputs -1 and"
+            f" 1; DDSCBF: {min(systems, GENERATORS)} identifications from"
+            f" {sample.work(GENERATOR_POINTS)} states, {sample.work(GENERATOR_REPETITIONS)} steps"
+            " from each"
+        ),
         ONE_IDENTIFICATION,
         f"for ever: {_long(sample)} s, {sample.size(LONG_EPISODES)} episodes",
     )
@@ -268,10 +345,15 @@ ARTEFACTS: tuple[Artefact, ...] = (
         corrections=(
             "A h of Sec. 6.3.1 has 2 x1 x2, not x1 x2, and sigma_1^2 + sigma_2^2",
             "Sec. 6.3.1: u = .1 does not identify g; inputs of both signs do",
-            "Def. 4.2.6 (iii) fails at x2 = 0, abs(x1) < .258, so that h/c does not apply, and 50 and 35 % are no bounds: (h - m T)/c",
+            (
+                "Def. 4.2.6 (iii) fails at x2 = 0, abs(x1) < .258, so that h/c does not apply, and"
+                " 50 and 35 % are no bounds: (h - m T)/c"
+            ),
             *FIT_ERRATA,
         ),
-        argument="with f and g known only sigma is left to learn, a constant in A h: what DDSCBF then differs by from the SCBF, and what "
-        "rates this has at any one horizon, is in the notes",
+        argument=(
+            "with f and g known only sigma is left to learn, a constant in A h: what DDSCBF then"
+            " differs by from the SCBF, and what rates this has at any one horizon, is in the notes"
+        ),
     ),
 )

@@ -1,4 +1,5 @@
-"""Chapter 6, the drift of the cubic system, identified from K repetitions of each step, beside the true one."""
+"""Chapter 6, the drift of the cubic system, identified from K repetitions of each step, beside the
+true one."""
 
 from __future__ import annotations
 
@@ -51,7 +52,8 @@ POINTS, SHOWN = 100, 30
 _BANDS = f"{ONE_MORE}; those 'in standard deviations' are Student's for the mean"
 _PRINTED_MSE = {"f_1": (1e-2, 2e-3, 6e-4), "f_2": (5e-2, 8e-3, 6e-4)}
 _UNITS = {"f_1": "(x_1/s)^2", "f_2": "(x_2/s)^2"}
-"""Each in those of its own state. The errors of f_1 and f_2 have nearly the same law: which is larger in one identification is chance."""
+"""Each in those of its own state. The errors of f_1 and f_2 have nearly the same law: which is
+larger in one identification is chance."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ class Study:
 
     Attributes:
         squares: mean squared errors at the states, (identifications, n).
-        errors_in_deviations: root mean squares of the errors in standard deviations of the posterior.
+        errors_in_deviations: root mean squares of the errors in standard deviations of the
+            posterior.
         overconfident: the same, where the noise of the data is taken for sigma^2/K.
         first: estimates and standard deviations of the first identification, (B, n) each.
     """
@@ -71,9 +74,17 @@ class Study:
     first: tuple[np.ndarray, np.ndarray]
 
 
-def study(problem: SafetyProblem, x: np.ndarray, repetitions: int, chosen: range, starts: int, steps: int) -> Study:
+def study(
+    problem: SafetyProblem, x: np.ndarray, repetitions: int, chosen: range, starts: int, steps: int
+) -> Study:
     """Identify f under u = 0, as the print does, and hold it against the truth at states."""
-    truth, squares, errors_in_deviations, overconfident, first = true_drift(problem, x), [], [], [], None
+    truth, squares, errors_in_deviations, overconfident, first = (
+        true_drift(problem, x),
+        [],
+        [],
+        [],
+        None,
+    )
     for seed in chosen:
         data = collect(problem, starts, repetitions, AT_REST, steps=steps, seed=seed)
         learned = identified_from(problem, data, PRIOR)
@@ -86,7 +97,9 @@ def study(problem: SafetyProblem, x: np.ndarray, repetitions: int, chosen: range
     return Study(np.array(squares), np.array(errors_in_deviations), np.array(overconfident), first)
 
 
-def _printed_doubt(learned: Posterior, data: Transitions, x: np.ndarray, truth: np.ndarray) -> float:
+def _printed_doubt(
+    learned: Posterior, data: Transitions, x: np.ndarray, truth: np.ndarray
+) -> float:
     """By the printed posterior, whose noise has the variance sigma^2/K instead of sigma^2/(K dt)."""
     rows = Rows.of(data)
     variance = learned.diffusion.sigma**2 / data.repetitions
@@ -107,13 +120,22 @@ def falls(name: str, squares: Mapping[int, np.ndarray]) -> Claim:
     for a, b in pairwise(squares):
         ratios = np.log(squares[a] / squares[b])
         mean = float(ratios.mean())
-        low, high = repeated_interval(ratios.tolist(), (mean, mean), CONFIDENCE, (-math.inf, math.inf))
+        low, high = repeated_interval(
+            ratios.tolist(), (mean, mean), CONFIDENCE, (-math.inf, math.inf)
+        )
         sure.append(low > 0.0)
-        evidence.append(f"{math.exp(mean):.2g}-fold [{math.exp(low):.2g}, {math.exp(high):.2g}] on average from K = {a} to {b}")
-    return Claim(f"The error of {name} falls as the repetitions K grow.", all(sure), ", ".join(evidence))
+        evidence.append(
+            f"{math.exp(mean):.2g}-fold [{math.exp(low):.2g}, {math.exp(high):.2g}] on average from"
+            f" K = {a} to {b}"
+        )
+    return Claim(
+        f"The error of {name} falls as the repetitions K grow.", all(sure), ", ".join(evidence)
+    )
 
 
-def falls_as_printed(name: str, squares: Mapping[int, np.ndarray], printed: Sequence[float]) -> Claim:
+def falls_as_printed(
+    name: str, squares: Mapping[int, np.ndarray], printed: Sequence[float]
+) -> Claim:
     """That a new identification for each K can have errors in the printed ratios.
 
     Args:
@@ -127,12 +149,16 @@ def falls_as_printed(name: str, squares: Mapping[int, np.ndarray], printed: Sequ
         low, high = map(math.exp, one_more(ratios))
         possible.append(low <= by[a] / by[b] <= high)
         evidence.append(
-            f"from K = {a} to {b} {by[a] / by[b]:.3g}-fold in print, {math.exp(ratios.mean()):.3g}-fold [{low:.2g}, {high:.2g}] here, "
-            f"{b / a:.3g}-fold by the law"
+            f"from K = {a} to {b} {by[a] / by[b]:.3g}-fold in print,"
+            f" {math.exp(ratios.mean()):.3g}-fold [{low:.2g}, {high:.2g}] here, {b / a:.3g}-fold by"
+            " the law"
         )
     fold, first, last = by[min(by)] / by[max(by)], min(by), max(by)
     return Claim(
-        f"The MSE of {name} falls {fold:.0f}-fold from K = {first} to {last}, in the printed steps.", all(possible), "; ".join(evidence)
+        f"The MSE of {name} falls {fold:.0f}-fold from K = {first} to {last}, in the printed"
+        " steps.",
+        all(possible),
+        "; ".join(evidence),
     )
 
 
@@ -141,13 +167,19 @@ def _drift_errors(sample: Sample) -> Outcome:
     x = draw_states(problem, POINTS, np.random.default_rng([sample.seed, 61]))
     chosen = seeds(sample, _IDENTIFICATIONS)
     found = {k: study(problem, x, k, chosen, STARTS, STEPS) for k in REPETITIONS}
-    squares = {name: {k: each.squares[:, i] for k, each in found.items()} for i, name in enumerate(_PRINTED_MSE)}
+    squares = {
+        name: {k: each.squares[:, i] for k, each in found.items()}
+        for i, name in enumerate(_PRINTED_MSE)
+    }
     numbers = [
         predicted(f"MSE of {name}, K = {k}", values, printed, _UNITS[name])
         for name, by in squares.items()
         for (k, values), printed in zip(by.items(), _PRINTED_MSE[name], strict=True)
     ]
-    many, doubt = found[REPETITIONS[-1]], f"rms error in standard deviations of the posterior, K = {REPETITIONS[-1]}"
+    many, doubt = (
+        found[REPETITIONS[-1]],
+        f"rms error in standard deviations of the posterior, K = {REPETITIONS[-1]}",
+    )
     widths = [n.high / n.low for n in numbers if n.low and n.high]
     return Outcome(
         numbers=[*numbers, Number.mean(doubt, many.errors_in_deviations, least=0.0)],
@@ -157,23 +189,33 @@ def _drift_errors(sample: Sample) -> Outcome:
         ],
         as_printed=[Number.mean(doubt, many.overconfident, least=0.0)],
         notes=[
-            f"The errors of single identifications differ so much that the intervals span {min(widths):.0f} to {max(widths):.0f}-fold: a "
-            "printed number of one identification tells little.",
+            (
+                "The errors of single identifications differ so much that the intervals span"
+                f" {min(widths):.0f} to {max(widths):.0f}-fold: a printed number of one"
+                " identification tells little."
+            ),
             _beside_the_law(problem, x, chosen, found[REPETITIONS[0]]),
         ],
     )
 
 
 def _beside_the_law(problem: SafetyProblem, x: np.ndarray, chosen: range, followed: Study) -> str:
-    """The smallest K, from states all over the disk and from as many on trajectories, beside M sigma^2/(K R dt)."""
+    """The smallest K, from states all over the disk and from as many on trajectories, beside M
+    sigma^2/(K R dt)."""
     spread_out = study(problem, x, REPETITIONS[0], chosen, STARTS * STEPS, 1)
     sigma = noise_level(problem, "sigma_1")
-    law = Features.of(problem, DEGREE).count * sigma**2 / (REPETITIONS[0] * STARTS * STEPS * problem.dt)
+    law = (
+        Features.of(problem, DEGREE).count
+        * sigma**2
+        / (REPETITIONS[0] * STARTS * STEPS * problem.dt)
+    )
     ratio = Number.mean("ratio", spread_out.squares.mean(axis=1) / law, least=0.0)
     return (
-        f"From {STARTS * STEPS} states drawn over the disk the MSE at K = {REPETITIONS[0]} is {ratio.ours:.2f} [{ratio.low:.2f}, "
-        f"{ratio.high:.2f}] times M sigma^2/(K R dt) = {law:.2g} (mean of {len(chosen)} identifications); from as many on {STARTS} "
-        f"trajectories, which do not see all of the disk, {followed.squares.mean() / law:.1f} times that."
+        f"From {STARTS * STEPS} states drawn over the disk the MSE at K = {REPETITIONS[0]} is"
+        f" {ratio.ours:.2f} [{ratio.low:.2f}, {ratio.high:.2f}] times M sigma^2/(K R dt) ="
+        f" {law:.2g} (mean of {len(chosen)} identifications); from as many on {STARTS}"
+        f" trajectories, which do not see all of the disk, {followed.squares.mean() / law:.1f}"
+        " times that."
     )
 
 
@@ -183,13 +225,18 @@ def _drift_picture(sample: Sample) -> Outcome:
     x = x[x[:, 0].argsort()]
     chosen = seeds(sample, _PICTURED)
     found = {k: study(problem, x, k, chosen, STARTS, STEPS) for k in REPETITIONS}
-    numbers = [predicted(f"rms error of f_2, K = {k}", np.sqrt(s.squares[:, 1]), unit="1/s") for k, s in found.items()]
+    numbers = [
+        predicted(f"rms error of f_2, K = {k}", np.sqrt(s.squares[:, 1]), unit="1/s")
+        for k, s in found.items()
+    ]
     covered = Number.mean(
         "rms error in standard deviations of the posterior, all K",
         np.concatenate([s.errors_in_deviations for s in found.values()]),
         least=0.0,
     )
-    printed = Number.mean(covered.name, np.concatenate([s.overconfident for s in found.values()]), least=0.0)
+    printed = Number.mean(
+        covered.name, np.concatenate([s.overconfident for s in found.values()]), least=0.0
+    )
     return Outcome(
         numbers=[*numbers, covered],
         claims=[falls("f_2 = x_1^3", {k: np.sqrt(s.squares[:, 1]) for k, s in found.items()})],
@@ -200,7 +247,10 @@ def _drift_picture(sample: Sample) -> Outcome:
             **{f"estimate {k}": s.first[0][:, 1].tolist() for k, s in found.items()},
             **{f"deviation {k}": s.first[1][:, 1].tolist() for k, s in found.items()},
         },
-        notes=["The picture is of the first identification; the rms errors are geometric means over identifications."],
+        notes=[
+            "The picture is of the first identification; the rms errors are geometric means over"
+            " identifications."
+        ],
     )
 
 
@@ -208,7 +258,14 @@ def _draw_drift(figure: Figure, outcome: Outcome) -> None:
     data, line = outcome.data, np.linspace(-1.0, 1.0, 201)
     panels = figure.subplots(1, len(REPETITIONS), sharey=True)
     for letter, axes, k in zip("abc", panels, REPETITIONS, strict=True):
-        draw_estimate(axes, (line, line**3), data["x_1"], data[f"estimate {k}"], data[f"deviation {k}"], COLORS[0])
+        draw_estimate(
+            axes,
+            (line, line**3),
+            data["x_1"],
+            data[f"estimate {k}"],
+            data[f"deviation {k}"],
+            COLORS[0],
+        )
         axes.set(xlabel="$x_1$", title=f"({letter}) K = {k}")
     panels[0].set_ylabel("$f_2$ (1/s)")
     add_legend(figure, panels[0].get_legend_handles_labels()[0])

@@ -1,4 +1,5 @@
-"""What the figures and tables of chapter 6 share: Bayesian identifications, their numbers, and the posterior of the noise levels."""
+"""What the figures and tables of chapter 6 share: Bayesian identifications, their numbers, and the
+posterior of the noise levels."""
 
 from __future__ import annotations
 
@@ -40,23 +41,36 @@ PRIOR_OF_SIGMA = (1.0, 1.0)
 CONFIDENCE = 0.95
 _BINS = 50
 
-ONE_MORE = "an interval holds one more identification with 95 %, if logarithms are normal: a printed number is of one"
+ONE_MORE = (
+    "an interval holds one more identification with 95 %, if logarithms are normal: a printed"
+    " number is of one"
+)
 """What the intervals of `predicted` are."""
 
 FIT_ERRATA = (
-    "Sec. 6.2.2: the noise of the data has the variance sigma^2/(K dt), with u1 and u2 besides, not sigma^2/K",
+    (
+        "Sec. 6.2.2: the noise of the data has the variance sigma^2/(K dt), with u1 and u2 besides,"
+        " not sigma^2/K"
+    ),
     "Eq. (6.13): K terms, not K + 1",
     "Sec. 6.3.1: Phi lacks x1^2 x2 and x1 x2^2; here the full cubic",
 )
 SIGMA_ERRATA = (
-    "Sec. 6.2.4: the likelihood is N(0, sigma^2 dt), with N factors; without dt it estimates sigma sqrt(dt)",
+    (
+        "Sec. 6.2.4: the likelihood is N(0, sigma^2 dt), with N factors; without dt it estimates"
+        " sigma sqrt(dt)"
+    ),
     "Eq. (6.11) has a closed solution",
 )
 
 
-def identified(problem: SafetyProblem, repetitions: int, seed: int, prior: float, *, inputs: Any = None) -> Posterior:
+def identified(
+    problem: SafetyProblem, repetitions: int, seed: int, prior: float, *, inputs: Any = None
+) -> Posterior:
     """Learn f, g and sigma from trajectories, by default under inputs of both signs."""
-    return identified_from(problem, collect(problem, STARTS, repetitions, inputs, steps=STEPS, seed=seed), prior)
+    return identified_from(
+        problem, collect(problem, STARTS, repetitions, inputs, steps=STEPS, seed=seed), prior
+    )
 
 
 def identified_from(problem: SafetyProblem, data: Transitions, prior: float) -> Posterior:
@@ -70,7 +84,9 @@ def identified_from(problem: SafetyProblem, data: Transitions, prior: float) -> 
 def estimated_drift(learned: Posterior, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The estimate of f and its standard deviation at states (B, n), both (B, n)."""
     phi = learned.features.matrix(x)
-    return phi @ learned.mean[:, : learned.features.count].T, np.sqrt(learned.drift_variance(x)[:, :, 0, 0])
+    return phi @ learned.mean[:, : learned.features.count].T, np.sqrt(
+        learned.drift_variance(x)[:, :, 0, 0]
+    )
 
 
 def true_drift(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
@@ -85,26 +101,34 @@ def noise_level(problem: SafetyProblem, name: str) -> float:
 
 
 def seeds(sample: Sample, full: int) -> range:
-    """Seeds of identifications, others for each seed of the sample; a quick sample has a tenth, and three if there are as many."""
+    """Seeds of identifications, others for each seed of the sample; a quick sample has a tenth, and
+    three if there are as many."""
     count = max(2, min(full, 3), full // 10) if sample.quick else full
     return range(1000 * sample.seed, 1000 * sample.seed + count)
 
 
 def one_more(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
-    """The 95 % prediction interval of one more value, where they are normal: mean +- t s sqrt(1 + 1/n)."""
+    """The 95 % prediction interval of one more value, where they are normal: mean +- t s sqrt(1 +
+    1/n)."""
     mean = float(np.mean(values))
-    half = float(stdtrit(len(values) - 1, 0.5 + CONFIDENCE / 2) * np.std(values, ddof=1)) * math.sqrt(1 + 1 / len(values))
+    half = float(
+        stdtrit(len(values) - 1, 0.5 + CONFIDENCE / 2) * np.std(values, ddof=1)
+    ) * math.sqrt(1 + 1 / len(values))
     return mean - half, mean + half
 
 
 def predicted(name: str, values: Any, printed: float | None = None, unit: str = "") -> Number:
-    """The geometric mean of a positive quantity over identifications, and the 95 % prediction interval of one more.
+    """The geometric mean of a positive quantity over identifications, and the 95 % prediction
+    interval of one more.
 
-    Its logarithm is taken for normal. A printed number is of a single identification: it is one more.
+    Its logarithm is taken for normal. A printed number is of a single identification: it is one
+    more.
     """
     logarithms = np.log(values)
     low, high = one_more(logarithms)
-    return Number(name, float(np.exp(logarithms.mean())), math.exp(low), math.exp(high), printed, unit=unit)
+    return Number(
+        name, float(np.exp(logarithms.mean())), math.exp(low), math.exp(high), printed, unit=unit
+    )
 
 
 def credible(name: str, draws: np.ndarray, unit: str) -> Number:
@@ -118,8 +142,11 @@ def _ends(content: float) -> tuple[float, float]:
     return (1 - content) / 2, (1 + content) / 2
 
 
-def noise_levels(problem: SafetyProblem, sample: Sample, prior: float, unit: tuple[str, ...]) -> Outcome:
-    """Sample the posterior of sigma from the residuals of fresh trajectories, with the identified f and g known."""
+def noise_levels(
+    problem: SafetyProblem, sample: Sample, prior: float, unit: tuple[str, ...]
+) -> Outcome:
+    """Sample the posterior of sigma from the residuals of fresh trajectories, with the identified f
+    and g known."""
     first, second, *_ = seeds(sample, 2)
     learned = identified(problem, REPETITIONS[-1], first, prior)
     data = collect(problem, sample.work(NOISE_STARTS), 1, AT_REST, steps=NOISE_STEPS, seed=second)
@@ -140,14 +167,21 @@ def noise_levels(problem: SafetyProblem, sample: Sample, prior: float, unit: tup
     modes = sigma_map(squares / problem.dt, np.full(len(squares), count), *PRIOR_OF_SIGMA).tolist()
     sharp = np.mean([draws.std() / draws.mean() for draws in every])
     notes = [
-        f"Most probable: {', '.join(f'sigma_{i} = {mode:.4f}' for i, mode in enumerate(modes, start=1))}. Relative standard deviation "
-        f"{100 * sharp:.2f} %; by the law sqrt(1/(2 N)) {100 / np.sqrt(2 * count):.2f} % with N = {count} residuals.",
+        (
+            "Most probable:"
+            f" {', '.join(f'sigma_{i} = {mode:.4f}' for i, mode in enumerate(modes, start=1))}."
+            f" Relative standard deviation {100 * sharp:.2f} %; by the law sqrt(1/(2 N))"
+            f" {100 / np.sqrt(2 * count):.2f} % with N = {count} residuals."
+        ),
     ]
-    return Outcome(numbers=numbers, claims=[gathered(every, true)], as_printed=printed, data=shown, notes=notes)
+    return Outcome(
+        numbers=numbers, claims=[gathered(every, true)], as_printed=printed, data=shown, notes=notes
+    )
 
 
 def gathered(every: Sequence[np.ndarray], true: Sequence[float]) -> Claim:
-    """That posteriors are around the true values: together in 95 % of all cases, so that each interval holds a little more."""
+    """That posteriors are around the true values: together in 95 % of all cases, so that each
+    interval holds a little more."""
     levels = _ends(1 - (1 - CONFIDENCE) / len(every))
     found = [tuple(np.quantile(draws, levels).tolist()) for draws in every]
     content = f"{100 * (levels[1] - levels[0]):g} %"
@@ -164,8 +198,10 @@ def gathered(every: Sequence[np.ndarray], true: Sequence[float]) -> Claim:
 def noise_setting(sample: Sample, rest: str) -> tuple[str, ...]:
     """How `noise_levels` goes."""
     return (
-        f"{sample.work(NOISE_STARTS)} trajectories of {NOISE_STEPS} steps of .01 s, {DRAWS} draws, {rest}; alpha = beta = 1 in the prior "
-        "of sigma",
+        (
+            f"{sample.work(NOISE_STARTS)} trajectories of {NOISE_STEPS} steps of .01 s, {DRAWS}"
+            f" draws, {rest}; alpha = beta = 1 in the prior of sigma"
+        ),
         "an interval holds 95 % of the posterior",
     )
 
@@ -174,10 +210,21 @@ def draw_levels(figure: Figure, outcome: Outcome) -> None:
     """Histograms of the draws, and where the printed likelihood puts them."""
     data = outcome.data
     panels = figure.subplots(1, 3)
-    for i, (letter, axes, number) in enumerate(zip("ab", panels, outcome.numbers, strict=False), start=1):
-        axes.stairs(data[f"counts {i}"], data[f"edges {i}"], fill=True, color=COLORS[i - 1], alpha=0.6, label=f"$\\sigma_{i}$")
+    for i, (letter, axes, number) in enumerate(
+        zip("ab", panels, outcome.numbers, strict=False), start=1
+    ):
+        axes.stairs(
+            data[f"counts {i}"],
+            data[f"edges {i}"],
+            fill=True,
+            color=COLORS[i - 1],
+            alpha=0.6,
+            label=f"$\\sigma_{i}$",
+        )
         axes.axvline(data["truth"][i - 1], color="black", linewidth=1.4, label="true value")
-        axes.set(xlabel=f"$\\sigma_{i}$ ({_pretty(number.unit)})", title=f"({letter}) $\\sigma_{i}$")
+        axes.set(
+            xlabel=f"$\\sigma_{i}$ ({_pretty(number.unit)})", title=f"({letter}) $\\sigma_{i}$"
+        )
         axes.locator_params(axis="x", nbins=4)
     panels[0].set_ylabel("draws")
     _draw_likelihoods(panels[2], outcome)
@@ -191,7 +238,14 @@ def _draw_likelihoods(axes: Axes, outcome: Outcome) -> None:
     for row, numbers in enumerate((outcome.numbers, outcome.as_printed)):
         for i, number in enumerate(numbers):
             # One above the other, for they are nearly equal.
-            axes.plot(number.ours, row + 0.12 * (1 - 2 * i), "os"[i], color=COLORS[i], markersize=6, alpha=0.8)
+            axes.plot(
+                number.ours,
+                row + 0.12 * (1 - 2 * i),
+                "os"[i],
+                color=COLORS[i],
+                markersize=6,
+                alpha=0.8,
+            )
     axes.axvline(truth, color="black", linewidth=1.0, zorder=0)
     low = outcome.as_printed[0].ours
     ticks = [float(f"{t:.1g}") for t in (low, np.sqrt(low * truth), truth)]
@@ -207,12 +261,21 @@ def _draw_likelihoods(axes: Axes, outcome: Outcome) -> None:
     axes.set_yticks([0, 1], ["corrected", "as printed"], rotation=90, va="center")
 
 
-def draw_estimate(axes: Axes, curve: tuple[Any, Any], across: Any, estimate: Any, deviation: Any, color: str) -> None:
+def draw_estimate(
+    axes: Axes, curve: tuple[Any, Any], across: Any, estimate: Any, deviation: Any, color: str
+) -> None:
     """A true curve, and estimates with what the posterior leaves open."""
     axes.plot(*curve, color="black", linewidth=1.4, label="true value", zorder=3)
     bars = 1.96 * np.array(deviation)
     axes.errorbar(
-        across, estimate, bars, fmt="o", color=color, markersize=3.5, elinewidth=1.0, label="estimate, with 95 % of its posterior"
+        across,
+        estimate,
+        bars,
+        fmt="o",
+        color=color,
+        markersize=3.5,
+        elinewidth=1.0,
+        label="estimate, with 95 % of its posterior",
     )
 
 

@@ -1,4 +1,5 @@
-"""What the tables of controllers of chapter 6 share: rates under a learned filter, a printed row and the SCBF that knows the system."""
+"""What the tables of controllers of chapter 6 share: rates under a learned filter, a printed row
+and the SCBF that knows the system."""
 
 from __future__ import annotations
 
@@ -12,7 +13,11 @@ import sympy as sp
 
 from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate
 from safe_envs.agents.evaluation.rollout import EpisodeStatistics, run_episodes
-from safe_envs.agents.evaluation.statistics import paired_difference_interval, rate_interval, repeated_interval
+from safe_envs.agents.evaluation.statistics import (
+    paired_difference_interval,
+    rate_interval,
+    repeated_interval,
+)
 from safe_envs.agents.policies.registry import make_policy
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -27,9 +32,13 @@ from safe_envs.wrappers.learning import LearnedModel
 PRINTED_EPISODES = 1000
 
 SIMILAR = 12.0
-"""Points between SCBF and Bayesian SCBF, up to which the print calls their rates similar: 55 and 43 % in Table 6.2 (Sec. 7.1)."""
+"""Points between SCBF and Bayesian SCBF, up to which the print calls their rates similar: 55 and 43
+% in Table 6.2 (Sec. 7.1)."""
 
-ONE_IDENTIFICATION = "an interval of a rate with identifications holds that with one more of them with 95 %: a printed rate is with one"
+ONE_IDENTIFICATION = (
+    "an interval of a rate with identifications holds that with one more of them with 95 %: a"
+    " printed rate is with one"
+)
 """What the intervals of `Learned.number` are."""
 
 
@@ -70,7 +79,13 @@ def known(problem: SafetyProblem, episodes: int, seed: int) -> Evaluation:
 
 def rate(name: str, found: Evaluation, printed: float | None = None) -> Number:
     """The rate of an evaluation of one filter."""
-    return Number.rate(name, found.rows[0]["safe"], found.rows[0]["episodes"], printed, PRINTED_EPISODES if printed is not None else None)
+    return Number.rate(
+        name,
+        found.rows[0]["safe"],
+        found.rows[0]["episodes"],
+        printed,
+        PRINTED_EPISODES if printed is not None else None,
+    )
 
 
 @dataclass(frozen=True)
@@ -80,7 +95,8 @@ class Learned:
     Attributes:
         rates: with each identification, from 0 to 1.
         episodes: of each.
-        difference: mean of the rate less that of the SCBF, in points, with its interval over identifications and episodes.
+        difference: mean of the rate less that of the SCBF, in points, with its interval over
+            identifications and episodes.
     """
 
     rates: list[float]
@@ -88,28 +104,49 @@ class Learned:
     difference: tuple[float, float, float]
 
     @classmethod
-    def run(cls, problem: SafetyProblem, text: str, models: Sequence[LearnedModel], reference: Evaluation) -> Learned:
+    def run(
+        cls,
+        problem: SafetyProblem,
+        text: str,
+        models: Sequence[LearnedModel],
+        reference: Evaluation,
+    ) -> Learned:
         """Evaluate a learned filter with each model, on the episodes of a reference."""
         config = reference.config
-        how: dict[str, Any] = {"episodes": config["episodes"], "seed": config["seed"], "bounds": False}
+        how: dict[str, Any] = {
+            "episodes": config["episodes"],
+            "seed": config["seed"],
+            "bounds": False,
+        }
         found = [_under(problem, text, model, how) for model in models]
         tables = [next(iter(e.flags.values()))[0].table(reference.flags["scbf"][0]) for e in found]
         mean = np.mean(tables, axis=0).tolist()
         differences = [(first - second) / how["episodes"] for _, first, second, _ in tables]
-        ends = repeated_interval(differences, paired_difference_interval(*mean), CONFIDENCE, (-1.0, 1.0))
+        ends = repeated_interval(
+            differences, paired_difference_interval(*mean), CONFIDENCE, (-1.0, 1.0)
+        )
         middle = float(np.mean(differences))
-        return cls([e.rows[0]["safety_rate"] for e in found], how["episodes"], (100 * middle, 100 * ends[0], 100 * ends[1]))
+        return cls(
+            [e.rows[0]["safety_rate"] for e in found],
+            how["episodes"],
+            (100 * middle, 100 * ends[0], 100 * ends[1]),
+        )
 
     def number(self, name: str, printed: float | None = None) -> Number:
-        """The mean rate, and the interval of the rate with one more identification: a printed one is with a single one.
+        """The mean rate, and the interval of the rate with one more identification: a printed one
+        is with a single one.
 
-        The distances from the mean to the ends of the interval over episodes, which all identifications share, and those of the
-        prediction interval over identifications are added as squares.
+        The distances from the mean to the ends of the interval over episodes, which all
+        identifications share, and those of the prediction interval over identifications are added
+        as squares.
         """
         mean = float(np.mean(self.rates))
         low, high = rate_interval(round(mean * self.episodes), self.episodes, CONFIDENCE)
         half = mean - one_more(self.rates)[0]
-        low, high = max(mean - math.hypot(mean - low, half), 0.0), min(mean + math.hypot(high - mean, half), 1.0)
+        low, high = (
+            max(mean - math.hypot(mean - low, half), 0.0),
+            min(mean + math.hypot(high - mean, half), 1.0),
+        )
         trials = PRINTED_EPISODES if printed is not None else None
         return Number(name, 100 * mean, 100 * low, 100 * high, printed, trials, "%")
 
@@ -118,11 +155,17 @@ class Learned:
         """The mean difference and the rates, in words."""
         mean, low, high = self.difference
         rates = f"{100 * min(self.rates):.1f} to {100 * max(self.rates):.1f} %"
-        return f"{mean:+.1f} points [{low:.1f}, {high:.1f}] on average over {len(self.rates)} identifications, with rates of {rates}"
+        return (
+            f"{mean:+.1f} points [{low:.1f}, {high:.1f}] on average over {len(self.rates)}"
+            f" identifications, with rates of {rates}"
+        )
 
 
-def _under(problem: SafetyProblem, text: str, model: LearnedModel, how: dict[str, Any]) -> Evaluation:
-    """Evaluate a learned filter; the bare env where the input was identified as without any effect, and there is no filter."""
+def _under(
+    problem: SafetyProblem, text: str, model: LearnedModel, how: dict[str, Any]
+) -> Evaluation:
+    """Evaluate a learned filter; the bare env where the input was identified as without any effect,
+    and there is no filter."""
     try:
         return evaluate(problem, filters=[text], learned=[model], **how)
     except RelativeDegreeError:
@@ -130,12 +173,22 @@ def _under(problem: SafetyProblem, text: str, model: LearnedModel, how: dict[str
 
 
 def similar(each: dict[str, Learned]) -> Claim:
-    """That an identified system is as safe as the real one, by the interval of the mean difference at each start.
+    """That an identified system is as safe as the real one, by the interval of the mean difference
+    at each start.
 
-    Source: thesis Sec. 7.1, which gives no number: the largest printed difference is taken for the limit.
+    Source: thesis Sec. 7.1, which gives no number: the largest printed difference is taken for the
+        limit.
     """
-    near = all(learned.difference[1] >= -SIMILAR and learned.difference[2] <= SIMILAR for learned in each.values())
-    evidence = "; ".join(f"{place}: {learned.told}" if place else learned.told for place, learned in each.items())
+    near = all(
+        learned.difference[1] >= -SIMILAR and learned.difference[2] <= SIMILAR
+        for learned in each.values()
+    )
+    evidence = "; ".join(
+        f"{place}: {learned.told}" if place else learned.told for place, learned in each.items()
+    )
     return Claim(
-        f"The learned system has a safety ratio similar to the real one's: up to {SIMILAR:g} points apart, as in print.", near, evidence
+        f"The learned system has a safety ratio similar to the real one's: up to {SIMILAR:g} points"
+        " apart, as in print.",
+        near,
+        evidence,
     )

@@ -17,11 +17,17 @@ def above_worst(horizon: float, each: Mapping[str, tuple[Sequence[Number], float
         horizon: up to which they were measured, in s.
         each: the rates and h/c, in per cent, by the start.
     """
-    lowest = {place: (min(number.low or 0.0 for number in rates), bound) for place, (rates, bound) in each.items()}
+    lowest = {
+        place: (min(number.low or 0.0 for number in rates), bound)
+        for place, (rates, bound) in each.items()
+    }
     return Claim(
         f"Within {horizon:g} s all measured rates are above the worst case h/c.",
         all(low > bound for low, bound in lowest.values()),
-        "; ".join(f"{place}: lower ends from {low:.1f} %, h/c {bound:.0f} %" for place, (low, bound) in lowest.items()),
+        "; ".join(
+            f"{place}: lower ends from {low:.1f} %, h/c {bound:.0f} %"
+            for place, (low, bound) in lowest.items()
+        ),
     )
 
 
@@ -36,7 +42,8 @@ def worst_for_ever(seconds: float, each: Mapping[str, tuple[Number, float]]) -> 
         f"h/c is a worst case for ever; here up to {seconds:g} s.",
         all(rate.high is not None and rate.high >= bound for rate, bound in each.values()),
         "; ".join(
-            f"{place}: SCBF {rate.ours:.1f} % [{rate.low:.1f}, {rate.high:.1f}], h/c {bound:.0f} %" for place, (rate, bound) in each.items()
+            f"{place}: SCBF {rate.ours:.1f} % [{rate.low:.1f}, {rate.high:.1f}], h/c {bound:.0f} %"
+            for place, (rate, bound) in each.items()
         ),
     )
 
@@ -49,17 +56,30 @@ def at_one_horizon(first: Row, second: Row, printed: tuple[float, float]) -> str
         second: the same from the second one.
         printed: of both, in per cent.
     """
-    times, curves = first["curve"]["time"], [_rates(row, at) for row, at in zip((first, second), printed, strict=True)]
-    both = [time for time, *pair in zip(times, *curves, strict=True) if not any(map(disagreement, pair))]
+    times, curves = (
+        first["curve"]["time"],
+        [_rates(row, at) for row, at in zip((first, second), printed, strict=True)],
+    )
+    both = [
+        time for time, *pair in zip(times, *curves, strict=True) if not any(map(disagreement, pair))
+    ]
     if both:
-        return f"The SCBF has both printed rates at the same horizon at {len(both)} of {len(times)} instants, first at T = {both[0]:.2f} s."
+        return (
+            f"The SCBF has both printed rates at the same horizon at {len(both)} of {len(times)}"
+            f" instants, first at T = {both[0]:.2f} s."
+        )
     k = min(range(len(times)), key=lambda k: abs(curves[0][k].ours - printed[0]))
     return (
-        f"At none of {len(times)} instants up to T = {times[-1]:g} s has the SCBF both printed rates: from the first start it is nearest "
-        f"to {printed[0]:g} % at T = {times[k]:.2f} s, with {curves[0][k].ours:.1f} %, and has {curves[1][k].ours:.1f} % from the second "
-        f"one then, {printed[1]:g} % in print. At longer horizons it has no more than {curves[0][-1].ours:.1f} % from the first start."
+        f"At none of {len(times)} instants up to T = {times[-1]:g} s has the SCBF both printed"
+        f" rates: from the first start it is nearest to {printed[0]:g} % at T = {times[k]:.2f} s,"
+        f" with {curves[0][k].ours:.1f} %, and has {curves[1][k].ours:.1f} % from the second one"
+        f" then, {printed[1]:g} % in print. At longer horizons it has no more than"
+        f" {curves[0][-1].ours:.1f} % from the first start."
     )
 
 
 def _rates(row: Row, printed: float) -> list[Number]:
-    return [Number.rate("", safe, row["episodes"], printed, PRINTED_EPISODES) for safe in row["curve"]["safe"]]
+    return [
+        Number.rate("", safe, row["episodes"], printed, PRINTED_EPISODES)
+        for safe in row["curve"]["safe"]
+    ]

@@ -1,4 +1,5 @@
-"""What a table or figure of the thesis is here: what is printed, how ours is computed and drawn, and what came out."""
+"""What a table or figure of the thesis is here: what is printed, how ours is computed and drawn,
+and what came out."""
 
 from __future__ import annotations
 
@@ -33,7 +34,8 @@ class Sample:
             require_whole("episodes", self.episodes, 1)
 
     def size(self, full: int) -> int:
-        """Episodes, or other repetitions that make the answer more certain, where the full work has so many."""
+        """Episodes, or other repetitions that make the answer more certain, where the full work has
+        so many."""
         return self.episodes or self.work(full)
 
     def work(self, full: int) -> int:
@@ -64,7 +66,14 @@ class Number:
     unit: str = ""
 
     @classmethod
-    def rate(cls, name: str, safe: int, trials: int, printed: float | None = None, printed_trials: int | None = None) -> Number:
+    def rate(
+        cls,
+        name: str,
+        safe: int,
+        trials: int,
+        printed: float | None = None,
+        printed_trials: int | None = None,
+    ) -> Number:
         """A safety rate in per cent, with its interval.
 
         Args:
@@ -78,8 +87,16 @@ class Number:
         return cls(name, 100 * safe / trials, 100 * low, 100 * high, printed, printed_trials, "%")
 
     @classmethod
-    def mean(cls, name: str, values: Any, unit: str = "", least: float = -math.inf, most: float = math.inf) -> Number:
-        """The mean of a quantity over independent repetitions, such as learnings, starts or episodes, with Student's interval.
+    def mean(
+        cls,
+        name: str,
+        values: Any,
+        unit: str = "",
+        least: float = -math.inf,
+        most: float = math.inf,
+    ) -> Number:
+        """The mean of a quantity over independent repetitions, such as learnings, starts or
+        episodes, with Student's interval.
 
         Args:
             name: see the class.
@@ -90,7 +107,9 @@ class Number:
         """
         mean = math.fsum(values) / len(values)
         bounds = least, most
-        low, high = repeated_interval(values, (mean, mean), 0.95, bounds) if len(values) > 1 else bounds
+        low, high = (
+            repeated_interval(values, (mean, mean), 0.95, bounds) if len(values) > 1 else bounds
+        )
         return cls(name, mean, low, high, unit=unit)
 
 
@@ -140,7 +159,8 @@ class Outcome:
         """Read what `document` wrote.
 
         Raises:
-            AttributeError, ArithmeticError, LookupError, TypeError, ValueError: it is of another shape.
+            AttributeError, ArithmeticError, LookupError, TypeError, ValueError: it is of another
+                shape.
         """
         data, notes = document["data"], document["notes"]
         if not isinstance(data, dict) or not all(isinstance(note, str) for note in notes):
@@ -160,7 +180,9 @@ def _typed(kind: type, row: dict[str, Any]) -> Any:
     hints = get_type_hints(kind)
     for name, value in row.items():
         # JSON does not tell 1.0 from 1.
-        if not isinstance(value, hints[name]) and not (type(value) is int and isinstance(0.0, hints[name])):
+        if not isinstance(value, hints[name]) and not (
+            type(value) is int and isinstance(0.0, hints[name])
+        ):
             raise TypeError(f"its {name} is {value!r}")
         if isinstance(value, int | float) and not math.isfinite(value):
             raise ValueError(f"its {name} is {value!r}")

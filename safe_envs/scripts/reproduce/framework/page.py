@@ -36,22 +36,34 @@ class _Entry:
         """The tables of numbers, with their headings."""
         tables = [
             ("", self.outcome.numbers),
-            *((f"Other setting: {name}", found.numbers) for name, found in self.outcome.elsewhere.items()),
+            *(
+                (f"Other setting: {name}", found.numbers)
+                for name, found in self.outcome.elsewhere.items()
+            ),
         ]
         tables.append(("By the printed formula", self.outcome.as_printed))
         return [(heading, numbers) for heading, numbers in tables if numbers]
 
     @property
     def checks(self) -> list[tuple[str, list[Claim]]]:
-        """Claims of the thesis and checks of ours, with their headings; those of another setting by its name."""
+        """Claims of the thesis and checks of ours, with their headings; those of another setting by
+        its name."""
         claims = [*self.outcome.claims]
         for name, found in self.outcome.elsewhere.items():
-            claims += [replace(claim, sentence=f"{claim.sentence} (other setting: {name})") for claim in found.claims]
-        both = [("claim of the thesis", [c for c in claims if c.printed]), ("check of ours", [c for c in claims if not c.printed])]
+            claims += [
+                replace(claim, sentence=f"{claim.sentence} (other setting: {name})")
+                for claim in found.claims
+            ]
+        both = [
+            ("claim of the thesis", [c for c in claims if c.printed]),
+            ("check of ours", [c for c in claims if not c.printed]),
+        ]
         return [(heading, some) for heading, some in both if some]
 
 
-def write_page(folder: Path, found: Sequence[tuple[Artefact, Outcome, float]], sample: Sample) -> None:
+def write_page(
+    folder: Path, found: Sequence[tuple[Artefact, Outcome, float]], sample: Sample
+) -> None:
     """Write `index.html` and `index.md` of what was found.
 
     Args:
@@ -70,7 +82,11 @@ def write_page(folder: Path, found: Sequence[tuple[Artefact, Outcome, float]], s
     environment.filters |= {"value": _value, "range": _range, "printed": _printed, "cell": _cell}
     for name in ("index.html", "index.md"):
         text = environment.get_template(f"{name}.jinja").render(
-            entries=entries, sample=sample, rules=RULES, versions=package_versions(), seconds=sum(e.seconds for e in entries)
+            entries=entries,
+            sample=sample,
+            rules=RULES,
+            versions=package_versions(),
+            seconds=sum(e.seconds for e in entries),
         )
         write_atomically(folder / name, lambda part, text=text: part.write_text(text))
 
@@ -88,7 +104,9 @@ def _picture(folder: Path, artefact: Artefact) -> str:
         with Image.open(path, formats=["png"]) as picture:
             picture.convert("RGB").quantize(_COLOURS).save(light, "png", optimize=True)
     except (Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
-        raise ConfigurationError(f"{path} cannot be read ({error}); remove it, and it is drawn again") from error
+        raise ConfigurationError(
+            f"{path} cannot be read ({error}); remove it, and it is drawn again"
+        ) from error
     return base64.b64encode(light.getvalue()).decode()
 
 
@@ -100,7 +118,9 @@ def _range(number: Number) -> str:
     if number.low is None or number.high is None:
         return ""
     return (
-        f"[{_quantity(number.low, '')}, {_quantity(number.high, '')}]" if number.unit != "%" else f"[{number.low:.1f}, {number.high:.1f}]"
+        f"[{_quantity(number.low, '')}, {_quantity(number.high, '')}]"
+        if number.unit != "%"
+        else f"[{number.low:.1f}, {number.high:.1f}]"
     )
 
 

@@ -1,4 +1,5 @@
-"""Results of artefacts on disk: by configuration and version, so that a stopped run goes on and a changed one starts anew.
+"""Results of artefacts on disk: by configuration and version, so that a stopped run goes on and a
+changed one starts anew.
 
 Each has a checksum of all that is kept, so that a digit that was changed is not taken for a result.
 """
@@ -48,7 +49,12 @@ def source_checksum() -> str:
 def configuration(artefact: Artefact, sample: Sample) -> dict[str, Any]:
     """What a result hangs on."""
     versions = {**package_versions(), "matplotlib": mpl.__version__}
-    return {"artefact": artefact.name, "sample": asdict(sample), "versions": versions, "source": source_checksum()}
+    return {
+        "artefact": artefact.name,
+        "sample": asdict(sample),
+        "versions": versions,
+        "source": source_checksum(),
+    }
 
 
 def require_same_sample(folder: Path, artefacts: Iterable[Artefact], sample: Sample) -> None:
@@ -59,9 +65,12 @@ def require_same_sample(folder: Path, artefacts: Iterable[Artefact], sample: Sam
     """
     for artefact in artefacts:
         document = _document(folder, artefact)
-        if document is not None and (found := document["configuration"].get("sample")) != asdict(sample):
+        if document is not None and (found := document["configuration"].get("sample")) != asdict(
+            sample
+        ):
             raise ConfigurationError(
-                f"{folder} holds {artefact.name} by other options: {json.dumps(found)[:_SHOWN]}; give another --out, or the same options"
+                f"{folder} holds {artefact.name} by other options: {json.dumps(found)[:_SHOWN]};"
+                " give another --out, or the same options"
             )
 
 
@@ -90,8 +99,11 @@ def read(folder: Path, artefact: Artefact, sample: Sample) -> tuple[Outcome, flo
     return outcome, seconds
 
 
-def keep(folder: Path, artefact: Artefact, sample: Sample, outcome: Outcome, seconds: float) -> None:
-    """Draw the outcome, and write it; the JSON comes last, with the checksums of the pictures, so that it stands for all.
+def keep(
+    folder: Path, artefact: Artefact, sample: Sample, outcome: Outcome, seconds: float
+) -> None:
+    """Draw the outcome, and write it; the JSON comes last, with the checksums of the pictures, so
+    that it stands for all.
 
     Raises:
         ConfigurationError: it cannot be written, as on a full disk.
@@ -105,16 +117,27 @@ def keep(folder: Path, artefact: Artefact, sample: Sample, outcome: Outcome, sec
                 # Without a date, so that equal results are equal files.
                 metadata = {"Date": None} if suffix == ".svg" else {"Software": None}
                 picture = folder / f"{artefact.name}{suffix}"
-                write_atomically(picture, lambda part, metadata=metadata: figure.savefig(part, dpi=150, metadata=metadata))
+                write_atomically(
+                    picture,
+                    lambda part, metadata=metadata: figure.savefig(
+                        part, dpi=150, metadata=metadata
+                    ),
+                )
                 pictures[suffix] = _checksum(picture.read_bytes())
                 # To lay it out takes as long as to write it, and the next one is to look the same.
                 figure.set_layout_engine("none")
-    document = {"configuration": configuration(artefact, sample), "outcome": outcome.document(), "seconds": seconds, "pictures": pictures}
+    document = {
+        "configuration": configuration(artefact, sample),
+        "outcome": outcome.document(),
+        "seconds": seconds,
+        "pictures": pictures,
+    }
     write_json(_path(folder, artefact), {**document, "sha256": _checksum_of_json(document)})
 
 
 def _document(folder: Path, artefact: Artefact) -> dict[str, Any] | None:
-    """What is in the file of an artefact, if there is one; of any version, with an object under "configuration".
+    """What is in the file of an artefact, if there is one; of any version, with an object under
+    "configuration".
 
     Raises:
         ConfigurationError: it is damaged or altered.
@@ -128,7 +151,9 @@ def _document(folder: Path, artefact: Artefact) -> dict[str, Any] | None:
             raise ValueError("it has no configuration")
         digest = document.get("sha256")
         # Versions before this one wrote none.
-        if digest is not None and digest != _checksum_of_json({k: v for k, v in document.items() if k != "sha256"}):
+        if digest is not None and digest != _checksum_of_json(
+            {k: v for k, v in document.items() if k != "sha256"}
+        ):
             raise ValueError("its content does not match its checksum")
     return document
 
@@ -137,10 +162,18 @@ def _document(folder: Path, artefact: Artefact) -> dict[str, Any] | None:
 def _reading(path: Path) -> Iterator[None]:
     try:
         yield
-    except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
+    except (
+        ArithmeticError,
+        AttributeError,
+        LookupError,
+        OSError,
+        RecursionError,
+        TypeError,
+        ValueError,
+    ) as error:
         raise ConfigurationError(
-            f"{path} cannot be read ({type(error).__name__}: {str(error)[:_SHOWN]}); it is damaged or altered: remove it, and it is "
-            "computed again"
+            f"{path} cannot be read ({type(error).__name__}: {str(error)[:_SHOWN]}); it is damaged"
+            " or altered: remove it, and it is computed again"
         ) from error
 
 

@@ -24,21 +24,33 @@ class Verdict(StrEnum):
 
 
 RULES = {
-    Verdict.REPRODUCED: "every claim of the thesis holds, every printed number agrees, and no order of printed numbers is turned. "
-    "A rate agrees if the 95 % interval of its difference to the printed one, at the printed sample size, holds 0, and ours is at most "
-    "twice as wide as that of the print; another number, if the printed one is inside our 95 % interval. An order counts if the printed "
-    "sample sizes can tell the two numbers apart at 95 %",
-    Verdict.ORDERING: "some number does not agree, but every claim holds, and no order of printed numbers is turned",
-    Verdict.ELSEWHERE: "neither of the above, but with the settings that are named every printed number agrees, no order is turned, and "
-    "the claims that are looked at there hold, among them all that do not hold otherwise",
+    Verdict.REPRODUCED: (
+        "every claim of the thesis holds, every printed number agrees, and no order of printed"
+        " numbers is turned. A rate agrees if the 95 % interval of its difference to the printed"
+        " one, at the printed sample size, holds 0, and ours is at most twice as wide as that of"
+        " the print; another number, if the printed one is inside our 95 % interval. An order"
+        " counts if the printed sample sizes can tell the two numbers apart at 95 %"
+    ),
+    Verdict.ORDERING: (
+        "some number does not agree, but every claim holds, and no order of printed numbers is"
+        " turned"
+    ),
+    Verdict.ELSEWHERE: (
+        "neither of the above, but with the settings that are named every printed number agrees, no"
+        " order is turned, and the claims that are looked at there hold, among them all that do not"
+        " hold otherwise"
+    ),
     Verdict.NOT: "none of the above; the argument stands beside it, if one is known",
-    Verdict.WRONG_FORMULA: "said besides: a number by the printed formula is outside our interval by the corrected one. It gives the print "
-    "where its numbers agree with the printed ones",
+    Verdict.WRONG_FORMULA: (
+        "said besides: a number by the printed formula is outside our interval by the corrected"
+        " one. It gives the print where its numbers agree with the printed ones"
+    ),
     Verdict.NONE: "a twentieth of the work shows that it works, and not what comes out",
 }
 
 _WIDEST = 2.0
-"""How many times wider than that of a printed rate our interval may be, to say that the two agree."""
+"""How many times wider than that of a printed rate our interval may be, to say that the two agree.
+"""
 
 
 @dataclass(frozen=True)
@@ -82,7 +94,10 @@ def judge(artefact: Artefact, outcome: Outcome, sample: Sample) -> Judgement:
         *(f"does not hold: {sentence}" for sentence in failed),
         *(f"{first.name} is not above {second.name}" for first, second in turned),
     ]
-    other = next((name for name, found in outcome.elsewhere.items() if _reached(found, outcome, failed)), None)
+    other = next(
+        (name for name, found in outcome.elsewhere.items() if _reached(found, outcome, failed)),
+        None,
+    )
     if not reasons and _says_something(outcome):
         verdict = Verdict.REPRODUCED
     elif orders and not turned and not failed:
@@ -90,26 +105,37 @@ def judge(artefact: Artefact, outcome: Outcome, sample: Sample) -> Judgement:
     elif other is not None:
         verdict, reasons = Verdict.ELSEWHERE, [*reasons, f"agrees with the other setting: {other}"]
     else:
-        verdict, reasons = Verdict.NOT, [*reasons, *([artefact.argument] if artefact.argument else [])]
+        verdict, reasons = (
+            Verdict.NOT,
+            [*reasons, *([artefact.argument] if artefact.argument else [])],
+        )
     wrong = [number for number in outcome.as_printed if not _same(number, outcome.numbers)]
     reasons += [f"by the printed formula {n.name} is {n.ours:.3g}{_unit(n)}" for n in wrong]
     return Judgement(verdict, bool(wrong), _gives_print(outcome), tuple(reasons))
 
 
 def _says_something(outcome: Outcome) -> bool:
-    return any(number.printed is not None for number in outcome.numbers) or any(claim.printed for claim in outcome.claims)
+    return any(number.printed is not None for number in outcome.numbers) or any(
+        claim.printed for claim in outcome.claims
+    )
 
 
 def disagreement(number: Number) -> str | None:
-    """Why a printed number and ours may not be the same; None where they may be, or none is printed."""
+    """Why a printed number and ours may not be the same; None where they may be, or none is
+    printed."""
     if number.printed is None:
         return None
-    text = f"{number.name}: {number.printed:g}{_unit(number)} printed, {number.ours:.3g}{_unit(number)} here"
+    text = (
+        f"{number.name}: {number.printed:g}{_unit(number)} printed,"
+        f" {number.ours:.3g}{_unit(number)} here"
+    )
     low, high = _ends(number)
     if number.printed_trials is None:
         return None if low <= number.printed <= high else text
     printed_low, printed_high = _printed_ends(number.printed, number.printed_trials)
-    below, above = _difference((number.ours, low, high), (number.printed, printed_low, printed_high))
+    below, above = _difference(
+        (number.ours, low, high), (number.printed, printed_low, printed_high)
+    )
     if not below <= 0.0 <= above:
         return text
     wide = high - low > _WIDEST * (printed_high - printed_low)
@@ -117,7 +143,8 @@ def disagreement(number: Number) -> str | None:
 
 
 def printed_orders(numbers: Sequence[Number]) -> list[tuple[Number, Number]]:
-    """Pairs of printed numbers of one unit, the larger first, that the printed sample sizes can tell apart."""
+    """Pairs of printed numbers of one unit, the larger first, that the printed sample sizes can
+    tell apart."""
     return [(a, b) for a, b in permutations(numbers, 2) if a.unit == b.unit and _is_above(a, b)]
 
 
@@ -169,7 +196,11 @@ def _same(printed_form: Number, numbers: Sequence[Number]) -> bool:
 
 def _ends(number: Number) -> tuple[float, float]:
     """Of our interval; the number itself where it has none."""
-    return (number.ours, number.ours) if number.low is None or number.high is None else (number.low, number.high)
+    return (
+        (number.ours, number.ours)
+        if number.low is None or number.high is None
+        else (number.low, number.high)
+    )
 
 
 def _printed_ends(rate: float, trials: int) -> tuple[float, float]:
@@ -177,11 +208,13 @@ def _printed_ends(rate: float, trials: int) -> tuple[float, float]:
     return 100 * low, 100 * high
 
 
-def _difference(first: tuple[float, float, float], second: tuple[float, float, float]) -> tuple[float, float]:
+def _difference(
+    first: tuple[float, float, float], second: tuple[float, float, float]
+) -> tuple[float, float]:
     """The interval of the difference of two independent quantities, each with its interval.
 
-    Source: R. G. Newcombe, Interval estimation for the difference between independent proportions, Statistics in Medicine 17 (1998)
-        873-890, method 10.
+    Source: R. G. Newcombe, Interval estimation for the difference between independent proportions,
+        Statistics in Medicine 17 (1998) 873-890, method 10.
     """
     (a, a_low, a_high), (b, b_low, b_high) = first, second
     return a - b - math.hypot(a - a_low, b_high - b), a - b + math.hypot(a_high - a, b - b_low)

@@ -20,10 +20,12 @@ from safe_envs.wrappers.learning.data.transitions import Transitions, numbers
 from safe_envs.wrappers.learning.models.files import Signature
 
 Step = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]
-"""From states (B, n), physical inputs (B, m) held and a generator to the states (B, n) one dt later."""
+"""From states (B, n), physical inputs (B, m) held and a generator to the states (B, n) one dt
+later."""
 
 _AT_ONCE = 1 << 17
-"""Transitions that are simulated together: few enough for the cache. The noise that a seed gives depends on it."""
+"""Transitions that are simulated together: few enough for the cache. The noise that a seed gives
+depends on it."""
 
 _TRIES_AT_ONCE = 1024
 _TRIES_BEFORE_DESPAIR = 1 << 20
@@ -44,7 +46,12 @@ def plant_step(problem: SafetyProblem, dt: float | None = None) -> Step:
 
     def step(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         draws = rng.standard_normal((integrator.channels, len(x)))
-        return stacked(integrator.step(tuple(np.ascontiguousarray(x.T)), tuple(np.ascontiguousarray(u.T)), draws), len(x))
+        return stacked(
+            integrator.step(
+                tuple(np.ascontiguousarray(x.T)), tuple(np.ascontiguousarray(u.T)), draws
+            ),
+            len(x),
+        )
 
     return step
 
@@ -55,15 +62,17 @@ def env_step(
     get_state: Callable[[gym.Env[Any, Any]], Any],
     to_action: Callable[[np.ndarray], Any] | None = None,
 ) -> Step:
-    """The step of any scalar env whose state can be set. It runs in a Python loop: such an env knows only one state at a time.
+    """The step of any scalar env whose state can be set. It runs in a Python loop: such an env
+    knows only one state at a time.
 
-    The env is reset, with a seed drawn from the generator, whenever the step is given another generator than before: the
-    env's own randomness is then as reproducible as the generator. One step of the env has to last the dt that is told to
-    `collect`.
+    The env is reset, with a seed drawn from the generator, whenever the step is given another
+    generator than before: the env's own randomness is then as reproducible as the generator. One
+    step of the env has to last the dt that is told to `collect`.
 
     Args:
         env: to be stepped.
-        set_state: puts the env into a state (n,); also after an episode has ended, of which the step takes no notice.
+        set_state: puts the env into a state (n,); also after an episode has ended, of which the
+            step takes no notice.
         get_state: reads the state (n,) off the env.
         to_action: from a physical input (m,) to an action of the env; None if they are the same.
     """
@@ -86,7 +95,8 @@ def env_step(
 
 
 def draw_states(problem: SafetyProblem, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw states uniformly from where a problem is explored: its region, where every barrier is positive.
+    """Draw states uniformly from where a problem is explored: its region, where every barrier is
+    positive.
 
     Args:
         problem: whose region and barriers are taken.
@@ -97,18 +107,21 @@ def draw_states(problem: SafetyProblem, count: int, rng: np.random.Generator) ->
         States, shape (count, n).
 
     Raises:
-        ConfigurationError: the count is no whole number from 1, or too large for the memory, or the barriers leave next to
-            nothing of the region.
+        ConfigurationError: the count is no whole number from 1, or too large for the memory, or the
+            barriers leave next to nothing of the region.
     """
     require_whole("count", count, 1)
-    require_room(float(count) * len(problem.states), f"{count} states of {problem.name}", "their number")
+    require_room(
+        float(count) * len(problem.states), f"{count} states of {problem.name}", "their number"
+    )
     low, high = np.array(problem.exploration.region).T
     found, accepted, tried = [], 0, 0
     while accepted < count:
         if tried >= _TRIES_BEFORE_DESPAIR and accepted < _SMALLEST_SHARE * tried:
             raise ConfigurationError(
-                f"only {accepted} of {tried} states drawn from the region {problem.exploration.region} of {problem.name} have positive "
-                "barriers; give SamplingDomain(region=...) ranges nearer to the safe set"
+                f"only {accepted} of {tried} states drawn from the region"
+                f" {problem.exploration.region} of {problem.name} have positive barriers; give"
+                " SamplingDomain(region=...) ranges nearer to the safe set"
             )
         drawn = rng.uniform(low, high, (max(count, _TRIES_AT_ONCE), len(low)))
         found.append(drawn[_explored(problem, drawn)])
@@ -128,10 +141,12 @@ def collect(
     dt: float | None = None,
     progress: Progress | None = None,
 ) -> Transitions:
-    """Collect one-step data where a problem is explored: at every state each of some inputs, some times.
+    """Collect one-step data where a problem is explored: at every state each of some inputs, some
+    times.
 
-    With several steps, trajectories are followed. Each goes on with the first successor under one of the inputs, chosen at
-    random, and starts anew from a fresh state where it leaves the region or a barrier is not positive.
+    With several steps, trajectories are followed. Each goes on with the first successor under one
+    of the inputs, chosen at random, and starts anew from a fresh state where it leaves the region
+    or a barrier is not positive.
 
     Args:
         problem: of what system; its exploration says where and under which inputs.
@@ -145,24 +160,28 @@ def collect(
         progress: is told which part is done.
 
     Returns:
-        Data of P = steps * points * J rows: the states at the beginning of all trajectories, then those after one step, and
-        so on; and for each state its inputs in order.
+        Data of P = steps * points * J rows: the states at the beginning of all trajectories, then
+        those after one step, and so on; and for each state its inputs in order.
 
     Raises:
-        ConfigurationError: an argument is not allowed, an input is outside the box, the data would take more than 2 GB, or no
-            states are found.
-        InvalidInputError: the inputs are no numbers, or the step returns an array of the wrong shape, or data that
-            `Transitions` refuses.
+        ConfigurationError: an argument is not allowed, an input is outside the box, the data would
+            take more than 2 GB, or no states are found.
+        InvalidInputError: the inputs are no numbers, or the step returns an array of the wrong
+            shape, or data that `Transitions` refuses.
         NumericalError: a successor is not finite.
     """
     require_problem(problem)
     for name, value in (("points", points), ("repetitions", repetitions), ("steps", steps)):
         require_whole(name, value, 1)
-    tried, period = _allowed(problem, problem.exploration.inputs if inputs is None else inputs), _period(problem, dt)
+    tried, period = (
+        _allowed(problem, problem.exploration.inputs if inputs is None else inputs),
+        _period(problem, dt),
+    )
     n, rows = len(problem.states), points * len(tried)
     require_room(
         float(steps) * rows * ((repetitions + 1) * n + len(problem.inputs) + 1),
-        f"data of {steps} steps from {points} points under {len(tried)} inputs, {repetitions} times each,",
+        f"data of {steps} steps from {points} points under {len(tried)} inputs, {repetitions} times"
+        " each,",
         "points, repetitions, inputs or steps",
     )
     # Two generators: the states that are drawn do not depend on how often a step is repeated.
@@ -174,7 +193,11 @@ def collect(
     u = np.tile(tried, (points, 1))
     tell = (lambda _: None) if progress is None else progress
     for k in range(steps):
-        states = draw_states(problem, points, drawing) if k == 0 else _followed(problem, successors[k - 1, :, 0], points, drawing)
+        states = (
+            draw_states(problem, points, drawing)
+            if k == 0
+            else _followed(problem, successors[k - 1, :, 0], points, drawing)
+        )
         x[k] = np.repeat(states, len(tried), axis=0)
         _repeat(step, x[k], u, noise, successors[k], lambda part, k=k: tell((k + part) / steps))
     every = steps * rows
@@ -189,7 +212,13 @@ def collect(
 
 
 def collect_paths(
-    problem: SafetyProblem, states: Any, inputs: Any, steps: int, dt: float, step: Step | None = None, seed: int = 0
+    problem: SafetyProblem,
+    states: Any,
+    inputs: Any,
+    steps: int,
+    dt: float,
+    step: Step | None = None,
+    seed: int = 0,
 ) -> np.ndarray:
     """Follow paths, each under one input that is held.
 
@@ -207,8 +236,8 @@ def collect_paths(
 
     Raises:
         ConfigurationError: an argument is not allowed, or an input is outside the box.
-        InvalidInputError: the states or inputs are no numbers, the states have the wrong shape or are not finite, or the
-            step returns an array of the wrong shape.
+        InvalidInputError: the states or inputs are no numbers, the states have the wrong shape or
+            are not finite, or the step returns an array of the wrong shape.
         NumericalError: a state that is reached is not finite.
     """
     require_problem(problem)
@@ -217,9 +246,14 @@ def collect_paths(
     begin = numbers("states", states)
     if begin.shape != (len(held), len(problem.states)) or not np.isfinite(begin).all():
         raise InvalidInputError(
-            f"states have the shape {begin.shape}; give ({len(held)}, {len(problem.states)}) finite numbers, a row for each of the inputs"
+            f"states have the shape {begin.shape}; give ({len(held)}, {len(problem.states)}) finite"
+            " numbers, a row for each of the inputs"
         )
-    require_room(float(begin.size) * (steps + 1), f"{len(begin)} paths of {steps} steps", "their number or their steps")
+    require_room(
+        float(begin.size) * (steps + 1),
+        f"{len(begin)} paths of {steps} steps",
+        "their number or their steps",
+    )
     noise = random_stream(seed, Purpose.PATHS)
     step = plant_step(problem, period) if step is None else step
     paths = np.empty((len(begin), steps + 1, begin.shape[1]))
@@ -241,25 +275,38 @@ def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
     names = ", ".join(i.symbol.name for i in problem.inputs)
     tried = numbers("inputs", inputs)
     if tried.ndim != 2 or tried.shape[-1] != len(problem.inputs) or not len(tried):
-        raise ConfigurationError(f"inputs = {inputs!r}; give one or more vectors of {len(problem.inputs)} numbers each: {names}")
+        raise ConfigurationError(
+            f"inputs = {inputs!r}; give one or more vectors of {len(problem.inputs)} numbers each:"
+            f" {names}"
+        )
     low, high = np.array(problem.box).T
     within = ((low <= tried) & (tried <= high)).all(axis=1)
     if not within.all():
-        raise ConfigurationError(f"the input {tried[within.argmin()]} is outside the box {problem.box} of {names}; give inputs within it")
+        raise ConfigurationError(
+            f"the input {tried[within.argmin()]} is outside the box {problem.box} of {names}; give"
+            " inputs within it"
+        )
     return tried
 
 
 def _explored(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
     """Whether states (B, n) are in the region and every barrier is positive there, shape (B,)."""
     low, high = np.array(problem.exploration.region).T
-    barriers = compile_function(problem.plant.states, [problem.plant.numeric(b.expression) for b in problem.barriers], "arrays")
+    barriers = compile_function(
+        problem.plant.states,
+        [problem.plant.numeric(b.expression) for b in problem.barriers],
+        "arrays",
+    )
     with np.errstate(all="ignore"):
         values = stacked(barriers(*np.ascontiguousarray(x.T)), len(x))
     return ((low <= x) & (x <= high)).all(axis=1) & (values > 0).all(axis=1)
 
 
-def _followed(problem: SafetyProblem, successors: np.ndarray, points: int, rng: np.random.Generator) -> np.ndarray:
-    """The next states (points, n) of trajectories, from their successors (points * J, n) under each input."""
+def _followed(
+    problem: SafetyProblem, successors: np.ndarray, points: int, rng: np.random.Generator
+) -> np.ndarray:
+    """The next states (points, n) of trajectories, from their successors (points * J, n) under each
+    input."""
     reached = successors.reshape(points, -1, successors.shape[-1])
     states = reached[np.arange(points), rng.integers(reached.shape[1], size=points)]
     left = ~_explored(problem, states)
@@ -268,7 +315,14 @@ def _followed(problem: SafetyProblem, successors: np.ndarray, points: int, rng: 
     return states
 
 
-def _repeat(step: Step, x: np.ndarray, u: np.ndarray, rng: np.random.Generator, successors: np.ndarray, progress: Progress) -> None:
+def _repeat(
+    step: Step,
+    x: np.ndarray,
+    u: np.ndarray,
+    rng: np.random.Generator,
+    successors: np.ndarray,
+    progress: Progress,
+) -> None:
     """Fill the successors (rows, K, n) of states (rows, n) under inputs (rows, m), part by part."""
     repetitions = successors.shape[1]
     flat = successors.reshape(-1, x.shape[1])
@@ -284,12 +338,15 @@ def _stepped(step: Step, x: np.ndarray, u: np.ndarray, rng: np.random.Generator)
     with np.errstate(all="ignore"):
         successors = np.asarray(step(x, u, rng), dtype=float)
     if successors.shape != x.shape:
-        raise InvalidInputError(f"a step from states {x.shape} returned {successors.shape}; it has to return a state for each of them")
+        raise InvalidInputError(
+            f"a step from states {x.shape} returned {successors.shape}; it has to return a state"
+            " for each of them"
+        )
     finite = np.isfinite(successors).all(axis=1)
     if not finite.all():
         bad = int(finite.argmin())
         raise NumericalError(
-            f"the step from x = {x[bad]} under u = {u[bad]} led to {successors[bad]}; leave such states out of SamplingDomain(region=...), "
-            "or give a smaller dt"
+            f"the step from x = {x[bad]} under u = {u[bad]} led to {successors[bad]}; leave such"
+            " states out of SamplingDomain(region=...), or give a smaller dt"
         )
     return successors

@@ -20,7 +20,8 @@ _ARRAYS = ("x", "u", "successors", "dt")
 class Transitions:
     """One-step data of a system.
 
-    What NumPy reads as numbers may be given. Arrays of floats are not copied: they must not be changed afterwards.
+    What NumPy reads as numbers may be given. Arrays of floats are not copied: they must not be
+    changed afterwards.
 
     Attributes:
         signature: of which system.
@@ -31,8 +32,8 @@ class Transitions:
         seed: of all randomness; None for data from elsewhere.
 
     Raises:
-        InvalidInputError: there are no data, an array has the wrong shape or is not finite, a dt is not positive, or a row
-            occurs twice.
+        InvalidInputError: there are no data, an array has the wrong shape or is not finite, a dt is
+            not positive, or a row occurs twice.
         ConfigurationError: the seed is no whole number, or the signature is none.
     """
 
@@ -54,7 +55,9 @@ class Transitions:
             _require_finite(name, getattr(self, name))
         shortest = int(self.dt.argmin())
         if not self.dt[shortest] > 0:
-            raise InvalidInputError(f"dt[{shortest}] = {self.dt[shortest]} s; a step needs a positive duration")
+            raise InvalidInputError(
+                f"dt[{shortest}] = {self.dt[shortest]} s; a step needs a positive duration"
+            )
         if self.seed is not None:
             require_whole("seed", self.seed, 0)
         self._refuse_copies()
@@ -63,10 +66,19 @@ class Transitions:
         n, m = len(self.signature.states), len(self.signature.inputs)
         points, repetitions = self.successors.shape[:2] if self.successors.ndim == 3 else (-1, -1)
         given = ", ".join(f"{name} {getattr(self, name).shape}" for name in _ARRAYS)
-        wanted = f"x (P, {n}), u (P, {m}), successors (P, K, {n}) and dt (P,) or one number, with P and K from 1"
+        wanted = (
+            f"x (P, {n}), u (P, {m}), successors (P, K, {n}) and dt (P,) or one number, with P and"
+            " K from 1"
+        )
         shapes = ((points, n), (points, m), (points, repetitions, n))
-        if (self.x.shape, self.u.shape, self.successors.shape) != shapes or self.dt.shape not in ((), (points,)):
-            raise InvalidInputError(f"the shapes do not fit each other or {self.signature.system}: {given}; give {wanted}")
+        if (self.x.shape, self.u.shape, self.successors.shape) != shapes or self.dt.shape not in (
+            (),
+            (points,),
+        ):
+            raise InvalidInputError(
+                f"the shapes do not fit each other or {self.signature.system}: {given}; give"
+                f" {wanted}"
+            )
         if not points or not repetitions:
             raise InvalidInputError(f"there are no data: {given}; give {wanted}")
 
@@ -76,23 +88,33 @@ class Transitions:
         suspects = np.flatnonzero(np.bincount(labels)[labels] > 1)
         if not suspects.size:
             return
-        rows = [self.dt[suspects], self.x[suspects], self.u[suspects], self.successors[suspects].reshape(len(suspects), -1)]
+        rows = [
+            self.dt[suspects],
+            self.x[suspects],
+            self.u[suspects],
+            self.successors[suspects].reshape(len(suspects), -1),
+        ]
         labels = _labels(np.column_stack(rows))
         copied = np.bincount(labels)[labels] > 1
         if copied.any():
             first, second = suspects[labels == labels[copied.argmax()]][:2].tolist()
             raise InvalidInputError(
-                f"rows {first} and {second} are the same: x = {self.x[first]}, u = {self.u[first]}, dt, and all successors. A copy "
-                "tells nothing new and makes estimates look surer than they are; drop the copies"
+                f"rows {first} and {second} are the same: x = {self.x[first]}, u = {self.u[first]},"
+                " dt, and all successors. A copy tells nothing new and makes estimates look surer"
+                " than they are; drop the copies"
             )
 
     @classmethod
-    def from_log(cls, source: SafetyProblem | Signature, x: Any, u: Any, successors: Any, dt: Any) -> Self:
-        """Data that were logged elsewhere, each step once. Of which plant is not known: their signature says nothing of it.
+    def from_log(
+        cls, source: SafetyProblem | Signature, x: Any, u: Any, successors: Any, dt: Any
+    ) -> Self:
+        """Data that were logged elsewhere, each step once. Of which plant is not known: their
+        signature says nothing of it.
 
         Args:
             source: the problem, or its signature, whose states and inputs they are of.
-            x: states from which the steps start, shape (P, n); here and below what NumPy reads as numbers.
+            x: states from which the steps start, shape (P, n); here and below what NumPy reads as
+                numbers.
             u: physical inputs that were held, shape (P, m).
             successors: states that followed, shape (P, n).
             dt: how long the steps lasted, in s: one number, or shape (P,).
@@ -103,10 +125,15 @@ class Transitions:
         """
         if not isinstance(source, Signature):
             require_problem(source)
-        signature = replace(source if isinstance(source, Signature) else Signature.of(source), plant=())
+        signature = replace(
+            source if isinstance(source, Signature) else Signature.of(source), plant=()
+        )
         followed = numbers("successors", successors)
         if followed.ndim != 2:
-            raise InvalidInputError(f"the successors of a log have the shape {followed.shape}; give (P, {len(signature.states)})")
+            raise InvalidInputError(
+                f"the successors of a log have the shape {followed.shape}; give (P,"
+                f" {len(signature.states)})"
+            )
         return cls(signature, x, u, followed[:, None], dt)
 
     @property
@@ -133,13 +160,18 @@ class Transitions:
         """Raise LearnedFileError unless the data are of a problem's system."""
         difference = self.signature.difference(problem)
         if difference:
-            raise LearnedFileError(f"the data are of another problem: {difference}; give data of {problem.name}, or let them be collected")
+            raise LearnedFileError(
+                f"the data are of another problem: {difference}; give data of {problem.name}, or"
+                " let them be collected"
+            )
 
     def split(self, share: float, rng: np.random.Generator) -> tuple[Transitions, Transitions]:
-        """Divide the data at random, by start states: rows that start from the same state stay together, in their order.
+        """Divide the data at random, by start states: rows that start from the same state stay
+        together, in their order.
 
         Args:
-            share: part of the start states that is held out, between 0 and 1; at least one is, and at least one is not.
+            share: part of the start states that is held out, between 0 and 1; at least one is, and
+                at least one is not.
             rng: of the choice.
 
         Returns:
@@ -155,25 +187,44 @@ class Transitions:
     def held_out(self, share: float, rng: np.random.Generator) -> np.ndarray:
         """Which rows `split` holds out, shape (P,); arguments and errors are the same."""
         if not 0 < share < 1:
-            raise ConfigurationError(f"share = {shown(share)}; give the part of the data to be held out, between 0 and 1")
+            raise ConfigurationError(
+                f"share = {shown(share)}; give the part of the data to be held out, between 0 and 1"
+            )
         labels = _labels(self.x)
         states = int(labels.max()) + 1
         if states < 2:
-            raise InvalidInputError(f"all {self.points} rows start from the state {self.x[0]}; to hold some out takes two states at least")
+            raise InvalidInputError(
+                f"all {self.points} rows start from the state {self.x[0]}; to hold some out takes"
+                " two states at least"
+            )
         held = np.zeros(states, dtype=bool)
         held[rng.permutation(states)[: min(max(round(share * states), 1), states - 1)]] = True
         return held[labels]
 
     def _part(self, rows: np.ndarray) -> Transitions:
-        return Transitions(self.signature, self.x[rows], self.u[rows], self.successors[rows], self.dt[rows], self.seed)
+        return Transitions(
+            self.signature,
+            self.x[rows],
+            self.u[rows],
+            self.successors[rows],
+            self.dt[rows],
+            self.seed,
+        )
 
     def save(self, path: Path) -> None:
-        """Write the data to a file, without pickle; see `safe_envs.wrappers.learning.models.files.save`.
+        """Write the data to a file, without pickle; see
+        `safe_envs.wrappers.learning.models.files.save`.
 
         Raises:
             ConfigurationError: it cannot be written there.
         """
-        save(path, DATA, self.signature, {"seed": self.seed}, {name: getattr(self, name) for name in _ARRAYS})
+        save(
+            path,
+            DATA,
+            self.signature,
+            {"seed": self.seed},
+            {name: getattr(self, name) for name in _ARRAYS},
+        )
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -184,11 +235,20 @@ class Transitions:
         """
         content = load(path)
         if content.kind != DATA:
-            raise LearnedFileError(f"{path} holds {shown(content.kind)}, not {shown(DATA)}; give a file that `Transitions.save` wrote")
+            raise LearnedFileError(
+                f"{path} holds {shown(content.kind)}, not {shown(DATA)}; give a file that"
+                " `Transitions.save` wrote"
+            )
         try:
-            return cls(content.signature, **{name: content.arrays[name] for name in _ARRAYS}, seed=content.details["seed"])
+            return cls(
+                content.signature,
+                **{name: content.arrays[name] for name in _ARRAYS},
+                seed=content.details["seed"],
+            )
         except (KeyError, TypeError, ValueError) as error:
-            raise LearnedFileError(f"the data in {path} are incomplete: {shortened(error)}. Collect them again") from error
+            raise LearnedFileError(
+                f"the data in {path} are incomplete: {shortened(error)}. Collect them again"
+            ) from error
 
 
 def numbers(name: str, given: Any) -> np.ndarray:
@@ -203,14 +263,21 @@ def numbers(name: str, given: Any) -> np.ndarray:
     """
     parts = given if isinstance(given, list | tuple) else (given,)
     if any(np.ma.is_masked(part) for part in parts):
-        raise InvalidInputError(f"{name} has masked entries, whose values mean nothing; drop such rows, as by numpy.ma.compress_rows")
+        raise InvalidInputError(
+            f"{name} has masked entries, whose values mean nothing; drop such rows, as by"
+            " numpy.ma.compress_rows"
+        )
     try:
         found = np.asarray(given)
         if not np.iscomplexobj(found):
             return found.astype(float, copy=False)
     except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"{name} is no array of numbers ({error}); give rows of equal length") from error
-    raise InvalidInputError(f"{name} is complex; give real numbers, the parts of a complex state as two states")
+        raise InvalidInputError(
+            f"{name} is no array of numbers ({error}); give rows of equal length"
+        ) from error
+    raise InvalidInputError(
+        f"{name} is complex; give real numbers, the parts of a complex state as two states"
+    )
 
 
 def _require_finite(name: str, values: np.ndarray) -> None:
@@ -218,11 +285,15 @@ def _require_finite(name: str, values: np.ndarray) -> None:
     if bad.any():
         place = np.unravel_index(int(bad.argmax()), values.shape)
         indices = ", ".join(str(int(i)) for i in place)
-        raise InvalidInputError(f"{name}[{indices}] = {values[place]}, one of {bad.sum()} entries that are not finite; drop such rows")
+        raise InvalidInputError(
+            f"{name}[{indices}] = {values[place]}, one of {bad.sum()} entries that are not finite;"
+            " drop such rows"
+        )
 
 
 def _labels(rows: np.ndarray) -> np.ndarray:
-    """A number for each row (P, c), from 0 without gaps: the same for rows that are exactly equal, shape (P,)."""
+    """A number for each row (P, c), from 0 without gaps: the same for rows that are exactly equal,
+    shape (P,)."""
     order = np.lexsort(rows.T)
     ordered = rows[order]
     labels = np.empty(len(rows), dtype=int)

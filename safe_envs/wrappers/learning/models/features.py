@@ -18,14 +18,16 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.models.files import require_finite, require_text
 
 _MOST = 300
-"""Features; a regression holds the square of some multiple of their number, and their symbols take minutes to write out."""
+"""Features; a regression holds the square of some multiple of their number, and their symbols take
+minutes to write out."""
 
 
 @dataclass(frozen=True)
 class Features:
     """Monomials of the states up to a total degree, each state scaled from its range to [-1, 1].
 
-    An angle enters by its cosine and sine; squares of the sine are left out, since they are 1 less those of the cosine.
+    An angle enters by its cosine and sine; squares of the sine are left out, since they are 1 less
+    those of the cosine.
 
     Attributes:
         states: n symbols.
@@ -46,14 +48,21 @@ class Features:
         require_whole("degree", self.degree, 0)
         unknown = set(self.angles) - {s.name for s in self.states}
         if unknown or len(self.region) != len(self.states):
-            raise ConfigurationError(f"features of {self.states} with the ranges {self.region} and the angles {self.angles} do not fit")
+            raise ConfigurationError(
+                f"features of {self.states} with the ranges {self.region} and the angles"
+                f" {self.angles} do not fit"
+            )
         if self.count > _MOST:
             names = ", ".join(s.name for s in self.states)
-            raise ConfigurationError(f"degree = {self.degree} makes {self.count} features of {names}; give one with at most {_MOST}")
+            raise ConfigurationError(
+                f"degree = {self.degree} makes {self.count} features of {names}; give one with at"
+                f" most {_MOST}"
+            )
 
     @classmethod
     def of(cls, problem: SafetyProblem, degree: int, name: str = "degree") -> Features:
-        """Features over the region in which a problem is explored; its unbounded states are the angles.
+        """Features over the region in which a problem is explored; its unbounded states are the
+        angles.
 
         Args:
             problem: whose region and states are taken.
@@ -67,7 +76,9 @@ class Features:
         return cls(problem.plant.states, problem.exploration.region, degree, _angles(problem))
 
     @classmethod
-    def from_json(cls, states: tuple[sp.Symbol, ...], region: Any, degree: Any, angles: Any) -> Features:
+    def from_json(
+        cls, states: tuple[sp.Symbol, ...], region: Any, degree: Any, angles: Any
+    ) -> Features:
         """Features as a file describes them.
 
         Raises:
@@ -75,7 +86,10 @@ class Features:
         """
         ranges = tuple((require_finite(low), require_finite(high)) for low, high in region)
         found = cls(states, ranges, degree, tuple(map(require_text, angles)))
-        if not all(math.isfinite(half) and half > 0 for half in (0.5 * (high - low) for low, high in ranges)):
+        if not all(
+            math.isfinite(half) and half > 0
+            for half in (0.5 * (high - low) for low, high in ranges)
+        ):
             raise ValueError(f"the ranges {shown(ranges)}")
         return found
 
@@ -95,8 +109,14 @@ class Features:
                 center, half = 0.5 * (low + high), 0.5 * (high - low)
                 found.append([((state - center) / half if center else state / half, self.degree)])
         coordinates = [entry for entries in found for entry in entries]
-        chosen = [c for total in range(self.degree + 1) for c in itertools.combinations_with_replacement(range(len(coordinates)), total)]
-        allowed = [c for c in chosen if all(c.count(k) <= most for k, (_, most) in enumerate(coordinates))]
+        chosen = [
+            c
+            for total in range(self.degree + 1)
+            for c in itertools.combinations_with_replacement(range(len(coordinates)), total)
+        ]
+        allowed = [
+            c for c in chosen if all(c.count(k) <= most for k, (_, most) in enumerate(coordinates))
+        ]
         return tuple(sp.Mul(*[coordinates[k][0] for k in c]) for c in allowed)
 
     @property
@@ -123,5 +143,9 @@ def _angles(problem: SafetyProblem) -> tuple[str, ...]:
 
 
 def _count(states: int, angles: int, degree: int) -> int:
-    """Number of features: monomials in as many coordinates as there are states, each times some of the sines."""
-    return sum(math.comb(angles, k) * math.comb(states + degree - k, states) for k in range(min(angles, degree) + 1))
+    """Number of features: monomials in as many coordinates as there are states, each times some of
+    the sines."""
+    return sum(
+        math.comb(angles, k) * math.comb(states + degree - k, states)
+        for k in range(min(angles, degree) + 1)
+    )

@@ -1,4 +1,5 @@
-"""Learned models and data as files: arrays and JSON in an npz, without pickle, refused where they do not fit or were altered."""
+"""Learned models and data as files: arrays and JSON in an npz, without pickle, refused where they
+do not fit or were altered."""
 
 from __future__ import annotations
 
@@ -48,11 +49,15 @@ _DAMAGED = (
 _MOST_PARTS = 1000
 LARGEST = 1e100
 """Number in a file: a product of a few is a number still."""
-_HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 
 
 class LearnedFileError(ConfigurationError):
-    """A file is no learned model or data set of this project, is damaged, or belongs to something else."""
+    """A file is no learned model or data set of this project, is damaged, or belongs to something
+    else."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +73,8 @@ class Signature:
         dt: control period in s.
         barriers: expressions of the barriers.
         model: parameters that the designer believed.
-        plant: parameters of the plant that was stepped; empty where they are not known, as for a log.
+        plant: parameters of the plant that was stepped; empty where they are not known, as for a
+            log.
     """
 
     system: str
@@ -105,10 +111,14 @@ class Signature:
         """
         difference = self.difference(problem, *also)
         if difference:
-            raise LearnedFileError(f"what was learned is of another problem: {difference}; learn again, by `safe-envs identify`")
+            raise LearnedFileError(
+                f"what was learned is of another problem: {difference}; learn again, by `safe-envs"
+                " identify`"
+            )
 
     def difference(self, problem: SafetyProblem, *also: str) -> str:
-        """In what this is not of a problem's system, in words; empty if it is. Arguments as for `require`."""
+        """In what this is not of a problem's system, in words; empty if it is. Arguments as for
+        `require`."""
         wanted = Signature.of(problem)
         for name in ("system", "states", "state_units", "inputs", "input_units", *also):
             mine, other = getattr(self, name), getattr(wanted, name)
@@ -117,10 +127,13 @@ class Signature:
         return ""
 
     def differences(self, problem: SafetyProblem) -> tuple[str, ...]:
-        """Parameters of the plant that are not those of a problem's, such as "v = 0.8 (here 1)"; none if they are not known."""
+        """Parameters of the plant that are not those of a problem's, such as "v = 0.8 (here 1)";
+        none if they are not known."""
         here = dict(_parameters(problem.plant))
         return tuple(
-            f"{name} = {value:.12g} (here {here.get(name, math.nan):.12g})" for name, value in self.plant if here.get(name) != value
+            f"{name} = {value:.12g} (here {here.get(name, math.nan):.12g})"
+            for name, value in self.plant
+            if here.get(name) != value
         )
 
     @classmethod
@@ -137,7 +150,9 @@ class Signature:
         for name in ("states", "state_units", "inputs", "input_units", "barriers"):
             found[name] = tuple(map(require_text, found[name]))
         for name in ("model", "plant"):
-            found[name] = tuple((require_text(parameter), require_finite(value)) for parameter, value in found[name])
+            found[name] = tuple(
+                (require_text(parameter), require_finite(value)) for parameter, value in found[name]
+            )
         return cls(**found)
 
 
@@ -149,7 +164,8 @@ def require_text(given: Any) -> str:
 
 
 def require_finite(given: Any) -> float:
-    """Return a number of JSON as a float; raise TypeError where it is none, ValueError where it is not finite."""
+    """Return a number of JSON as a float; raise TypeError where it is none, ValueError where it is
+    not finite."""
     if isinstance(given, bool) or not isinstance(given, int | float):
         raise TypeError(f"{shown(given)} is no number")
     if not math.isfinite(given):
@@ -166,7 +182,10 @@ def array_of(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]
     """
     array = arrays[name].astype(float, copy=False)
     if array.shape != shape or not (np.abs(array) <= LARGEST).all():
-        raise ValueError(f"{name} has the shape {array.shape}, not {shape}, or a number that is not finite or above {LARGEST:g}")
+        raise ValueError(
+            f"{name} has the shape {array.shape}, not {shape}, or a number that is not finite or"
+            f" above {LARGEST:g}"
+        )
     return array
 
 
@@ -193,9 +212,13 @@ class Content:
     sha256: str
 
 
-def checksum(kind: str, signature: Signature, details: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> str:
+def checksum(
+    kind: str, signature: Signature, details: Mapping[str, Any], arrays: Mapping[str, np.ndarray]
+) -> str:
     """SHA-256 of everything that is saved, as hexadecimal digits."""
-    digest = hashlib.sha256(json.dumps([kind, asdict(signature), details], sort_keys=True, default=_plain).encode())
+    digest = hashlib.sha256(
+        json.dumps([kind, asdict(signature), details], sort_keys=True, default=_plain).encode()
+    )
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
         digest.update(f"{name}{array.dtype.str}{array.shape}".encode())
@@ -203,7 +226,13 @@ def checksum(kind: str, signature: Signature, details: Mapping[str, Any], arrays
     return digest.hexdigest()
 
 
-def save(path: Path, kind: str, signature: Signature, details: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
+def save(
+    path: Path,
+    kind: str,
+    signature: Signature,
+    details: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+) -> None:
     """Write a file, whole or not at all.
 
     Args:
@@ -218,7 +247,10 @@ def save(path: Path, kind: str, signature: Signature, details: Mapping[str, Any]
     """
     size = sum(np.asarray(array).nbytes for array in arrays.values())
     if size > MOST_BYTES:
-        raise ConfigurationError(f"{path} would take {size / 1e6:.3g} MB; at most {MOST_BYTES / 1e6:g} MB are read: save less in a file")
+        raise ConfigurationError(
+            f"{path} would take {size / 1e6:.3g} MB; at most {MOST_BYTES / 1e6:g} MB are read: save"
+            " less in a file"
+        )
     header = {
         "format": _FORMAT,
         "kind": kind,
@@ -227,7 +259,9 @@ def save(path: Path, kind: str, signature: Signature, details: Mapping[str, Any]
         "versions": {package: version(package) for package in _PACKAGES},
         "sha256": checksum(kind, signature, details, arrays),
     }
-    encoded = np.frombuffer(json.dumps(header, allow_nan=False, default=_plain).encode(), dtype=np.uint8)
+    encoded = np.frombuffer(
+        json.dumps(header, allow_nan=False, default=_plain).encode(), dtype=np.uint8
+    )
 
     def write(part: Path) -> None:
         with part.open("wb") as stream:
@@ -237,7 +271,9 @@ def save(path: Path, kind: str, signature: Signature, details: Mapping[str, Any]
 
 
 def _savez(stream: BinaryIO, arrays: Mapping[str, np.ndarray]) -> None:
-    np.savez(stream, allow_pickle=False, **{name: np.asarray(array) for name, array in arrays.items()})  # pyright: ignore[reportArgumentType]
+    np.savez(
+        stream, allow_pickle=False, **{name: np.asarray(array) for name, array in arrays.items()}
+    )  # pyright: ignore[reportArgumentType]
 
 
 def _plain(value: Any) -> Any:
@@ -258,19 +294,28 @@ def load(path: Path) -> Content:
         with open_regular(path) as stream, open_archive(stream) as archive:
             content = _content(name, archive)
     except FileNotFoundError as error:
-        raise LearnedFileError(f"{name} does not exist; `safe-envs identify` writes such files") from error
+        raise LearnedFileError(
+            f"{name} does not exist; `safe-envs identify` writes such files"
+        ) from error
     except IsADirectoryError as error:
-        raise LearnedFileError(f"{name} is a folder; name a file in it that `safe-envs identify` wrote") from error
+        raise LearnedFileError(
+            f"{name} is a folder; name a file in it that `safe-envs identify` wrote"
+        ) from error
     except OSError as error:
-        raise LearnedFileError(f"{name} cannot be read: {error.strerror}; name a file that `safe-envs identify` wrote") from error
+        raise LearnedFileError(
+            f"{name} cannot be read: {error.strerror}; name a file that `safe-envs identify` wrote"
+        ) from error
     except _DAMAGED as error:
         if isinstance(error, LearnedFileError):
             raise
         raise LearnedFileError(
-            f"{name} is no file of `safe-envs identify`, or it is truncated or altered ({type(error).__name__})"
+            f"{name} is no file of `safe-envs identify`, or it is truncated or altered"
+            f" ({type(error).__name__})"
         ) from error
     if content.sha256 != checksum(content.kind, content.signature, content.details, content.arrays):
-        raise LearnedFileError(f"{name} was altered: its content does not match its checksum. Learn again")
+        raise LearnedFileError(
+            f"{name} was altered: its content does not match its checksum. Learn again"
+        )
     return content
 
 
@@ -280,22 +325,41 @@ def _content(name: str, archive: zipfile.ZipFile) -> Content:
     if len(parts) != len(archive.infolist()) or len(parts) > _MOST_PARTS:
         raise ValueError("too many parts, or two of one name")
     # Ours are as large in the file as in memory.
-    if any(part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size for part in parts.values()):
+    if any(
+        part.compress_type != zipfile.ZIP_STORED or part.file_size != part.compress_size
+        for part in parts.values()
+    ):
         raise ValueError("a part is compressed")
     if parts[_HEADER].file_size > MOST_BYTES_OF_TEXT:
         raise ValueError("the header is too large")
     header = json.loads(_array(archive, parts.pop(_HEADER)).tobytes())
     if header["format"] != _FORMAT:
-        raise LearnedFileError(f"{name} has the format {shown(header['format'])}; this version reads {_FORMAT}. Learn again")
-    kind, signature, details = require_text(header["kind"]), Signature.from_json(header["signature"]), dict(header["details"])
-    return Content(kind, signature, details, {key: _array(archive, part) for key, part in parts.items()}, require_text(header["sha256"]))
+        raise LearnedFileError(
+            f"{name} has the format {shown(header['format'])}; this version reads {_FORMAT}. Learn"
+            " again"
+        )
+    kind, signature, details = (
+        require_text(header["kind"]),
+        Signature.from_json(header["signature"]),
+        dict(header["details"]),
+    )
+    return Content(
+        kind,
+        signature,
+        details,
+        {key: _array(archive, part) for key, part in parts.items()},
+        require_text(header["sha256"]),
+    )
 
 
 def _array(archive: zipfile.ZipFile, part: zipfile.ZipInfo) -> np.ndarray:
     """An array of numbers, for which no more memory is taken than the part has bytes."""
     with archive.open(part) as stream:
         shape, _, kind = _HEADERS[np.lib.format.read_magic(stream)](stream)
-        if kind.kind not in "biuf" or math.prod(shape) * kind.itemsize != part.file_size - stream.tell():
+        if (
+            kind.kind not in "biuf"
+            or math.prod(shape) * kind.itemsize != part.file_size - stream.tell()
+        ):
             raise ValueError("it holds no numbers, or others than its header says")
         stream.seek(0)
         return np.lib.format.read_array(stream, allow_pickle=False)

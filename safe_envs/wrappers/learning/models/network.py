@@ -15,8 +15,9 @@ from safe_envs.errors import ConfigurationError, nearest, shown
 Activation = Literal["relu", "tanh"]
 
 _BLOCK = 32
-"""States in a matrix product. BLAS computes the rows of products of other shapes by other kernels, with other roundings: with
-one shape alone, a state's outputs are the same to the last bit in every batch. More states would be wasted on small batches."""
+"""States in a matrix product. BLAS computes the rows of products of other shapes by other kernels,
+with other roundings: with one shape alone, a state's outputs are the same to the last bit in every
+batch. More states would be wasted on small batches."""
 
 _ZERO = np.array(0.0)
 _VECTORS = ("input_mean", "input_scale", "output_mean", "output_scale")
@@ -24,7 +25,8 @@ _VECTORS = ("input_mean", "input_scale", "output_mean", "output_scale")
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Fully connected layers between standardised inputs and outputs; all that it takes and returns is in physical units.
+    """Fully connected layers between standardised inputs and outputs; all that it takes and returns
+    is in physical units.
 
     Attributes:
         weights: of each layer, (outputs, inputs) of the layer.
@@ -36,7 +38,8 @@ class Network:
         output_scale: (q,), by which they are multiplied before.
 
     Raises:
-        ConfigurationError: the shapes do not fit, a number is not finite, a scale is not positive, or the activation is unknown.
+        ConfigurationError: the shapes do not fit, a number is not finite, a scale is not positive,
+            or the activation is unknown.
     """
 
     weights: tuple[np.ndarray, ...]
@@ -50,7 +53,9 @@ class Network:
 
     def __post_init__(self) -> None:
         for name in ("weights", "biases"):
-            object.__setattr__(self, name, tuple(np.asarray(a, dtype=float) for a in getattr(self, name)))
+            object.__setattr__(
+                self, name, tuple(np.asarray(a, dtype=float) for a in getattr(self, name))
+            )
         for name in _VECTORS:
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         self._check()
@@ -62,25 +67,38 @@ class Network:
     def _check(self) -> None:
         require_activation(self.activation)
         sizes = [w.shape[-1] for w in self.weights] + [len(self.output_mean)]
-        fits = bool(self.weights) and [w.shape for w in self.weights] == list(zip(sizes[1:], sizes, strict=False))
+        fits = bool(self.weights) and [w.shape for w in self.weights] == list(
+            zip(sizes[1:], sizes, strict=False)
+        )
         fits = fits and [b.shape for b in self.biases] == [(size,) for size in sizes[1:]]
         ends = (sizes[0], sizes[0], sizes[-1], sizes[-1])
-        if not fits or any(getattr(self, name).shape != (size,) for name, size in zip(_VECTORS, ends, strict=True)):
+        if not fits or any(
+            getattr(self, name).shape != (size,) for name, size in zip(_VECTORS, ends, strict=True)
+        ):
             raise ConfigurationError(
-                f"the layers {[w.shape for w in self.weights]} of a network do not fit each other or the {ends[::2]} ends"
+                f"the layers {[w.shape for w in self.weights]} of a network do not fit each other"
+                f" or the {ends[::2]} ends"
             )
         numbers = (*self.weights, *self.biases, *(getattr(self, name) for name in _VECTORS))
-        if not all(np.isfinite(a).all() for a in numbers) or (self.input_scale <= 0).any() or (self.output_scale <= 0).any():
+        if (
+            not all(np.isfinite(a).all() for a in numbers)
+            or (self.input_scale <= 0).any()
+            or (self.output_scale <= 0).any()
+        ):
             raise ConfigurationError("a network needs finite numbers, and scales above 0")
 
     def _fold(self) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
-        """Weights, their transposes and biases of each layer, with the standardisation in the first and in the last one."""
+        """Weights, their transposes and biases of each layer, with the standardisation in the first
+        and in the last one."""
         weights, biases = list(self.weights), list(self.biases)
         weights[0] = weights[0] / self.input_scale
         biases[0] = biases[0] - weights[0] @ self.input_mean
         weights[-1] = weights[-1] * self.output_scale[:, None]
         biases[-1] = biases[-1] * self.output_scale + self.output_mean
-        return tuple((np.ascontiguousarray(w), np.ascontiguousarray(w.T), b) for w, b in zip(weights, biases, strict=True))
+        return tuple(
+            (np.ascontiguousarray(w), np.ascontiguousarray(w.T), b)
+            for w, b in zip(weights, biases, strict=True)
+        )
 
     def floats(self, inputs: Sequence[float]) -> list[float]:
         """The q outputs for p inputs; NaN where an input is not finite."""
@@ -93,11 +111,14 @@ class Network:
             inputs: p components (B,).
 
         Returns:
-            q components (B,), NaN where an input is not finite; the same to the last bit in every batch that a state is in.
+            q components (B,), NaN where an input is not finite; the same to the last bit in every
+            batch that a state is in.
         """
         return _components(self._layers(_blocks(inputs))[-1], len(inputs[0]))
 
-    def values_and_slopes_floats(self, inputs: Sequence[float], output: int) -> tuple[list[float], list[float]]:
+    def values_and_slopes_floats(
+        self, inputs: Sequence[float], output: int
+    ) -> tuple[list[float], list[float]]:
         """All outputs, and the slopes of one of them.
 
         Args:
@@ -110,7 +131,9 @@ class Network:
         layers = self._layers(_one(inputs))
         return layers[-1].tolist(), self._slopes(layers, output).tolist()
 
-    def values_and_slopes_arrays(self, inputs: Sequence[np.ndarray], output: int) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    def values_and_slopes_arrays(
+        self, inputs: Sequence[np.ndarray], output: int
+    ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
         """The same at a batch: p components (B,) in; q components and p components out."""
         count, layers = len(inputs[0]), self._layers(_blocks(inputs))
         return _components(layers[-1], count), _components(self._slopes(layers, output), count)
@@ -129,19 +152,32 @@ class Network:
 
     def _slopes(self, layers: Sequence[np.ndarray], output: int) -> np.ndarray:
         """Derivatives (..., p) of an output by backpropagation through what the layers gave."""
-        slopes = np.broadcast_to(self._folded[-1][0][output], (*layers[0].shape[:-1], self._folded[-1][0].shape[1]))
+        slopes = np.broadcast_to(
+            self._folded[-1][0][output], (*layers[0].shape[:-1], self._folded[-1][0].shape[1])
+        )
         for (weights, _, _), value in zip(self._folded[-2::-1], layers[-2::-1], strict=True):
             # The sign of a rectified value is its slope, and NaN for NaN.
-            slopes = (slopes * (np.sign(value) if self.activation == "relu" else 1.0 - value * value)) @ weights
+            slopes = (
+                slopes * (np.sign(value) if self.activation == "relu" else 1.0 - value * value)
+            ) @ weights
         return slopes
 
     def to_arrays(self, prefix: str) -> dict[str, np.ndarray]:
         """The numbers by name, each name beginning with a prefix; for an npz file."""
-        numbered = {f"{name}_{k}": a for name in ("weights", "biases") for k, a in enumerate(getattr(self, name))}
-        return {f"{prefix}_{name}": a for name, a in {**numbered, **{name: getattr(self, name) for name in _VECTORS}}.items()}
+        numbered = {
+            f"{name}_{k}": a
+            for name in ("weights", "biases")
+            for k, a in enumerate(getattr(self, name))
+        }
+        return {
+            f"{prefix}_{name}": a
+            for name, a in {**numbered, **{name: getattr(self, name) for name in _VECTORS}}.items()
+        }
 
     @classmethod
-    def from_arrays(cls, mapping: Mapping[str, np.ndarray], prefix: str, activation: Activation) -> Network:
+    def from_arrays(
+        cls, mapping: Mapping[str, np.ndarray], prefix: str, activation: Activation
+    ) -> Network:
         """Make a network of what `to_arrays` gave.
 
         Raises:
@@ -149,23 +185,34 @@ class Network:
             ConfigurationError: the arrays do not fit.
         """
         depth = sum(name.startswith(f"{prefix}_weights_") for name in mapping)
-        weights, biases = (tuple(mapping[f"{prefix}_{name}_{k}"] for k in range(depth)) for name in ("weights", "biases"))
+        weights, biases = (
+            tuple(mapping[f"{prefix}_{name}_{k}"] for k in range(depth))
+            for name in ("weights", "biases")
+        )
         return cls(weights, biases, activation, *(mapping[f"{prefix}_{name}"] for name in _VECTORS))
 
 
 def require_activation(name: str) -> None:
     """Raise ConfigurationError unless there is an activation of this name."""
     if name not in get_args(Activation):
-        raise ConfigurationError(f"activation = {shown(name)}; {nearest(name, get_args(Activation))}")
+        raise ConfigurationError(
+            f"activation = {shown(name)}; {nearest(name, get_args(Activation))}"
+        )
 
 
 def _one(inputs: Sequence[float]) -> np.ndarray:
-    """Inputs (p,); all NaN if one is not finite: a saturated activation would answer to infinity as if nothing were wrong."""
-    return np.array(inputs, dtype=float) if all(map(math.isfinite, inputs)) else np.full(len(inputs), math.nan)
+    """Inputs (p,); all NaN if one is not finite: a saturated activation would answer to infinity as
+    if nothing were wrong."""
+    return (
+        np.array(inputs, dtype=float)
+        if all(map(math.isfinite, inputs))
+        else np.full(len(inputs), math.nan)
+    )
 
 
 def _blocks(inputs: Sequence[np.ndarray]) -> np.ndarray:
-    """Components (B,) as whole blocks of states, shape (blocks, _BLOCK, p); zeros fill the last one, NaN stands for infinity."""
+    """Components (B,) as whole blocks of states, shape (blocks, _BLOCK, p); zeros fill the last
+    one, NaN stands for infinity."""
     count = len(inputs[0])
     x = np.zeros((-(-count // _BLOCK), _BLOCK, len(inputs)))
     rows = x.reshape(-1, len(inputs))

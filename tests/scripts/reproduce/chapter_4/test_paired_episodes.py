@@ -9,7 +9,13 @@ from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
 from safe_envs.agents.policies.nominal import ZeroController
 from safe_envs.registry import load_problem
-from safe_envs.scripts.reproduce.chapter_4.paired_episodes import difference, exits, is_above, is_below, with_interval
+from safe_envs.scripts.reproduce.chapter_4.paired_episodes import (
+    difference,
+    exits,
+    is_above,
+    is_below,
+    with_interval,
+)
 
 
 def test_exits_are_those_of_an_evaluation() -> None:
@@ -31,6 +37,8 @@ def test_difference_is_of_pairs() -> None:
     assert is_below(difference("", second, first))
     assert not is_above(difference("", first, first))
     assert not is_below(difference("", first, first))
-    assert (number.low, number.high) == pytest.approx([100 * end for end in paired_difference_interval(50, 10, 0, 40)])
+    assert (number.low, number.high) == pytest.approx(
+        [100 * end for end in paired_difference_interval(50, 10, 0, 40)]
+    )
     assert with_interval(number).startswith("+10.0 [")
     assert not is_above(difference("", first, second[::-1]))

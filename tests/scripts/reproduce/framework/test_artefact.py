@@ -15,7 +15,9 @@ def test_a_mean_has_students_interval_within_its_bounds():
     values, half = [10.0, 20.0, 30.0, 40.0], 3.182446 * math.sqrt(500.0 / 3.0) / 2.0
     for given in (values, np.array(values)):
         number = Number.mean("n", given, "s")
-        assert (number.low, number.ours, number.high) == pytest.approx((25.0 - half, 25.0, 25.0 + half))
+        assert (number.low, number.ours, number.high) == pytest.approx(
+            (25.0 - half, 25.0, 25.0 + half)
+        )
         assert (number.name, number.unit, number.printed) == ("n", "s", None)
     number = Number.mean("n", values, "%", 10.0, 30.0)
     assert (number.low, number.high) == (10.0, 30.0)

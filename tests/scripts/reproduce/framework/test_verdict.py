@@ -7,7 +7,13 @@ from dataclasses import replace
 import pytest
 
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
-from safe_envs.scripts.reproduce.framework.verdict import RULES, Verdict, disagreement, judge, printed_orders
+from safe_envs.scripts.reproduce.framework.verdict import (
+    RULES,
+    Verdict,
+    disagreement,
+    judge,
+    printed_orders,
+)
 
 TABLE = Artefact("table-0.0", "", lambda _: Outcome(), lambda _: (), argument="no two are alike")
 SAMPLE = Sample()
@@ -16,7 +22,10 @@ CHECK_FAILS = Claim("it sings", False, "", printed=False)
 
 
 def rates(high, low, printed=(90.0, 60.0)):
-    return [Number.rate("high", high, 100, printed[0], 50), Number.rate("low", low, 100, printed[1], 50)]
+    return [
+        Number.rate("high", high, 100, printed[0], 50),
+        Number.rate("low", low, 100, printed[1], 50),
+    ]
 
 
 def claims(*found):
@@ -24,10 +33,12 @@ def claims(*found):
 
 
 def test_a_rate_agrees_by_the_interval_of_the_difference():
-    # 45 of 50 have the interval 78.6 to 95.7 %. Against 79 of 100, [70.0, 85.8], the difference of 11 is not more than
-    # hypot(85.8 - 79, 90 - 78.6) = 13.3; against 76.5 it is.
+    # 45 of 50 have the interval 78.6 to 95.7 %. Against 79 of 100, [70.0, 85.8], the difference of
+    # 11 is not more than hypot(85.8 - 79, 90 - 78.6) = 13.3; against 76.5 it is.
     assert disagreement(Number("a", 79.0, 70.0, 85.8, 90.0, 50, "%")) is None
-    assert "90 % printed, 76.5 % here" in (disagreement(Number("a", 76.5, 70.0, 83.0, 90.0, 50, "%")) or "")
+    assert "90 % printed, 76.5 % here" in (
+        disagreement(Number("a", 76.5, 70.0, 83.0, 90.0, 50, "%")) or ""
+    )
     # On the other side: 90 + hypot(95.7 - 90, 99 - 97) = 96.04.
     assert disagreement(Number("a", 95.9, 93.9, 97.9, 90.0, 50, "%")) is None
     assert disagreement(Number("a", 96.2, 94.2, 98.2, 90.0, 50, "%")) is not None
@@ -42,28 +53,37 @@ def test_an_interval_that_is_too_wide_says_nothing(half, told):
 
 
 def test_what_is_far_from_the_print_is_so_however_wide():
-    assert disagreement(Number("a", 40.0, 10.0, 70.0, 99.0, 50, "%")) == "a: 99 % printed, 40 % here"
+    assert (
+        disagreement(Number("a", 40.0, 10.0, 70.0, 99.0, 50, "%")) == "a: 99 % printed, 40 % here"
+    )
 
 
 def test_another_number_agrees_if_the_printed_one_is_inside():
     for printed, inside in ((0.9, True), (1.1, True), (0.89, False), (1.11, False)):
         assert (disagreement(Number("a", 1.0, 0.9, 1.1, printed)) is None) is inside
     assert disagreement(Number("a", 1.0, printed=1.0)) is None
-    assert disagreement(Number("a", 1.0, printed=1.0001, unit="s")) == "a: 1.0001 s printed, 1 s here"
+    assert (
+        disagreement(Number("a", 1.0, printed=1.0001, unit="s")) == "a: 1.0001 s printed, 1 s here"
+    )
 
 
 def test_orders_are_those_that_the_printed_samples_can_tell_apart():
     def orders(*numbers):
         return [(a.name, b.name) for a, b in printed_orders(numbers)]
 
-    a, b, c = (Number.rate(name, 50, 100, printed, 50) for name, printed in (("a", 90.0), ("b", 80.0), ("c", 60.0)))
+    a, b, c = (
+        Number.rate(name, 50, 100, printed, 50)
+        for name, printed in (("a", 90.0), ("b", 80.0), ("c", 60.0))
+    )
     # 90 and 80 % of 50 differ by 10 [-4.6, 24.2]; 80 and 60 % by 20 [1.9, 36.4].
     assert orders(c, b, a) == [("b", "c"), ("a", "c")]
     sized = [replace(n, printed_trials=1000) for n in (c, b, a)]
     assert orders(*sized) == [("b", "c"), ("a", "c"), ("a", "b")]
     assert orders(Number("x", 1.0, printed=2.0), Number("y", 1.0, printed=1.0)) == [("x", "y")]
     assert orders(Number("x", 1.0, printed=2.0, unit="s"), Number("y", 1.0, printed=1.0)) == []
-    assert orders(Number("x", 1.0, printed=2.0), Number("y", 1.0), Number("z", 1.0, printed=2.0)) == []
+    assert (
+        orders(Number("x", 1.0, printed=2.0), Number("y", 1.0), Number("z", 1.0, printed=2.0)) == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -78,17 +98,45 @@ def test_orders_are_those_that_the_printed_samples_can_tell_apart():
         (Outcome(rates(20, 40)), Verdict.NOT),
         # Equal ones are turned, too.
         (Outcome(rates(75, 75)), Verdict.NOT),
-        (Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60))}), Verdict.ELSEWHERE),
+        (
+            Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60))}),
+            Verdict.ELSEWHERE,
+        ),
         (Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 20))}), Verdict.NOT),
         (Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(75, 75))}), Verdict.NOT),
         (Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60)[:1])}), Verdict.NOT),
-        (Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60), [SAID_NOT])}), Verdict.NOT),
-        (Outcome(rates(20, 40), [SAID_NOT], elsewhere={"more noise": Outcome(rates(88, 60))}), Verdict.NOT),
-        (Outcome(rates(20, 40), [SAID_NOT], elsewhere={"more noise": Outcome(rates(88, 60), [SAID])}), Verdict.ELSEWHERE),
-        (Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60), [CHECK_FAILS])}), Verdict.ELSEWHERE),
-        (Outcome(rates(20, 40), elsewhere={"more noise": Outcome([Number("nothing printed", 1.0)])}), Verdict.NOT),
+        (
+            Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60), [SAID_NOT])}),
+            Verdict.NOT,
+        ),
+        (
+            Outcome(rates(20, 40), [SAID_NOT], elsewhere={"more noise": Outcome(rates(88, 60))}),
+            Verdict.NOT,
+        ),
+        (
+            Outcome(
+                rates(20, 40), [SAID_NOT], elsewhere={"more noise": Outcome(rates(88, 60), [SAID])}
+            ),
+            Verdict.ELSEWHERE,
+        ),
+        (
+            Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60), [CHECK_FAILS])}),
+            Verdict.ELSEWHERE,
+        ),
+        (
+            Outcome(
+                rates(20, 40), elsewhere={"more noise": Outcome([Number("nothing printed", 1.0)])}
+            ),
+            Verdict.NOT,
+        ),
         (Outcome(claims=[SAID_NOT], elsewhere={"more noise": claims(SAID)}), Verdict.ELSEWHERE),
-        (Outcome(claims=[SAID_NOT], elsewhere={"more noise": claims(replace(SAID, sentence="another"))}), Verdict.NOT),
+        (
+            Outcome(
+                claims=[SAID_NOT],
+                elsewhere={"more noise": claims(replace(SAID, sentence="another"))},
+            ),
+            Verdict.NOT,
+        ),
         (claims(SAID), Verdict.REPRODUCED),
         # With nothing that is printed, nothing is reproduced.
         (Outcome([Number("ours", 1.0)], [replace(SAID, printed=False)]), Verdict.NOT),
@@ -99,7 +147,9 @@ def test_the_verdict_follows_from_the_numbers(outcome, verdict):
     judgement = judge(TABLE, outcome, SAMPLE)
     assert judgement.verdict == verdict
     assert verdict in RULES
-    assert ("agrees with the other setting: more noise" in judgement.reasons) is (verdict == Verdict.ELSEWHERE)
+    assert ("agrees with the other setting: more noise" in judgement.reasons) is (
+        verdict == Verdict.ELSEWHERE
+    )
     assert (TABLE.argument in judgement.reasons) is (verdict == Verdict.NOT)
     assert judge(TABLE, outcome, Sample(quick=True)).verdict == Verdict.NONE
 
@@ -123,10 +173,16 @@ def test_a_printed_formula_is_wrong_if_it_gives_another_number():
 
 
 def test_a_wrong_formula_that_gives_the_print_is_said_to():
-    text = judge(TABLE, Outcome(rates(40, 20), as_printed=[Number("high", 90.0, unit="%")]), SAMPLE).text
+    text = judge(
+        TABLE, Outcome(rates(40, 20), as_printed=[Number("high", 90.0, unit="%")]), SAMPLE
+    ).text
     assert text == "ordering reproduced; printed formula is wrong, and gives the print"
     own = Number("high", 35.0, printed=35.0, unit="%")
-    assert judge(TABLE, Outcome([Number("high", 27.0, unit="%"), rates(40, 20)[1]], as_printed=[own]), SAMPLE).gives_print
+    assert judge(
+        TABLE, Outcome([Number("high", 27.0, unit="%"), rates(40, 20)[1]], as_printed=[own]), SAMPLE
+    ).gives_print
     # What is outside the printed number's interval gives something else again.
-    text = judge(TABLE, Outcome(rates(40, 20), as_printed=[Number("high", 10.0, unit="%")]), SAMPLE).text
+    text = judge(
+        TABLE, Outcome(rates(40, 20), as_printed=[Number("high", 10.0, unit="%")]), SAMPLE
+    ).text
     assert text == "ordering reproduced; printed formula is wrong"

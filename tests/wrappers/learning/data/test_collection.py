@@ -16,7 +16,13 @@ from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.registry import load_problem
 from safe_envs.wrappers.learning.data import collection as module
-from safe_envs.wrappers.learning.data.collection import collect, collect_paths, draw_states, env_step, plant_step
+from safe_envs.wrappers.learning.data.collection import (
+    collect,
+    collect_paths,
+    draw_states,
+    env_step,
+    plant_step,
+)
 
 DISK = load_problem("safe_envs/CubicSDEDisk-v0")
 SMOOTH = load_problem("safe_envs/CubicSDEDisk-v0", {"noise": 0.0})
@@ -38,7 +44,12 @@ def at_rest(x, u, rng):
 
 def test_every_input_is_tried_at_every_state():
     data = collect(DISK, 4, repetitions=3, inputs=[(-1.0,), (0.0,), (2.0,)], seed=1)
-    assert (data.x.shape, data.u.shape, data.successors.shape, data.dt.shape) == ((12, 2), (12, 1), (12, 3, 2), (12,))
+    assert (data.x.shape, data.u.shape, data.successors.shape, data.dt.shape) == (
+        (12, 2),
+        (12, 1),
+        (12, 3, 2),
+        (12,),
+    )
     np.testing.assert_array_equal(data.u[:, 0], [-1.0, 0.0, 2.0] * 4)
     np.testing.assert_array_equal(data.x, np.repeat(data.x[::3], 3, axis=0))
     assert len(np.unique(data.x, axis=0)) == 4
@@ -54,7 +65,9 @@ def test_inputs_of_the_exploration_are_the_default():
 
 @pytest.mark.parametrize("steps", [1, 5])
 def test_the_seed_is_all_the_randomness(steps):
-    one, same, other = (collect(DISK, 6, repetitions=2, steps=steps, seed=seed) for seed in (4, 4, 5))
+    one, same, other = (
+        collect(DISK, 6, repetitions=2, steps=steps, seed=seed) for seed in (4, 4, 5)
+    )
     np.testing.assert_array_equal(one.successors, same.successors)
     np.testing.assert_array_equal(one.x, same.x)
     assert not np.isin(one.x, other.x).any()
@@ -62,7 +75,9 @@ def test_the_seed_is_all_the_randomness(steps):
 
 
 def test_start_states_do_not_depend_on_the_repetitions():
-    np.testing.assert_array_equal(collect(DISK, 6, seed=4).x, collect(DISK, 6, repetitions=7, seed=4).x)
+    np.testing.assert_array_equal(
+        collect(DISK, 6, seed=4).x, collect(DISK, 6, repetitions=7, seed=4).x
+    )
 
 
 @pytest.mark.parametrize("at_once", [1, 4, 7])
@@ -90,7 +105,9 @@ def test_successors_have_the_mean_and_the_variance_of_euler_maruyama():
     data = collect(DISK, 5, repetitions=repetitions, inputs=[(-2.0,), (3.0,)], seed=7)
     moved = (data.successors - data.x[:, None]) / DISK.dt
     deviation = 0.2 / math.sqrt(DISK.dt)
-    assert abs(moved.mean(axis=1) - rates(data.x, data.u)).max() < 5 * deviation / math.sqrt(repetitions)
+    assert abs(moved.mean(axis=1) - rates(data.x, data.u)).max() < 5 * deviation / math.sqrt(
+        repetitions
+    )
     variance = moved.var(axis=1)
     assert abs(variance / deviation**2 - 1).max() < 5 * math.sqrt(2 / repetitions)
     covariance = ((moved - moved.mean(axis=1, keepdims=True)).prod(axis=2)).mean(axis=1)
@@ -100,7 +117,9 @@ def test_successors_have_the_mean_and_the_variance_of_euler_maruyama():
 def test_dt_is_that_of_the_step():
     data = collect(SMOOTH, 3, dt=1e-4)
     assert (data.dt == 1e-4).all()
-    np.testing.assert_allclose((data.successors[:, 0] - data.x) / 1e-4, rates(data.x, data.u), atol=1e-3)
+    np.testing.assert_allclose(
+        (data.successors[:, 0] - data.x) / 1e-4, rates(data.x, data.u), atol=1e-3
+    )
     assert data.signature.dt == SMOOTH.dt
 
 
@@ -119,7 +138,9 @@ def test_states_are_drawn_uniformly():
     assert states.shape == (20_000, 2)
     # Of a disk: r^2 is uniform, and so is the angle.
     for uniform in ((states**2).sum(axis=1), np.arctan2(*states.T) / (2 * math.pi) + 0.5):
-        assert np.histogram(uniform, bins=10, range=(0.0, 1.0))[0] == pytest.approx([2000] * 10, abs=220)
+        assert np.histogram(uniform, bins=10, range=(0.0, 1.0))[0] == pytest.approx(
+            [2000] * 10, abs=220
+        )
 
 
 def test_trajectories_go_on_with_what_was_reached():
@@ -147,7 +168,9 @@ def test_progress_is_told():
 
 def test_a_step_of_ones_own():
     data = collect(DISK, 3, repetitions=2, step=shifted, dt=0.5)
-    np.testing.assert_array_equal(data.successors, np.repeat((data.x + 0.01 * data.u)[:, None], 2, axis=1))
+    np.testing.assert_array_equal(
+        data.successors, np.repeat((data.x + 0.01 * data.u)[:, None], 2, axis=1)
+    )
     assert (data.dt == 0.5).all()
 
 
@@ -161,7 +184,10 @@ def test_a_step_of_ones_own():
         ({"seed": -1}, "seed = -1"),
         ({"dt": 0.0}, r"dt = 0\.0 s"),
         ({"dt": math.nan}, "dt = nan"),
-        ({"points": 10**9, "repetitions": 100}, r"data of 1 steps from 1000000000 points .* take \d.*GB; at most 2 GB"),
+        (
+            {"points": 10**9, "repetitions": 100},
+            r"data of 1 steps from 1000000000 points .* take \d.*GB; at most 2 GB",
+        ),
         ({"inputs": [(10.5,)]}, r"\[10\.5\] is outside the box \(\(-10\.0, 10\.0\),\) of u"),
         ({"inputs": [(math.nan,)]}, "outside the box"),
         ({"inputs": [(1.0, 1.0)]}, "vectors of 1 numbers each: u"),
@@ -176,22 +202,34 @@ def test_arguments_that_are_not_allowed(arguments, message):
 
 def test_a_region_without_safe_states_is_an_error():
     x_1 = DISK.plant.states[0]
-    with pytest.raises(ConfigurationError, match=r"only 0 of \d+ states drawn from the region .*nearer to the safe set"):
+    with pytest.raises(
+        ConfigurationError,
+        match=r"only 0 of \d+ states drawn from the region .*nearer to the safe set",
+    ):
         collect(replace(DISK, barriers=(Barrier(-1 - x_1**2),)), 3)
 
 
 def test_an_undefined_barrier_is_not_explored():
     x_1 = DISK.plant.states[0]
-    assert (draw_states(replace(DISK, barriers=(Barrier(sp.log(x_1) + 10),)), 50, np.random.default_rng(0))[:, 0] > 0).all()
+    assert (
+        draw_states(
+            replace(DISK, barriers=(Barrier(sp.log(x_1) + 10),)), 50, np.random.default_rng(0)
+        )[:, 0]
+        > 0
+    ).all()
 
 
 def test_a_step_that_is_not_finite_names_its_state_and_input():
     def diverging(x, u, rng):
         return np.where(u > 0, np.inf, x)
 
-    with pytest.raises(NumericalError, match=r"from x = \[.*\] under u = \[1\.\] led to \[inf inf\]"):
+    with pytest.raises(
+        NumericalError, match=r"from x = \[.*\] under u = \[1\.\] led to \[inf inf\]"
+    ):
         collect(DISK, 3, step=diverging)
-    plant = replace(SMOOTH.plant, drift=[1 / (DISK.plant.states[0] - DISK.plant.states[0] ** 2 * 0 - 1), 0])
+    plant = replace(
+        SMOOTH.plant, drift=[1 / (DISK.plant.states[0] - DISK.plant.states[0] ** 2 * 0 - 1), 0]
+    )
     region = SamplingDomain(region=((1.0, 1.0 + 1e-15), (-1.0, 1.0)))
     singular = replace(SMOOTH, plant=plant, barriers=(Barrier(sp.Integer(1)),), explored=region)
     with pytest.raises(NumericalError, match="give a smaller dt"):
@@ -209,19 +247,28 @@ def test_data_without_news_are_refused():
 
 
 def test_paths_hold_their_inputs():
-    states, inputs = np.array([[0.1, 0.2], [0.3, -0.2], [0.0, 0.0]]), np.array([[1.0], [-2.0], [0.0]])
+    states, inputs = (
+        np.array([[0.1, 0.2], [0.3, -0.2], [0.0, 0.0]]),
+        np.array([[1.0], [-2.0], [0.0]]),
+    )
     paths = collect_paths(SMOOTH, states, inputs, 50, 0.002)
     assert paths.shape == (3, 51, 2)
     np.testing.assert_array_equal(paths[:, 0], states)
-    np.testing.assert_allclose((paths[:, 1] - paths[:, 0]) / 0.002, rates(states, inputs), atol=1e-3)
+    np.testing.assert_allclose(
+        (paths[:, 1] - paths[:, 0]) / 0.002, rates(states, inputs), atol=1e-3
+    )
     # RK4: half the step leads to the same places.
-    np.testing.assert_allclose(collect_paths(SMOOTH, states, inputs, 100, 0.001)[:, ::2], paths, atol=1e-11)
+    np.testing.assert_allclose(
+        collect_paths(SMOOTH, states, inputs, 100, 0.001)[:, ::2], paths, atol=1e-11
+    )
     np.testing.assert_array_equal(paths[2], np.zeros((51, 2)))
 
 
 def test_noise_of_paths_is_of_their_seed():
     states, inputs = [[0.1, 0.2]] * 2, [[1.0]] * 2
-    one, same, other = (collect_paths(DISK, states, inputs, 5, 0.01, seed=seed) for seed in (0, 0, 1))
+    one, same, other = (
+        collect_paths(DISK, states, inputs, 5, 0.01, seed=seed) for seed in (0, 0, 1)
+    )
     np.testing.assert_array_equal(one, same)
     assert not (one[:, 1:] == other[:, 1:]).any()
     assert not (one[0, 1:] == one[1, 1:]).any()
@@ -241,7 +288,9 @@ def test_noise_of_paths_is_of_their_seed():
 )
 def test_paths_that_are_not_allowed(arguments, error, message):
     with pytest.raises(error, match=message):
-        collect_paths(DISK, **{"states": [[0.1, 0.2]], "inputs": [[1.0]], "steps": 2, "dt": 0.01, **arguments})
+        collect_paths(
+            DISK, **{"states": [[0.1, 0.2]], "inputs": [[1.0]], "steps": 2, "dt": 0.01, **arguments}
+        )
 
 
 class TestEnvStep:
@@ -272,8 +321,16 @@ class TestEnvStep:
 
     def test_it_feeds_the_collector(self, pendulum):
         problem = load_problem("safe_envs/Pendulum-v0")
-        step = env_step(pendulum, self.set_state, self.get_state, to_action=lambda u: (u / 10.0).astype(np.float32))
-        one, same = (collect(problem, 10, inputs=[(-1.0,), (1.0,)], step=step, dt=0.05, seed=3) for _ in range(2))
+        step = env_step(
+            pendulum,
+            self.set_state,
+            self.get_state,
+            to_action=lambda u: (u / 10.0).astype(np.float32),
+        )
+        one, same = (
+            collect(problem, 10, inputs=[(-1.0,), (1.0,)], step=step, dt=0.05, seed=3)
+            for _ in range(2)
+        )
         np.testing.assert_array_equal(one.successors, same.successors)
         expected = one.x[:, 1] + (15.0 * np.sin(one.x[:, 0]) + 0.3 * one.u[:, 0]) * 0.05
         np.testing.assert_allclose(one.successors[:, 0, 1], expected, atol=1e-7)
@@ -291,7 +348,9 @@ class TestEnvStep:
 
 
 def test_sizes_are_checked_before_anything_is_drawn():
-    with pytest.raises(ConfigurationError, match=r"1000000000000 states of CubicSDEDisk take 1\.6e"):
+    with pytest.raises(
+        ConfigurationError, match=r"1000000000000 states of CubicSDEDisk take 1\.6e"
+    ):
         draw_states(DISK, 10**12, np.random.default_rng(0))
     with pytest.raises(ConfigurationError, match="1 paths of 1000000000000 steps take"):
         collect_paths(DISK, [[0.1, 0.2]], [[1.0]], 10**12, 0.01)
@@ -304,10 +363,14 @@ def test_a_step_of_ones_own_may_be_that_of_any_plant():
 
 def test_numbers_of_numpy_are_numbers():
     data = collect(DISK, np.int64(3), repetitions=np.int32(2), seed=np.int64(1))
-    np.testing.assert_array_equal(data.successors, collect(DISK, 3, repetitions=2, seed=1).successors)
+    np.testing.assert_array_equal(
+        data.successors, collect(DISK, 3, repetitions=2, seed=1).successors
+    )
 
 
 @pytest.mark.parametrize("problem", ["safe_envs/Pendulum-v0", None])
 def test_what_is_no_problem_is_refused(problem):
-    with pytest.raises(ConfigurationError, match=r"problem = .* give a SafetyProblem, as load_problem"):
+    with pytest.raises(
+        ConfigurationError, match=r"problem = .* give a SafetyProblem, as load_problem"
+    ):
         collect(problem, 3)

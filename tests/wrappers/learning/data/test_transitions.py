@@ -52,16 +52,28 @@ def test_sizes_and_time():
         ({"u": [[1.0], [1.0]]}, r"u \(2, 1\)"),
         ({"successors": np.ones((3, 2))}, r"successors \(3, 2\).*give .*\(P, K, 2\)"),
         ({"dt": [0.01, 0.01]}, r"dt \(2,\)"),
-        ({"x": np.empty((0, 2)), "u": np.empty((0, 1)), "successors": np.empty((0, 2, 2))}, "there are no data"),
+        (
+            {"x": np.empty((0, 2)), "u": np.empty((0, 1)), "successors": np.empty((0, 2, 2))},
+            "there are no data",
+        ),
         ({"successors": np.empty((3, 0, 2))}, "there are no data"),
         ({"x": [[0.0, 0.1], [0.2]]}, "x is no array of numbers"),
         ({"u": [["fast"], [1.0], [1.0]]}, "u is no array of numbers"),
-        ({"x": np.ma.masked_greater([[0.0, 0.1], [0.2, 0.3], [0.4, 0.5]], 0.45)}, "x has masked entries"),
-        ({"x": list(np.ma.masked_greater([[0.0, 0.1], [0.2, 0.3], [0.4, 0.5]], 0.45))}, "x has masked entries"),
+        (
+            {"x": np.ma.masked_greater([[0.0, 0.1], [0.2, 0.3], [0.4, 0.5]], 0.45)},
+            "x has masked entries",
+        ),
+        (
+            {"x": list(np.ma.masked_greater([[0.0, 0.1], [0.2, 0.3], [0.4, 0.5]], 0.45))},
+            "x has masked entries",
+        ),
         ({"u": np.array([[1.0], [1j], [1.0]])}, "u is complex; give real numbers"),
         ({"u": [[1.0], [1j], [1.0]]}, "u is complex"),
         ({"x": [[0.0, 0.1], [0.2, np.nan], [0.4, 0.5]]}, r"x\[1, 1\] = nan, one of 1 entries"),
-        ({"successors": np.full((3, 2, 2), np.inf)}, r"successors\[0, 0, 0\] = inf, one of 12 entries"),
+        (
+            {"successors": np.full((3, 2, 2), np.inf)},
+            r"successors\[0, 0, 0\] = inf, one of 12 entries",
+        ),
         ({"dt": 0.0}, r"dt\[0\] = 0.0 s; a step needs a positive duration"),
         ({"dt": [0.01, -0.01, 0.01]}, r"dt\[1\] = -0.01 s"),
     ],
@@ -78,7 +90,11 @@ def test_seed_is_a_whole_number_or_none():
 
 
 def test_copied_rows_are_refused():
-    x, u, successors = [[0.0, 0.1], [0.2, 0.3], [0.0, 0.1]], [[1.0]] * 3, np.arange(12.0).reshape(3, 2, 2)
+    x, u, successors = (
+        [[0.0, 0.1], [0.2, 0.3], [0.0, 0.1]],
+        [[1.0]] * 3,
+        np.arange(12.0).reshape(3, 2, 2),
+    )
     successors[2] = successors[0]
     with pytest.raises(InvalidInputError, match=r"rows 0 and 2 are the same.*drop the copies"):
         logged(x=x, u=u, successors=successors)
@@ -95,11 +111,15 @@ def test_repetitions_may_agree_without_noise():
 
 def test_a_log_equals_collected_data():
     data = collect(DISK, 20, seed=3)
-    log = Transitions.from_log(DISK, data.x.tolist(), data.u.tolist(), data.successors[:, 0].tolist(), DISK.dt)
+    log = Transitions.from_log(
+        DISK, data.x.tolist(), data.u.tolist(), data.successors[:, 0].tolist(), DISK.dt
+    )
     # Of which plant a log is, nobody knows.
     data = replace(data, seed=None, signature=replace(data.signature, plant=()))
     assert_same(data, log)
-    assert_same(Transitions.from_log(SIGNATURE, data.x, data.u, data.successors[:, 0], data.dt), log)
+    assert_same(
+        Transitions.from_log(SIGNATURE, data.x, data.u, data.successors[:, 0], data.dt), log
+    )
 
 
 def test_a_log_has_no_repetitions():
@@ -144,7 +164,12 @@ def test_a_file_of_something_else_is_refused(tmp_path):
     files.save(path, "transitions", SIGNATURE, {"seed": 0}, {"x": np.zeros((1, 2))})
     with pytest.raises(LearnedFileError, match="incomplete: 'u'"):
         Transitions.load(path)
-    arrays = {"x": np.zeros((1, 3)), "u": np.zeros((1, 1)), "successors": np.zeros((1, 1, 3)), "dt": np.ones(1)}
+    arrays = {
+        "x": np.zeros((1, 3)),
+        "u": np.zeros((1, 1)),
+        "successors": np.zeros((1, 1, 3)),
+        "dt": np.ones(1),
+    }
     files.save(path, "transitions", SIGNATURE, {"seed": 0}, arrays)
     with pytest.raises(LearnedFileError, match="the shapes do not fit"):
         Transitions.load(path)
@@ -171,7 +196,10 @@ def test_what_data_are_of_is_a_problem_or_a_signature(tmp_path):
 
 def test_data_of_another_problem_are_told_from_models():
     logged().require(DISK)
-    with pytest.raises(LearnedFileError, match="the data are of another problem: its system: CubicSDEDisk, that of Scalar"):
+    with pytest.raises(
+        LearnedFileError,
+        match="the data are of another problem: its system: CubicSDEDisk, that of Scalar",
+    ):
         logged().require(load_problem("safe_envs/Scalar-v0"))
 
 

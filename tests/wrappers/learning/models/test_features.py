@@ -19,7 +19,10 @@ def test_their_number_is_known_before_they_are(name):
 
 
 def test_too_many_are_refused():
-    with pytest.raises(ConfigurationError, match="degree = 300 makes 45451 features of x_1, x_2; give one with at most 300"):
+    with pytest.raises(
+        ConfigurationError,
+        match="degree = 300 makes 45451 features of x_1, x_2; give one with at most 300",
+    ):
         Features.of(problem_of("safe_envs/CubicSDE-v0"), 300)
     with pytest.raises(ConfigurationError, match="degree = 3 makes 546 features of x, y, z"):
         Features.of(problem_of("safe_envs/QuadrotorLimits-v0"), 3)
@@ -27,5 +30,7 @@ def test_too_many_are_refused():
 
 
 def test_the_degree_is_called_as_the_user_calls_it():
-    with pytest.raises(ConfigurationError, match="diffusion_degree = -1; give a whole number from 0"):
+    with pytest.raises(
+        ConfigurationError, match="diffusion_degree = -1; give a whole number from 0"
+    ):
         Features.of(problem_of("safe_envs/CubicSDE-v0"), -1, "diffusion_degree")

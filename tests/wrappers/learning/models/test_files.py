@@ -38,7 +38,9 @@ def with_header(path, **changes):
     """Write the file again, with another header and nothing else changed."""
     arrays = archived(path)
     header = {**json.loads(arrays["header"].tobytes()), **changes}
-    np.savez(path, **{**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)})
+    np.savez(
+        path, **{**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
+    )
 
 
 def test_what_is_saved_is_loaded(path):
@@ -52,7 +54,13 @@ def test_what_is_saved_is_loaded(path):
 
 def test_the_order_in_memory_does_not_matter(path):
     before = load(path).sha256
-    save(path, "regression", SIGNATURE, DETAILS, {name: np.asfortranarray(array) for name, array in ARRAYS.items()})
+    save(
+        path,
+        "regression",
+        SIGNATURE,
+        DETAILS,
+        {name: np.asfortranarray(array) for name, array in ARRAYS.items()},
+    )
     assert load(path).sha256 == before
 
 
@@ -63,7 +71,12 @@ def test_the_checksum_is_of_everything(path):
         ("regression", replace(SIGNATURE, dt=0.02), DETAILS, ARRAYS),
         ("regression", SIGNATURE, {**DETAILS, "degree": 4}, ARRAYS),
         ("regression", SIGNATURE, DETAILS, {**ARRAYS, "weights": ARRAYS["weights"].T}),
-        ("regression", SIGNATURE, DETAILS, {**ARRAYS, "weights": ARRAYS["weights"].astype(np.float32)}),
+        (
+            "regression",
+            SIGNATURE,
+            DETAILS,
+            {**ARRAYS, "weights": ARRAYS["weights"].astype(np.float32)},
+        ),
         ("regression", SIGNATURE, DETAILS, {"w": ARRAYS["weights"], "count": ARRAYS["count"]}),
     ):
         save(path, kind, signature, details, arrays)
@@ -91,14 +104,24 @@ def test_altered_arrays_under_the_old_header_are_refused(path):
     arrays = archived(path)
     weights = arrays["weights"].copy()
     weights[3, 2] += 1e-12
-    for changed in ({**arrays, "weights": weights}, {**arrays, "more": np.zeros(1)}, {k: v for k, v in arrays.items() if k != "count"}):
+    for changed in (
+        {**arrays, "weights": weights},
+        {**arrays, "more": np.zeros(1)},
+        {k: v for k, v in arrays.items() if k != "count"},
+    ):
         np.savez(path, **changed)
         with pytest.raises(LearnedFileError, match="was altered"):
             load(path)
 
 
 @pytest.mark.parametrize(
-    "changes", [{"kind": "network"}, {"details": {}}, {"sha256": "0" * 64}, {"signature": {**asdict(SIGNATURE), "system": "Scalar"}}]
+    "changes",
+    [
+        {"kind": "network"},
+        {"details": {}},
+        {"sha256": "0" * 64},
+        {"signature": {**asdict(SIGNATURE), "system": "Scalar"}},
+    ],
 )
 def test_an_altered_header_is_refused(path, changes):
     with_header(path, **changes)
@@ -184,7 +207,9 @@ def test_a_folder_that_does_not_exist_is_an_error(tmp_path):
 
 
 def test_another_system_is_refused():
-    with pytest.raises(LearnedFileError, match="its system: CubicSDEDisk, that of Scalar: Scalar; learn again"):
+    with pytest.raises(
+        LearnedFileError, match="its system: CubicSDEDisk, that of Scalar: Scalar; learn again"
+    ):
         SIGNATURE.require(load_problem("safe_envs/Scalar-v0"))
     with pytest.raises(LearnedFileError, match="its state units"):
         replace(SIGNATURE, state_units=("m", "m")).require(DISK)
@@ -208,7 +233,10 @@ def test_what_else_has_to_fit():
 def test_data_are_no_model(tmp_path):
     save(tmp_path / "data.npz", "transitions", SIGNATURE, DETAILS, ARRAYS)
     for method in (None, "bayesian"):
-        with pytest.raises(LearnedFileError, match=r"data\.npz holds transitions \(data\), no model; `safe-envs identify --data"):
+        with pytest.raises(
+            LearnedFileError,
+            match=r"data\.npz holds transitions \(data\), no model; `safe-envs identify --data",
+        ):
             load_learned(tmp_path / "data.npz", DISK, method)
 
 

@@ -1,4 +1,5 @@
-"""Learned files that were damaged, or written by whoever wants to do harm: what was saved, or an error of ours."""
+"""Learned files that were damaged, or written by whoever wants to do harm: what was saved, or an
+error of ours."""
 
 from __future__ import annotations
 
@@ -31,7 +32,28 @@ pytestmark = pytest.mark.slow
 SIGNATURE = Signature.of(problem_of("safe_envs/CubicSDEDisk-v0"))
 ARRAYS = {"weights": np.linspace(0.0, 1.0, 4), "count": np.array(3)}
 
-json_values = st.sampled_from([None, True, 0, 1, -1, 2, 3.5, 1e300, 1e-300, 10**400, 10**9, "", "x", [], [1], {}, {"a": 1}, [[1, 2]]])
+json_values = st.sampled_from(
+    [
+        None,
+        True,
+        0,
+        1,
+        -1,
+        2,
+        3.5,
+        1e300,
+        1e-300,
+        10**400,
+        10**9,
+        "",
+        "x",
+        [],
+        [1],
+        {},
+        {"a": 1},
+        [[1, 2]],
+    ]
+)
 numbers = st.sampled_from([0.0, -1.0, 5.0, 1e50, -1e99, 1e300, 1e-300, math.nan, math.inf])
 
 
@@ -64,7 +86,11 @@ def whole(tmp_path_factory) -> bytes:
 def test_a_damaged_file_is_the_same_or_refused(whole, data):
     content = loaded(damaged_by(data, whole))
     if content is not None:
-        assert (content.kind, content.signature, content.details) == ("regression", SIGNATURE, {"degree": 3})
+        assert (content.kind, content.signature, content.details) == (
+            "regression",
+            SIGNATURE,
+            {"degree": 3},
+        )
         assert all(np.array_equal(content.arrays[name], array) for name, array in ARRAYS.items())
 
 
@@ -83,10 +109,15 @@ def test_a_bomb_is_not_unpacked(tmp_path, whole, part):
         load(tmp_path / "bomb.npz")
 
 
-@pytest.mark.parametrize("shape", ["(10000000000,)", "(1000000000000000000,)", "(-1,)", "(3,)", f"({'1,' * 200})"])
+@pytest.mark.parametrize(
+    "shape", ["(10000000000,)", "(1000000000000000000,)", "(-1,)", "(3,)", f"({'1,' * 200})"]
+)
 def test_an_array_is_as_large_as_its_header_says(whole, shape):
     content = io.BytesIO()
-    header = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(500).encode() + b"\n"
+    header = (
+        f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}".ljust(500).encode()
+        + b"\n"
+    )
     content.write(b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header + bytes(32))
     stream = io.BytesIO(whole)
     with zipfile.ZipFile(stream, "a") as archive:
@@ -113,7 +144,13 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path):
 
 def places(document: Any, place: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     """Of all that a JSON document holds."""
-    inner = document.items() if isinstance(document, dict) else enumerate(document) if isinstance(document, list) else ()
+    inner = (
+        document.items()
+        if isinstance(document, dict)
+        else enumerate(document)
+        if isinstance(document, list)
+        else ()
+    )
     return [place, *(found for key, value in inner for found in places(value, (*place, key)))]
 
 
@@ -152,13 +189,25 @@ def write(path: Path, model, document: dict[str, Any], arrays: dict[str, np.ndar
     parts = [model.method, document["signature"], document["details"]]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode())
     for name in sorted(arrays):
-        digest.update(f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode() + arrays[name].tobytes())
-    header = {"format": 2, "kind": model.method, **document, "versions": {}, "sha256": digest.hexdigest()}
-    path.write_bytes(archive_of({**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}))
+        digest.update(
+            f"{name}{arrays[name].dtype.str}{arrays[name].shape}".encode() + arrays[name].tobytes()
+        )
+    header = {
+        "format": 2,
+        "kind": model.method,
+        **document,
+        "versions": {},
+        "sha256": digest.hexdigest(),
+    }
+    path.write_bytes(
+        archive_of({**arrays, "header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)})
+    )
 
 
 def document_of(model) -> dict[str, Any]:
-    return json.loads(json.dumps({"details": model._saved(), "signature": asdict(model.signature)}, default=float))
+    return json.loads(
+        json.dumps({"details": model._saved(), "signature": asdict(model.signature)}, default=float)
+    )
 
 
 LEARNED = pytest.mark.parametrize(
@@ -173,7 +222,9 @@ LEARNED = pytest.mark.parametrize(
 
 
 @LEARNED
-def test_what_these_tests_write_is_taken_where_nothing_was_changed(request, tmp_path, what, env, filter_name):
+def test_what_these_tests_write_is_taken_where_nothing_was_changed(
+    request, tmp_path, what, env, filter_name
+):
     model = request.getfixturevalue(what)
     write(tmp_path / "model.npz", model, document_of(model), model.arrays())
     found = load_learned(tmp_path / "model.npz", request.getfixturevalue(env))
@@ -181,7 +232,9 @@ def test_what_these_tests_write_is_taken_where_nothing_was_changed(request, tmp_
 
 
 @pytest.mark.slow
-@hypothesis.settings(max_examples=25, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture])
+@hypothesis.settings(
+    max_examples=25, suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture]
+)
 @hypothesis.given(data=st.data())
 @LEARNED
 def test_wrong_content_is_refused_or_gives_actions(request, tmp_path, what, env, filter_name, data):
@@ -197,7 +250,11 @@ def test_wrong_content_is_refused_or_gives_actions(request, tmp_path, what, env,
     try:
         found = load_learned(tmp_path / "model.npz", problem)
         conditions = parse_conditions(filter_name, problem, {found.method: found})
-        action = SafetyFilter.for_problem(problem, conditions).filter(np.full(problem.plant.n, 0.1), np.zeros(problem.plant.m)).action
+        action = (
+            SafetyFilter.for_problem(problem, conditions)
+            .filter(np.full(problem.plant.n, 0.1), np.zeros(problem.plant.m))
+            .action
+        )
     except SafeEnvsError as error:
         message = str(error)
     assert len(message) < 2000
@@ -213,7 +270,12 @@ def test_degrees_are_those_of_the_barriers(tmp_path, disk, residual, degrees):
 
 
 def test_data_of_another_shape_are_refused(tmp_path, cubic):
-    arrays = {"x": np.zeros((2, 2)), "u": np.zeros((2, 1)), "successors": np.zeros((2, 1, 2)), "dt": np.ones(2)}
+    arrays = {
+        "x": np.zeros((2, 2)),
+        "u": np.zeros((2, 1)),
+        "successors": np.zeros((2, 1, 2)),
+        "dt": np.ones(2),
+    }
     for details in ({}, {"seed": "x"}, {"seed": 1.5}, {"seed": -1}, {"seed": [1]}):
         save(tmp_path / "data.npz", "transitions", Signature.of(cubic), details, arrays)
         with pytest.raises(LearnedFileError, match="incomplete"):

@@ -40,12 +40,16 @@ def test_the_outputs_are_those_of_torch(activation, widths):
 
     network, x = random_network(activation, widths), batch(100, widths[0])
     act = torch.relu if activation == "relu" else torch.tanh
-    y = (torch.tensor(np.stack(x, axis=1)) - torch.tensor(network.input_mean)) / torch.tensor(network.input_scale)
+    y = (torch.tensor(np.stack(x, axis=1)) - torch.tensor(network.input_mean)) / torch.tensor(
+        network.input_scale
+    )
     for k, (w, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         y = torch.nn.functional.linear(y, torch.tensor(w), torch.tensor(b))
         y = act(y) if k + 1 < len(network.weights) else y
     expected = (y * torch.tensor(network.output_scale) + torch.tensor(network.output_mean)).numpy()
-    np.testing.assert_allclose(np.stack(network.arrays(x), axis=1), expected, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(
+        np.stack(network.arrays(x), axis=1), expected, rtol=1e-10, atol=1e-10
+    )
     one = [float(c[7]) for c in x]
     np.testing.assert_allclose(network.floats(one), expected[7], rtol=1e-10, atol=1e-10)
 
@@ -57,8 +61,12 @@ def test_the_slopes_are_those_of_finite_differences(activation, output):
     values, slopes = network.values_and_slopes_arrays(x, output)
     assert all(np.array_equal(a, b) for a, b in zip(values, network.arrays(x), strict=True))
     for i, slope in enumerate(slopes):
-        above, below = (network.arrays(tuple(c + s * step * (i == j) for j, c in enumerate(x)))[output] for s in (1, -1))
-        # A rectifier that switches within the step spoils the difference, not the slope: so the median.
+        above, below = (
+            network.arrays(tuple(c + s * step * (i == j) for j, c in enumerate(x)))[output]
+            for s in (1, -1)
+        )
+        # A rectifier that switches within the step spoils the difference, not the slope: so the
+        # median.
         wrong = np.abs(slope - (above - below) / (2 * step))
         assert np.median(wrong) < 1e-8 * np.abs(slope).max()
         assert (wrong < 1e-6).mean() > 0.95
@@ -132,7 +140,9 @@ def data(rows=600):
 def test_a_network_learns_functions_of_any_unit_and_says_how_well():
     x, y = data()
     progress = []
-    trained = train(x, y, hidden=(30, 20), epochs=150, batch=64, rate=3e-3, progress=progress.append)
+    trained = train(
+        x, y, hidden=(30, 20), epochs=150, batch=64, rate=3e-3, progress=progress.append
+    )
     assert trained.heldout.shape == (90, 2)
     assert (np.sqrt((trained.heldout**2).mean(axis=0)) < 0.15 * y.std(axis=0)).all()
     assert len(progress) == trained.epochs <= 150
@@ -147,7 +157,9 @@ def test_the_same_seed_gives_the_same_network_and_leaves_torch_as_it_was():
 
     x, y = data(200)
     threads, state = torch.get_num_threads(), torch.get_rng_state()
-    nets = [train(x, y, hidden=(8,), epochs=5, seed=seed).network.to_arrays("n") for seed in (1, 1, 2)]
+    nets = [
+        train(x, y, hidden=(8,), epochs=5, seed=seed).network.to_arrays("n") for seed in (1, 1, 2)
+    ]
     assert torch.get_num_threads() == threads
     assert torch.equal(torch.get_rng_state(), state)
     assert all(np.array_equal(nets[0][name], nets[1][name]) for name in nets[0])
@@ -163,14 +175,19 @@ def test_the_noise_of_a_constant_target_is_not_blown_up():
     # The noise weighs nothing in the loss: the other target is learned as if it were not there.
     quiet = train(x, np.stack((y[:, 0], np.full(300, -0.78)), axis=1), hidden=(20,), epochs=30)
     assert trained.validation_loss == pytest.approx(quiet.validation_loss, rel=0.01)
-    # A size can be told: against 1 the second target here is nothing, although it is all noise by itself.
-    told = train(x, np.stack((y[:, 0], noise), axis=1), hidden=(20,), epochs=30, sizes=np.array([1.0, 1.0]))
+    # A size can be told: against 1 the second target here is nothing, although it is all noise by
+    # itself.
+    told = train(
+        x, np.stack((y[:, 0], noise), axis=1), hidden=(20,), epochs=30, sizes=np.array([1.0, 1.0])
+    )
     assert told.network.output_scale[1] == 1e-4
 
 
 def test_constant_columns_of_zeros_are_fine():
     x, y = data(50)
-    trained = train(np.hstack((x, np.zeros((50, 1)))), np.hstack((y, np.zeros((50, 1)))), hidden=(5,), epochs=2)
+    trained = train(
+        np.hstack((x, np.zeros((50, 1)))), np.hstack((y, np.zeros((50, 1)))), hidden=(5,), epochs=2
+    )
     assert trained.network.input_scale[2] == trained.network.output_scale[2] == 1.0
 
 
@@ -194,7 +211,9 @@ def test_a_target_that_is_constant_is_answered_by_the_constant(value):
 
 def test_training_stops_when_the_validation_loss_does_not_fall():
     rng = np.random.default_rng(0)
-    trained = train(rng.normal(size=(60, 2)), rng.normal(size=(60, 1)), hidden=(60, 30), epochs=2000, rate=1e-2)
+    trained = train(
+        rng.normal(size=(60, 2)), rng.normal(size=(60, 1)), hidden=(60, 30), epochs=2000, rate=1e-2
+    )
     assert 60 < trained.epochs < 1000
 
 
@@ -237,7 +256,16 @@ def test_shapes_that_do_not_fit_are_refused():
 
 
 @pytest.mark.parametrize(
-    "setting", [{"epochs": 0}, {"batch": 1.5}, {"hidden": (5, 0)}, {"rate": 0.0}, {"rate": np.nan}, {"seed": -1}, {"activation": "gelu"}]
+    "setting",
+    [
+        {"epochs": 0},
+        {"batch": 1.5},
+        {"hidden": (5, 0)},
+        {"rate": 0.0},
+        {"rate": np.nan},
+        {"seed": -1},
+        {"activation": "gelu"},
+    ],
 )
 def test_bad_settings_are_refused(setting):
     with pytest.raises(ConfigurationError):
@@ -245,7 +273,12 @@ def test_bad_settings_are_refused(setting):
 
 
 @pytest.mark.parametrize(
-    ("hidden", "message"), [(100, "hidden = 100; give the width"), ([10**11], "parameters; at most 10000000"), ([0], "width")]
+    ("hidden", "message"),
+    [
+        (100, "hidden = 100; give the width"),
+        ([10**11], "parameters; at most 10000000"),
+        ([0], "width"),
+    ],
 )
 def test_hidden_layers_that_are_none_or_huge_are_refused(hidden, message):
     with pytest.raises(ConfigurationError, match=message):
