@@ -104,6 +104,8 @@ def cases() -> dict[str, Case]:
             "evaluate Pendulum-v1 --filter-spec {root}/examples/pendulum_v1.py:spec --episodes 3 --seed 2",
         )
     )
+    found["leaderboard/Scalar-v0"] = Case(("leaderboard Scalar-v0 --quick --episodes 5 --out board",))
+    found["repeats/Scalar-v0"] = Case(("evaluate Scalar-v0 --filter bayesian-scbf --repeats 2 --episodes 4 --horizon 0.5",))
     found["sweep/grid"] = Case(("sweep grid.yaml --out found --jobs 1", "sweep-report found"), {"grid.yaml": _SWEEP})
     found["sweep/cells"] = Case(("sweep cells.yaml --out found --jobs 1", "sweep-report found"), {"cells.yaml": _LEARNED_SWEEP})
     for env_id, algorithm, options in _TRAINED:
@@ -148,7 +150,7 @@ def _verify(env_id: str, system: System) -> tuple[str, ...]:
         f"verify {env_id} --no-simulate {options}",
         f"verify {env_id} --no-simulate --noise 0.1 --knowledge plant --filter scbf {options}",
     )
-    simulated = env_id in ("StochasticDubins-v0", "QuadrotorAltitude-v0", "Scalar-v0", "ACC-v0")
+    simulated = env_id not in ("DubinsObstacles-v0", "CubicSDEDisk-v0", "Pendulum-v0", "QuadrotorLimits-v0")
     return (*lines, f"verify {env_id} --simulate {options}") if simulated else lines
 
 

@@ -43,22 +43,20 @@ def _vector(name: str, **options: Any) -> Any:
 def _run(env: Any) -> dict[str, Any]:
     observation, info = env.reset(seed=7)
     shape: Any = env.action_space.shape
-    found: dict[str, Any] = {
-        "types": {key: _type(value) for key, value in sorted({**info, "observation": observation}.items())},
-        "reset": {"observation": _plain(observation), "info": _plain(info)},
-        "steps": [],
-    }
-    ended = False
+    types = {key: _type(value) for key, value in {**info, "observation": observation}.items()}
+    answers: list[dict[str, Any]] = [{"observation": observation, **info}]
     for step in range(_STEPS):
-        if ended:
-            break
         action = np.sin(0.7 * step + np.arange(np.prod(shape)).reshape(shape)).astype(np.float32)
         observation, reward, terminated, truncated, info = env.step(action)
-        answer = {"observation": observation, "reward": reward, "terminated": terminated, "truncated": truncated, "info": info}
-        found["steps"].append(_plain(answer))
-        ended = bool(np.ndim(terminated) == 0 and (terminated or truncated))
+        answers.append({"observation": observation, "reward": reward, "terminated": terminated, "truncated": truncated, **info})
+        if np.ndim(terminated) == 0 and (terminated or truncated):
+            break
     env.close()
-    return found
+    # By key, so that a key that gets another name is one change of the file.
+    keys = sorted(set().union(*answers))
+    columns = {key: {str(i): _plain(answer[key]) for i, answer in enumerate(answers) if key in answer} for key in keys}
+    always = {key: list(column.values()) if len(column) == len(answers) else column for key, column in columns.items()}
+    return {"types": types, "values": always}
 
 
 def _type(value: Any) -> str:

@@ -42,7 +42,7 @@ _LONGEST = 24
 """Numbers of an array that are stored; of a longer one its ends and sums are."""
 
 _SHOWN = 8
-_LEFT_OUT = ("versions", "timing", "seconds", "learning_seconds", "training_seconds", "steps_per_second", "sha256", "key")
+_LEFT_OUT = ("versions", "timing", "seconds", "learning_seconds", "trained_in", "steps_per_second", "sha256", "key")
 
 
 def names() -> list[str]:
