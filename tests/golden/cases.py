@@ -19,6 +19,7 @@ class System:
         degree_one: whether its barrier has relative degree 1.
         mismatch: options that make the model differ from the plant.
         clf: whether it has a control Lyapunov function.
+        start: options with which short episodes come near the edge of the safe set.
     """
 
     filter: str
@@ -26,6 +27,7 @@ class System:
     degree_one: bool
     mismatch: str
     clf: bool = False
+    start: str = ""
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,8 @@ SYSTEMS = {
     "QuadrotorAltitude-v0": System("hocbf", 0.05, False, "--plant m=0.5 --model m=0.45"),
     "Quadrotor-v0": System("hocbf", 0.05, False, "--plant m=0.5 --model m=0.45"),
     "QuadrotorLimits-v0": System("hocbf", 0.05, False, "--plant m=0.5 --model m=0.45"),
-    "ACC-v0": System("scbf", 0.05, True, "--plant M=1700 --model f_1=6", clf=True),
-    "ACCGap-v0": System("scbf", 0.01, False, "--plant M=1700 --model f_1=6", clf=True),
+    "ACC-v0": System("scbf", 0.05, True, "--plant M=1700 --model f_1=6", clf=True, start=" --start 22,20,40"),
+    "ACCGap-v0": System("scbf", 0.01, False, "--plant M=1700 --model f_1=6", clf=True, start=" --start 21,10.6"),
     "Pendulum-v0": System("scbf", 0.01, True, "--plant m=1.1 --model l=0.75"),
     "CubicSDE-v0": System("scbf", 0.01, True, "--plant a=0.7 --model a=0.5", clf=True),
     "CubicSDEDisk-v0": System("scbf", 0.01, True, "--plant a=0.7 --model a=0.5"),
@@ -105,7 +107,7 @@ def cases() -> dict[str, Case]:
         )
     )
     found["leaderboard/Scalar-v0"] = Case(("leaderboard Scalar-v0 --quick --episodes 5 --out board",))
-    found["repeats/Scalar-v0"] = Case(("evaluate Scalar-v0 --filter bayesian-scbf --repeats 2 --episodes 4 --horizon 0.5",))
+    found["repeats/Scalar-v0"] = Case(("evaluate Scalar-v0 --filter bayesian-scbf --repeats 3 --episodes 20 --horizon 1",))
     found["sweep/grid"] = Case(("sweep grid.yaml --out found --jobs 1", "sweep-report found"), {"grid.yaml": _SWEEP})
     found["sweep/cells"] = Case(("sweep cells.yaml --out found --jobs 1", "sweep-report found"), {"cells.yaml": _LEARNED_SWEEP})
     for env_id, algorithm, options in _TRAINED:
@@ -124,7 +126,7 @@ def _evaluate(env_id: str, system: System) -> tuple[str, ...]:
     names = ["none", "hocbf", "ecbf", "scbf", "szcbf", *(["cbf", "cbf:alpha=2", "rcbf", "srcbf"] if system.degree_one else [])]
     filters = " ".join(f"--filter {name}" for name in names)
     policy, objective = ("clf", "clf") if system.clf else ("nominal", "nearest")
-    few = f"evaluate {env_id} --episodes 4 --horizon {60 * system.dt:g}"
+    few = f"evaluate {env_id} --episodes 4 --horizon {60 * system.dt:g}{system.start}"
     return (
         f"evaluate {env_id} --episodes 6 --seed 3",
         f"{few} --seed 1 {filters}",
@@ -137,7 +139,7 @@ def _evaluate(env_id: str, system: System) -> tuple[str, ...]:
 
 
 def _rare(env_id: str, system: System) -> tuple[str, ...]:
-    small = f"evaluate {env_id} --rare --particles 20 --repetitions 10 --horizon {50 * system.dt:g}"
+    small = f"evaluate {env_id} --rare --particles 20 --repetitions 10 --horizon {50 * system.dt:g}{system.start}"
     return (
         f"{small} --seed 1 --noise 0.2",
         f"{small} --seed 2 --noise 0.1 --monitoring continuous --policy zero --filter {system.filter}",
@@ -158,7 +160,7 @@ def _identify(env_id: str, system: System) -> tuple[str, ...]:
     noiseless = "--noise 0"
     forms = ("confidence", "simultaneous") if system.degree_one else ()
     bayesian = " ".join(f"--filter bayesian-scbf{form}" for form in ("", *(f":{name}=0.9" for name in forms)))
-    few = f"--episodes 4 --horizon {40 * system.dt:g} --seed 8"
+    few = f"--episodes 4 --horizon {40 * system.dt:g}{system.start} --seed 8"
     return (
         f"identify {env_id} --method learned-hocbf --set states=60 --set epochs=3 --seed 1 --out residual.npz {noiseless}",
         f"evaluate {env_id} --filter learned-hocbf:level=0.9 --learned residual.npz {noiseless} {few}",
