@@ -63,11 +63,11 @@ SYSTEMS = {
     "Scalar-v0": System("scbf", 0.01, True, "--noise 0.3 --model sigma=0.25"),
 }
 
-_SWEEP = """
+_GRID = """
 fixed: {env: Scalar-v0, episodes: 20, horizon: 0.3, bounds: true}
 grid: {filter: [none, scbf], noise: [0.2, 0.5]}
 """
-_LEARNED_SWEEP = """
+_CELLS = """
 fixed: {episodes: 10, horizon: 0.5, policy: random, seed: 4}
 cells:
   - {env: DubinsDisk-v0, filter: "hocbf:p=2,8", plant.v: 0.9}
@@ -108,8 +108,8 @@ def cases() -> dict[str, Case]:
     )
     found["leaderboard/Scalar-v0"] = Case(("leaderboard Scalar-v0 --quick --episodes 5 --out board",))
     found["repeats/Scalar-v0"] = Case(("evaluate Scalar-v0 --filter bayesian-scbf --repeats 3 --episodes 20 --horizon 1",))
-    found["sweep/grid"] = Case(("sweep grid.yaml --out found --jobs 1", "sweep-report found"), {"grid.yaml": _SWEEP})
-    found["sweep/cells"] = Case(("sweep cells.yaml --out found --jobs 1", "sweep-report found"), {"cells.yaml": _LEARNED_SWEEP})
+    found["sweep/grid"] = Case(("sweep grid.yaml --out found --jobs 1", "sweep-report found"), {"grid.yaml": _GRID})
+    found["sweep/cells"] = Case(("sweep cells.yaml --out found --jobs 1", "sweep-report found"), {"cells.yaml": _CELLS})
     for env_id, algorithm, options in _TRAINED:
         found[f"train/{env_id}-{algorithm}"] = Case(
             (

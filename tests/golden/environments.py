@@ -24,7 +24,8 @@ def rows(env_id: str, filter_name: str, dt: float) -> dict[str, Any]:
     Returns:
         Records by kind of env: scalar or vector, bare or filtered; the vector env's episodes end within the steps in one.
     """
-    name, short = f"safe_envs/{env_id}", {"horizon": 8 * dt}
+    name = f"safe_envs/{env_id}"
+    short: dict[str, Any] = {"horizon": 8 * dt}
     return {
         "scalar": _run(gym.make(name)),
         "scalar filtered": _run(SafetyFilterWrapper(gym.make(name, noise=0.1), filter_name)),
