@@ -4,6 +4,7 @@
 # make oracle the long comparisons with exact answers, which the suite holds in small
 # make clusters   sweeps on a Dask and on a Ray cluster that are started for it
 # make mutants   wrong versions of the code, each of which the tests must notice
+# make golden    what commands and envs compute, held against stored rows: for changes of names and structure only
 # make lint   style, formatting and types
 # make wheel-test   a wheel, installed without extras in an environment of its own, and used there
 # make docs   the documentation, in site/; nothing is fetched but the packages
@@ -14,7 +15,7 @@ BIN := .venv/bin
 READY := .venv/.ready
 DOCS_READY := .venv/.docs-ready
 
-.PHONY: demo test check oracle clusters mutants lint wheel-test docs clean
+.PHONY: demo test check oracle clusters mutants golden lint wheel-test docs clean
 
 demo: $(READY)
 	$(BIN)/safe-envs demo
@@ -33,6 +34,9 @@ clusters: $(READY)
 
 mutants: $(READY)
 	$(BIN)/python tests/mutants/run.py
+
+golden: $(READY)
+	$(BIN)/python tests/golden/run.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

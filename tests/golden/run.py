@@ -1,0 +1,230 @@
+#!/usr/bin/env python3
+"""Compare what the commands and envs compute with stored rows: `python tests/golden/run.py [--write] [NAME ...]`.
+
+For a change that is to alter names and structure only. Each case is a file in `rows`, with what its command lines wrote by --json, less
+times, versions, checksums and paths. Whole numbers and texts are compared exactly, floats to a relative 1e-9. Exit status: 0 where all is
+as stored, 1 where something differs, 2 where no case has a name that was given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import math
+import os
+import sys
+import tempfile
+import time
+import traceback
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))  # This checkout, wherever the installed one is.
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(variable, "1")
+
+from cases import SYSTEMS, cases  # noqa: E402
+from environments import rows  # noqa: E402
+
+from scripts.cli import main as safe_envs_main  # noqa: E402
+
+ROWS = Path(__file__).parent / "rows"
+_TOLERANCE = 1e-9
+_LONGEST = 24
+"""Numbers of an array that are stored; of a longer one its ends and sums are."""
+
+_SHOWN = 8
+_LEFT_OUT = ("versions", "timing", "seconds", "learning_seconds", "trained_in", "steps_per_second", "sha256", "key")
+
+
+def names() -> list[str]:
+    """Return the names of all cases."""
+    return [*cases(), *(f"env/{env_id}" for env_id in SYSTEMS)]
+
+
+def compute(name: str) -> Any:
+    """Run a case in a temporary folder.
+
+    Returns:
+        What it found, as JSON has it; the key "error" with the traceback where the case itself broke.
+    """
+    try:
+        with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            warnings.simplefilter("ignore")
+            kind, _, subject = name.partition("/")
+            if kind == "env":
+                return _kept(rows(subject, SYSTEMS[subject].filter, SYSTEMS[subject].dt), folder)
+            case = cases()[name]
+            for file, text in case.files.items():
+                Path(file).write_text(text)
+            return {line: _kept(_document(arguments), folder) for line, arguments in case.arguments(str(ROOT))}
+    except Exception:
+        return {"error": traceback.format_exc()}
+
+
+def _document(arguments: list[str]) -> Any:
+    """Run a command in this process; return what it wrote by --json.
+
+    Raises:
+        RuntimeError: it refused.
+    """
+    out, err = io.StringIO(), io.StringIO()
+    argv = ["safe-envs", *arguments, "--quiet", "--json", "golden.json"]
+    with mock.patch.object(sys, "argv", argv), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            safe_envs_main()
+            status: Any = 0
+        except SystemExit as ended:
+            status = ended.code
+    if status:
+        raise RuntimeError(f"{' '.join(arguments)}: exit status {status}, {err.getvalue()}")
+    path = Path("golden.json")
+    found = json.loads(path.read_text())
+    path.unlink()
+    return found
+
+
+def _kept(value: Any, folder: str) -> Any:
+    """Return a value without what differs from run to run, and with long arrays shortened."""
+    if isinstance(value, dict):
+        return {key: _kept(entry, folder) for key, entry in value.items() if key not in _LEFT_OUT}
+    if isinstance(value, str):
+        return value.replace(os.path.realpath(folder), "FOLDER").replace(folder, "FOLDER").replace(str(ROOT), "ROOT")
+    if not isinstance(value, list):
+        return value
+    numbers = _flat(value)
+    if numbers is None or len(numbers) <= _LONGEST:
+        return [_kept(entry, folder) for entry in value]
+    known = [(i + 1, float(number)) for i, number in enumerate(numbers) if number is not None]
+    # Sums of one sign: what rounds differently does not cancel.
+    return {
+        "length": len(value),
+        "numbers": len(numbers),
+        "without value": len(numbers) - len(known),
+        "first": numbers[:4],
+        "last": numbers[-4:],
+        "positive": math.fsum(max(x, 0.0) for _, x in known),
+        "negative": math.fsum(max(-x, 0.0) for _, x in known),
+        "positive by place": math.fsum(i * max(x, 0.0) for i, x in known),
+        "negative by place": math.fsum(i * max(-x, 0.0) for i, x in known),
+    }
+
+
+def _flat(value: list[Any]) -> list[Any] | None:
+    """Return the numbers in lists of lists; None if there is something else."""
+    found: list[Any] = []
+    for entry in value:
+        if isinstance(entry, list):
+            inner = _flat(entry)
+            if inner is None:
+                return None
+            found += inner
+        elif entry is None or isinstance(entry, (bool, int, float)):
+            found.append(entry)
+        else:
+            return None
+    return found
+
+
+def differences(stored: Any, got: Any, path: str = "$") -> Iterator[str]:
+    """Yield where two JSON values differ: path, what is stored, what was got."""
+    if isinstance(stored, dict) and isinstance(got, dict):
+        for key in sorted(stored.keys() | got.keys()):
+            if key not in got:
+                yield f"{path}.{key}: stored {_short(stored[key])}, got nothing"
+            elif key not in stored:
+                yield f"{path}.{key}: not stored, got {_short(got[key])}"
+            else:
+                yield from differences(stored[key], got[key], f"{path}.{key}")
+    elif isinstance(stored, list) and isinstance(got, list) and len(stored) == len(got):
+        for i, (first, second) in enumerate(zip(stored, got, strict=True)):
+            yield from differences(first, second, f"{path}[{i}]")
+    elif not _same(stored, got):
+        yield f"{path}: stored {_short(stored)}, got {_short(got)}"
+
+
+def _same(stored: Any, got: Any) -> bool:
+    if type(stored) is not type(got):
+        return False
+    if isinstance(stored, float):
+        return math.isclose(stored, got, rel_tol=_TOLERANCE) or (math.isnan(stored) and math.isnan(got))
+    return stored == got
+
+
+def _short(value: Any) -> str:
+    text = json.dumps(value)
+    return text if len(text) < 200 else f"{text[:200]}..."
+
+
+def text_of(value: Any, indent: int = 0) -> str:
+    """Return JSON with sorted keys, indented by 1, and lists of plain values on one line."""
+    if isinstance(value, dict) and value:
+        entries = (f"{json.dumps(key)}: {text_of(value[key], indent + 1)}" for key in sorted(value))
+    elif isinstance(value, list) and any(isinstance(entry, (list, dict)) for entry in value):
+        entries = (text_of(entry, indent + 1) for entry in value)
+    else:
+        return json.dumps(value)
+    first, last = "{}" if isinstance(value, dict) else "[]"
+    inner = "\n" + " " * (indent + 1)
+    return f"{first}{inner}{f',{inner}'.join(entries)}\n{' ' * indent}{last}"
+
+
+def _report(name: str, found: Any, write: bool) -> int:
+    """Store what a case found, or print how it differs from what is stored; return how many differences there are."""
+    file = ROWS / f"{name}.json"
+    if "error" in found:
+        print(f"{name}: broke\n{found['error']}")
+        return 1
+    if write:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text_of(found) + "\n")
+        return 0
+    if not file.is_file():
+        print(f"{name}: nothing is stored; write it with --write")
+        return 1
+    different = list(differences(json.loads(file.read_text()), json.loads(json.dumps(found))))
+    for line in different[:_SHOWN]:
+        print(f"{name}: {line}")
+    if len(different) > _SHOWN:
+        print(f"{name}: and {len(different) - _SHOWN} more")
+    return len(different)
+
+
+def _timed(name: str) -> tuple[Any, float]:
+    began = time.process_time()
+    return compute(name), time.process_time() - began
+
+
+def main() -> int:
+    """Run what the command line names; return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help="parts of names of cases, such as evaluate/ or Scalar; all by default")
+    parser.add_argument("--write", action="store_true", help="store what is found")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--times", action="store_true", help="print the processor time of each case")
+    given = parser.parse_args()
+    chosen = [name for name in names() if not given.names or any(part in name for part in given.names)]
+    if not chosen:
+        print(f"no case has a name with {' or '.join(given.names)}")
+        return 2
+    wrong = 0
+    with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) if given.jobs > 1 else contextlib.nullcontext() as pool:
+        answers = pool.map(_timed, chosen) if pool else map(_timed, chosen)
+        for name, (found, seconds) in zip(chosen, answers, strict=True):
+            wrong += bool(_report(name, found, given.write))
+            if given.times:
+                print(f"{seconds:6.2f} s  {name}", flush=True)
+    print(f"{len(chosen)} cases {'stored' if given.write else 'compared'}, {wrong} {'broke' if given.write else 'differ'}")
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
