@@ -1,6 +1,8 @@
-"""The golden cases: command lines of `safe-envs` by case, small enough that all of them take about two minutes of one processor.
+"""The golden cases: command lines of `safe-envs` by case, small enough that all of them take about
+two minutes of one processor.
 
-`{root}` stands for the folder of the project. Each case runs in a temporary folder of its own, its lines in order.
+`{root}` stands for the folder of the project. Each case runs in a temporary folder of its own, its
+lines in order.
 """
 
 from __future__ import annotations
@@ -55,8 +57,12 @@ SYSTEMS = {
     "QuadrotorAltitude-v0": System("hocbf", 0.05, False, "--plant m=0.5 --model m=0.45"),
     "Quadrotor-v0": System("hocbf", 0.05, False, "--plant m=0.5 --model m=0.45"),
     "QuadrotorLimits-v0": System("hocbf", 0.05, False, "--plant m=0.5 --model m=0.45"),
-    "ACC-v0": System("scbf", 0.05, True, "--plant M=1700 --model f_1=6", clf=True, start=" --start 22,20,40"),
-    "ACCGap-v0": System("scbf", 0.01, False, "--plant M=1700 --model f_1=6", clf=True, start=" --start 21,10.6"),
+    "ACC-v0": System(
+        "scbf", 0.05, True, "--plant M=1700 --model f_1=6", clf=True, start=" --start 22,20,40"
+    ),
+    "ACCGap-v0": System(
+        "scbf", 0.01, False, "--plant M=1700 --model f_1=6", clf=True, start=" --start 21,10.6"
+    ),
     "Pendulum-v0": System("scbf", 0.01, True, "--plant m=1.1 --model l=0.75"),
     "CubicSDE-v0": System("scbf", 0.01, True, "--plant a=0.7 --model a=0.5", clf=True),
     "CubicSDEDisk-v0": System("scbf", 0.01, True, "--plant a=0.7 --model a=0.5"),
@@ -76,15 +82,40 @@ cells:
 """
 
 _TRAINED = (
-    ("Scalar-v0", "ppo", "--set n_steps=32 --num-envs 8 --n-timesteps 512 --filter scbf --intervention-penalty 0.1"),
+    (
+        "Scalar-v0",
+        "ppo",
+        "--set n_steps=32 --num-envs 8 --n-timesteps 512 --filter scbf --intervention-penalty 0.1",
+    ),
     ("CubicSDEDisk-v0", "a2c", "--num-envs 4 --n-timesteps 200"),
-    ("DubinsDisk-v0", "sac", "--set learning_starts=32 --num-envs 4 --n-timesteps 120 --filter hocbf --action both --horizon 2"),
-    ("Quadrotor-v0", "td3", "--set learning_starts=32 --num-envs 4 --n-timesteps 120 --filter hocbf --action proposed --horizon 2"),
-    ("QuadrotorLimits-v0", "ppo", "--set n_steps=16 --num-envs 8 --n-timesteps 256 --knowledge plant --filter hocbf --horizon 2"),
+    (
+        "DubinsDisk-v0",
+        "sac",
+        "--set learning_starts=32 --num-envs 4 --n-timesteps 120 --filter hocbf --action both --horizon 2",
+    ),
+    (
+        "Quadrotor-v0",
+        "td3",
+        "--set learning_starts=32 --num-envs 4 --n-timesteps 120 --filter hocbf --action proposed --horizon 2",
+    ),
+    (
+        "QuadrotorLimits-v0",
+        "ppo",
+        "--set n_steps=16 --num-envs 8 --n-timesteps 256 --knowledge plant --filter hocbf --horizon 2",
+    ),
 )
 
 _ARTEFACTS = (
-    *("figure-3.1", "figure-3.2b", "figure-3.3", "example-4.2.2", "figure-4.1", "table-4.1", "figure-4.2", "figure-5.1"),
+    *(
+        "figure-3.1",
+        "figure-3.2b",
+        "figure-3.3",
+        "example-4.2.2",
+        "figure-4.1",
+        "table-4.1",
+        "figure-4.2",
+        "figure-5.1",
+    ),
     *("table-5.1", "table-5.2", "figure-5.3a", "figure-6.3", "figure-6.4", "table-6.3"),
 )
 
@@ -106,10 +137,18 @@ def cases() -> dict[str, Case]:
             "evaluate Pendulum-v1 --filter-spec {root}/examples/pendulum_v1.py:spec --episodes 3 --seed 2",
         )
     )
-    found["leaderboard/Scalar-v0"] = Case(("leaderboard Scalar-v0 --quick --episodes 5 --out board",))
-    found["repeats/Scalar-v0"] = Case(("evaluate Scalar-v0 --filter bayesian-scbf --repeats 3 --episodes 20 --horizon 1",))
-    found["sweep/grid"] = Case(("sweep grid.yaml --out found --jobs 1", "sweep-report found"), {"grid.yaml": _GRID})
-    found["sweep/cells"] = Case(("sweep cells.yaml --out found --jobs 1", "sweep-report found"), {"cells.yaml": _CELLS})
+    found["leaderboard/Scalar-v0"] = Case(
+        ("leaderboard Scalar-v0 --quick --episodes 5 --out board",)
+    )
+    found["repeats/Scalar-v0"] = Case(
+        ("evaluate Scalar-v0 --filter bayesian-scbf --repeats 3 --episodes 20 --horizon 1",)
+    )
+    found["sweep/grid"] = Case(
+        ("sweep grid.yaml --out found --jobs 1", "sweep-report found"), {"grid.yaml": _GRID}
+    )
+    found["sweep/cells"] = Case(
+        ("sweep cells.yaml --out found --jobs 1", "sweep-report found"), {"cells.yaml": _CELLS}
+    )
     for env_id, algorithm, options in _TRAINED:
         found[f"train/{env_id}-{algorithm}"] = Case(
             (
@@ -118,12 +157,21 @@ def cases() -> dict[str, Case]:
             )
         )
     for name in _ARTEFACTS:
-        found[f"reproduce/{name}"] = Case((f"reproduce {name} --quick --episodes 5 --jobs 1 --out report",))
+        found[f"reproduce/{name}"] = Case(
+            (f"reproduce {name} --quick --episodes 5 --jobs 1 --out report",)
+        )
     return found
 
 
 def _evaluate(env_id: str, system: System) -> tuple[str, ...]:
-    names = ["none", "hocbf", "ecbf", "scbf", "szcbf", *(["cbf", "cbf:alpha=2", "rcbf", "srcbf"] if system.degree_one else [])]
+    names = [
+        "none",
+        "hocbf",
+        "ecbf",
+        "scbf",
+        "szcbf",
+        *(["cbf", "cbf:alpha=2", "rcbf", "srcbf"] if system.degree_one else []),
+    ]
     filters = " ".join(f"--filter {name}" for name in names)
     policy, objective = ("clf", "clf") if system.clf else ("nominal", "nearest")
     few = f"evaluate {env_id} --episodes 4 --horizon {60 * system.dt:g}{system.start}"
@@ -152,14 +200,21 @@ def _verify(env_id: str, system: System) -> tuple[str, ...]:
         f"verify {env_id} --no-simulate {options}",
         f"verify {env_id} --no-simulate --noise 0.1 --knowledge plant --filter scbf {options}",
     )
-    simulated = env_id not in ("DubinsObstacles-v0", "CubicSDEDisk-v0", "Pendulum-v0", "QuadrotorLimits-v0")
+    simulated = env_id not in (
+        "DubinsObstacles-v0",
+        "CubicSDEDisk-v0",
+        "Pendulum-v0",
+        "QuadrotorLimits-v0",
+    )
     return (*lines, f"verify {env_id} --simulate {options}") if simulated else lines
 
 
 def _identify(env_id: str, system: System) -> tuple[str, ...]:
     noiseless = "--noise 0"
     forms = ("confidence", "simultaneous") if system.degree_one else ()
-    bayesian = " ".join(f"--filter bayesian-scbf{form}" for form in ("", *(f":{name}=0.9" for name in forms)))
+    bayesian = " ".join(
+        f"--filter bayesian-scbf{form}" for form in ("", *(f":{name}=0.9" for name in forms))
+    )
     few = f"--episodes 4 --horizon {40 * system.dt:g}{system.start} --seed 8"
     return (
         f"identify {env_id} --method learned-hocbf --set states=60 --set epochs=3 --seed 1 --out residual.npz {noiseless}",

@@ -1,4 +1,5 @@
-"""Golden rows of the envs themselves: observations, rewards, flags and every entry of info, bare and behind the env's filter."""
+"""Golden rows of the envs themselves: observations, rewards, flags and every entry of info, bare
+and behind the env's filter."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
+from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 
 _STEPS = 20
 _NUM_ENVS = 3
@@ -22,18 +23,25 @@ def rows(env_id: str, filter_name: str, dt: float) -> dict[str, Any]:
         dt: control period in s.
 
     Returns:
-        Records by kind of env: scalar or vector, bare or filtered; the vector env's episodes end within the steps in one.
+        Records by kind of env: scalar or vector, bare or filtered; the vector env's episodes end
+        within the steps in one.
     """
     name = f"safe_envs/{env_id}"
     short: dict[str, Any] = {"horizon": 8 * dt}
     return {
         "scalar": _run(gym.make(name)),
         "scalar filtered": _run(SafetyFilterWrapper(gym.make(name, noise=0.1), filter_name)),
-        "scalar plant": _run(SafetyFilterWrapper(gym.make(name, substeps=2), filter_name, knowledge="plant")),
+        "scalar plant": _run(
+            SafetyFilterWrapper(gym.make(name, substeps=2), filter_name, knowledge="plant")
+        ),
         "vector": _run(gym.make_vec(name, num_envs=_NUM_ENVS)),
         "vector filtered": _run(SafetyFilterVectorWrapper(_vector(name), filter_name)),
         "vector short": _run(gym.make_vec(name, num_envs=_NUM_ENVS, **short)),
-        "vector short filtered": _run(SafetyFilterVectorWrapper(_vector(name, autoreset_mode="SameStep", **short), filter_name)),
+        "vector short filtered": _run(
+            SafetyFilterVectorWrapper(
+                _vector(name, autoreset_mode="SameStep", **short), filter_name
+            )
+        ),
     }
 
 
@@ -49,19 +57,37 @@ def _run(env: Any) -> dict[str, Any]:
     for step in range(_STEPS):
         action = np.sin(0.7 * step + np.arange(np.prod(shape)).reshape(shape)).astype(np.float32)
         observation, reward, terminated, truncated, info = env.step(action)
-        answers.append({"observation": observation, "reward": reward, "terminated": terminated, "truncated": truncated, **info})
+        answers.append(
+            {
+                "observation": observation,
+                "reward": reward,
+                "terminated": terminated,
+                "truncated": truncated,
+                **info,
+            }
+        )
         if np.ndim(terminated) == 0 and (terminated or truncated):
             break
     env.close()
     # By key, so that a key that gets another name is one change of the file.
     keys = sorted(set().union(*answers))
-    columns = {key: {str(i): _plain(answer[key]) for i, answer in enumerate(answers) if key in answer} for key in keys}
-    always = {key: list(column.values()) if len(column) == len(answers) else column for key, column in columns.items()}
+    columns = {
+        key: {str(i): _plain(answer[key]) for i, answer in enumerate(answers) if key in answer}
+        for key in keys
+    }
+    always = {
+        key: list(column.values()) if len(column) == len(answers) else column
+        for key, column in columns.items()
+    }
     return {"types": types, "values": always}
 
 
 def _type(value: Any) -> str:
-    return f"{value.dtype}{list(value.shape)}" if isinstance(value, np.ndarray) else type(value).__name__
+    return (
+        f"{value.dtype}{list(value.shape)}"
+        if isinstance(value, np.ndarray)
+        else type(value).__name__
+    )
 
 
 def _plain(value: Any) -> Any:

@@ -1,9 +1,11 @@
 #!/usr/bin/env python3
-"""Compare what the commands and envs compute with stored rows: `python tests/golden/run.py [--write] [NAME ...]`.
+"""Compare what the commands and envs compute with stored rows: `python tests/golden/run.py
+[--write] [NAME ...]`.
 
-For a change that is to alter names and structure only. Each case is a file in `rows`, with what its command lines wrote by --json, less
-times, versions, checksums and paths. Whole numbers and texts are compared exactly, floats to a relative 1e-9. Exit status: 0 where all is
-as stored, 1 where something differs, 2 where no case has a name that was given.
+For a change that is to alter names and structure only. Each case is a file in `rows`, with what its
+command lines wrote by --json, less times, versions, checksums and paths. Whole numbers and texts
+are compared exactly, floats to a relative 1e-9. Exit status: 0 where all is as stored, 1 where
+something differs, 2 where no case has a name that was given.
 """
 
 from __future__ import annotations
@@ -34,7 +36,7 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 from cases import SYSTEMS, cases  # noqa: E402
 from environments import rows  # noqa: E402
 
-from scripts.cli import main as safe_envs_main  # noqa: E402
+from safe_envs.scripts.cli import main as safe_envs_main  # noqa: E402
 
 ROWS = Path(__file__).parent / "rows"
 _TOLERANCE = 1e-9
@@ -42,7 +44,16 @@ _LONGEST = 24
 """Numbers of an array that are stored; of a longer one its ends and sums are."""
 
 _SHOWN = 8
-_LEFT_OUT = ("versions", "timing", "seconds", "learning_seconds", "trained_in", "steps_per_second", "sha256", "key")
+_LEFT_OUT = (
+    "versions",
+    "timing",
+    "seconds",
+    "learning_seconds",
+    "trained_in",
+    "steps_per_second",
+    "sha256",
+    "key",
+)
 
 
 def names() -> list[str]:
@@ -54,10 +65,15 @@ def compute(name: str) -> Any:
     """Run a case in a temporary folder.
 
     Returns:
-        What it found, as JSON has it; the key "error" with the traceback where the case itself broke.
+        What it found, as JSON has it; the key "error" with the traceback where the case itself
+        broke.
     """
     try:
-        with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        with (
+            warnings.catch_warnings(),
+            tempfile.TemporaryDirectory() as folder,
+            contextlib.chdir(folder),
+        ):
             warnings.simplefilter("ignore")
             kind, _, subject = name.partition("/")
             if kind == "env":
@@ -65,7 +81,10 @@ def compute(name: str) -> Any:
             case = cases()[name]
             for file, text in case.files.items():
                 Path(file).write_text(text)
-            return {line: _kept(_document(arguments), folder) for line, arguments in case.arguments(str(ROOT))}
+            return {
+                line: _kept(_document(arguments), folder)
+                for line, arguments in case.arguments(str(ROOT))
+            }
     except Exception:
         return {"error": traceback.format_exc()}
 
@@ -78,7 +97,11 @@ def _document(arguments: list[str]) -> Any:
     """
     out, err = io.StringIO(), io.StringIO()
     argv = ["safe-envs", *arguments, "--quiet", "--json", "golden.json"]
-    with mock.patch.object(sys, "argv", argv), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+    with (
+        mock.patch.object(sys, "argv", argv),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
         try:
             safe_envs_main()
             status: Any = 0
@@ -97,7 +120,11 @@ def _kept(value: Any, folder: str) -> Any:
     if isinstance(value, dict):
         return {key: _kept(entry, folder) for key, entry in value.items() if key not in _LEFT_OUT}
     if isinstance(value, str):
-        return value.replace(os.path.realpath(folder), "FOLDER").replace(folder, "FOLDER").replace(str(ROOT), "ROOT")
+        return (
+            value.replace(os.path.realpath(folder), "FOLDER")
+            .replace(folder, "FOLDER")
+            .replace(str(ROOT), "ROOT")
+        )
     if not isinstance(value, list):
         return value
     numbers = _flat(value)
@@ -155,7 +182,9 @@ def _same(stored: Any, got: Any) -> bool:
     if type(stored) is not type(got):
         return False
     if isinstance(stored, float):
-        return math.isclose(stored, got, rel_tol=_TOLERANCE) or (math.isnan(stored) and math.isnan(got))
+        return math.isclose(stored, got, rel_tol=_TOLERANCE) or (
+            math.isnan(stored) and math.isnan(got)
+        )
     return stored == got
 
 
@@ -178,7 +207,8 @@ def text_of(value: Any, indent: int = 0) -> str:
 
 
 def _report(name: str, found: Any, write: bool) -> int:
-    """Store what a case found, or print how it differs from what is stored; return how many differences there are."""
+    """Store what a case found, or print how it differs from what is stored; return how many
+    differences there are."""
     file = ROWS / f"{name}.json"
     if "error" in found:
         print(f"{name}: broke\n{found['error']}")
@@ -205,24 +235,40 @@ def _timed(name: str) -> tuple[Any, float]:
 
 def main() -> int:
     """Run what the command line names; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", help="parts of names of cases, such as evaluate/ or Scalar; all by default")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "names",
+        nargs="*",
+        help="parts of names of cases, such as evaluate/ or Scalar; all by default",
+    )
     parser.add_argument("--write", action="store_true", help="store what is found")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--times", action="store_true", help="print the processor time of each case")
+    parser.add_argument(
+        "--times", action="store_true", help="print the processor time of each case"
+    )
     given = parser.parse_args()
-    chosen = [name for name in names() if not given.names or any(part in name for part in given.names)]
+    chosen = [
+        name for name in names() if not given.names or any(part in name for part in given.names)
+    ]
     if not chosen:
         print(f"no case has a name with {' or '.join(given.names)}")
         return 2
     wrong = 0
-    with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) if given.jobs > 1 else contextlib.nullcontext() as pool:
+    with (
+        ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn"))
+        if given.jobs > 1
+        else contextlib.nullcontext() as pool
+    ):
         answers = pool.map(_timed, chosen) if pool else map(_timed, chosen)
         for name, (found, seconds) in zip(chosen, answers, strict=True):
             wrong += bool(_report(name, found, given.write))
             if given.times:
                 print(f"{seconds:6.2f} s  {name}", flush=True)
-    print(f"{len(chosen)} cases {'stored' if given.write else 'compared'}, {wrong} {'broke' if given.write else 'differ'}")
+    print(
+        f"{len(chosen)} cases {'stored' if given.write else 'compared'}, {wrong} {'broke' if given.write else 'differ'}"
+    )
     return int(wrong > 0)
 
 
