@@ -1,0 +1,46 @@
+"""Extensions that other packages declare as entry points, found by name."""
+
+from __future__ import annotations
+
+from importlib.metadata import entry_points
+from typing import Any
+
+from safe_envs.errors import ConfigurationError, nearest, shortened, shown
+
+CONDITIONS = "safe_envs.conditions"
+POLICIES = "safe_envs.policies"
+SYSTEMS = "safe_envs.systems"
+
+
+def plugin_names(group: str) -> tuple[str, ...]:
+    """Return the names that installed packages declare in a group, sorted; nothing is imported."""
+    return tuple(sorted({point.name for point in entry_points(group=group)}))
+
+
+def load_plugin(group: str, name: str) -> Any:
+    """Import what an installed package declares under a name, which runs the code there.
+
+    Args:
+        group: `CONDITIONS`, `POLICIES` or `SYSTEMS`.
+        name: one of `plugin_names`.
+
+    Raises:
+        ConfigurationError: No package declares the name, more than one does, or its import fails.
+    """
+    found = {point.value: point for point in entry_points(group=group, name=name)}
+    if not found:
+        names = plugin_names(group)
+        raise ConfigurationError(f"{group} has no {shown(name)}; {nearest(name, names)}")
+    if len(found) > 1:
+        raise ConfigurationError(
+            f"{group}: {name!r} is declared more than once ({', '.join(sorted(found))});"
+            " uninstall all but one of the packages"
+        )
+    (point,) = found.values()
+    try:
+        return point.load()
+    except Exception as error:
+        raise ConfigurationError(
+            f"{group}: {name!r} ({point.value}) cannot be imported"
+            f" ({type(error).__name__}: {shortened(error)}); repair or uninstall its package"
+        ) from error
