@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE, finite_number
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
+from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
+from safe_envs.problem.options import ProblemOptions
 from safe_envs.problem.sampling_domain import SamplingDomain
 
 TIME = sp.Symbol("t", nonnegative=True)
@@ -241,46 +243,28 @@ class SafetyProblem:
         """Positive where the state has left the workspace; -1 if the workspace is unbounded."""
         return _excess(tuple((s.symbol, s.low, s.high) for s in self.states))
 
-    def configured(
-        self,
-        *,
-        noise: float | Sequence[float] | None = None,
-        plant: Mapping[str, float] | None = None,
-        model: Mapping[str, float] | None = None,
-        dt: float | None = None,
-        substeps: int | None = None,
-        horizon: float | None = None,
-        box: Sequence[Any] | None = None,
-        start: str | Sequence[float] | None = None,
-    ) -> SafetyProblem:
-        """Return the problem with other numbers; None keeps the default.
+    def configured(self, **options: Any) -> SafetyProblem:
+        """Return the problem with other numbers; what is not given stays.
 
         Args:
-            noise: diffusion of plant and model alike, one number for all channels or one for each;
-                0 turns it off.
-            plant: parameters of the plant, by name.
-            model: parameters of the model, by name.
-            dt: control period in s.
-            substeps: integration steps in a control period.
-            horizon: length of an episode in s.
-            box: (low, high) for every input, or one such pair for each.
-            start: name of an initial distribution, or a fixed initial state.
+            **options: fields of `ProblemOptions`, except `barrier`, whose arguments go to the
+                function that builds the problem.
 
         Raises:
-            ConfigurationError: a name is unknown or a value is not allowed.
+            ConfigurationError: A name is unknown or a value is not allowed.
         """
-        levels = self._noise_levels(noise)
+        given = ProblemOptions.of(self.name, options, ())
+        levels = self._noise_levels(given.noise)
         changes: dict[str, Any] = {
-            "plant": self.plant.with_parameters(**{**levels, **(plant or {})}),
-            "model": self.model.with_parameters(**{**levels, **(model or {})}),
+            "plant": self.plant.with_parameters(**{**levels, **(given.plant or {})}),
+            "model": self.model.with_parameters(**{**levels, **(given.model or {})}),
         }
-        for name, value in (("dt", dt), ("horizon", horizon)):
-            if value is not None:
-                changes[name] = finite_number(name, value)
-        if substeps is not None:
-            changes["substeps"] = substeps
-        if box is not None:
-            changes["inputs"] = self._boxed(box)
+        for name in ("dt", "substeps", "horizon"):
+            if getattr(given, name) is not None:
+                changes[name] = getattr(given, name)
+        if given.box is not None:
+            changes["inputs"] = self._boxed(given.box)
+        start = given.start
         if isinstance(start, str):
             if start not in self.starts:
                 raise ConfigurationError(

@@ -9,9 +9,9 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from safe_envs import ENV_IDS, SafeEnv, SafetyProblem
+from safe_envs import ENV_IDS, SafetyProblem
 from safe_envs.dynamics.lie import relative_degree
-from safe_envs.registry import make_env
+from safe_envs.registry import env_class, make_problem
 from safe_envs.scripts.options.console import require_result, stdout, write_result
 
 _COLUMNS = ("states", "inputs", "degree", "filter", "noise", "dt", "horizon")
@@ -34,9 +34,8 @@ def list_envs(json_file: Path | None = None) -> None:
     for name in _COLUMNS:
         table.add_column(name, no_wrap=True)
     rows = [
-        {"env_id": env_id, "about": _about(env), **_defaults(env.problem)}
+        {"env_id": env_id, "about": _about(env_id), **_defaults(make_problem(env_id))}
         for env_id in ENV_IDS
-        for env in (make_env(env_id),)
     ]
     for row in rows:
         table.add_row(
@@ -47,8 +46,8 @@ def list_envs(json_file: Path | None = None) -> None:
     write_result(json_file, lambda: {"envs": rows})
 
 
-def _about(env: SafeEnv) -> str:
-    return (type(env).__doc__ or "").strip().partition("\n")[0]
+def _about(env_id: str) -> str:
+    return (env_class(env_id).__doc__ or "").strip().partition("\n")[0]
 
 
 def _defaults(problem: SafetyProblem) -> dict[str, Any]:

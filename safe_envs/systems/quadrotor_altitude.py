@@ -6,9 +6,10 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE, finite_number
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
 from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import TIME, Feature, SafetyProblem, Start, Variable
 from safe_envs.problem.sampling_domain import SamplingDomain

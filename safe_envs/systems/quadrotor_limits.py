@@ -7,10 +7,10 @@ import math
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import finite_number
 from safe_envs.envs.env import SystemEnv
 from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError
+from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import TIME, Feature, SafetyProblem
 from safe_envs.systems._common import around, uniforms

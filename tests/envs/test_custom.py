@@ -14,8 +14,9 @@ from gymnasium.utils.env_checker import check_env
 
 import safe_envs
 from safe_envs import ConfigurationError, SafetyProblem, SystemDefinitionError, state_problem
-from safe_envs.envs.custom import Custom, load_system
+from safe_envs.envs.custom import Custom
 from safe_envs.object_import import load_object
+from safe_envs.problem.factory import load_system
 from safe_envs.systems import CUSTOM_ID
 
 STATEMENT = """
@@ -228,7 +229,7 @@ def test_ids_of_others_are_not_replaced(tmp_path, my_id):
 def test_the_id_for_any_system_asks_for_one(make, arguments):
     with pytest.raises(
         ConfigurationError,
-        match=r"system = .*; give the place of its statement as a text, FILE.py:NAME",
+        match=r"system = .*; give the place where it is defined as a text, FILE.py:NAME",
     ):
         make(CUSTOM_ID, **arguments)
 
