@@ -43,7 +43,7 @@ def problem(kind="plain"):
         marker.touch()
         assert os.environ["SPARED"] != str(os.getpid())
         os.kill(os.getpid(), signal.SIGKILL)
-    return make_problem("Scalar-v0", {"horizon": 0.2})
+    return make_problem("Scalar-v0", horizon=0.2)
 """
 
 # The sweep of a file, told where: in a process of its own, which may be made to end after some
