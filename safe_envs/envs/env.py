@@ -132,7 +132,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         if seed is not None:
             self._noise.clear()
-        self._x = self._simulation.draw_start(self.np_random)
+        self._x = self._simulation.starts.draw(self.np_random)
         self._steps = 0
         self._h_min = math.inf
         self._episode_cost = 0.0

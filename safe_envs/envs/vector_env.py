@@ -335,7 +335,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _restart(self, envs: np.ndarray) -> None:
         """Put some envs at the start of an episode."""
-        start = self._simulation.draw_starts([self._rngs[i] for i in envs.tolist()])
+        start = self._simulation.starts.draw_batch([self._rngs[i] for i in envs.tolist()])
         if envs.size == self.num_envs:
             self._x = tuple(start)
         else:

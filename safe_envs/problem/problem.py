@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,59 +17,13 @@ from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest,
 from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
+from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.options import ProblemOptions
 from safe_envs.problem.sampling_domain import SamplingDomain
-
-TIME = sp.Symbol("t", nonnegative=True)
-"""Time since the start of the episode, in s: references and rewards may depend on it. No state or
-input, which may have any sign, is the same symbol, even if its name is t."""
+from safe_envs.problem.signals import TIME, Feature, Variable, excess
 
 _WIDEST = 1e100
 """Largest bound of a box: its square, an effort, is still a number."""
-
-
-@dataclass(frozen=True)
-class Variable:
-    """A state or an input with its range.
-
-    For a state the range is the workspace: an episode ends when the state leaves it (an infinite
-    range never ends one). For an input it is the box of admissible actions, finite.
-    """
-
-    symbol: sp.Symbol
-    low: float
-    high: float
-    unit: str = ""
-
-
-@dataclass(frozen=True)
-class Feature:
-    """An entry of the observation: an expression of the states and of `TIME`, with finite bounds."""
-
-    name: str
-    expression: sp.Expr
-    low: float
-    high: float
-
-    @property
-    def symbol(self) -> sp.Symbol:
-        """The symbol by which a nominal controller refers to it."""
-        return sp.Symbol(self.name, real=True)
-
-
-@dataclass(frozen=True)
-class Start:
-    """Distribution of the initial state: a map of independent uniforms on [0, 1), kept where
-    `condition` > 0."""
-
-    state: tuple[sp.Expr, ...]
-    uniforms: tuple[sp.Symbol, ...] = ()
-    condition: sp.Expr | None = None
-
-    @classmethod
-    def at(cls, values: Sequence[float]) -> Start:
-        """A fixed initial state."""
-        return cls(tuple(sp.Float(v, 17) for v in values))
 
 
 @dataclass(frozen=True)
@@ -241,7 +195,7 @@ class SafetyProblem:
     @property
     def outside(self) -> sp.Expr:
         """Positive where the state has left the workspace; -1 if the workspace is unbounded."""
-        return _excess(tuple((s.symbol, s.low, s.high) for s in self.states))
+        return excess(self.states)
 
     def configured(self, **options: Any) -> SafetyProblem:
         """Return the problem with other numbers; what is not given stays.
@@ -341,18 +295,3 @@ def _numbers(given: Any) -> np.ndarray:
         return np.empty(0) if found.dtype.kind in "US" else np.atleast_1d(found.astype(float))
     except (TypeError, ValueError, OverflowError):
         return np.empty(0)
-
-
-@lru_cache(maxsize=256)
-def _excess(ranges: tuple[tuple[sp.Symbol, float, float], ...]) -> sp.Expr:
-    """By how much the furthest state is outside its range; -1 without a bound. Remembered, for
-    sympy compares all it takes the most of."""
-    symmetric: dict[float, list[sp.Expr]] = {}
-    excess: list[sp.Expr] = []
-    for symbol, low, high in ranges:
-        if low == -high and math.isfinite(high):
-            symmetric.setdefault(high, []).append(sp.Abs(symbol))
-        else:
-            excess += [symbol - high] * math.isfinite(high) + [low - symbol] * math.isfinite(low)
-    excess += [sp.Max(*sizes) - half for half, sizes in symmetric.items()]
-    return sp.Max(*excess) if excess else sp.Integer(-1)

@@ -12,8 +12,10 @@ from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
-from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import positive
 
 u = sp.Symbol("u", real=True)

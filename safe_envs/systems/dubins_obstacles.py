@@ -11,7 +11,9 @@ from safe_envs.envs.env import SystemEnv
 from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import around, positive, uniforms
 from safe_envs.systems.dubins import omega, theta, x, y
 from safe_envs.systems.dubins_obstacle import separation, vehicle_among, way_to

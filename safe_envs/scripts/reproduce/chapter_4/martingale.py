@@ -18,7 +18,9 @@ from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import Variable
 from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
