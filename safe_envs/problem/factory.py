@@ -66,7 +66,7 @@ def load_system(place: Any) -> Factory:
             f"system = {place!r}; give the place where it is defined as a text, FILE.py:NAME or"
             " MODULE:NAME, like make_problem('Custom-v0', system='cart_pole.py:problem')"
         )
-    named = ":" not in place and place in plugin_names(SYSTEMS)
+    named = ":" not in place and plugin_names(SYSTEMS)
     found = load_plugin(SYSTEMS, place) if named else load_object(place)
     if isinstance(found, SafetyProblem):
         require_sound(found)

@@ -11,7 +11,6 @@ import sympy as sp
 from safe_envs.dynamics.lie import generator, lie_derivative_f
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -234,12 +233,6 @@ class DubinsDisk(SystemEnv):
     problem_factory = staticmethod(dubins_disk)
 
 
-class DubinsDiskVector(SystemVectorEnv):
-    """`DubinsDisk` in a batch."""
-
-    env_class = DubinsDisk
-
-
 class StochasticDubins(SystemEnv):
     """A vehicle at constant speed, disturbed by noise, is to stay in a disk.
 
@@ -295,9 +288,3 @@ class StochasticDubins(SystemEnv):
     """
 
     problem_factory = staticmethod(stochastic_dubins)
-
-
-class StochasticDubinsVector(SystemVectorEnv):
-    """`StochasticDubins` in a batch."""
-
-    env_class = StochasticDubins

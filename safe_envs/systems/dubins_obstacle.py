@@ -10,7 +10,6 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -189,9 +188,3 @@ class DubinsObstacle(SystemEnv):
     """
 
     problem_factory = staticmethod(dubins_obstacle)
-
-
-class DubinsObstacleVector(SystemVectorEnv):
-    """`DubinsObstacle` in a batch."""
-
-    env_class = DubinsObstacle

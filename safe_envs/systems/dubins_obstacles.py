@@ -8,7 +8,6 @@ import math
 import sympy as sp
 
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
@@ -181,9 +180,3 @@ class DubinsObstacles(SystemEnv):
     """
 
     problem_factory = staticmethod(dubins_obstacles)
-
-
-class DubinsObstaclesVector(SystemVectorEnv):
-    """`DubinsObstacles` in a batch."""
-
-    env_class = DubinsObstacles

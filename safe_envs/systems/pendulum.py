@@ -6,7 +6,6 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -135,9 +134,3 @@ class Pendulum(SystemEnv):
     """
 
     problem_factory = staticmethod(pendulum)
-
-
-class PendulumVector(SystemVectorEnv):
-    """`Pendulum` in a batch."""
-
-    env_class = Pendulum

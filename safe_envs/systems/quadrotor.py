@@ -10,7 +10,6 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
@@ -252,9 +251,3 @@ class Quadrotor(SystemEnv):
     """
 
     problem_factory = staticmethod(quadrotor_full)
-
-
-class QuadrotorVector(SystemVectorEnv):
-    """`Quadrotor` in a batch."""
-
-    env_class = Quadrotor

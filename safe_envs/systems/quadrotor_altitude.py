@@ -8,7 +8,6 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
@@ -172,9 +171,3 @@ class QuadrotorAltitude(SystemEnv):
     """
 
     problem_factory = staticmethod(quadrotor_altitude)
-
-
-class QuadrotorAltitudeVector(SystemVectorEnv):
-    """`QuadrotorAltitude` in a batch."""
-
-    env_class = QuadrotorAltitude

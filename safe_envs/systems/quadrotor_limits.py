@@ -8,7 +8,6 @@ import math
 import sympy as sp
 
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
@@ -157,9 +156,3 @@ class QuadrotorLimits(SystemEnv):
     """
 
     problem_factory = staticmethod(quadrotor_limits)
-
-
-class QuadrotorLimitsVector(SystemVectorEnv):
-    """`QuadrotorLimits` in a batch."""
-
-    env_class = QuadrotorLimits

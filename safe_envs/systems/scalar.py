@@ -6,7 +6,6 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -115,9 +114,3 @@ class Scalar(SystemEnv):
     """
 
     problem_factory = staticmethod(scalar)
-
-
-class ScalarVector(SystemVectorEnv):
-    """`Scalar` in a batch."""
-
-    env_class = Scalar
