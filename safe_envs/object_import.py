@@ -109,6 +109,10 @@ def _of_file(path: Path) -> ModuleType:
         raise ConfigurationError(
             f"{shortened(path)} cannot be read: {error.strerror}; {_ADVICE}"
         ) from error
+    main = sys.modules["__main__"]
+    # The script that runs is there already; a second run would state its classes again.
+    if Path(getattr(main, "__file__", None) or "/").resolve() == path.resolve():
+        return main
     return _loaded(path.resolve(), changed)
 
 
