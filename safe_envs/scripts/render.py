@@ -144,10 +144,9 @@ def split_filters(text: str) -> list[str]:
         ConfigurationError: one has no text.
     """
     from safe_envs.agents.evaluation.evaluate import BARE
-    from safe_envs.wrappers import CONDITIONS, LEARNED
+    from safe_envs.wrappers import head_pattern
 
-    names = "|".join(sorted((BARE, *CONDITIONS, *LEARNED), key=len, reverse=True))
-    found = [part.strip() for part in re.split(rf",(?=\s*(?:{names})\s*(?:[:+,]|$))", text)]
+    found = [part.strip() for part in re.split(rf",(?=\s*{head_pattern(BARE)})", text)]
     if not all(found):
         raise ConfigurationError(
             f"--compare {shown(text)} names no filter at one place; give names with commas between:"
@@ -256,21 +255,19 @@ def make_runs(
     from safe_envs.agents.evaluation.identification import Learning
     from safe_envs.agents.policies.registry import make_policy
     from safe_envs.errors import nearest, require_whole
-    from safe_envs.wrappers import CONDITIONS, LEARNED, require_readable
+    from safe_envs.wrappers import require_known, require_readable
 
     require_whole("seed", seed, 0)
     if knowledge not in ("model", "plant"):
         raise ConfigurationError(
             f"knowledge = {shown(knowledge)}; {nearest(knowledge, ('model', 'plant'))}"
         )
-    known = (BARE, *CONDITIONS, *LEARNED)
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.
-        for word in re.split("[:+]", name)[0].split(","):
-            if word.strip() not in known:
-                raise ConfigurationError(
-                    f"unknown filter {shown(word.strip())}; {nearest(word.strip(), known)}"
-                )
+        words = [word.strip() for word in re.split("[:+]", name)[0].split(",")]
+        for word in words if len(words) > 1 else [name]:
+            if word != BARE:
+                require_known(word, BARE)
         if name != BARE:
             require_readable(name, problem)
     actors = [make_policy(policy, problem, trust) for _ in names]
