@@ -11,7 +11,7 @@ from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import NumericalError, SafeEnvsError, SystemDefinitionError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.wrappers.conditions import (
     AffineConstraint,
     Condition,
@@ -66,7 +66,7 @@ def check_condition(
         RelativeDegreeError: The condition does not suit the problem.
     """
     if isinstance(problem, str):
-        problem = load_problem(problem)
+        problem = make_problem(problem)
     each = parse_conditions(condition, problem) if isinstance(condition, str) else (condition,)
     each = each * len(problem.barriers) if len(each) == 1 else each
     for one in each:
