@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from safe_envs import ENV_IDS
@@ -24,6 +23,7 @@ from safe_envs.scripts.options.console import (
     write_result,
 )
 from safe_envs.scripts.reports.rates import percent_in
+from safe_envs.scripts.reports.tables import make_table
 
 _RESULTS = "results.json"
 _QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 50}
@@ -230,11 +230,8 @@ def _time(row: Row) -> str:
 
 def _table(rows: Sequence[Row]) -> Table:
     """A row for each policy and filter."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in ("env", "policy", "filter", "safe [95 % interval]", "return", "processor time"):
-        table.add_column(
-            title, justify="left" if title in ("env", "policy", "filter") else "right", no_wrap=True
-        )
+    titles = ("env", "policy", "filter", "safe [95 % interval]", "return", "processor time")
+    table = make_table("lllr", *titles, tight=False)
     for row in rows:
         name = row["env_id"].removeprefix("safe_envs/")
         table.add_row(

@@ -12,6 +12,7 @@ from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.scripts.options import text_options
 from safe_envs.scripts.options.console import Json, stdout, write_result
 from safe_envs.scripts.reports.rates import percent, percent_in
+from safe_envs.scripts.reports.tables import make_table
 
 _PICTURE = "report.png"
 _SHOWN = 10
@@ -101,8 +102,6 @@ def _worst(rows: list[Row], count: int) -> list[Row]:
 
 
 def _print(index: dict[str, Any], rows: list[Row], worst: int) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
     from rich.text import Text
 
     from safe_envs.agents.evaluation.evaluate import BARE
@@ -115,17 +114,9 @@ def _print(index: dict[str, Any], rows: list[Row], worst: int) -> None:
         f" {missing} are missing."
     )
     console.print(counts, highlight=False, markup=False)
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in (
-        *names,
-        "safe [95 % interval]",
-        "min h 5 %",
-        "violations",
-        "intervened",
-        "infeasible",
-        "return",
-    ):
-        table.add_column(title, no_wrap=True, justify="left" if title in names else "right")
+    kinds = "l" * len(names) + "r"
+    titles = ("min h 5 %", "violations", "intervened", "infeasible", "return")
+    table = make_table(kinds, *names, "safe [95 % interval]", *titles, tight=False)
     for row in _worst(rows, worst):
         rates = [
             "-" if row["filter"] == BARE else percent(row[name])

@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
 
 from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.number_text import real
@@ -18,6 +16,7 @@ from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 from safe_envs.scripts.reports.rates import percent_in
+from safe_envs.scripts.reports.tables import make_table
 
 
 @with_env
@@ -212,9 +211,8 @@ def _number(value: Any) -> Any:
 def _report(filter_name: str, rows: list[dict[str, Any]]) -> None:
     """Print how safe and how good the agent was in each evaluation."""
     console = stdout()
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in ("steps", "safe [95 % interval]", "return", "violations in training"):
-        table.add_column(title, justify="right")
+    titles = ("steps", "safe [95 % interval]", "return", "violations in training")
+    table = make_table("r", *titles, tight=False)
     for row in rows:
         rate = percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
         table.add_row(

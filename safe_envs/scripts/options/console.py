@@ -152,6 +152,11 @@ def stdout() -> Console:
     return kind(width=_PIPE_WIDTH, quiet=_Terminal.silent, file=trimmed)
 
 
+def say(console: Console, text: str) -> None:
+    """Print a text as it is, in lines of any length."""
+    console.print(text, soft_wrap=True, highlight=False, markup=False)
+
+
 def require_result(path: Path | None) -> None:
     """Raise ConfigurationError if the file of --json cannot be written: asked before a long run,
     not after it."""
