@@ -21,7 +21,7 @@ from safe_envs import Barrier, ControlAffineSDE
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import load_problem
-from safe_envs.scripts.options.console import require_result, stdout, write_result
+from safe_envs.scripts.options.console import require_result, say, stdout, write_result
 from safe_envs.scripts.reports.tables import make_table
 from safe_envs.wrappers import (
     CBF,
@@ -96,9 +96,9 @@ def benchmark(json_file: Path | None = None, compare: Path | None = None) -> Non
     earlier = {} if compare is None else read_figures(compare)
     figures = measure()
     console = stdout()
-    console.print(
+    say(
+        console,
         f"{_ID} with scbf, safe-envs {safe_envs.__version__}, on one of {os.cpu_count()} cores\n",
-        highlight=False,
     )
     console.print(table_of(figures, earlier))
     write_result(json_file, lambda: figures)

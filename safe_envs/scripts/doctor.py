@@ -20,7 +20,13 @@ from rich.text import Text
 
 from safe_envs import ENV_IDS, __version__
 from safe_envs.rendering.viewer import require_pygame
-from safe_envs.scripts.options.console import progress_bar, require_result, stdout, write_result
+from safe_envs.scripts.options.console import (
+    progress_bar,
+    require_result,
+    say,
+    stdout,
+    write_result,
+)
 from safe_envs.scripts.reports.tables import make_table
 
 _NEEDED = ""
@@ -318,9 +324,7 @@ def speeds() -> dict[str, float]:
 
 def _report(found: dict[str, list[Check]], speed: dict[str, float], healthy: bool) -> None:
     console = stdout()
-    console.print(
-        f"safe-envs {__version__} on {platform.platform()}\n", highlight=False, markup=False
-    )
+    say(console, f"safe-envs {__version__} on {platform.platform()}\n")
     table = make_table("p", "", "", "found", "what to do", tight=False)
     for checks in found.values():
         for check in checks:
@@ -332,9 +336,7 @@ def _report(found: dict[str, list[Check]], speed: dict[str, float], healthy: boo
     for name, steps in speed.items():
         table.add_row("", f"speed: {name}", f"{steps:,.0f} steps/s", "")
     console.print(table)
-    console.print(
-        f"\n{'All is well.' if healthy else 'Something is wrong: see above.'}", highlight=False
-    )
+    say(console, f"\n{'All is well.' if healthy else 'Something is wrong: see above.'}")
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from safe_envs.agents.evaluation.rollout import Row
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
-from safe_envs.scripts.reports.rates import percent, percent_in
+from safe_envs.scripts.reports.rates import percent, percent_in, rate_of
 from safe_envs.scripts.reports.tables import make_table, print_whole
 
 _COLUMNS = (
@@ -44,7 +44,7 @@ _VERDICTS = {
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     """Print a heading, a row for each filter, comparisons, and what has to be known to read them."""
     interval = _interval(evaluation)
-    console.print(heading(evaluation), soft_wrap=True, highlight=False)
+    say(console, heading(evaluation))
     learned = learned_columns(evaluation.rows)
     titles = ("filter", f"safe [{interval}]", *learned, "estimated\nbound", *_COLUMNS)
     table = make_table("pr", *titles)
@@ -241,7 +241,7 @@ def _cells(row: Row, speed: float) -> list[str]:
     filtered = row["filter"] != BARE
     return [
         row["filter"],
-        percent_in(row["safety_rate"], row["ci_low"], row["ci_high"]),
+        rate_of(row),
         _bound(row),
         f"{row['min_h_median']:.3g}",
         f"{row['min_h_p05']:.3g}",

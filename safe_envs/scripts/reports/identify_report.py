@@ -233,7 +233,7 @@ def print_report(console: Console, found: Identification) -> None:
     origin = f"seed {found.seed}" if found.source is None else f"data {found.source.path}"
     title.append(f" | method {found.learned.method} | {origin}", style="not bold")
     title.append(f"\n{found.setup}", style="not bold")
-    console.print(title, soft_wrap=True, highlight=False)
+    say(console, title)
     of, details = (
         ("", "") if found.source is None else (f" of {found.source.path}", f", {found.source}")
     )
@@ -344,9 +344,7 @@ def _functions_table(functions: Sequence[Function]) -> Table:
 
 
 def _head(console: Console, name: str, text: str) -> None:
-    console.print(
-        Text.assemble((f"\n{name}", "bold"), f": {text}"), soft_wrap=True, highlight=False
-    )
+    say(console, Text.assemble((f"\n{name}", "bold"), f": {text}"))
 
 
 def _number(value: float) -> str:

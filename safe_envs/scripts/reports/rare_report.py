@@ -14,7 +14,7 @@ from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
 from safe_envs.agents.evaluation.rollout import Row
 from safe_envs.agents.rare_events.estimate import RareEvaluation, estimate_rare
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.options.console import progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import progress_bar, say, stdout, write_result
 from safe_envs.scripts.reports.evaluation_report import describe_system, early_end, unsafe_starts
 from safe_envs.scripts.reports.tables import make_table, print_whole
 
@@ -60,7 +60,7 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
     """Print a heading, a row for each filter, and what has to be known to read them."""
     config = answer.config
     interval = f"{100 * config['confidence']:.10g} % interval"
-    console.print(_heading(answer), soft_wrap=True, highlight=False)
+    say(console, _heading(answer))
     table = make_table("pr", "filter", f"P(violation) [{interval}]", *_COLUMNS)
     for row, speed in zip(answer.rows, answer.timing["rows"], strict=True):
         table.add_row(Text(row["filter"]), *_cells(row, speed["steps_per_second"]))
@@ -72,7 +72,7 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
     if reasons.row_count:
         console.print(reasons)
     for note in _notes(answer):
-        console.print(note, soft_wrap=True, highlight=False, markup=False)
+        say(console, note)
 
 
 def _heading(answer: RareEvaluation) -> Text:

@@ -54,7 +54,7 @@ def print_report(
         f"\n{describe_system(problem)}; the conditions know the {formulas.knowledge}",
         style="not bold",
     )
-    console.print(title, soft_wrap=True, highlight=False)
+    say(console, title)
     _section(console, "Safe set", _set_lines(found, starts))
     for barrier in found.barriers:
         _section(

@@ -21,6 +21,7 @@ from safe_envs.scripts.options.console import (
     Json,
     progress_bar,
     require_result,
+    say,
     stdout,
     write_result,
 )
@@ -242,7 +243,7 @@ def _report(found: Sequence[tuple[Artefact, Any, float]], sample: Sample, out: P
         table.add_row(artefact.name, judgement.text, "; ".join(judgement.reasons))
     console = stdout()
     console.print(table)
-    console.print(f"\nThe page: {out / 'index.html'}", highlight=False, markup=False)
+    say(console, f"\nThe page: {out / 'index.html'}")
 
 
 if __name__ == "__main__":
