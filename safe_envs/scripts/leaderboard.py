@@ -15,6 +15,7 @@ from safe_envs.atomic_io import write_json
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.options import completion
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
     progress_bar,
@@ -260,6 +261,4 @@ def _markdown(rows: Sequence[Row]) -> list[str]:
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("leaderboard")
+    run_alone("leaderboard", leaderboard)

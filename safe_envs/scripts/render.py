@@ -14,6 +14,7 @@ import typer
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.figures.film import require_film, steps_a_frame, write_film
 from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
@@ -321,6 +322,4 @@ def _beside(runs: Sequence[Run]) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("render")
+    run_alone("render", render)

@@ -12,6 +12,7 @@ import typer
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
     progress_bar,
@@ -167,6 +168,4 @@ def _told(found: Sweep, failures: Sequence[Outcome]) -> str:
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("sweep")
+    run_alone("sweep", sweep)

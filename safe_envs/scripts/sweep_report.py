@@ -10,6 +10,7 @@ import typer
 
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, say, stdout, write_result
 from safe_envs.scripts.reports.rates import percent, rate_of
 from safe_envs.scripts.reports.tables import make_table
@@ -166,6 +167,4 @@ def _value(value: Any) -> str:
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("sweep-report")
+    run_alone("sweep-report", sweep_report)

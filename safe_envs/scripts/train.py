@@ -13,6 +13,7 @@ import typer
 from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.number_text import real
 from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 from safe_envs.scripts.reports.rates import rate_of
@@ -220,6 +221,4 @@ def _report(filter_name: str, rows: list[dict[str, Any]]) -> None:
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("train")
+    run_alone("train", train)

@@ -17,6 +17,7 @@ import typer
 
 from safe_envs.errors import ConfigurationError, WorkersLostError, nearest
 from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
     progress_bar,
@@ -247,6 +248,4 @@ def _report(found: Sequence[tuple[Artefact, Any, float]], sample: Sample, out: P
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("reproduce")
+    run_alone("reproduce", reproduce)
