@@ -15,6 +15,7 @@ import typer
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import named_values, real
 from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
@@ -237,6 +238,4 @@ def _filter_of(method: str) -> str:
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("identify")
+    run_alone("identify", identify)

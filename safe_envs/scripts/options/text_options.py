@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from safe_envs.atomic_io import require_writable
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.scripts.options.console import STDOUT
 
 Knowledge = Annotated[str, typer.Option(metavar="model|plant", help="What the filters know.")]
@@ -60,9 +60,21 @@ def require_outputs(
             )
         taken[place] = f"{option} {path}"
     if plot is not None:
-        from safe_envs.scripts.figures.evaluation_figure import require_format
+        _require_format(plot)
 
-        require_format(plot)
+
+def _require_format(path: Path) -> None:
+    """Raise ConfigurationError unless the suffix of a path names a format that can be drawn."""
+    # Not imported before it is needed: completion has to be quick.
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    # pgf is left out: it needs a TeX installation.
+    formats = sorted(set(FigureCanvasBase.get_supported_filetypes()) - {"pgf"})
+    suffix = path.suffix.removeprefix(".").lower()
+    if suffix not in formats:
+        raise ConfigurationError(
+            f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, formats)}"
+        )
 
 
 def inputs_of(
