@@ -14,7 +14,7 @@ import typer
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.figures.film import require_film, steps_a_frame, write_film
 from safe_envs.scripts.options import text_options
-from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:
@@ -123,13 +123,13 @@ def render(
         count = write_film(out, frames_of(runs, every, problem.steps, tell), every * problem.dt)
     console = stdout()
     for each in runs:
-        console.print(each.summary(), highlight=False)
+        say(console, each.summary())
     size = (
         "a still"
         if out.suffix.lower() == ".png"
         else f"{count} frames, {count * every * problem.dt:.2f} s"
     )
-    console.print(f"{out}: {size}", highlight=False)
+    say(console, f"{out}: {size}")
     write_result(
         json_file,
         lambda: {"film": str(out), "frames": count, "episodes": [each.document() for each in runs]},

@@ -16,6 +16,7 @@ from safe_envs.scripts.options.console import (
     Json,
     progress_bar,
     require_result,
+    say,
     stdout,
     write_result,
 )
@@ -91,23 +92,13 @@ def sweep(
     failures = _compute(store, place, out)
     done = len(found.cells) - len(store.missing)
     kept = f", of which {before} were there before" if before else ""
-    stdout().print(
-        f"{done} of {len(found.cells)} cells are in {out}{kept}.",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
+    say(stdout(), f"{done} of {len(found.cells)} cells are in {out}{kept}.")
     if store.hidden:
         hidden = (
             f"{store.hidden} cells of another grid or version are in {out} too, where no report"
             " reads them now"
         )
-        stdout().print(
-            f"Note: {hidden}; give each sweep a folder of its own.",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
+        say(stdout(), f"Note: {hidden}; give each sweep a folder of its own.")
     counts = {"cells": len(found.cells), "done": done, "before": before}
     write_result(json, lambda: _document(found, failures, counts))
     if failures:
