@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,16 +14,14 @@ from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.console import (
     Json,
-    progress_bar,
     require_result,
     say,
     stdout,
     write_result,
 )
-from safe_envs.scripts.reports.tables import make_table
+from safe_envs.scripts.options.job_progress import run_jobs
 
 if TYPE_CHECKING:
-    from safe_envs.agents.jobs.job import Outcome
     from safe_envs.scripts.reproduce.framework.artefact import Artefact, Sample
 
 _ALL = "all"
@@ -67,17 +64,21 @@ def reproduce(
     DIR by the same options, DIR/index.md the same as Markdown. What is computed is kept by its
     configuration and the version of the code: a run that was stopped goes on.
     """
+    from safe_envs.agents.jobs.executor import Backend
+    from safe_envs.agents.jobs.fingerprint import source_checksum
     from safe_envs.scripts.reproduce.framework.artefact import Sample
     from safe_envs.scripts.reproduce.framework.page import write_page
     from safe_envs.scripts.reproduce.framework.store import read, require_same_sample
+    from safe_envs.scripts.reproduce.framework.summary import summary_document, summary_table
 
     require_result(json_file)
     sample = Sample(episodes, seed, quick)
     chosen = _chosen(names or [_ALL])
     require_same_sample(out, _chosen([_ALL]), sample)
     missing = [artefact for artefact in chosen if read(out, artefact, sample) is None]
-    with progress_bar(f"{len(missing)} of {len(chosen)} to do") as tell:
-        failures = _compute(missing, sample, out, jobs, tell or (lambda _: None))
+    tasks = [ArtefactJob(each.name, sample, out, source_checksum()) for each in missing]
+    backend = Backend(jobs=max(1, min(jobs, len(tasks))))
+    failures = run_jobs(tasks, backend, out, f"{len(missing)} of {len(chosen)} to do")
     found = [
         (artefact, *answer)
         for artefact in _chosen([_ALL])
@@ -85,12 +86,11 @@ def reproduce(
     ]
     write_page(out, found, sample)
     reported = [entry for entry in found if entry[0] in chosen]
-    _report(reported, sample, out)
-    write_result(json_file, lambda: _document(reported, sample))
+    stdout().print(summary_table(reported, sample))
+    say(stdout(), f"\nThe page: {out / 'index.html'}")
+    write_result(json_file, lambda: summary_document(reported, sample))
     if failures:
-        raise ConfigurationError(
-            "; ".join(f"{name} failed: {error}" for name, error in failures.items())
-        )
+        raise ConfigurationError("; ".join(f"{each.key} failed: {each.error}" for each in failures))
 
 
 def _chosen(names: Sequence[str]) -> list[Artefact]:
@@ -101,28 +101,6 @@ def _chosen(names: Sequence[str]) -> list[Artefact]:
         if name != _ALL and name not in known:
             raise ConfigurationError(f"unknown artefact {name!r}; {nearest(name, [_ALL, *known])}")
     return [artefact for name, artefact in known.items() if _ALL in names or name in names]
-
-
-def _compute(
-    missing: Sequence[Artefact], sample: Sample, out: Path, jobs: int, tell: Callable[[float], None]
-) -> dict[str, str]:
-    """Compute and keep what is missing; return the errors of those that failed."""
-    from safe_envs.agents.jobs.executor import Backend, run
-    from safe_envs.agents.jobs.fingerprint import source_checksum
-
-    ended: dict[str, str | None] = {}
-
-    def note(outcome: Outcome) -> None:
-        ended[outcome.key] = outcome.error
-        tell(len(ended) / len(missing))
-
-    tasks = [ArtefactJob(each.name, sample, out, source_checksum()) for each in missing]
-    try:
-        run(tasks, Backend(jobs=max(1, min(jobs, len(tasks)))), note)
-    except KeyboardInterrupt:
-        print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
-        raise
-    return {name: error for name, error in ended.items() if error is not None}
 
 
 @dataclass(frozen=True)
@@ -160,32 +138,6 @@ class ArtefactJob:
         began = time.perf_counter()
         outcome = artefact.compute(self.sample)
         keep(self.out, artefact, self.sample, outcome, time.perf_counter() - began)
-
-
-def _document(found: Sequence[tuple[Artefact, Any, float]], sample: Sample) -> dict[str, Any]:
-    """Return the requested artefacts with their verdicts and outcomes."""
-    from safe_envs.scripts.reproduce.framework.verdict import judge
-
-    rows = []
-    for artefact, outcome, seconds in found:
-        judgement = judge(artefact, outcome, sample)
-        verdict = {"verdict": judgement.verdict.value, "reasons": list(judgement.reasons)}
-        rows.append(
-            {"name": artefact.name, **verdict, "seconds": seconds, "outcome": outcome.document()}
-        )
-    return {"sample": asdict(sample), "artefacts": rows}
-
-
-def _report(found: Sequence[tuple[Artefact, Any, float]], sample: Sample, out: Path) -> None:
-    from safe_envs.scripts.reproduce.framework.verdict import judge
-
-    table = make_table("llp", "artefact", "verdict", "because", tight=False)
-    for artefact, outcome, _ in found:
-        judgement = judge(artefact, outcome, sample)
-        table.add_row(artefact.name, judgement.text, "; ".join(judgement.reasons))
-    console = stdout()
-    console.print(table)
-    say(console, f"\nThe page: {out / 'index.html'}")
 
 
 if __name__ == "__main__":
