@@ -110,7 +110,6 @@ def train(
     """
     from safe_envs.agents.policies.registry import DESCRIPTION
     from safe_envs.agents.training.config import Training
-    from safe_envs.agents.training.trainer import train as train_agent
 
     text_options.require_outputs(
         json_file, None, inputs=text_options.inputs_of(env.system, filters=filters or ())
@@ -135,6 +134,8 @@ def train(
         eval_episodes=eval_episodes,
         threads=threads,
     )
+    from safe_envs.agents.training.trainer import train as train_agent
+
     # The policy itself is written at the very end.
     finished = resume and os.path.exists(out / DESCRIPTION)
     with progress_bar("Training") as tell:
