@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from safe_envs.agents.evaluation.evaluate import package_versions
+from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.registry import make_problem
 from safe_envs.scripts.identify import SETTINGS, read_settings, settings_of
 from safe_envs.scripts.reports.identify_report import Function, Source, percent, unit_of

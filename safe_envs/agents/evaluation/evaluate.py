@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +13,7 @@ from safe_envs.agents.evaluation.comparison import Comparison, SafetyBits, compa
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.guarantees import GuaranteeAverager, together
 from safe_envs.agents.evaluation.identification import describe, seconds_of
+from safe_envs.agents.evaluation.parallel_rollout import play_in_processes
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.agents.evaluation.rollout import (
     EpisodeStatistics,
@@ -28,24 +26,13 @@ from safe_envs.agents.evaluation.rollout import (
 from safe_envs.agents.evaluation.spec import BARE, EvaluationSpec, Work
 from safe_envs.agents.evaluation.statistics import require_confidence
 from safe_envs.agents.evaluation.visited_states import Seen
-from safe_envs.agents.jobs.processes import play_in_processes
+from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import FilterSpec
 from safe_envs.wrappers.learning import LearnedModel
 
-__all__ = ["BARE", "Evaluation", "evaluate", "package_versions"]
-
-_PACKAGES = (
-    "safe-envs",
-    "gymnasium",
-    "numpy",
-    "scipy",
-    "sympy",
-    "proxsuite",
-    "stable-baselines3",
-    "torch",
-)
+__all__ = ["BARE", "Evaluation", "evaluate"]
 
 
 @dataclass(frozen=True)
@@ -315,17 +302,3 @@ def evaluate(
 def _speed(name: str, totals: Sequence[EpisodeStatistics], seconds: float) -> dict[str, Any]:
     steps = sum(each.steps for each in totals)
     return {"filter": name, "seconds": seconds, "steps": steps, "steps_per_second": steps / seconds}
-
-
-def package_versions() -> dict[str, str]:
-    """Versions of Python and of the packages on which results depend, by name."""
-    return dict(_versions())
-
-
-@cache
-def _versions() -> dict[str, str]:
-    """Read once: each is in a file of its own."""
-    return {
-        "python": platform.python_version(),
-        **{package: version(package) for package in _PACKAGES},
-    }

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, require_monitoring
-from safe_envs.agents.evaluation.evaluate import package_versions
 from safe_envs.agents.evaluation.rollout import Progress, Row
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Work
 from safe_envs.agents.evaluation.statistics import (
@@ -21,6 +20,7 @@ from safe_envs.agents.evaluation.statistics import (
     rate_interval,
     require_confidence,
 )
+from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.policies.registry import Policy
 from safe_envs.agents.rare_events.importance_sampling import Drifting, optimal_tilt
 from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Repetitions, Splitting

@@ -1,5 +1,4 @@
-"""What a sweep's file may hold: its sections, the names of settings, and values of the kind that
-each takes."""
+"""The settings of a sweep: their sections in a file, their names, and the kinds of their values."""
 
 from __future__ import annotations
 
@@ -9,14 +8,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from safe_envs.agents.evaluation.evaluate import BARE
-from safe_envs.agents.sweeps.cell import ENV_OPTIONS
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import real
-from safe_envs.problem.options import PARAMETER_GROUPS
+from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS
 from safe_envs.registry import full_id
 
-_SECTIONS = ("fixed", "grid", "cells")
-_DEFAULTS: dict[str, Any] = {
+ENV_OPTIONS = ("system", *(name for name in OPTION_NAMES if name not in PARAMETER_GROUPS))
+"""Settings that are arguments of `gym.make`."""
+
+EVALUATION_DEFAULTS: dict[str, Any] = {
     "policy": "nominal",
     "knowledge": "model",
     "objective": "nearest",
@@ -24,7 +24,10 @@ _DEFAULTS: dict[str, Any] = {
     "episodes": 1000,
     "bounds": False,
 }
-_NAMES = ("env", "filter", *ENV_OPTIONS, *_DEFAULTS)
+"""Settings that are arguments of `evaluate`, with the values of a cell that leaves them out."""
+
+_SECTIONS = ("fixed", "grid", "cells")
+_NAMES = ("env", "filter", *ENV_OPTIONS, *EVALUATION_DEFAULTS)
 _WORDS = ("env", "system", "filter", "policy", "knowledge", "objective")
 _GROUPS = tuple(f"{group}.NAME" for group in PARAMETER_GROUPS)
 
@@ -32,14 +35,14 @@ Settings = dict[str, Any]
 
 
 def sections(document: Any, what: str) -> tuple[Settings, dict[str, list[Any]], list[Settings]]:
-    """The sections `fixed`, `grid` and `cells` of a sweep, each checked by itself.
+    """Return the sections `fixed`, `grid` and `cells` of a sweep, each checked by itself.
 
     Args:
-        document: what the file holds.
-        what: how errors call it.
+        document: Content of the file.
+        what: Name of the sweep in errors.
 
     Raises:
-        ConfigurationError: a section or a setting is unknown, or a value is not of its setting's
+        ConfigurationError: A section or a setting is unknown, or a value is not of its setting's
             kind.
     """
     given = _mapping(document, what, _SECTIONS)
@@ -51,11 +54,14 @@ def sections(document: Any, what: str) -> tuple[Settings, dict[str, list[Any]], 
 
 
 def complete(settings: Settings, what: str) -> Settings:
-    """The settings of a cell, in one order, with what is the same for every env where it was left
-    open.
+    """Return the settings of a cell in a fixed order, with the defaults of an evaluation.
+
+    Args:
+        settings: As given; checked by `sections`.
+        what: Name of the sweep in errors.
 
     Raises:
-        ConfigurationError: it has no filter, or not just one of env and system.
+        ConfigurationError: The cell has no filter, or not just one of env and system.
     """
     if ("env" in settings) == ("system" in settings):
         raise ConfigurationError(
@@ -63,9 +69,9 @@ def complete(settings: Settings, what: str) -> Settings:
         )
     if "filter" not in settings:
         raise ConfigurationError(
-            f"{what}: a cell has no filter; name one, or {BARE} for the bare env"
+            f"{what}: a cell has no filter; name one, or {BARE} for the unfiltered env"
         )
-    given = {**_DEFAULTS, **settings}
+    given = {**EVALUATION_DEFAULTS, **settings}
     return {
         name: given[name]
         for name in sorted(given, key=lambda name: (name not in _NAMES, _rank(name), name))
@@ -73,7 +79,7 @@ def complete(settings: Settings, what: str) -> Settings:
 
 
 def text_of(value: Any) -> str:
-    """The value of a setting as text; also of one that is not allowed, such as a date of YAML's."""
+    """Return the value of a setting as text, also one that is not allowed, such as a YAML date."""
     if isinstance(value, str):
         return value
     try:
@@ -146,7 +152,7 @@ def _require_known(name: str, what: str) -> None:
 
 
 def _value(name: str, value: Any, what: str) -> Any:
-    """A value of the kind that its setting takes, in one form where there are several."""
+    """Return a value of the kind that its setting takes, in one form where there are several."""
     if name in _WORDS:
         return _word(name, value, what)
     if name == "bounds":
@@ -184,10 +190,9 @@ def _word(name: str, value: Any, what: str) -> str:
 
 
 def _number(name: str, value: Any, what: str) -> Any:
-    """A finite number; of a barrier as it is, since that may count something, and of all else as a
-    float, to be one cell with its equals.
+    """Return a finite number, or a word where an env takes one.
 
-    Words pass where an env takes them.
+    All but those of a barrier, which may be counts, are floats, so that equal cells are one cell.
     """
     given = value
     if isinstance(value, str):

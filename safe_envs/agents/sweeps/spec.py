@@ -1,5 +1,4 @@
-"""What a sweep is: from a file that names settings and their values to cells, each of which is one
-evaluation."""
+"""A sweep: the cells that a file with settings and lists of their values describes."""
 
 from __future__ import annotations
 
@@ -11,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.policies.registry import make_policy
-from safe_envs.agents.sweeps.cell import Cell, checksum, versions
+from safe_envs.agents.sweeps.cell import Cell, versions
 from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_imported
 from safe_envs.agents.sweeps.document import document_in
 from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_of
@@ -23,11 +23,11 @@ from safe_envs.wrappers import SafetyFilter, learned_parts, require_readable
 _NO_PART = ("seed", "episodes", "bounds")
 """Settings that change neither the problem nor the filter nor the policy."""
 
-_BESIDE = {"filter": ("env", "system", "knowledge", "objective"), "policy": ("env", "system")}
-"""With what else a setting has to suit."""
+_TOGETHER = {"filter": ("env", "system", "knowledge", "objective"), "policy": ("env", "system")}
+"""Settings with which another one has to be compatible."""
 
 _MOST_CELLS = 50_000
-"""They are all told apart before the first is computed, in a second."""
+"""All of them are compared, in a second, before the first is computed."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Sweep:
     """Cells, in the order of their file.
 
     Attributes:
-        cells: each once.
-        swept: names of the settings that are not the same in all of them.
+        cells: Each once.
+        swept: Names of the settings that are not the same in all of them.
     """
 
     cells: tuple[Cell, ...]
@@ -51,13 +51,13 @@ def read_sweep(path: Path, trust: bool = False) -> Sweep:
     see `docs/guides/sweep.md`.
 
     Args:
-        path: of the file. Paths in it begin at the working directory.
-        trust: load a policy's .zip, which runs code that it contains.
+        path: Of the file. Paths in it begin at the working directory.
+        trust: Load a policy's .zip, which runs code that it contains.
 
     Raises:
-        ConfigurationError: the file cannot be read, or a section, setting, id, filter, policy or
+        ConfigurationError: The file cannot be read, or a section, setting, id, filter, policy or
             value is not allowed.
-        RelativeDegreeError: a filter does not suit a barrier.
+        RelativeDegreeError: A filter does not suit a barrier.
     """
     sweep = sweep_of(document_in(path), trust, what=str(path))
     _check(sweep, str(path))
@@ -65,15 +65,15 @@ def read_sweep(path: Path, trust: bool = False) -> Sweep:
 
 
 def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Sweep:
-    """A sweep from what its file holds, with names and kinds of values checked.
+    """Return the sweep of a file's content, with names and kinds of values checked.
 
     Args:
-        document: the file's mapping from sections.
-        trust: see `read_sweep`.
-        what: how errors call it.
+        document: Mapping from the file's sections.
+        trust: See `read_sweep`.
+        what: Name of the sweep in errors.
 
     Raises:
-        ConfigurationError: a section or a setting is not allowed.
+        ConfigurationError: A section or a setting is not allowed.
     """
     fixed, grid, given = sections(document, what)
     for name in (*grid, *itertools.chain.from_iterable(given)):
@@ -103,15 +103,14 @@ def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Swe
 
 
 def describe(cell: Cell, names: Iterable[str]) -> str:
-    """A cell in a few words: the settings of these names."""
+    """Return a cell in a few words: its settings of these names."""
     return ", ".join(
         f"{name} = {text_of(cell.settings[name])}" for name in names if name in cell.settings
     )
 
 
 def _equal(settings: Settings) -> str:
-    """The same for settings that differ in 1 and 1.0 of a barrier only, and so are of the same
-    episodes."""
+    """Return a text that is the same for settings that differ only in 1 and 1.0 of a barrier."""
 
     def one_form(value: Any) -> Any:
         return json.loads(json.dumps(value), parse_int=float)
@@ -130,7 +129,7 @@ def _cells(found: Iterable[Settings], trust: bool) -> Iterable[Cell]:
         settings, files = absolute(given), {}
         for path in read_by(settings):
             if path not in digests:
-                digests[path] = {str(each): checksum(each) for each in with_imported(path)}
+                digests[path] = {str(each): file_checksum(each) for each in with_imported(path)}
             files |= digests[path]
         yield Cell(settings, files, versions(), trust)
 
@@ -141,22 +140,23 @@ def _swept(settings: Sequence[Mapping[str, Any]]) -> Iterable[str]:
 
 
 def _check(sweep: Sweep, what: str) -> None:
-    """Make the problem, the filter and the policy of every cell that has a value, or one with its
-    env, that none before it had.
+    """Make the problem, filter and policy of each cell with a value, or a pair, that is new.
 
-    Others would repeat it, and to make the problem of a large system takes a second.
+    The others would repeat it, and the problem of a large system takes a second.
 
     Raises:
-        SafeEnvsError: one cannot be made; says of which cell.
+        SafeEnvsError: One cannot be made; the message names the cell.
     """
     seen: set[str] = set()
     for cell in sweep.cells:
-        beside = {
-            name: [cell.settings.get(other) for other in others] for name, others in _BESIDE.items()
+        together = {
+            name: [cell.settings.get(other) for other in others]
+            for name, others in _TOGETHER.items()
         }
-        looked_at = {name: value for name, value in cell.settings.items() if name not in _NO_PART}
         parts = {
-            name: json.dumps([name, value, beside.get(name)]) for name, value in looked_at.items()
+            name: json.dumps([name, value, together.get(name)])
+            for name, value in cell.settings.items()
+            if name not in _NO_PART
         }
         new = {name for name, part in parts.items() if part not in seen}
         if not new:

@@ -14,8 +14,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
 
+from safe_envs.agents.jobs.store import reading
 from safe_envs.atomic_io import write_atomically, writing
-from safe_envs.errors import ConfigurationError
 
 _EPISODES = 100
 
@@ -151,20 +151,15 @@ def _lines(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """The whole lines of a log, as they are and read."""
     if not path.is_file():
         return
-    with path.open() as stream:
-        try:
-            # The last line of a training that was killed may be half a line.
-            while (text := stream.readline(_LONGEST)).endswith("\n"):
-                line = json.loads(text)
-                if type(line["step"]) is not int:
-                    raise ValueError(f"a line is of step {line['step']!r}")
-                yield text, line
-            if len(text) == _LONGEST:
-                raise ValueError("a line is too long")
-        except (LookupError, RecursionError, TypeError, ValueError) as error:
-            raise ConfigurationError(
-                f"{path} cannot be read ({error}); it is damaged or altered: remove it"
-            ) from error
+    with reading(path, "remove it"), path.open() as stream:
+        # The last line of a training that was killed may be incomplete.
+        while (text := stream.readline(_LONGEST)).endswith("\n"):
+            line = json.loads(text)
+            if type(line["step"]) is not int:
+                raise ValueError(f"a line is of step {line['step']!r}")
+            yield text, line
+        if len(text) == _LONGEST:
+            raise ValueError("a line is too long")
 
 
 def _number(value: Any) -> float | int | None:

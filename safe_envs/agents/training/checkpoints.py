@@ -11,16 +11,14 @@ import io
 import json
 import math
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors import SafetensorError
 from safetensors.numpy import load_file
 from safetensors.numpy import save as serialized
 
+from safe_envs.agents.jobs.store import reading
 from safe_envs.agents.policies.network import save_policy
 from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS
 from safe_envs.agents.training.learner_state import (
@@ -36,7 +34,7 @@ from safe_envs.agents.training.learner_state import (
 )
 from safe_envs.atomic_io import write_atomically, write_json, writing
 from safe_envs.bounded_reading import open_regular, read_bytes
-from safe_envs.errors import ConfigurationError, SafeEnvsError
+from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 
 if TYPE_CHECKING:
@@ -52,6 +50,7 @@ _MODEL, _SCALES = "model.zip", "normalization.pkl"
 _OF_THE_POLICY = (_MODEL, _SCALES, TENSORS, DESCRIPTION)
 _CHECKPOINT = "checkpoint_"
 _FORMAT = 2
+_ADVICE = "start the training again in another folder"
 
 _MOST_TEXT = 1_000_000
 """Bytes of the JSON of a checkpoint, at most: it has a few hundred numbers."""
@@ -62,19 +61,6 @@ _HEADER = 1_000_000
 _PER_PARAMETER = 8
 """Numbers, at most, that the networks and optimizers of a learner have for one of a new learner,
 which has no optimizers' state yet."""
-
-# What JSON, safetensors and those who read them raise on damaged files.
-_DAMAGED = (
-    AttributeError,
-    ArithmeticError,
-    LookupError,
-    OSError,
-    RecursionError,
-    RuntimeError,
-    SafetensorError,
-    TypeError,
-    ValueError,
-)
 
 
 def last_checkpoint(folder: Path) -> Path | None:
@@ -152,7 +138,7 @@ def restore_model(checkpoint: Path, model: Any, figures: SafetyFigures, n_timest
     Raises:
         ConfigurationError: the checkpoint cannot be read, or is that of another model.
     """
-    with _reading(checkpoint):
+    with reading(checkpoint, _ADVICE):
         document = json.loads(read_bytes(checkpoint / _STATE, _MOST_TEXT))
         if not isinstance(document, dict):
             raise ValueError(f"{_STATE} holds no names with values")
@@ -193,23 +179,9 @@ def resume_episodes(checkpoint: Path, model: Any, seed: int) -> None:
     A training that goes on does this at each of its checkpoints too, so that one which was
     interrupted does the same.
     """
-    with _reading(checkpoint):
+    with reading(checkpoint, _ADVICE):
         envs = model.get_env()
         restore_envs(envs, _arrays(checkpoint / _ENVS, _size(env_arrays(envs))), seed)
-
-
-@contextmanager
-def _reading(checkpoint: Path) -> Iterator[None]:
-    """Say of what damaged files raise which checkpoint it is."""
-    try:
-        yield
-    except SafeEnvsError:
-        raise
-    except _DAMAGED as error:
-        raise ConfigurationError(
-            f"the checkpoint {checkpoint} cannot be read ({type(error).__name__}: {error}); start"
-            " the training anew in another folder"
-        ) from error
 
 
 def _arrays(path: Path, most: int) -> Arrays:

@@ -45,7 +45,7 @@ import numpy as np
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
-from safe_envs.agents.training.algorithms import ACTIONS
+from safe_envs.agents.training.hyperparameters import ACTIONS
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.problem.problem import SafetyProblem
 

@@ -15,11 +15,11 @@ import safe_envs
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.rollout import episode_seed
-from safe_envs.agents.training.algorithms import whole_batches
 from safe_envs.agents.training.callbacks import ProgressLog, SafetyFigures, read_progress
 from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.hyperparameters import ALGORITHMS, scheduled
-from safe_envs.agents.training.trainer import _Session, train
+from safe_envs.agents.training.hyperparameters import ALGORITHMS, scheduled, whole_batches
+from safe_envs.agents.training.session import TrainingSession
+from safe_envs.agents.training.trainer import train
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.registry import make_problem
 
@@ -248,13 +248,13 @@ def test_hyperparameters_that_do_not_work_are_refused_and_leave_the_folder_to_ot
 
 
 def test_the_zoo_s_texts_and_lists_are_understood(tmp_path):
-    session = _Session(
+    session = TrainingSession(
         training(settings={"normalize": "{'norm_obs': False, 'norm_reward': True}", "gamma": 0.9}),
         tmp_path,
     )
     scales = session._model.get_env()
     assert (scales.norm_obs, scales.norm_reward, scales.gamma) == (False, True, 0.9)
-    session = _Session(
+    session = TrainingSession(
         training(
             "sac",
             settings={
@@ -289,7 +289,7 @@ def test_a_rollout_is_cut_into_whole_batches():
 def test_the_filter_in_the_loop_knows_what_it_is_to_know(tmp_path):
     problem = make_problem("safe_envs/QuadrotorAltitude-v0")
     for knowledge, system in (("model", problem.model), ("plant", problem.plant)):
-        session = _Session(
+        session = TrainingSession(
             Training.of("QuadrotorAltitude-v0", "ppo", filter="hocbf", knowledge=knowledge),
             tmp_path,
         )
