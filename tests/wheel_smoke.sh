@@ -115,8 +115,8 @@ class Cautious(SCBF):
     name = "cautious"
 
 
-def policy(observation):
-    return [0.5]
+def policy(observations):
+    return 0.5 * observations
 END
 safe-envs evaluate Scalar-v0 --filter plug_ins.py:Cautious --policy plug_ins.py:policy --episodes 20 --quiet
 
