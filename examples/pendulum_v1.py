@@ -2,8 +2,8 @@
 
     safe-envs evaluate Pendulum-v1 --filter-spec examples/pendulum_v1.py:spec
 
-The barrier bounds the energy: at the top (theta = 0) the rate must stay below 2 rad/s. Without torque
-the energy is constant, so some torque meets the condition everywhere, weak as the motor is.
+The barrier bounds the energy: at the top (theta = 0) the rate must stay below 2 rad/s. Without
+torque the energy is constant, so some torque meets the condition everywhere, weak as the motor is.
 """
 
 import numpy as np

@@ -12,8 +12,8 @@ from safe_envs.scripts.cli import app
 
 _INTRODUCTION = """# Command line
 
-Every command exits with status 0, or with status 2 and one message for an error that the user can correct. `--help`
-after a command prints its section of this page. These options precede a command:
+Every command exits with status 0, or with status 2 and one message for an error that the user can
+correct. `--help` after a command prints its section of this page. These options precede a command:
 """
 
 _LETTERS = {int: "N", Path: "PATH"}

@@ -22,7 +22,6 @@ from safe_envs.dynamics.codegen import compile_function
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, UNSAFE
 from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.guarantee import applicable_bounds
 
 _GRID = 241
 _EPISODES = 1000
@@ -187,7 +186,7 @@ def _bounds() -> Figure:
         )
     times = np.linspace(0.0, problem.horizon, 41)
     at_times = zip(
-        *[applicable_bounds(verification, starts, t) for t in times.tolist()], strict=True
+        *[verification.guarantee.applicable_bounds(starts, t) for t in times.tolist()], strict=True
     )
     for bounds, color in zip(at_times, (QUIET, COLORS[1]), strict=True):
         label = f"{bounds[-1].name.split(',')[0]}: {bounds[-1].status}"
