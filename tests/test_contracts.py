@@ -167,7 +167,8 @@ def prose() -> Iterator[tuple[Path, int, str]]:
 def allowed(path: Path, around: str) -> bool:
     name = path.relative_to(ROOT).as_posix()
     return any(
-        re.fullmatch(paths, name) and re.search(text, around, re.I) for paths, text, _ in ALLOWED
+        re.fullmatch(paths, name) and re.search(text.replace(" ", r"\s+"), around, re.I)
+        for paths, text, _ in ALLOWED
     )
 
 
