@@ -1,4 +1,4 @@
-"""One import root: `safe_envs` is all that is installed; the links at the top level are short cuts."""
+"""One import root: only `safe_envs` is installed; the links at the top level are short cuts."""
 
 from __future__ import annotations
 
