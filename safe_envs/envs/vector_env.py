@@ -12,7 +12,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from safe_envs.dynamics.codegen import Components, constants, filled, finite, settled, stacked
-from safe_envs.envs.env import action_box, make_problem, observation_box
+from safe_envs.envs.env import SystemEnv, action_box, observation_box
 from safe_envs.envs.info import Info, safety_info, with_masks
 from safe_envs.envs.simulation import NoiseStreams, Simulation, center_and_half_width, steps_until
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
@@ -335,7 +335,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _restart(self, envs: np.ndarray) -> None:
         """Put some envs at the start of an episode."""
-        start = self._simulation.draw_starts([self._rngs[i] for i in envs.tolist()])
+        start = self._simulation.starts.draw_batch([self._rngs[i] for i in envs.tolist()])
         if envs.size == self.num_envs:
             self._x = tuple(start)
         else:
@@ -394,21 +394,25 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 class SystemVectorEnv(SafeVectorEnv):
-    """Base of the registered vector envs; arguments as for `SystemEnv`, and `num_envs` and
-    `autoreset_mode`."""
+    """Base of the registered vector envs.
 
-    env_class: ClassVar[type[Any]]
+    Args:
+        num_envs: see `SafeVectorEnv`.
+        autoreset_mode: see `SafeVectorEnv`.
+        max_episode_steps: see `SafeVectorEnv`.
+        render_mode: see `SafeVectorEnv`.
+        **options: as for `SystemEnv`.
+    """
+
+    env_class: ClassVar[type[SystemEnv]]
 
     def __init__(
         self,
         num_envs: int = 1,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        barrier: Mapping[str, Any] | None = None,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        problem = make_problem(
-            self.env_class.__name__, self.env_class.problem_factory, barrier, options
-        )
+        problem = self.env_class.make_problem(**options)
         super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)

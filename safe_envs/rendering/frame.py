@@ -34,26 +34,26 @@ class Picture:
         return make_scene(self._problem)
 
     def draw(
-        self, moment: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None
+        self, snapshot: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None
     ) -> pygame.Surface:
         """Draw an instant; the surface is drawn over by the next call.
 
         Args:
-            moment: what is drawn.
+            snapshot: what is drawn.
             caption: above it.
             shot: somebody else's picture of it, uint8 of shape (height, width, 3), to show in place
                 of the scene.
         """
-        self._panel.draw(self._canvas, moment, caption)
+        self._panel.draw(self._canvas, snapshot, caption)
         if shot is None:
-            self._scene.draw(self._canvas, moment)
+            self._scene.draw(self._canvas, snapshot)
         else:
             self._canvas.photograph(shot, SCENE)
         return self._canvas.surface
 
     def frame(
-        self, moment: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None
+        self, snapshot: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None
     ) -> np.ndarray:
         """Draw an instant; uint8 of shape (height, width, 3). Arguments as for `draw`."""
-        self.draw(moment, caption, shot)
+        self.draw(snapshot, caption, shot)
         return self._canvas.pixels()

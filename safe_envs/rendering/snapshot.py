@@ -15,7 +15,7 @@ _KEPT = 5000
 
 
 @dataclass(frozen=True)
-class Decision:
+class DrawnDecision:
     """What a filter made of a policy's action: components in physical units."""
 
     nominal: Sequence[float]
@@ -45,7 +45,7 @@ class EpisodeSnapshot:
     barriers: Sequence[float]
     least: float
     executed: Sequence[float] | None
-    decision: Decision | None
+    decision: DrawnDecision | None
     violated: np.ndarray | None
     violated_at: float
 
@@ -95,7 +95,7 @@ class History:
         state: Sequence[float],
         time: float,
         executed: Sequence[float] | None,
-        decision: Decision | None,
+        decision: DrawnDecision | None,
     ) -> None:
         """Add a state and what led to it."""
         if self._count == len(self._rows):
@@ -111,7 +111,7 @@ class History:
             self._violated, self._violated_at = np.array(state, dtype=float), time
 
     @property
-    def moment(self) -> EpisodeSnapshot:
+    def snapshot(self) -> EpisodeSnapshot:
         """The instant that was added last."""
         rows = self._rows[: self._count]
         barriers, executed, decision = self._latest

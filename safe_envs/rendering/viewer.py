@@ -12,7 +12,7 @@ import numpy as np
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rendering.snapshot import Decision, History
+from safe_envs.rendering.snapshot import DrawnDecision, History
 
 if TYPE_CHECKING:
     from safe_envs.rendering.frame import Picture
@@ -97,7 +97,7 @@ class Viewer:
         self._problem = problem
         self._live = mode == "human"
         self._histories = [History(problem) for _ in range(num_envs)]
-        self._decisions: list[Decision | None] = [None] * num_envs
+        self._decisions: list[DrawnDecision | None] = [None] * num_envs
         self._picture: Picture | None = None
         self._window: Window | None = None
 
@@ -109,7 +109,7 @@ class Viewer:
     def announce(self, nominal: Rows, active: Rows, feasible: Rows) -> None:
         """Keep what a filter decided, a row for each env, for the step that comes next."""
         self._decisions = [
-            Decision(tuple(n), bool(a), bool(f))
+            DrawnDecision(tuple(n), bool(a), bool(f))
             for n, a, f in zip(nominal, active, feasible, strict=True)
         ]
 
@@ -151,7 +151,7 @@ class Viewer:
         each = shots or [None] * len(self._histories)
         return tuple(
             [
-                picture.frame(history.moment, self.caption, shot)
+                picture.frame(history.snapshot, self.caption, shot)
                 for history, shot in zip(self._histories, each, strict=True)
             ]
         )
@@ -185,7 +185,7 @@ class Viewer:
     def _go_live(self) -> None:
         if not self._live:
             return
-        surface = self._drawn().draw(self._histories[0].moment, self.caption)
+        surface = self._drawn().draw(self._histories[0].snapshot, self.caption)
         if self._window is None:
             from safe_envs.rendering.window import Window
 

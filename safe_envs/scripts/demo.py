@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Annotated
 
-from safe_envs.agents.evaluation.evaluate import evaluate
-from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.trainer import train
+import typer
+
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.figures.evaluation_figure import draw
-from safe_envs.scripts.options.console import progress_bar, require_result, stdout, write_result
-from safe_envs.scripts.reports.evaluation_report import print_evaluation
+from safe_envs.scripts.options.app import run_alone
+from safe_envs.scripts.options.console import (
+    Json,
+    progress_bar,
+    require_result,
+    say,
+    stdout,
+    write_result,
+)
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
 FILTERS = ("none", "hocbf", "scbf")
@@ -20,22 +26,19 @@ _STEPS = 100_000
 
 
 def demo(
-    folder: Path, episodes: int = 1000, steps: int = _STEPS, json_file: Path | None = None
+    folder: Annotated[
+        Path, typer.Option(metavar="FOLDER", help="Where the trained policy and the pictures go.")
+    ] = Path("demo-results"),
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes for each filter.")] = 1000,
+    json: Json = None,
 ) -> None:
-    """Train PPO without a filter, and print and draw the safety of the nominal controller and of
-    PPO.
+    """Train PPO briefly without a filter, then show the safety of it and of the nominal controller,
+    bare and filtered."""
+    from safe_envs.agents.evaluation.evaluate import evaluate
+    from safe_envs.scripts.figures.evaluation_figure import draw
+    from safe_envs.scripts.reports.evaluation_report import print_evaluation
 
-    Args:
-        folder: where the policy and the pictures go; it is made if need be. A training that is in
-            it is gone on with.
-        episodes: for each policy and filter.
-        steps: control periods of the training.
-        json_file: where both evaluations go, if they are to.
-
-    Raises:
-        ConfigurationError: the folder cannot be made, or the file cannot be written.
-    """
-    require_result(json_file)
+    require_result(json)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -44,7 +47,7 @@ def demo(
         ) from error
     console = stdout()
     policy = folder / "ppo"
-    _train(policy, steps)
+    _train(policy)
     documents = []
     for actor in ("nominal", str(policy)):
         with progress_bar("Evaluating") as tell:
@@ -53,31 +56,25 @@ def demo(
         documents.append(answer.document())
         picture = folder / f"{Path(actor).stem}.png"
         draw(answer, picture)
-        console.print(f"Picture: {picture}\n", highlight=False, markup=False)
-    write_result(json_file, lambda: {"folder": str(folder), "evaluations": documents})
+        say(console, f"Picture: {picture}\n")
+    write_result(json, lambda: {"folder": str(folder), "evaluations": documents})
 
 
-def _train(policy: Path, steps: int) -> None:
+def _train(policy: Path) -> None:
     """Train the policy, or finish its training."""
-    console = stdout()
-    console.print(
-        f"Training PPO on {ENV_ID}, {steps} steps without any filter ...", highlight=False
-    )
+    from safe_envs.agents.training.config import Training
+    from safe_envs.agents.training.trainer import train
+
+    say(stdout(), f"Training PPO on {ENV_ID}, {_STEPS} steps without any filter ...")
     with progress_bar("Training PPO") as tell:
         seconds = train(
-            Training.of(ENV_ID, "ppo", n_timesteps=steps, eval_freq=steps),
+            Training.of(ENV_ID, "ppo", n_timesteps=_STEPS, eval_freq=_STEPS),
             policy,
             resume=os.path.exists(policy),
             tell=tell,
         )
-    console.print(
-        f"Trained in {seconds:.0f} s of processor time and saved in {policy}\n",
-        highlight=False,
-        markup=False,
-    )
+    say(stdout(), f"Trained in {seconds:.0f} s of processor time and saved in {policy}\n")
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("demo")
+    run_alone("demo", demo)

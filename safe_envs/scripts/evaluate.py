@@ -10,6 +10,7 @@ import typer
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
@@ -241,6 +242,4 @@ def evaluate(
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("evaluate")
+    run_alone("evaluate", evaluate)

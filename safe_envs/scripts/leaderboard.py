@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from safe_envs import ENV_IDS
@@ -16,14 +15,17 @@ from safe_envs.atomic_io import write_json
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.options import completion
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
     progress_bar,
     require_result,
+    say,
     stdout,
     write_result,
 )
-from safe_envs.scripts.reports.rates import percent_in
+from safe_envs.scripts.reports.rates import rate_of
+from safe_envs.scripts.reports.tables import make_table
 
 _RESULTS = "results.json"
 _QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 50}
@@ -114,7 +116,7 @@ def leaderboard(
             tell((k + 1) / len(ids))
     found = [row for env_id in ids for row in rows if row["env_id"] == env_id]
     if markdown:
-        stdout().print("\n".join(_markdown(found)), highlight=False, markup=False, soft_wrap=True)
+        say(stdout(), "\n".join(_markdown(found)))
     else:
         stdout().print(_table(found))
     write_result(json_file, lambda: _document(known, found))
@@ -127,9 +129,9 @@ def _of_env(
     the filter."""
     from safe_envs.agents.training.config import Training
     from safe_envs.agents.training.trainer import train
-    from safe_envs.registry import load_problem
+    from safe_envs.registry import make_problem
 
-    natural = load_problem(env_id).filter
+    natural = make_problem(env_id).filter
     rows = _evaluated(env_id, "nominal", "nominal", ["none", natural], known, None)
     for i, (name, in_loop, filters) in enumerate(
         (
@@ -220,25 +222,23 @@ def _document(known: dict[str, Any], rows: Sequence[Row]) -> dict[str, Any]:
     return {"settings": known, "versions": package_versions(), "rows": list(rows)}
 
 
-def _rate(row: Row) -> str:
-    return percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
-
-
 def _time(row: Row) -> str:
     return "-" if row["trained_in"] is None else f"{row['trained_in']:.0f} s"
 
 
 def _table(rows: Sequence[Row]) -> Table:
     """A row for each policy and filter."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in ("env", "policy", "filter", "safe [95 % interval]", "return", "processor time"):
-        table.add_column(
-            title, justify="left" if title in ("env", "policy", "filter") else "right", no_wrap=True
-        )
+    titles = ("env", "policy", "filter", "safe [95 % interval]", "return", "processor time")
+    table = make_table("lllr", *titles, tight=False)
     for row in rows:
         name = row["env_id"].removeprefix("safe_envs/")
         table.add_row(
-            name, row["policy"], row["filter"], _rate(row), f"{row['return_mean']:.4g}", _time(row)
+            name,
+            row["policy"],
+            row["filter"],
+            rate_of(row),
+            f"{row['return_mean']:.4g}",
+            _time(row),
         )
     return table
 
@@ -254,13 +254,11 @@ def _markdown(rows: Sequence[Row]) -> list[str]:
     table = [["env", "filter", *policies, "processor time"], ["---"] * 8]
     for k in range(0, len(rows), 5):
         of_env = rows[k : k + 5]
-        cells = [f"{_rate(row)}, {row['return_mean']:.4g}" for row in of_env]
+        cells = [f"{rate_of(row)}, {row['return_mean']:.4g}" for row in of_env]
         name = of_env[0]["env_id"].removeprefix("safe_envs/").removesuffix("-v0")
         table.append([name, of_env[1]["filter"], *cells, f"{_time(of_env[2])}, {_time(of_env[4])}"])
     return [f"| {' | '.join(line)} |" for line in table]
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("leaderboard")
+    run_alone("leaderboard", leaderboard)

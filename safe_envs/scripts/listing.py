@@ -1,57 +1,43 @@
-"""`safe-envs list`: what there is to evaluate."""
+"""`safe-envs list`: the registered envs."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich import box
-from rich.markup import escape
-from rich.table import Table
+from safe_envs.scripts.options.app import run_alone
+from safe_envs.scripts.options.console import Json, require_result, stdout, write_result
+from safe_envs.scripts.reports.tables import make_table
+from safe_envs.systems import ENV_IDS
 
-from safe_envs import ENV_IDS, SafeEnv, SafetyProblem
-from safe_envs.dynamics.lie import relative_degree
-from safe_envs.registry import make_env
-from safe_envs.scripts.options.console import require_result, stdout, write_result
+if TYPE_CHECKING:
+    from safe_envs.problem.problem import SafetyProblem
 
 _COLUMNS = ("states", "inputs", "degree", "filter", "noise", "dt", "horizon")
 
 
-def list_envs(json_file: Path | None = None) -> None:
-    """Print a table of the registered envs, with what each is about and its defaults.
+def list_envs(json: Json = None) -> None:
+    """List the registered envs."""
+    from rich.markup import escape
 
-    Args:
-        json_file: where the same goes as JSON, if it is to.
+    from safe_envs.registry import make_env
 
-    Raises:
-        ConfigurationError: the file cannot be written.
-    """
-    require_result(json_file)
-    table = Table(
-        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True
-    )
-    table.add_column("id, and what is to be kept safe", max_width=50)
-    for name in _COLUMNS:
-        table.add_column(name, no_wrap=True)
-    rows = [
-        {"env_id": env_id, "about": _about(env), **_defaults(env.problem)}
-        for env_id in ENV_IDS
-        for env in (make_env(env_id),)
-    ]
-    for row in rows:
-        table.add_row(
-            f"[bold]{row['env_id']}[/]\n{escape(row['about'])}\n",
-            *[_cell(name, row[name]) for name in _COLUMNS],
-        )
+    require_result(json)
+    table = make_table("pl", "id, and what is to be kept safe", *_COLUMNS)
+    table.columns[0].max_width = 50
+    rows = []
+    for env_id in ENV_IDS:
+        env = make_env(env_id)
+        about = (type(env).__doc__ or "").strip().partition("\n")[0]
+        rows.append({"env_id": env_id, "about": about, **_defaults(env.problem)})
+        cells = [_cell(name, rows[-1][name]) for name in _COLUMNS]
+        table.add_row(f"[bold]{env_id}[/]\n{escape(about)}\n", *cells)
     stdout().print(table)
-    write_result(json_file, lambda: {"envs": rows})
-
-
-def _about(env: SafeEnv) -> str:
-    return (type(env).__doc__ or "").strip().partition("\n")[0]
+    write_result(json, lambda: {"envs": rows})
 
 
 def _defaults(problem: SafetyProblem) -> dict[str, Any]:
+    from safe_envs.dynamics.lie import relative_degree
+
     levels = {p.name: value for p, value in problem.plant.parameters.items()}
     return {
         "states": problem.plant.n,
@@ -71,6 +57,4 @@ def _cell(name: str, value: Any) -> str:
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("list")
+    run_alone("list", list_envs)

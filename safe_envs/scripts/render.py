@@ -14,7 +14,8 @@ import typer
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.figures.film import require_film, steps_a_frame, write_film
 from safe_envs.scripts.options import text_options
-from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
+from safe_envs.scripts.options.app import run_alone
+from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:
@@ -84,7 +85,7 @@ def render(
     The episode is that of an env which is reset with the seed. Filters that rest on something
     learned learn it first, unless --learned gives it.
     """
-    from safe_envs.registry import load_problem
+    from safe_envs.registry import make_problem
 
     if filter_name is not None and compare is not None:
         raise ConfigurationError(
@@ -104,7 +105,7 @@ def render(
         out=out,
         inputs=text_options.inputs_of(env.system, policy, names or (), learned or ()),
     )
-    problem = load_problem(env.full_id, env.arguments)
+    problem = make_problem(env.full_id, **env.arguments)
     with progress_bar("Drawing") as tell:
         runs = make_runs(
             problem,
@@ -123,13 +124,13 @@ def render(
         count = write_film(out, frames_of(runs, every, problem.steps, tell), every * problem.dt)
     console = stdout()
     for each in runs:
-        console.print(each.summary(), highlight=False)
+        say(console, each.summary())
     size = (
         "a still"
         if out.suffix.lower() == ".png"
         else f"{count} frames, {count * every * problem.dt:.2f} s"
     )
-    console.print(f"{out}: {size}", highlight=False)
+    say(console, f"{out}: {size}")
     write_result(
         json_file,
         lambda: {"film": str(out), "frames": count, "episodes": [each.document() for each in runs]},
@@ -144,10 +145,9 @@ def split_filters(text: str) -> list[str]:
         ConfigurationError: one has no text.
     """
     from safe_envs.agents.evaluation.evaluate import BARE
-    from safe_envs.wrappers import CONDITIONS, LEARNED
+    from safe_envs.wrappers import head_pattern
 
-    names = "|".join(sorted((BARE, *CONDITIONS, *LEARNED), key=len, reverse=True))
-    found = [part.strip() for part in re.split(rf",(?=\s*(?:{names})\s*(?:[:+,]|$))", text)]
+    found = [part.strip() for part in re.split(rf",(?=\s*{head_pattern(BARE)})", text)]
     if not all(found):
         raise ConfigurationError(
             f"--compare {shown(text)} names no filter at one place; give names with commas between:"
@@ -256,21 +256,19 @@ def make_runs(
     from safe_envs.agents.evaluation.identification import Learning
     from safe_envs.agents.policies.registry import make_policy
     from safe_envs.errors import nearest, require_whole
-    from safe_envs.wrappers import CONDITIONS, LEARNED, require_readable
+    from safe_envs.wrappers import require_known, require_readable
 
     require_whole("seed", seed, 0)
     if knowledge not in ("model", "plant"):
         raise ConfigurationError(
             f"knowledge = {shown(knowledge)}; {nearest(knowledge, ('model', 'plant'))}"
         )
-    known = (BARE, *CONDITIONS, *LEARNED)
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.
-        for word in re.split("[:+]", name)[0].split(","):
-            if word.strip() not in known:
-                raise ConfigurationError(
-                    f"unknown filter {shown(word.strip())}; {nearest(word.strip(), known)}"
-                )
+        words = [word.strip() for word in re.split("[:+]", name)[0].split(",")]
+        for word in words if len(words) > 1 else [name]:
+            if word != BARE:
+                require_known(word, BARE)
         if name != BARE:
             require_readable(name, problem)
     actors = [make_policy(policy, problem, trust) for _ in names]
@@ -321,6 +319,4 @@ def _beside(runs: Sequence[Run]) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("render")
+    run_alone("render", render)

@@ -12,10 +12,12 @@ import typer
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
     progress_bar,
     require_result,
+    say,
     stdout,
     write_result,
 )
@@ -91,23 +93,13 @@ def sweep(
     failures = _compute(store, place, out)
     done = len(found.cells) - len(store.missing)
     kept = f", of which {before} were there before" if before else ""
-    stdout().print(
-        f"{done} of {len(found.cells)} cells are in {out}{kept}.",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
+    say(stdout(), f"{done} of {len(found.cells)} cells are in {out}{kept}.")
     if store.hidden:
         hidden = (
             f"{store.hidden} cells of another grid or version are in {out} too, where no report"
             " reads them now"
         )
-        stdout().print(
-            f"Note: {hidden}; give each sweep a folder of its own.",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
+        say(stdout(), f"Note: {hidden}; give each sweep a folder of its own.")
     counts = {"cells": len(found.cells), "done": done, "before": before}
     write_result(json, lambda: _document(found, failures, counts))
     if failures:
@@ -176,6 +168,4 @@ def _told(found: Sweep, failures: Sequence[Outcome]) -> str:
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("sweep")
+    run_alone("sweep", sweep)

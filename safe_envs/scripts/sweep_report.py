@@ -10,8 +10,10 @@ import typer
 
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.scripts.options import text_options
-from safe_envs.scripts.options.console import Json, stdout, write_result
-from safe_envs.scripts.reports.rates import percent, percent_in
+from safe_envs.scripts.options.app import run_alone
+from safe_envs.scripts.options.console import Json, say, stdout, write_result
+from safe_envs.scripts.reports.rates import percent, rate_of
+from safe_envs.scripts.reports.tables import make_table
 
 _PICTURE = "report.png"
 _SHOWN = 10
@@ -90,7 +92,7 @@ def sweep_report(
         )
     else:
         told = "There is no picture, since no cell is done."
-    stdout().print(f"\n{told}", highlight=False, markup=False, soft_wrap=True)
+    say(stdout(), f"\n{told}")
     write_result(json, lambda: _document(index, rows, worst))
 
 
@@ -101,8 +103,6 @@ def _worst(rows: list[Row], count: int) -> list[Row]:
 
 
 def _print(index: dict[str, Any], rows: list[Row], worst: int) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
     from rich.text import Text
 
     from safe_envs.agents.evaluation.evaluate import BARE
@@ -114,18 +114,10 @@ def _print(index: dict[str, Any], rows: list[Row], worst: int) -> None:
         f"{len(rows) - len(failed)} of {len(index['cells'])} cells are done, {len(failed)} failed,"
         f" {missing} are missing."
     )
-    console.print(counts, highlight=False, markup=False)
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in (
-        *names,
-        "safe [95 % interval]",
-        "min h 5 %",
-        "violations",
-        "intervened",
-        "infeasible",
-        "return",
-    ):
-        table.add_column(title, no_wrap=True, justify="left" if title in names else "right")
+    say(console, counts)
+    kinds = "l" * len(names) + "r"
+    titles = ("min h 5 %", "violations", "intervened", "infeasible", "return")
+    table = make_table(kinds, *names, "safe [95 % interval]", *titles, tight=False)
     for row in _worst(rows, worst):
         rates = [
             "-" if row["filter"] == BARE else percent(row[name])
@@ -137,20 +129,15 @@ def _print(index: dict[str, Any], rows: list[Row], worst: int) -> None:
             *rates,
             f"{row['return_mean']:.4g}",
         ]
-        table.add_row(*[Text(_value(row[name])) for name in names], _rate(row), *cells)
+        table.add_row(*[Text(_value(row[name])) for name in names], rate_of(row), *cells)
     if table.row_count:
-        console.print(f"\nThe {table.row_count} worst:", highlight=False)
+        say(console, f"\nThe {table.row_count} worst:")
         console.print(table)
     for i, row in enumerate(failed):
         if i == 0:
-            console.print("\nFailed:", highlight=False)
+            say(console, "\nFailed:")
         told = ", ".join(f"{name} = {_value(row[name])}" for name in names)
-        console.print(
-            f"  {told or 'the only cell'}: {row['error']}",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
+        say(console, f"  {told or 'the only cell'}: {row['error']}")
 
 
 def _document(index: dict[str, Any], rows: list[Row], worst: int) -> dict[str, Any]:
@@ -179,11 +166,5 @@ def _value(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _rate(row: Row) -> str:
-    return percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
-
-
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("sweep-report")
+    run_alone("sweep-report", sweep_report)

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
 
 from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.number_text import real
 from safe_envs.scripts.options import completion, text_options
-from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
+from safe_envs.scripts.options.app import run_alone
+from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
-from safe_envs.scripts.reports.rates import percent_in
+from safe_envs.scripts.reports.rates import rate_of
+from safe_envs.scripts.reports.tables import make_table
 
 
 @with_env
@@ -150,19 +150,14 @@ def train(
             )
             raise
     if finished:
-        stdout().print(
-            f"The training in {out} was finished already: nothing was left to do.",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
+        say(stdout(), f"The training in {out} was finished already: nothing was left to do.")
     rows = json.loads((out / "evaluations.json").read_text())
     _report(training.filter or "none", rows)
     known = [f"--knowledge={knowledge}"] if knowledge != "model" else []
     command = env.evaluate_command(
         "--policy", str(out), "--filter", training.filter or "none", *known
     )
-    stdout().print(f"\nTo evaluate the policy: {command}", highlight=False, markup=False)
+    say(stdout(), f"\nTo evaluate the policy: {command}")
     write_result(
         json_file,
         lambda: {
@@ -212,22 +207,18 @@ def _number(value: Any) -> Any:
 def _report(filter_name: str, rows: list[dict[str, Any]]) -> None:
     """Print how safe and how good the agent was in each evaluation."""
     console = stdout()
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in ("steps", "safe [95 % interval]", "return", "violations in training"):
-        table.add_column(title, justify="right")
+    titles = ("steps", "safe [95 % interval]", "return", "violations in training")
+    table = make_table("r", *titles, tight=False)
     for row in rows:
-        rate = percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
         table.add_row(
             f"{row['timesteps']:,}",
-            rate,
+            rate_of(row),
             f"{row['return_mean']:.4g}",
             f"{row['training']['violations']:.0f}",
         )
-    console.print(f"Evaluations with the filter {filter_name}:", highlight=False, markup=False)
+    say(console, f"Evaluations with the filter {filter_name}:")
     console.print(table)
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("train")
+    run_alone("train", train)

@@ -10,6 +10,7 @@ import typer
 
 from safe_envs.errors import require_whole
 from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
@@ -72,7 +73,7 @@ def verify(
     """
     from safe_envs.agents.evaluation.bound_check import judged, measure, starts_of
     from safe_envs.agents.policies.registry import make_policy
-    from safe_envs.registry import load_problem, title_of
+    from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.verify_report import document, print_report
     from safe_envs.wrappers import parse_conditions
     from safe_envs.wrappers.verification.feasibility import verify as find
@@ -84,7 +85,7 @@ def verify(
     )
     known, arguments = env.full_id, env.arguments
     title = title_of(known, arguments)
-    problem = load_problem(known, arguments)
+    problem = make_problem(known, **arguments)
     actor = make_policy(
         policy, problem, trust
     )  # An unknown one is to show before the search, and without a simulation too.
@@ -108,6 +109,4 @@ def verify(
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("verify")
+    run_alone("verify", verify)

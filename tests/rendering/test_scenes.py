@@ -5,7 +5,8 @@ import pytest
 import sympy as sp
 
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, SafeEnv, SafetyProblem
-from safe_envs.problem.problem import Feature, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.signals import Feature, Variable
 from safe_envs.rendering import style
 from tests.conftest import problem_of
 from tests.rendering.drawn import SCENE, shown, stepped
@@ -22,7 +23,7 @@ def test_the_disk_is_to_scale():
         env.reset(seed=0)
         frame = env.render()
         picture = Picture(env.problem)
-        axes = picture._scene._plane.background(picture._canvas, env.viewer._histories[0].moment)
+        axes = picture._scene._plane.background(picture._canvas, env.viewer._histories[0].snapshot)
         assert axes.scale[0] == pytest.approx(axes.scale[1])
         for angle in (0.3, 2.0, 4.0):
             x, y = axes.place(radius * np.cos(angle), radius * np.sin(angle))

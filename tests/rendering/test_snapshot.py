@@ -19,8 +19,10 @@ def test_a_restored_snapshot_is_what_is_drawn():
     snapshot = envs.snapshot()
     envs.reset(seed=5)
     envs.restore(snapshot)
-    assert all(history.moment.times[-1] == pytest.approx(0.2) for history in envs.viewer._histories)
-    np.testing.assert_array_equal(envs.viewer._histories[1].moment.state, snapshot["state"][1])
+    assert all(
+        history.snapshot.times[-1] == pytest.approx(0.2) for history in envs.viewer._histories
+    )
+    np.testing.assert_array_equal(envs.viewer._histories[1].snapshot.state, snapshot["state"][1])
 
 
 def histories(monkeypatch, kept: int, count: int):
@@ -38,7 +40,7 @@ def histories(monkeypatch, kept: int, count: int):
 
 @pytest.mark.parametrize("count", [9, 10, 11, 23])
 def test_a_long_history_keeps_the_latest_states(monkeypatch, count):
-    moment = histories(monkeypatch, 5, count).moment
+    moment = histories(monkeypatch, 5, count).snapshot
     assert min(count, 5) <= len(moment.times) <= 10
     steps = np.arange(count)[-len(moment.times) :]
     np.testing.assert_allclose(moment.times, 0.1 * steps)
@@ -54,8 +56,8 @@ def test_a_long_history_keeps_the_latest_states(monkeypatch, count):
 def test_a_new_episode_forgets_the_least_barrier(monkeypatch):
     recorded = histories(monkeypatch, 5, 3)
     recorded.restart([0.5], 0.0)
-    assert recorded.moment.least == pytest.approx(0.5)
-    assert recorded.moment.violated is None
+    assert recorded.snapshot.least == pytest.approx(0.5)
+    assert recorded.snapshot.violated is None
 
 
 def test_the_panel_says_the_least_of_the_whole_episode(monkeypatch):
@@ -70,7 +72,7 @@ def test_the_panel_says_the_least_of_the_whole_episode(monkeypatch):
         *_, info = env.step([-1.0])
     texts = written(monkeypatch)
     env.render()
-    assert info["h_min"] < env.viewer._histories[0].moment.h.min()
+    assert info["h_min"] < env.viewer._histories[0].snapshot.h.min()
     assert f"least {style.number(info['h_min'])}" in texts
 
 
@@ -83,13 +85,13 @@ def test_a_decision_is_of_one_step():
     viewer.announce([[1.0]], [True], [False])
     viewer.restart([[0.0]], [0.0], [0])
     viewer.advance([[0.0]], [0.1], [[0.5]])
-    assert history.moment.decision is None
+    assert history.snapshot.decision is None
     viewer.announce([[1.0]], [True], [False])
     viewer.advance([[0.0]], [0.2], [[0.5]])
-    assert history.moment.infeasible
-    assert history.moment.intervening
+    assert history.snapshot.infeasible
+    assert history.snapshot.intervening
     viewer.advance([[0.0]], [0.3], [[0.5]])
-    assert history.moment.decision is None
+    assert history.snapshot.decision is None
 
 
 @pytest.mark.parametrize(
@@ -117,7 +119,7 @@ def test_trails_of_endless_episodes_are_bounded():
     env.reset(seed=0)
     for _ in range(12_000):
         env.step([0.0])
-    moment = env.viewer._histories[0].moment
+    moment = env.viewer._histories[0].snapshot
     assert 5000 <= len(moment.times) <= 10_000
     assert moment.times[-1] == pytest.approx(120.0)
     assert env.render().shape == (540, 960, 3)

@@ -107,7 +107,7 @@ def test_without_a_filter_there_is_no_nominal_action():
     bare = stepped(env, 1).render()
     filtered = SafetyFilterWrapper(gym.make(DUBINS, render_mode="rgb_array"), "szcbf:alphas=9,9")
     assert (stepped(filtered, 1).render()[170:210, PANEL] != bare[170:210, PANEL]).any()
-    moment = env.viewer._histories[0].moment
+    moment = env.viewer._histories[0].snapshot
     assert moment.decision is None
     assert moment.executed is not None
 

@@ -15,6 +15,7 @@ import pytest
 from safe_envs.agents.training import vec_env_speed as sb3_speed
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts import benchmark
+from safe_envs.scripts.reports import benchmark_cases, benchmark_figures
 from safe_envs.wrappers import SafetyFilterWrapper
 
 pytestmark = pytest.mark.slow
@@ -22,8 +23,8 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(benchmark, "_ROUNDS", 1)
-    monkeypatch.setattr(benchmark, "_SECONDS_PER_ROUND", 1e-4)
+    monkeypatch.setattr(benchmark_figures, "_ROUNDS", 1)
+    monkeypatch.setattr(benchmark_figures, "_SECONDS_PER_ROUND", 1e-4)
     monkeypatch.setattr(sb3_speed, "speeds", partial(sb3_speed.speeds, steps=5, rounds=1))
     few = {
         "learned-hocbf": {"states": 200, "epochs": 2},
@@ -32,24 +33,24 @@ def quick(monkeypatch):
     }
     learned = {
         name: (env_id, method, {**few[method], **{k: v for k, v in settings.items() if k == "way"}})
-        for name, (env_id, method, settings) in benchmark._LEARNED.items()
+        for name, (env_id, method, settings) in benchmark_figures._LEARNED.items()
     }
-    monkeypatch.setattr(benchmark, "_LEARNED", learned)
+    monkeypatch.setattr(benchmark_figures, "_LEARNED", learned)
 
 
 @pytest.mark.slow
 def test_figures_are_finite_and_positive_and_ratios_fit(quick):
-    figures = benchmark.measure()
+    figures = benchmark_figures.measure()
     faults = [figures.pop(name) for name in list(figures) if name.startswith("page faults")]
     assert all(fault >= 0 for fault in faults)
     assert all(math.isfinite(value) and value > 0 for value in figures.values())
     for batch in (1, 32, 1024, 10_000):
         assert sum(name.startswith(f"filter call, {batch} state") for name in figures) == 1
     step, vector = "env.step, {}", "vector env, {}"
-    assert figures["filtered / bare env.step"] == pytest.approx(
-        figures[step.format("filtered")] / figures[step.format("bare")]
+    assert figures["filtered / unfiltered env.step"] == pytest.approx(
+        figures[step.format("filtered")] / figures[step.format("unfiltered")]
     )
-    for name in ("bare", "filtered"):
+    for name in ("unfiltered", "filtered"):
         assert figures[f"vector env, {name}, million steps a second"] == pytest.approx(
             1 / figures[vector.format(name)]
         )
@@ -59,7 +60,9 @@ def test_figures_are_finite_and_positive_and_ratios_fit(quick):
 
 
 def test_command_prints_and_writes_the_figures(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(benchmark, "measure", lambda: {"filter call, 1 state": 5.0, "a ratio": 0.5})
+    monkeypatch.setattr(
+        benchmark_figures, "measure", lambda: {"filter call, 1 state": 5.0, "a ratio": 0.5}
+    )
     benchmark.benchmark(tmp_path / "out.json")
     figures = json.loads((tmp_path / "out.json").read_text())
     out = capsys.readouterr().out
@@ -70,7 +73,9 @@ def test_command_prints_and_writes_the_figures(monkeypatch, tmp_path, capsys):
 def test_earlier_figures_stand_beside_with_their_ratio(monkeypatch, tmp_path, capsys):
     earlier = tmp_path / "earlier.json"
     earlier.write_text('{"filter call, 1 state": 4.0, "hand-fused loop": 0.1}')
-    monkeypatch.setattr(benchmark, "measure", lambda: {"filter call, 1 state": 5.0, "new": 0.5})
+    monkeypatch.setattr(
+        benchmark_figures, "measure", lambda: {"filter call, 1 state": 5.0, "new": 0.5}
+    )
     benchmark.benchmark(compare=earlier)
     lines = {
         line.rsplit("  ")[0].strip(): line.split()[-3:]
@@ -90,7 +95,7 @@ def test_what_holds_no_earlier_figures_is_refused(tmp_path, text):
 
 
 def test_the_fused_loop_does_the_work_of_the_filter():
-    step = benchmark._fused_loop().call
+    step = benchmark_cases.fused_loop().call
     cells = dict(zip(step.__code__.co_freevars, step.__closure__, strict=True))
     before = np.stack([cells[name].cell_contents for name in ("x", "y", "theta")], axis=1)
     step()
@@ -111,9 +116,11 @@ def test_page_faults_are_those_of_fresh_memory():
     if resource.getrusage(resource.RUSAGE_SELF).ru_minflt == before:
         pytest.skip("this system does not count page faults")
     kept = np.zeros(1 << 20)
-    (reused,) = benchmark._page_faults(benchmark.Case(lambda: kept.fill(1.0), calls=50)).values()
-    (fresh,) = benchmark._page_faults(
-        benchmark.Case(lambda: mmap.mmap(-1, 1 << 24).write(bytes(1 << 24)), calls=5)
+    (reused,) = benchmark_figures._page_faults(
+        benchmark_cases.Case(lambda: kept.fill(1.0), calls=50)
+    ).values()
+    (fresh,) = benchmark_figures._page_faults(
+        benchmark_cases.Case(lambda: mmap.mmap(-1, 1 << 24).write(bytes(1 << 24)), calls=5)
     ).values()
     assert reused < 1
     # 16 MiB at a time, in pages of at most 2 MiB.
@@ -123,4 +130,4 @@ def test_page_faults_are_those_of_fresh_memory():
 def test_a_system_that_counts_no_page_faults_gives_no_figure(monkeypatch):
     resource = pytest.importorskip("resource")
     monkeypatch.setattr(resource, "getrusage", lambda who: SimpleNamespace(ru_minflt=0))
-    assert benchmark._page_faults(benchmark.Case(lambda: None)) == {}
+    assert benchmark_figures._page_faults(benchmark_cases.Case(lambda: None)) == {}

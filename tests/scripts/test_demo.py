@@ -10,9 +10,10 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.slow
-def test_demo_prints_two_tables_and_leaves_a_policy_and_two_pictures(tmp_path, capsys):
+def test_demo_prints_two_tables_and_leaves_a_policy_and_two_pictures(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(demo, "_STEPS", 2048)
     folder = tmp_path / "new" / "results"
-    demo.demo(folder, episodes=10, steps=2048)
+    demo.demo(folder, episodes=10)
     out = capsys.readouterr().out
     assert sorted(p.name for p in folder.iterdir()) == ["nominal.png", "ppo", "ppo.png"]
     assert {"model.zip", "policy.json", "policy.safetensors"} <= {

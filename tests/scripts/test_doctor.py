@@ -8,7 +8,7 @@ from importlib.metadata import PackageNotFoundError
 import pytest
 
 import safe_envs
-from safe_envs.scripts import doctor
+from safe_envs.scripts.reports import installation
 from safe_envs.wrappers import SafetyFilterWrapper
 from tests.scripts.conftest import strictly
 
@@ -16,8 +16,8 @@ from tests.scripts.conftest import strictly
 @pytest.fixture
 def quick(monkeypatch):
     """Two envs, and no measurement of speed."""
-    monkeypatch.setattr(doctor, "ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0"))
-    monkeypatch.setattr(doctor, "speeds", lambda: {"env": 1000.0})
+    monkeypatch.setattr(installation, "ENV_IDS", ("safe_envs/Scalar-v0", "safe_envs/DubinsDisk-v0"))
+    monkeypatch.setattr(installation, "speeds", lambda: {"env": 1000.0})
 
 
 def test_a_sound_installation_is_sound(safe_envs_command, quick):
@@ -33,7 +33,7 @@ def test_a_sound_installation_is_sound(safe_envs_command, quick):
         check["name"] for check in checks["packages"]
     }
     assert [check["name"] for check in checks["solvers"]] == [
-        program.name for program in doctor.PROGRAMS
+        program.name for program in installation.KNOWN_QPS
     ]
     assert [check["name"] for check in checks["envs"]] == [
         "safe_envs/Scalar-v0",
@@ -44,7 +44,8 @@ def test_a_sound_installation_is_sound(safe_envs_command, quick):
 
 def test_each_solver_is_looked_at():
     kinds = {
-        (len(program.proposed), len(program.b) > 1, program.feasible) for program in doctor.PROGRAMS
+        (len(program.proposed), len(program.b) > 1, program.feasible)
+        for program in installation.KNOWN_QPS
     }
     assert kinds == {
         (1, True, True),
@@ -54,12 +55,12 @@ def test_each_solver_is_looked_at():
             for met in (True, False)
         ),
     }
-    assert all(check.ok for check in doctor.solvers())
+    assert all(check.ok for check in installation.solvers())
 
 
 @pytest.mark.parametrize("change", [{"answer": (0.6, 0.5)}, {"feasible": False}])
 def test_a_wrong_answer_ends_with_status_1(safe_envs_command, quick, monkeypatch, change):
-    monkeypatch.setattr(doctor, "PROGRAMS", (replace(doctor.PROGRAMS[0], **change),))
+    monkeypatch.setattr(installation, "KNOWN_QPS", (replace(installation.KNOWN_QPS[0], **change),))
     status, out, _ = safe_envs_command("doctor", "--json", "found.json")
     assert status == 1
     assert "WRONG" in out
@@ -70,14 +71,14 @@ def test_a_wrong_answer_ends_with_status_1(safe_envs_command, quick, monkeypatch
 
 
 def test_an_env_that_breaks_is_named(quick, monkeypatch):
-    monkeypatch.setattr(doctor, "ENV_IDS", ("safe_envs/Nothing-v0",))
-    (check,) = doctor.envs()
+    monkeypatch.setattr(installation, "ENV_IDS", ("safe_envs/Nothing-v0",))
+    (check,) = installation.envs()
     assert check.ok is False
     assert "ConfigurationError" in check.found
     assert check.advice
 
 
-@pytest.mark.parametrize("bad", [0, doctor._STEPS - 1])
+@pytest.mark.parametrize("bad", [0, installation._STEPS - 1])
 @pytest.mark.parametrize("what", ["action", "reward"])
 def test_one_bad_step_of_an_env_is_found(quick, monkeypatch, bad, what):
     steps = []
@@ -91,13 +92,13 @@ def test_one_bad_step_of_an_env_is_found(quick, monkeypatch, bad, what):
         steps.append(info)
         return observation, reward, terminated, truncated, info
 
-    monkeypatch.setattr(doctor, "ENV_IDS", ("safe_envs/Scalar-v0",))
+    monkeypatch.setattr(installation, "ENV_IDS", ("safe_envs/Scalar-v0",))
     monkeypatch.setattr(SafetyFilterWrapper, "step", stepped)
-    (check,) = doctor.envs()
-    assert len(steps) == doctor._STEPS
+    (check,) = installation.envs()
+    assert len(steps) == installation._STEPS
     assert (check.ok, check.found) == (
         False,
-        "an action outside of the box, or a reward that is not finite",
+        "an action outside of the input bounds, or a reward that is not finite",
     )
 
 
@@ -107,9 +108,9 @@ def test_what_is_missing_says_how_to_install_it(monkeypatch):
             raise PackageNotFoundError(package)
         return "1.0"
 
-    monkeypatch.setattr(doctor, "version", version)
+    monkeypatch.setattr(installation, "version", version)
     monkeypatch.setattr(
-        doctor,
+        installation,
         "requires",
         lambda _: [
             "torch>=2.3",
@@ -118,7 +119,7 @@ def test_what_is_missing_says_how_to_install_it(monkeypatch):
             "ruff; extra == 'dev'",
         ],
     )
-    found = {check.name: check for check in doctor.packages()}
+    found = {check.name: check for check in installation.packages()}
     assert list(found) == ["python", "torch", "numpy", "tensorboard"]
     assert (found["torch"].ok, found["torch"].advice) == (False, 'pip install "torch"')
     assert (found["tensorboard"].ok, found["tensorboard"].advice) == (
@@ -130,7 +131,7 @@ def test_what_is_missing_says_how_to_install_it(monkeypatch):
 
 
 def test_speeds_are_of_single_envs(monkeypatch):
-    monkeypatch.setattr(doctor, "_NUM_ENVS", 8)
-    found = doctor.speeds()
+    monkeypatch.setattr(installation, "_NUM_ENVS", 8)
+    found = installation.speeds()
     assert len(found) == 4
     assert all(steps > 0 for steps in found.values())

@@ -14,9 +14,9 @@ from safe_envs.agents.policies.registry import make_policy
 from safe_envs.errors import ConfigurationError
 from safe_envs.rendering import style
 from safe_envs.scripts.cli import app
-from safe_envs.scripts.doctor import packages
 from safe_envs.scripts.figures.film import steps_a_frame, write_film
 from safe_envs.scripts.render import frames_of, split_filters
+from safe_envs.scripts.reports.installation import packages
 from safe_envs.wrappers import SafetyFilterWrapper
 from tests.conftest import problem_of
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,12 @@ from safe_envs.bounded_reading import read_bytes
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import (
-    CONDITIONS,
-    LEARNED,
     Condition,
     FilterSpec,
     SafetyFilterVectorWrapper,
+    learned_parts,
     parse_conditions,
+    require_known,
     require_readable,
     spec_of,
 )
@@ -169,11 +168,8 @@ def _checked(name: str, problem: SafetyProblem) -> str | None:
             f"filter {shown(name)}: {BARE!r} is the bare env, no condition of a barrier; give it"
             " alone or leave it out"
         )
-    if re.split("[:+]", name)[0] not in (*CONDITIONS, *LEARNED):
-        raise ConfigurationError(
-            f"unknown filter {shown(name)}; {nearest(name, (BARE, *CONDITIONS, *LEARNED))}"
-        )
-    if any(re.split(":", part)[0] in LEARNED for part in name.split("+")):
+    require_known(name, BARE)
+    if learned_parts(name):
         require_readable(name, problem)
         return None
     return spec_of(parse_conditions(name, problem))

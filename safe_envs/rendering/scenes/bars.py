@@ -48,7 +48,7 @@ class BarsScene(Scene):
         self._ranges = [self.range_of(i) for i in range(min(len(self.names), _MOST))]
         self._pitch = min(_HIGHEST, (_BOTTOM - _TOP) / len(self._ranges))
 
-    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+    def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw the bars."""
         more = len(self.names) - len(self._ranges)
         rest = f" (and {more} more)" if more else ""
@@ -62,13 +62,17 @@ class BarsScene(Scene):
         )
         for i, usual in enumerate(self._ranges):
             self._draw_bar(
-                canvas, moment, i, round(_TOP + i * self._pitch), *grown(usual, moment.states[:, i])
+                canvas,
+                snapshot,
+                i,
+                round(_TOP + i * self._pitch),
+                *grown(usual, snapshot.states[:, i]),
             )
 
     def _draw_bar(
-        self, canvas: Canvas, moment: EpisodeSnapshot, i: int, top: int, low: float, high: float
+        self, canvas: Canvas, snapshot: EpisodeSnapshot, i: int, top: int, low: float, high: float
     ) -> None:
-        value = float(moment.state[i])
+        value = float(snapshot.state[i])
 
         def place(at: float) -> float:
             return _LEFT + _WIDTH * (min(max(at, low), high) - low) / (high - low)
@@ -84,15 +88,15 @@ class BarsScene(Scene):
         )
         bar = (_LEFT, top + 20, _WIDTH, 14)
         canvas.fill(bar, UNSAFE)
-        for start, end in self._barriers.intervals(moment.state, i, low, high):
+        for start, end in self._barriers.intervals(snapshot.state, i, low, high):
             canvas.fill((place(start), top + 20, place(end) - place(start), 14), tint(2))
             for edge in (start, end):
                 if low < edge < high:
                     canvas.line((place(edge), top + 18), (place(edge), top + 35), EDGE, 3)
         canvas.frame(bar, GREY)
-        if moment.violated is not None:
-            canvas.cross((place(float(moment.violated[i])), top + 27), 5, VIOLATION)
-        draw_point(canvas, (place(value), top + 27), warning_color(moment))
+        if snapshot.violated is not None:
+            canvas.cross((place(float(snapshot.violated[i])), top + 27), 5, VIOLATION)
+        draw_point(canvas, (place(value), top + 27), warning_color(snapshot))
         if self._pitch >= _WITH_ENDS:
             for end, side in ((low, 0.0), (high, 1.0)):
                 canvas.text(
@@ -105,27 +109,27 @@ class BarsScene(Scene):
         if self._pitch >= _WITH_TRAIL:
             self._draw_trail(
                 canvas,
-                moment,
+                snapshot,
                 i,
                 Axes(
                     (_LEFT, top + 56, _WIDTH, round(self._pitch) - 72),
                     (low, high),
-                    self._times(moment),
+                    self._times(snapshot),
                 ),
             )
 
-    def _times(self, moment: EpisodeSnapshot) -> Range:
-        now = float(moment.times[-1])
+    def _times(self, snapshot: EpisodeSnapshot) -> Range:
+        now = float(snapshot.times[-1])
         return now - self.problem.horizon, now
 
-    def _draw_trail(self, canvas: Canvas, moment: EpisodeSnapshot, i: int, axes: Axes) -> None:
+    def _draw_trail(self, canvas: Canvas, snapshot: EpisodeSnapshot, i: int, axes: Axes) -> None:
         left, top, width, height = axes.box
         canvas.fill(axes.box, PANEL)
         for tick in ticks(*axes.x, most=10):
             canvas.fill((round(axes.place(tick, 0.0)[0]), top, 1, height), LINE)
-        draw_trail(canvas, axes, moment.states[:, i], moment.times, moment.h)
-        if moment.violated is not None:
-            draw_violation(canvas, axes, (float(moment.violated[i]), moment.violated_at))
+        draw_trail(canvas, axes, snapshot.states[:, i], snapshot.times, snapshot.h)
+        if snapshot.violated is not None:
+            draw_violation(canvas, axes, (float(snapshot.violated[i]), snapshot.violated_at))
         canvas.frame((left - 1, top - 1, width + 2, height + 2), LINE)
         canvas.text(
             f"{self.problem.horizon:g} s ago",

@@ -44,7 +44,7 @@ class Scene(ABC):
         self.names = [s.symbol.name for s in problem.states]
 
     @abstractmethod
-    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+    def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw an instant within `style.SCENE`."""
 
     def index(self, name: str) -> int:
@@ -99,9 +99,9 @@ def _around(values: np.ndarray, limits: Range) -> Range:
     return max(float(values[0]) - pad, limits[0]), min(float(values[-1]) + pad, limits[1])
 
 
-def warning_color(moment: EpisodeSnapshot, usual: Color = EXECUTED) -> Color:
+def warning_color(snapshot: EpisodeSnapshot, usual: Color = EXECUTED) -> Color:
     """Of what moves: a warning while the filter intervenes or has no feasible action."""
-    return INFEASIBLE if moment.infeasible else INTERVENING if moment.intervening else usual
+    return INFEASIBLE if snapshot.infeasible else INTERVENING if snapshot.intervening else usual
 
 
 def draw_trail(canvas: Canvas, axes: Axes, x: np.ndarray, y: np.ndarray, h: np.ndarray) -> None:

@@ -10,7 +10,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.canvas import Box, Canvas
 from safe_envs.rendering.safe_set import Barriers, tint
 from safe_envs.rendering.scenes.base import Scene, warning_color
-from safe_envs.rendering.scenes.plane import Plane
+from safe_envs.rendering.scenes.plane import StatePlane
 from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import EDGE, GREY, HATCH, INK, PAPER, SMALL, UNSAFE, mix, number
 
@@ -27,7 +27,7 @@ class PendulumScene(Scene):
         self._angle = self.index("theta")
         self._reach = self.range_of(self._angle)
         self._barriers = Barriers(problem)
-        self._plane = Plane(self, ("theta", "thetadot"), _PLANE)
+        self._plane = StatePlane(self, ("theta", "thetadot"), _PLANE)
         self._length = next(
             (
                 float(value)
@@ -37,15 +37,15 @@ class PendulumScene(Scene):
             None,
         )
 
-    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+    def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw the rod and the plane."""
-        self._draw_rod(canvas, moment)
-        self._plane.draw(canvas, moment)
+        self._draw_rod(canvas, snapshot)
+        self._plane.draw(canvas, snapshot)
 
-    def _draw_rod(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+    def _draw_rod(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         left, top, width, height = _ROD
         pivot, length = (left + width / 2, top + height - 26.0), height - 44.0
-        theta = float(moment.state[self._angle])
+        theta = float(snapshot.state[self._angle])
 
         def at(angle: float, radius: float) -> tuple[float, float]:
             return pivot[0] + radius * math.sin(angle), pivot[1] - radius * math.cos(angle)
@@ -57,7 +57,7 @@ class PendulumScene(Scene):
         canvas.shape(sector(low, high), UNSAFE, HATCH)
         for angle in np.arange(low, high, math.radians(4.0)).tolist():
             canvas.line(at(angle, 0.15 * length), at(angle, length), HATCH)
-        for start, end in self._barriers.intervals(moment.state, self._angle, low, high):
+        for start, end in self._barriers.intervals(snapshot.state, self._angle, low, high):
             canvas.shape(sector(start, end), tint(1), EDGE, 2)
             for angle in (start, end):
                 if low < angle < high:
@@ -75,7 +75,7 @@ class PendulumScene(Scene):
         for x in range(-148, 150, 12):
             canvas.line((pivot[0] + x, base + 9), (pivot[0] + x + 9, base), GREY)
         canvas.fill((pivot[0] - 14, pivot[1], 28, 12), GREY, 3)
-        color = warning_color(moment)
+        color = warning_color(snapshot)
         canvas.line(pivot, at(theta, length), PAPER, 11)
         canvas.line(pivot, at(theta, length), INK, 6)
         canvas.disk(at(theta, length), 12, PAPER)

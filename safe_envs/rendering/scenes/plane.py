@@ -28,7 +28,7 @@ _LONGEST = 4.0
 line."""
 
 
-class Plane:
+class StatePlane:
     """The safe set, the trail and the state in a box of a scene, the other states held at their
     values now.
 
@@ -68,21 +68,22 @@ class Plane:
         )
         self._views: dict[Axes, tuple[SafeSet | None, Canvas]] = {}
 
-    def background(self, canvas: Canvas, moment: EpisodeSnapshot) -> Axes:
+    def background(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> Axes:
         """Draw the safe set and the axes, which grow where the trail leaves them."""
         ranges = [
-            grown(r, _values(moment, i)) for r, i in zip(self._shown, (self.x, self.y), strict=True)
+            grown(r, _values(snapshot, i))
+            for r, i in zip(self._shown, (self.x, self.y), strict=True)
         ]
         axes = Axes.equal(self._box, *ranges) if self._equal else Axes(self._box, *ranges)
         if axes not in self._views:
-            self._views[axes] = self._view(axes, moment)
+            self._views[axes] = self._view(axes, snapshot)
         safe_set, furniture = self._views[axes]
         if safe_set is not None:
-            safe_set.draw(canvas, moment.state)
+            safe_set.draw(canvas, snapshot.state)
         canvas.lay(furniture)
         return axes
 
-    def _view(self, axes: Axes, moment: EpisodeSnapshot) -> tuple[SafeSet | None, Canvas]:
+    def _view(self, axes: Axes, snapshot: EpisodeSnapshot) -> tuple[SafeSet | None, Canvas]:
         safe_set = (
             SafeSet(self._barriers, axes, (self.x, self.y)) if len(self._barriers.chosen) else None
         )
@@ -92,7 +93,7 @@ class Plane:
         if safe_set is None:
             furniture.fill(axes.box, tint(LEVELS - 1))
         elif not self._changes:
-            safe_set.draw(furniture, moment.state)
+            safe_set.draw(furniture, snapshot.state)
         if self._decorate is not None:
             furniture.within(axes.box)
             self._decorate(furniture, axes)
@@ -100,27 +101,27 @@ class Plane:
         axes.furnish(furniture, *self._labels, grid=False)
         return safe_set if self._changes else None, furniture
 
-    def trail(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> tuple[float, float]:
+    def trail(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> tuple[float, float]:
         """Draw the trail and the first violation; returns the pixel of the state."""
-        x, y = _values(moment, self.x), _values(moment, self.y)
-        draw_trail(canvas, axes, x, y, moment.h)
-        if moment.violated is not None:
-            x_then = moment.violated_at if self.x < 0 else moment.violated[self.x]
-            draw_violation(canvas, axes, (x_then, moment.violated[self.y]))
+        x, y = _values(snapshot, self.x), _values(snapshot, self.y)
+        draw_trail(canvas, axes, x, y, snapshot.h)
+        if snapshot.violated is not None:
+            x_then = snapshot.violated_at if self.x < 0 else snapshot.violated[self.x]
+            draw_violation(canvas, axes, (x_then, snapshot.violated[self.y]))
         return axes.place(float(x[-1]), float(y[-1]))
 
-    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+    def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw all of it, with a point for the state."""
-        axes = self.background(canvas, moment)
-        at = self.trail(canvas, axes, moment)
+        axes = self.background(canvas, snapshot)
+        at = self.trail(canvas, axes, snapshot)
         canvas.within(axes.box)
-        draw_point(canvas, at, warning_color(moment))
+        draw_point(canvas, at, warning_color(snapshot))
         canvas.within(None)
 
 
-def _values(moment: EpisodeSnapshot, i: int) -> np.ndarray:
+def _values(snapshot: EpisodeSnapshot, i: int) -> np.ndarray:
     """A state along the episode; the time for -1."""
-    return moment.times if i < 0 else moment.states[:, i]
+    return snapshot.times if i < 0 else snapshot.states[:, i]
 
 
 class PlaneScene(Scene):
@@ -135,8 +136,8 @@ class PlaneScene(Scene):
         alike = self.unit(names[0]) == self.unit(names[1]) and max(wide, tall) <= _LONGEST * min(
             wide, tall
         )
-        self._plane = Plane(self, names, BOX, equal=alike, shown=shown)
+        self._plane = StatePlane(self, names, BOX, equal=alike, shown=shown)
 
-    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+    def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw the plane."""
-        self._plane.draw(canvas, moment)
+        self._plane.draw(canvas, snapshot)

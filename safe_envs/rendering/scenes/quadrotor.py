@@ -11,8 +11,8 @@ from safe_envs.rendering.axes import Axes
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.safe_set import Barriers, barriers_in
 from safe_envs.rendering.scenes.base import Scene, warning_color
-from safe_envs.rendering.scenes.plane import BOX, Plane
-from safe_envs.rendering.scenes.time_series import StripScene, reference_of
+from safe_envs.rendering.scenes.plane import BOX, StatePlane
+from safe_envs.rendering.scenes.time_series import TimeSeriesScene, reference_of
 from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import (
     EDGE,
@@ -47,7 +47,9 @@ def rotation(phi: float, theta: float, psi: float) -> np.ndarray:
     )
 
 
-def draw_craft(canvas: Canvas, at: tuple[float, float], attitude: np.ndarray, color: Color) -> None:
+def draw_quadrotor(
+    canvas: Canvas, at: tuple[float, float], attitude: np.ndarray, color: Color
+) -> None:
     """Draw the symbol of a quadrotor, seen along y from a little above; its size is fixed in
     pixels."""
 
@@ -68,15 +70,17 @@ def draw_craft(canvas: Canvas, at: tuple[float, float], attitude: np.ndarray, co
     canvas.disk(seen(np.zeros((1, 3)))[0], 7, color, INK, 1)
 
 
-class AltitudeScene(StripScene):
+class AltitudeScene(TimeSeriesScene):
     """The altitude z over time, with a level quadrotor at the right."""
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem, "z")
 
-    def draw_marker(self, canvas: Canvas, at: tuple[float, float], moment: EpisodeSnapshot) -> None:
+    def draw_marker(
+        self, canvas: Canvas, at: tuple[float, float], snapshot: EpisodeSnapshot
+    ) -> None:
         """Draw the quadrotor."""
-        draw_craft(canvas, at, np.eye(3), warning_color(moment))
+        draw_quadrotor(canvas, at, np.eye(3), warning_color(snapshot))
 
 
 class SideView(Scene):
@@ -92,7 +96,7 @@ class SideView(Scene):
         place = [self.index(name) for name in ("x", "y", "z")]
         self._angles = [self.index(name) for name in ("phi", "theta", "psi")]
         shown = self.range_of(place[0]), self.range_of(place[2])
-        self._plane = Plane(
+        self._plane = StatePlane(
             self, ("x", "z"), BOX, chosen=barriers_in(problem, place), equal=True, shown=shown
         )
         self._references = [reference_of(problem, name) for name in ("x", "z")]
@@ -104,20 +108,20 @@ class SideView(Scene):
                 np.zeros(len(self.names)), self._angles[1], *reach
             )
 
-    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+    def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw the quadrotor and what it is to follow."""
-        axes = self._plane.background(canvas, moment)
+        axes = self._plane.background(canvas, snapshot)
         canvas.within(axes.box)
-        self._draw_reference(canvas, axes, moment)
-        at = self._plane.trail(canvas, axes, moment)
+        self._draw_reference(canvas, axes, snapshot)
+        at = self._plane.trail(canvas, axes, snapshot)
         canvas.within(axes.box)
-        attitude = rotation(*(float(moment.state[i]) for i in self._angles))
-        draw_craft(canvas, at, attitude, warning_color(moment))
+        attitude = rotation(*(float(snapshot.state[i]) for i in self._angles))
+        draw_quadrotor(canvas, at, attitude, warning_color(snapshot))
         self._draw_dial(canvas, attitude)
         canvas.within(None)
 
-    def _draw_reference(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> None:
-        now = moment.times[-1:]
+    def _draw_reference(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
+        now = snapshot.times[-1:]
         x, z = (
             None if reference is None else float(reference(now)[0])
             for reference in self._references

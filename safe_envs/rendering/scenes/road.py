@@ -48,7 +48,7 @@ class Road(Scene):
     """The plane of the problem names the own speed and the gap.
 
     Distances on the road are to scale, from bumper to bumper; the cars are symbols of a fixed size.
-    What is required is the gap at which the smallest barrier vanishes at the speeds of that moment.
+    What is required is the gap at which the smallest barrier vanishes at the speeds of that snapshot.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -87,16 +87,16 @@ class Road(Scene):
             low, high = np.where(safe, low, middle), np.where(safe, middle, high)
         return 0.5 * (low + high)
 
-    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+    def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw the road and the chart."""
-        kept = thinned(len(moment.times), _MOST)
-        required = self.required(moment.states[kept])
-        self._draw_road(canvas, moment, float(required[-1]))
-        self._draw_chart(canvas, moment, kept, required)
+        kept = thinned(len(snapshot.times), _MOST)
+        required = self.required(snapshot.states[kept])
+        self._draw_road(canvas, snapshot, float(required[-1]))
+        self._draw_chart(canvas, snapshot, kept, required)
 
-    def _draw_road(self, canvas: Canvas, moment: EpisodeSnapshot, required: float) -> None:
+    def _draw_road(self, canvas: Canvas, snapshot: EpisodeSnapshot, required: float) -> None:
         _, top, _, height = _ROAD
-        gap = float(moment.state[self._gap])
+        gap = float(snapshot.state[self._gap])
         axes = Axes(_ROAD, (0.0, _reach(max(gap, required))), (0.0, 1.0))
         canvas.text("Road, to scale", (76, 18), INK, SMALL, bold=True)
         canvas.fill((10, top, 580, height), (228, 230, 234))
@@ -114,7 +114,7 @@ class Road(Scene):
         for y in (top + 4, top + height - 5):
             canvas.line((10, y), (590, y), PAPER, 3)
         canvas.line((edge, top - 4), (edge, top + height + 4), EDGE, 3)
-        _draw_car(canvas, (own - _CAR[0] / 2, top + height / 2), warning_color(moment))
+        _draw_car(canvas, (own - _CAR[0] / 2, top + height / 2), warning_color(snapshot))
         _draw_car(canvas, (lead + _CAR[0] / 2, top + height / 2), GREY)
         self._draw_dimension(
             canvas,
@@ -128,7 +128,7 @@ class Road(Scene):
         self._draw_dimension(
             canvas, own, edge, top + height + 14, f"required {number(required)} m", EDGE, False
         )
-        self._draw_speeds(canvas, moment, own, lead)
+        self._draw_speeds(canvas, snapshot, own, lead)
 
     def _draw_dimension(
         self,
@@ -149,19 +149,19 @@ class Road(Scene):
         )
 
     def _draw_speeds(
-        self, canvas: Canvas, moment: EpisodeSnapshot, own: float, lead: float
+        self, canvas: Canvas, snapshot: EpisodeSnapshot, own: float, lead: float
     ) -> None:
         y = _ROAD[1] + _ROAD[3] + 34
-        speed = float(moment.state[self._speed])
+        speed = float(snapshot.state[self._speed])
         canvas.text(f"own {number(speed)} m/s", (14, y), INK, SMALL)
         if self._lead is not None:
-            other = float(moment.state[self._lead]) if isinstance(self._lead, int) else self._lead
+            other = float(snapshot.state[self._lead]) if isinstance(self._lead, int) else self._lead
             canvas.text(f"lead {number(other)} m/s", (586, y), INK, SMALL, align=(1.0, 0.0))
 
     def _draw_chart(
-        self, canvas: Canvas, moment: EpisodeSnapshot, kept: np.ndarray, required: np.ndarray
+        self, canvas: Canvas, snapshot: EpisodeSnapshot, kept: np.ndarray, required: np.ndarray
     ) -> None:
-        times, gaps = moment.times[kept], moment.states[kept, self._gap]
+        times, gaps = snapshot.times[kept], snapshot.states[kept, self._gap]
         end = max(self.problem.horizon, float(times[-1]))
         axes = Axes(
             _CHART,
@@ -189,11 +189,13 @@ class Road(Scene):
             align=(1.0, 1.0),
         )
         canvas.within(None)
-        draw_trail(canvas, axes, moment.times, moment.states[:, self._gap], moment.h)
-        if moment.violated is not None:
-            draw_violation(canvas, axes, (moment.violated_at, float(moment.violated[self._gap])))
+        draw_trail(canvas, axes, snapshot.times, snapshot.states[:, self._gap], snapshot.h)
+        if snapshot.violated is not None:
+            draw_violation(
+                canvas, axes, (snapshot.violated_at, float(snapshot.violated[self._gap]))
+            )
         canvas.within(_CHART)
-        draw_point(canvas, axes.place(float(times[-1]), float(gaps[-1])), warning_color(moment))
+        draw_point(canvas, axes.place(float(times[-1]), float(gaps[-1])), warning_color(snapshot))
         canvas.within(None)
 
 

@@ -7,12 +7,13 @@ from collections.abc import Callable
 import numpy as np
 
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.problem.problem import TIME, SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import TIME
 from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Box, Canvas
 from safe_envs.rendering.safe_set import Barriers, SafeSet
 from safe_envs.rendering.scenes.base import Scene, draw_point, warning_color
-from safe_envs.rendering.scenes.plane import Plane
+from safe_envs.rendering.scenes.plane import StatePlane
 from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import GOAL, GREY, INK, SMALL, mix
 
@@ -30,7 +31,7 @@ def reference_of(problem: SafetyProblem, name: str) -> Callable[[np.ndarray], np
     return None
 
 
-class StripScene(Scene):
+class TimeSeriesScene(Scene):
     """A state over time to the left, and at the right where it is now on its line, at the same
     height.
 
@@ -43,7 +44,7 @@ class StripScene(Scene):
         super().__init__(problem)
         self._state = self.index(name)
         self._reference = reference_of(problem, name)
-        self._chart = Plane(
+        self._chart = StatePlane(
             self,
             ("", name),
             _CHART,
@@ -53,28 +54,30 @@ class StripScene(Scene):
         self._barriers = Barriers(problem)
         self._lines: dict[Range, Canvas] = {}
 
-    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+    def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw both."""
-        axes = self._chart.background(canvas, moment)
+        axes = self._chart.background(canvas, snapshot)
         line = Axes(_LINE, (0.0, 1.0), axes.y)
-        canvas.lay(self._line(line, moment))
+        canvas.lay(self._line(line, snapshot))
         if self._reference is not None:
             canvas.within(_LINE)
-            wanted = line.place(0.5, float(self._reference(moment.times[-1:])[0]))[1]
+            wanted = line.place(0.5, float(self._reference(snapshot.times[-1:])[0]))[1]
             canvas.dashes(np.array([(_LINE[0], wanted), (_LINE[0] + _LINE[2], wanted)]), GOAL, 2)
-        at = self._chart.trail(canvas, axes, moment)
+        at = self._chart.trail(canvas, axes, snapshot)
         middle = (_LINE[0] + _LINE[2] / 2, at[1])
         canvas.within((0, 0, 600, 540))
         canvas.dashes(np.array([at, middle]), GREY, 1, 8.0)
         canvas.within(axes.box)
-        draw_point(canvas, at, warning_color(moment))
+        draw_point(canvas, at, warning_color(snapshot))
         canvas.within(_LINE)
-        self.draw_marker(canvas, middle, moment)
+        self.draw_marker(canvas, middle, snapshot)
         canvas.within(None)
 
-    def draw_marker(self, canvas: Canvas, at: tuple[float, float], moment: EpisodeSnapshot) -> None:
+    def draw_marker(
+        self, canvas: Canvas, at: tuple[float, float], snapshot: EpisodeSnapshot
+    ) -> None:
         """Draw what moves on the line."""
-        draw_point(canvas, at, warning_color(moment))
+        draw_point(canvas, at, warning_color(snapshot))
 
     def _draw_reference(self, canvas: Canvas, axes: Axes) -> None:
         if self._reference is not None:
@@ -86,14 +89,14 @@ class StripScene(Scene):
                 "reference", (top[0], top[1] - 4), mix(GOAL, INK, 0.6), SMALL, align=(0.5, 1.0)
             )
 
-    def _line(self, axes: Axes, moment: EpisodeSnapshot) -> Canvas:
+    def _line(self, axes: Axes, snapshot: EpisodeSnapshot) -> Canvas:
         """The line with the safe set on it, drawn once, unless a barrier depends on other states."""
         state = self.problem.plant.states[self._state]
         fixed = all(b.expression.free_symbols <= {state} for b in self.problem.barriers)
         if fixed and axes.y in self._lines:
             return self._lines[axes.y]
         drawn = self._lines[axes.y] = Canvas((600, 540), clear=True)
-        SafeSet(self._barriers, axes, (-1, self._state)).draw(drawn, moment.state)
+        SafeSet(self._barriers, axes, (-1, self._state)).draw(drawn, snapshot.state)
         left, top, width, height = axes.box
         middle = left + width / 2
         drawn.line((middle, top), (middle, top + height), mix(INK, (255, 255, 255), 0.4), 1)
@@ -102,7 +105,7 @@ class StripScene(Scene):
         return drawn
 
 
-class LineScene(StripScene):
+class LineScene(TimeSeriesScene):
     """The first state of a problem, on a line."""
 
     def __init__(self, problem: SafetyProblem) -> None:

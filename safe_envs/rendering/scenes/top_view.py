@@ -16,7 +16,7 @@ from safe_envs.rendering.axes import Axes
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.safe_set import LEVELS, STEP, tint
 from safe_envs.rendering.scenes.base import Scene, warning_color
-from safe_envs.rendering.scenes.plane import BOX, Plane
+from safe_envs.rendering.scenes.plane import BOX, StatePlane
 from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import GOAL, GREY, INK, PAPER, SMALL, VIOLATION, mix
 
@@ -93,31 +93,35 @@ class TopView(Scene):
         ]
         self._goal = None if problem.goal is None else circle_of(problem, problem.goal, x, y)
         self._rings = len(self._obstacles) == len(circles)
-        self._plane = Plane(self, ("x", "y"), BOX, chosen=[] if self._rings else None, equal=True)
+        self._plane = StatePlane(
+            self, ("x", "y"), BOX, chosen=[] if self._rings else None, equal=True
+        )
 
-    def draw(self, canvas: Canvas, moment: EpisodeSnapshot) -> None:
+    def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw the vehicle and what is around it."""
-        axes = self._plane.background(canvas, moment)
+        axes = self._plane.background(canvas, snapshot)
         canvas.within(axes.box)
-        self._draw_obstacles(canvas, axes, moment)
-        self._draw_hit(canvas, axes, moment)
+        self._draw_obstacles(canvas, axes, snapshot)
+        self._draw_hit(canvas, axes, snapshot)
         if self._goal is not None:
-            self._draw_goal(canvas, axes, moment, self._goal)
-        at = self._plane.trail(canvas, axes, moment)
+            self._draw_goal(canvas, axes, snapshot, self._goal)
+        at = self._plane.trail(canvas, axes, snapshot)
         canvas.within(axes.box)
-        draw_vehicle(canvas, at, float(moment.state[self._heading]), moment)
+        draw_vehicle(canvas, at, float(snapshot.state[self._heading]), snapshot)
         canvas.within(None)
 
-    def _draw_goal(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot, goal: Circle) -> None:
-        at = axes.place(*goal.middles(moment.states[-1:])[0])
+    def _draw_goal(
+        self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot, goal: Circle
+    ) -> None:
+        at = axes.place(*goal.middles(snapshot.states[-1:])[0])
         radius = goal.radius * axes.scale[0]
         canvas.disk(at, radius, mix(GOAL, PAPER, 0.35), GOAL, 2)
         canvas.disk(at, 2, INK)
         canvas.text("goal", (at[0], at[1] - radius - 3), INK, SMALL, align=(0.5, 1.0))
 
-    def _draw_obstacles(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> None:
+    def _draw_obstacles(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
         ways = [
-            axes.places(*obstacle.middles(moment.states[-60:]).T) for obstacle in self._obstacles
+            axes.places(*obstacle.middles(snapshot.states[-60:]).T) for obstacle in self._obstacles
         ]
         sizes = [obstacle.radius * axes.scale[0] for obstacle in self._obstacles]
         if self._rings:
@@ -140,14 +144,14 @@ class TopView(Scene):
                     align=(0.5, 1.0),
                 )
 
-    def _draw_hit(self, canvas: Canvas, axes: Axes, moment: EpisodeSnapshot) -> None:
+    def _draw_hit(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
         """Outline the obstacles that the vehicle was in at the first violation, where they were
         then; they may be elsewhere now."""
-        if moment.violated is None:
+        if snapshot.violated is None:
             return
-        vehicle = moment.violated[[self.index("x"), self.index("y")]]
+        vehicle = snapshot.violated[[self.index("x"), self.index("y")]]
         for obstacle in self._obstacles:
-            then, now = obstacle.middles(np.stack([moment.violated, moment.state]))
+            then, now = obstacle.middles(np.stack([snapshot.violated, snapshot.state]))
             if (
                 math.dist(then, vehicle) > obstacle.radius
                 or math.dist(then, now) * axes.scale[0] < _MOVED
@@ -163,7 +167,7 @@ class TopView(Scene):
             up = vehicle[1] < then[1]
             edge = at[1] - size - 2 if up else at[1] + size + 2
             canvas.text(
-                f"at {moment.violated_at:.2f} s",
+                f"at {snapshot.violated_at:.2f} s",
                 (at[0], edge),
                 mix(color, INK, 0.6),
                 SMALL,
@@ -172,14 +176,14 @@ class TopView(Scene):
 
 
 def draw_vehicle(
-    canvas: Canvas, at: tuple[float, float], heading: float, moment: EpisodeSnapshot
+    canvas: Canvas, at: tuple[float, float], heading: float, snapshot: EpisodeSnapshot
 ) -> None:
     """Draw a triangle that points along a heading, and a line ahead of it."""
     ahead = math.cos(heading), -math.sin(heading)
     aside = -ahead[1], ahead[0]
     canvas.line(at, (at[0] + 2.2 * _LENGTH * ahead[0], at[1] + 2.2 * _LENGTH * ahead[1]), INK)
     outline = [(1.0, 0.0), (-0.6, 0.6), (-0.3, 0.0), (-0.6, -0.6)]
-    for size, fill, edge in ((_LENGTH + 3, PAPER, PAPER), (_LENGTH, warning_color(moment), INK)):
+    for size, fill, edge in ((_LENGTH + 3, PAPER, PAPER), (_LENGTH, warning_color(snapshot), INK)):
         corners = [
             (
                 at[0] + size * (a * ahead[0] + b * aside[0]),

@@ -16,7 +16,6 @@ from safe_envs.agents.evaluation.evaluate import BARE, Evaluation
 from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.scripts.reports.rates import percent
@@ -39,21 +38,6 @@ STYLE: Any = {
     "figure.constrained_layout.use": True,
     "svg.fonttype": "none",
 }
-
-
-def require_format(path: Path) -> None:
-    """Check that the suffix of a path names a format that can be written.
-
-    Raises:
-        ConfigurationError: it does not.
-    """
-    # pgf is left out: it needs a TeX installation.
-    formats = sorted(set(Figure().canvas.get_supported_filetypes()) - {"pgf"})
-    suffix = path.suffix.removeprefix(".").lower()
-    if suffix not in formats:
-        raise ConfigurationError(
-            f"--plot {path}: unknown format {shown(suffix)}; {nearest(suffix, formats)}"
-        )
 
 
 def draw(evaluation: Evaluation, path: Path) -> None:

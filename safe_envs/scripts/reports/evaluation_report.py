@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from rich import box
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
@@ -13,8 +11,10 @@ from safe_envs.agents.evaluation.evaluate import BARE, Evaluation
 from safe_envs.agents.evaluation.refinement import TOLERANCE, Refinement
 from safe_envs.agents.evaluation.rollout import Row
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
-from safe_envs.scripts.reports.rates import percent, percent_in
+from safe_envs.scripts.reports.rates import percent, percent_in, rate_of
+from safe_envs.scripts.reports.tables import make_table, print_whole
 
 _COLUMNS = (
     "min h\nmedian",
@@ -26,7 +26,6 @@ _COLUMNS = (
     "return",
     "steps/s",
 )
-_WIDEST = 1000
 ESTIMATED = (
     "a bound is estimated: a theorem, with a supremum and a shortfall from a search of the safe"
     " set, and as far as these episodes do not contradict it. It counts leaving the workspace as an"
@@ -45,53 +44,54 @@ _VERDICTS = {
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     """Print a heading, a row for each filter, comparisons, and what has to be known to read them."""
     interval = _interval(evaluation)
-    console.print(heading(evaluation), soft_wrap=True, highlight=False)
+    say(console, heading(evaluation))
     learned = learned_columns(evaluation.rows)
-    table = _table(f"safe [{interval}]", *learned, "estimated\nbound", *_COLUMNS)
+    titles = ("filter", f"safe [{interval}]", *learned, "estimated\nbound", *_COLUMNS)
+    table = make_table("pr", *titles)
     for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True):
         name, rate, *rest = _cells(row, speed["steps_per_second"])
         table.add_row(Text(name), rate, *[cell(row, speed) for cell in learned.values()], *rest)
-    _print_table(console, table)
+    print_whole(console, table)
     compared = (
         []
         if evaluation.repeats
         else [c for c in evaluation.comparisons if BARE not in (c["first"], c["second"])]
     )
     if compared:
-        _say(console, f"Difference of the safety rates on the same episodes [{interval}]:")
+        say(console, f"Difference of the safety rates on the same episodes [{interval}]:")
     for comparison in compared:
-        _say(console, f"  {_describe(comparison)}")
+        say(console, f"  {_describe(comparison)}")
     notes = _notes(evaluation)
     if compared and notes:
         console.print()
     for note in notes:
-        _say(console, f"Note: {note}")
+        say(console, f"Note: {note}")
 
 
 def print_refinement(console: Console, refinement: Refinement) -> None:
     """Print the safety rates with each control period, and whether they have converged."""
     interval = _interval(refinement.evaluations[0])
-    _say(
+    say(
         console,
         f"\nRefinement: safe [{interval}] with smaller control periods, from the same seeds but"
         " with noise that is not coupled",
     )
-    table = _table(*[f"dt = {dt:g} s" for dt in refinement.periods])
+    table = make_table("pr", "filter", *[f"dt = {dt:g} s" for dt in refinement.periods])
     for row in refinement.rows:
         rates = zip(row["safety_rate"], row["ci_low"], row["ci_high"], strict=True)
         table.add_row(Text(row["filter"]), *[percent_in(*rate) for rate in rates])
-    _print_table(console, table)
+    print_whole(console, table)
     if refinement.evaluations[0].repeats:
-        _say(console, "Nothing is random here: what changes with the period, changes for sure.")
+        say(console, "Nothing is random here: what changes with the period, changes for sure.")
         return
     for row in refinement.rows:
         change = _points(row["change"], row["change_low"], row["change_high"])
-        _say(
+        say(
             console,
             f"  {row['filter']}: {_VERDICTS[row['verdict']].format(change, row['withheld'])}",
         )
     reach = f"{100 * TOLERANCE:g} points"
-    _say(
+    say(
         console,
         f"Converged: the {interval} of the change from dt/2 to dt/4 reaches no further than {reach}"
         " either way.",
@@ -157,32 +157,6 @@ def describe_plant(problem: SafetyProblem) -> str:
 
 def _interval(evaluation: Evaluation) -> str:
     return f"{100 * evaluation.config['confidence']:.10g} % interval"
-
-
-def _table(*columns: str) -> Table:
-    """A table with a column of filters before those named."""
-    table = Table(
-        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True
-    )
-    table.add_column("filter", overflow="fold", vertical="bottom")
-    for name in columns:
-        table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
-    return table
-
-
-def _print_table(console: Console, table: Table) -> None:
-    # A column that is cut off would be a number that is wrong.
-    console.width = max(
-        console.width,
-        console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum,
-    )
-    console.print()
-    console.print(table)
-    console.print()
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 def _describe(comparison: Comparison) -> str:
@@ -267,7 +241,7 @@ def _cells(row: Row, speed: float) -> list[str]:
     filtered = row["filter"] != BARE
     return [
         row["filter"],
-        percent_in(row["safety_rate"], row["ci_low"], row["ci_high"]),
+        rate_of(row),
         _bound(row),
         f"{row['min_h_median']:.3g}",
         f"{row['min_h_p05']:.3g}",

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -15,8 +14,9 @@ from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
 from safe_envs.agents.evaluation.rollout import Row
 from safe_envs.agents.rare_events.estimate import RareEvaluation, estimate_rare
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.options.console import progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import progress_bar, say, stdout, write_result
 from safe_envs.scripts.reports.evaluation_report import describe_system, early_end, unsafe_starts
+from safe_envs.scripts.reports.tables import make_table, print_whole
 
 _COLUMNS = (
     "method",
@@ -26,7 +26,6 @@ _COLUMNS = (
     "violations in\nplain episodes",
     "steps/s",
 )
-_WIDEST = 1000
 
 
 def run_rare(
@@ -61,24 +60,11 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
     """Print a heading, a row for each filter, and what has to be known to read them."""
     config = answer.config
     interval = f"{100 * config['confidence']:.10g} % interval"
-    console.print(_heading(answer), soft_wrap=True, highlight=False)
-    table = Table(
-        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True
-    )
-    table.add_column("filter", overflow="fold", vertical="bottom")
-    table.add_column(f"P(violation) [{interval}]", justify="right", no_wrap=True, vertical="bottom")
-    for name in _COLUMNS:
-        table.add_column(name, justify="right", no_wrap=True, vertical="bottom")
+    say(console, _heading(answer))
+    table = make_table("pr", "filter", f"P(violation) [{interval}]", *_COLUMNS)
     for row, speed in zip(answer.rows, answer.timing["rows"], strict=True):
         table.add_row(Text(row["filter"]), *_cells(row, speed["steps_per_second"]))
-    # A column that is cut off would be a number that is wrong.
-    console.width = max(
-        console.width,
-        console.measure(table, options=console.options.update(max_width=_WIDEST)).maximum,
-    )
-    console.print()
-    console.print(table)
-    console.print()
+    print_whole(console, table)
     reasons = Table.grid()
     for reason in dict.fromkeys(row["reason"] for row in answer.rows if row["reason"]):
         names = ", ".join(row["filter"] for row in answer.rows if row["reason"] == reason)
@@ -86,7 +72,7 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
     if reasons.row_count:
         console.print(reasons)
     for note in _notes(answer):
-        console.print(note, soft_wrap=True, highlight=False, markup=False)
+        say(console, note)
 
 
 def _heading(answer: RareEvaluation) -> Text:

@@ -17,13 +17,16 @@ import typer
 
 from safe_envs.errors import ConfigurationError, WorkersLostError, nearest
 from safe_envs.scripts.options import completion, text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
     Json,
     progress_bar,
     require_result,
+    say,
     stdout,
     write_result,
 )
+from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:
     from safe_envs.scripts.reproduce.framework.artefact import Artefact, Sample
@@ -233,23 +236,16 @@ def _document(found: Sequence[tuple[Artefact, Any, float]], sample: Sample) -> d
 
 
 def _report(found: Sequence[tuple[Artefact, Any, float]], sample: Sample, out: Path) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
     from safe_envs.scripts.reproduce.framework.verdict import judge
 
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in ("artefact", "verdict", "because"):
-        table.add_column(title, no_wrap=title != "because")
+    table = make_table("llp", "artefact", "verdict", "because", tight=False)
     for artefact, outcome, _ in found:
         judgement = judge(artefact, outcome, sample)
         table.add_row(artefact.name, judgement.text, "; ".join(judgement.reasons))
     console = stdout()
     console.print(table)
-    console.print(f"\nThe page: {out / 'index.html'}", highlight=False, markup=False)
+    say(console, f"\nThe page: {out / 'index.html'}")
 
 
 if __name__ == "__main__":
-    from safe_envs.scripts.cli import main
-
-    main("reproduce")
+    run_alone("reproduce", reproduce)

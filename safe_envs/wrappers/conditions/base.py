@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import sympy as sp
 
@@ -24,12 +24,21 @@ from safe_envs.dynamics.lie import (
     tidied,
 )
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, RelativeDegreeError, SystemDefinitionError, shown
+from safe_envs.errors import (
+    ConfigurationError,
+    RelativeDegreeError,
+    SafeEnvsError,
+    SystemDefinitionError,
+    shortened,
+    shown,
+)
 from safe_envs.problem.barrier import Barrier
 from safe_envs.wrappers.conditions.class_k import ClassK, Rate, applied
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
+    from safe_envs.wrappers.learning.base import LearnedModel
+    from safe_envs.wrappers.learning.posterior import Posterior
 
 FIRST_ORDER = "first-order"
 
@@ -94,6 +103,18 @@ class AffineConstraint:
         )
 
 
+class CredibleSet(NamedTuple):
+    """The identified systems for all of which a condition is met.
+
+    Attributes:
+        posterior: their distribution.
+        miss_probability: of the systems that the set leaves out.
+    """
+
+    posterior: Posterior
+    miss_probability: float
+
+
 @dataclass(frozen=True)
 class Condition(ABC):
     """Base of the conditions, which are small frozen dataclasses of their parameters.
@@ -107,10 +128,14 @@ class Condition(ABC):
     number.
 
     Attributes:
-        name: by which `parse_condition` and the command line know it.
+        name: under which messages show it; by default that of the class. Names of
+            `safe_envs.wrappers.conditions.registry` are those of the command line.
         stochastic: whether it takes the noise into account.
+        almost_sure: whether it keeps every path in the safe set under noise, where it can be met.
+            Then it asks for unbounded control wherever noise acts at the edge.
         corrects_model: whether it corrects what the model gets wrong, so that it is of no use to a
             filter that knows the plant.
+        method: by which the models that it needs are learned; None if it needs none.
         sampling_margin: "none", "first-order", or a number >= 0 in the units of the row.
 
     Raises:
@@ -119,9 +144,14 @@ class Condition(ABC):
 
     name: ClassVar[str]
     stochastic: ClassVar[bool] = False
+    almost_sure: ClassVar[bool] = False
     corrects_model: ClassVar[bool] = False
+    method: ClassVar[str | None] = None
 
     sampling_margin: str | float = field(default="none", kw_only=True)
+
+    def __init_subclass__(cls) -> None:
+        cls.name = cls.__dict__.get("name", cls.__name__)
 
     def __post_init__(self) -> None:
         margin = self.sampling_margin
@@ -147,12 +177,25 @@ class Condition(ABC):
     def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint for a model and a barrier, in the model's symbols.
 
+        Args:
+            model: system that the filter knows.
+            barrier: barrier h.
+
         Raises:
-            RelativeDegreeError: the condition does not suit the barrier's relative degree.
-            SystemDefinitionError: a class-K function cannot be differentiated as often as the chain
+            RelativeDegreeError: The condition does not suit the barrier's relative degree.
+            SystemDefinitionError: A class-K function cannot be differentiated as often as the chain
                 needs.
+            ConfigurationError: The code of a condition from outside fails.
         """
-        return _constraint(self, model, barrier)
+        try:
+            return _constraint(self, model, barrier)
+        except SafeEnvsError:
+            raise
+        except Exception as error:
+            raise ConfigurationError(
+                f"{self.name} cannot derive its constraint on {barrier.name}"
+                f" ({type(error).__name__}: {shortened(error)}); correct its class"
+            ) from error
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
         """The system that the condition differentiates along: the model, unless it has learned
@@ -164,9 +207,24 @@ class Condition(ABC):
         """Derive the constraint without a margin for sampling."""
 
     @classmethod
-    @abstractmethod
     def for_gains(cls, gains: Sequence[float]) -> Condition:
-        """The condition with the rates p_1..p_r of a problem for its parameters."""
+        """Return the condition with the rates p_1..p_r of a problem; its defaults if it has none."""
+        return cls()
+
+    @property
+    def learned_models(self) -> tuple[LearnedModel, ...]:
+        """Learned models that the condition needs."""
+        return ()
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the condition needs a learned model."""
+        return bool(self.learned_models)
+
+    @property
+    def credible_set(self) -> CredibleSet | None:
+        """Identified systems for all of which the condition is met at once; None without any."""
+        return None
 
     def chain_rates(self, degree: int) -> tuple[float, ...] | None:
         """alpha_1..alpha_r of the chain b_j = D b_(j-1) + alpha_j b_(j-1); None where it is not of
@@ -175,23 +233,9 @@ class Condition(ABC):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What makes the same condition again, besides the margin."""
-        return {key: value for key, value in vars(self).items() if key != "sampling_margin"}
-
-    @property
-    def spec(self) -> str:
-        """The text from which `parse_condition` makes the same condition."""
-        margin = {} if self.sampling_margin == "none" else {"sampling_margin": self.sampling_margin}
-        return ":".join(
-            [
-                self.name,
-                *(f"{key}={_text(value)}" for key, value in {**self.parameters, **margin}.items()),
-            ]
-        )
-
-
-def _text(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        """Arguments that make the same condition, besides the sampling margin."""
+        given = {key: value for key, value in vars(self).items() if key != "sampling_margin"}
+        return {key: value for key, value in given.items() if value is not None}
 
 
 @lru_cache(maxsize=256)

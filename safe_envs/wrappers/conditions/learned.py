@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -24,7 +23,13 @@ from safe_envs.dynamics.lie import (
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import FIRST_ORDER, AffineConstraint, Condition, chain_of
+from safe_envs.wrappers.conditions.base import (
+    FIRST_ORDER,
+    AffineConstraint,
+    Condition,
+    CredibleSet,
+    chain_of,
+)
 from safe_envs.wrappers.conditions.cbf import gains_of_poles
 from safe_envs.wrappers.conditions.class_k import positive_rates
 
@@ -46,7 +51,7 @@ class LearnedCondition(Condition):
     """
 
     learned: LearnedModel
-    method: ClassVar[str]
+    method: ClassVar[str]  # pyright: ignore[reportIncompatibleVariableOverride]  (never None)
     corrects_model = True
 
     def require_fit(self, problem: SafetyProblem) -> None:
@@ -71,16 +76,25 @@ class LearnedCondition(Condition):
         )
 
     @classmethod
-    @abstractmethod
     def from_learned(cls, learned: Any, gains: Sequence[float], **settings: Any) -> Condition:
-        """The condition of something learned, with the rates p_1..p_r of a problem where it has
-        any."""
+        """Return the condition of a learned model.
+
+        Args:
+            learned: the model.
+            gains: rates p_1..p_r of a problem in 1/s, for conditions that have any.
+            settings: further arguments of the condition.
+        """
+        return cls(learned, **settings)
+
+    @property
+    def learned_models(self) -> tuple[LearnedModel, ...]:
+        """The learned model."""
+        return (self.learned,)
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What makes the same condition again: the settings, and the file or, without one, the
-        checksum of what was learned."""
-        settings = {k: v for k, v in super().parameters.items() if k != "learned" and v is not None}
+        """Settings, and the file of the learned model or, without one, its checksum."""
+        settings = {key: value for key, value in super().parameters.items() if key != "learned"}
         path = self.learned.path
         return {
             **settings,
@@ -220,13 +234,6 @@ class DDSCBF(LearnedCondition):
         super().__post_init__()
         _at_least_zero("margin", self.margin)
 
-    @classmethod
-    def from_learned(
-        cls, learned: GeneratorModel, gains: Sequence[float], **settings: Any
-    ) -> DDSCBF:
-        """The condition; it has no rates."""
-        return cls(learned, **settings)
-
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
         """The model with the learned diffusion, where that is what was learned."""
         return model if self.learned.diffusion is None else self.learned.diffusion.system(model)
@@ -292,12 +299,12 @@ class BayesianSCBF(LearnedCondition):
             if getattr(self, field) is not None:
                 _share(field, getattr(self, field))
 
-    @classmethod
-    def from_learned(
-        cls, learned: Posterior, gains: Sequence[float], **settings: Any
-    ) -> BayesianSCBF:
-        """The condition; it has no rates."""
-        return cls(learned, **settings)
+    @property
+    def credible_set(self) -> CredibleSet | None:
+        """The systems of the simultaneous form; None of the others."""
+        if self.simultaneous is None:
+            return None
+        return CredibleSet(self.learned, self.delta_theta + self.delta_sigma)
 
     @property
     def robust(self) -> bool:

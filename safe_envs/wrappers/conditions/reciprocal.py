@@ -3,7 +3,6 @@ SRCBF."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import sympy as sp
@@ -67,11 +66,6 @@ class _Reciprocal(Condition):
             model, (h,), resolved(self.derivative(model, h), barrier), demand.subs(_H, h)
         )
 
-    @classmethod
-    def for_gains(cls, gains: Sequence[float]) -> _Reciprocal:
-        """The condition with gamma = 1, as in the thesis: gamma is no rate."""
-        return cls()
-
 
 @dataclass(frozen=True)
 class RCBF(_Reciprocal):
@@ -81,7 +75,8 @@ class RCBF(_Reciprocal):
     as infeasible.
 
     Attributes:
-        gamma: weight > 0, in 1/s times the square of the unit of B.
+        gamma: weight > 0, in 1/s times the square of the unit of B; no rate, so that the gains of a
+            problem do not set it.
         form: "inverse" for B = 1/h, "log" for B = -log(h/(1 + h)).
 
     Source: thesis Sec. 2.1.2, Def. 2.1.6.
@@ -99,7 +94,8 @@ class SRCBF(_Reciprocal):
     there, flagged as infeasible.
 
     Attributes:
-        gamma: weight > 0, in 1/s times the square of the unit of B.
+        gamma: weight > 0, in 1/s times the square of the unit of B; no rate, so that the gains of a
+            problem do not set it.
         form: "inverse" for B = 1/h, "log" for B = -log(h/(1 + h)).
 
     Source: thesis Def. 4.2.1, Sec. 4.2.2 and 4.3.1.
@@ -107,3 +103,4 @@ class SRCBF(_Reciprocal):
 
     name = "srcbf"
     stochastic = True
+    almost_sure = True

@@ -31,11 +31,6 @@ class SCBF(Condition):
         """Derive the constraint; see `chain_of` for what it raises."""
         return AffineConstraint.after(model, *chain_of(model, barrier, None, generator))
 
-    @classmethod
-    def for_gains(cls, gains: Sequence[float]) -> SCBF:
-        """The SCBF has no rates."""
-        return cls()
-
     def chain_rates(self, degree: int) -> tuple[float, ...]:
         """Zeros; see `Condition.chain_rates`."""
         return (0.0,) * degree

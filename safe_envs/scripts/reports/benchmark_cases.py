@@ -1,0 +1,153 @@
+"""What the benchmark times: filter calls, env steps, and a hand-written loop to compare them with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+import sympy as sp
+
+from safe_envs import Barrier, ControlAffineSDE
+from safe_envs.wrappers import (
+    CBF,
+    HOCBF,
+    SafetyFilter,
+    SafetyFilterVectorWrapper,
+    SafetyFilterWrapper,
+    parse_conditions,
+)
+
+ENV_ID = "safe_envs/StochasticDubins-v0"
+NUM_ENVS = 1024
+_LIMITS = "safe_envs/QuadrotorLimits-v0"
+_BATCHES = (1, 32, 1024, 10_000)
+
+
+class Case(NamedTuple):
+    """A call to time.
+
+    Attributes:
+        call: what is timed.
+        states: how many it handles.
+        prepare: done before each round.
+        calls: in a round; None for as many as fit its time.
+    """
+
+    call: Callable[[], Any]
+    states: int = 1
+    prepare: Callable[[], Any] = lambda: None
+    calls: int | None = None
+
+
+def filter_calls() -> dict[str, Case]:
+    """Return calls of a filter with one constraint, over batches of several sizes."""
+    safety_filter = SafetyFilterWrapper(gym.make(ENV_ID), "scbf").safety_filter
+    rng = np.random.default_rng(0)
+    cases = {}
+    for batch in _BATCHES:
+        leading = () if batch == 1 else (batch,)
+        x, u = rng.uniform(-2.0, 2.0, (*leading, 3)), rng.uniform(-10.0, 10.0, (*leading, 1))
+        cases[f"filter call, {batch} state{'s' * (batch > 1)}"] = Case(
+            lambda x=x, u=u: safety_filter.filter(x, u), batch
+        )
+    return cases
+
+
+def several_constraints() -> dict[str, Case]:
+    """Return filter calls for a point mass in the plane with two inputs, an obstacle, a wall and a
+    speed limit, and for a quadrotor with four rotors."""
+    x, y, v, w, a, b = sp.symbols("x y v w a b", real=True)
+    point = ControlAffineSDE(
+        (x, y, v, w), (a, b), [v, w, 0, 0], [[0, 0], [0, 0], [1, 0], [0, 1]], [0, 0, 0, 0]
+    )
+    barriers = [
+        (Barrier(x**2 + y**2 - 1), HOCBF((2, 2))),
+        (Barrier(3 - x), HOCBF((1, 1))),
+        (Barrier(1 - v**2 - w**2), CBF(1.0)),
+    ]
+    in_plane = SafetyFilter(point, barriers, [(-2.0, 2.0)] * 2)
+    rng = np.random.default_rng(0)
+    angle, radius = rng.uniform(0, 2 * np.pi, NUM_ENVS), rng.uniform(1.1, 2.0, NUM_ENVS)
+    states = np.stack(
+        [radius * np.cos(angle), radius * np.sin(angle), *rng.uniform(-0.6, 0.6, (2, NUM_ENVS))],
+        axis=1,
+    )
+    inputs = rng.uniform(-3.0, 3.0, (NUM_ENVS, 2))
+    acting = np.flatnonzero(in_plane.filter(states, inputs).active.any(axis=1))[0]
+    problem = gym.make(_LIMITS).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]
+    limits = SafetyFilter.for_problem(problem, parse_conditions("hocbf", problem))
+    envs = gym.make_vec(_LIMITS, num_envs=NUM_ENVS)
+    envs.reset(seed=0)
+    flying = envs.unwrapped.state + rng.normal(0.0, 0.7, (NUM_ENVS, 12))  # pyright: ignore[reportAttributeAccessIssue]
+    low, high = np.transpose(problem.box)
+    rotors = rng.uniform(low, high, (NUM_ENVS, 4))
+    return {
+        "three constraints, two inputs, 1 state": Case(
+            lambda: in_plane.filter(states[acting], inputs[acting])
+        ),
+        f"three constraints, two inputs, {NUM_ENVS} states": Case(
+            lambda: in_plane.filter(states, inputs), NUM_ENVS
+        ),
+        f"three constraints, four inputs (ProxQP), {NUM_ENVS} states": Case(
+            lambda: limits.filter(flying, rotors), NUM_ENVS
+        ),
+    }
+
+
+def scalar_steps() -> dict[str, Case]:
+    """Return steps of a scalar env, unfiltered and filtered."""
+
+    # No episode may end within a round: the vehicle turns on the spot, with little noise.
+    def make() -> gym.Env[Any, Any]:
+        return gym.make(ENV_ID, horizon=1e9, start=[0.0, 0.0, 0.0], noise=0.01)
+
+    envs = {"unfiltered": make(), "filtered": SafetyFilterWrapper(make(), "scbf")}
+    action = np.array([0.9], dtype=np.float32)
+    return {
+        f"env.step, {name}": Case(
+            lambda env=env: env.step(action), prepare=lambda env=env: env.reset(seed=0)
+        )
+        for name, env in envs.items()
+    }
+
+
+def vector_steps() -> dict[str, Case]:
+    """Return steps of a vector env, unfiltered and filtered."""
+    unfiltered, other = (gym.make_vec(ENV_ID, num_envs=NUM_ENVS) for _ in range(2))
+    envs = {"unfiltered": unfiltered, "filtered": SafetyFilterVectorWrapper(other, "scbf")}
+    actions = np.full((NUM_ENVS, 1), 0.3, dtype=np.float32)
+    cases = {}
+    for name, env in envs.items():
+        env.reset(seed=0)
+        # Ten whole episodes, so that resets and draws of noise have their share of every round.
+        calls = 10 * (env.unwrapped.problem.steps + 1)  # pyright: ignore[reportAttributeAccessIssue]
+        cases[f"vector env, {name}"] = Case(
+            lambda env=env: env.step(actions), NUM_ENVS, calls=calls
+        )
+    return cases
+
+
+def fused_loop() -> Case:
+    """Return a step of the Dubins SCBF, written by hand: no reward, no observation, no info, no reset, no checks."""
+    problem = gym.make(ENV_ID).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]
+    values = {parameter.name: value for parameter, value in problem.plant.parameters.items()}
+    v, dt, (low, high) = values["v"], problem.dt, problem.box[0]
+    root = values["sigma_1"] * dt**0.5
+    rng = np.random.default_rng(0)
+    x, y, theta = rng.uniform(-1.0, 1.0, (3, NUM_ENVS))
+    nominal = np.full(NUM_ENVS, 3.0)
+
+    def step() -> None:
+        nonlocal x, y, theta
+        cos, sin = np.cos(theta), np.sin(theta)
+        # A A h = a u + b, with a = 2 v (x sin - y cos) and b = -2 v^2: thesis Eq. (4.25).
+        a, b = 2 * v * (x * sin - y * cos), -2 * v * v
+        u = np.clip(np.where(a * nominal + b >= 0, nominal, -b / a), low, high)
+        w = rng.standard_normal((2, NUM_ENVS))
+        x = x + v * cos * dt + root * w[0]
+        y = y + v * sin * dt + root * w[1]
+        theta = theta + u * dt
+
+    return Case(step, NUM_ENVS)

@@ -1,0 +1,176 @@
+"""Checks of an installation: its packages, solvers and envs, and how fast they are."""
+
+from __future__ import annotations
+
+import platform
+import re
+import sys
+import timeit
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.util import find_spec
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from safe_envs import ENV_IDS
+from safe_envs.rendering.viewer import require_pygame
+from safe_envs.scripts.reports.known_qps import KNOWN_QPS, KnownQP
+
+_NEEDED = ""
+"""In place of an extra: what is needed in any case."""
+
+_TOLERANCE = 1e-6
+_STEPS = 20
+_SPEED_ID = "safe_envs/StochasticDubins-v0"
+_SPEED_FILTER = "scbf"
+_NUM_ENVS = 1024
+
+
+@dataclass(frozen=True)
+class Check:
+    """The result of a check.
+
+    Attributes:
+        name: of what was checked.
+        ok: whether it is as it should be; None for what may be missing.
+        found: what was found.
+        advice: what to do, if anything.
+    """
+
+    name: str
+    ok: bool | None
+    found: str
+    advice: str = ""
+
+
+def packages() -> Iterator[Check]:
+    """Check Python, the required packages, and the optional ones with their extras."""
+    version_ok = sys.version_info >= (3, 11)
+    yield Check("python", version_ok, platform.python_version(), "Python 3.11 or newer is needed")
+    for package, extra in required():
+        if package == "pygame-ce" and (wrong := _other_pygame()):
+            yield wrong
+            continue
+        try:
+            yield Check(package, True, version(package))
+        except PackageNotFoundError:
+            target = package if extra == _NEEDED else f"safe-envs[{extra}]"
+            ok = False if extra == _NEEDED else None
+            yield Check(package, ok, "missing", f'pip install "{target}"')
+
+
+def _other_pygame() -> Check | None:
+    """Return what is wrong if pygame, or a pygame-ce that is too old, is imported in place of the
+    pygame-ce that draws; else None."""
+    if find_spec("pygame") is None:
+        return None
+    try:
+        require_pygame()
+    except gym.error.DependencyNotInstalled as error:
+        found, _, advice = str(error).partition(": ")
+        return Check("pygame-ce", False, found, advice)
+    return None
+
+
+def required() -> list[tuple[str, str]]:
+    """Return the packages of the metadata, each with its extra; those of `dev` are not for users."""
+    found: dict[str, str] = {}
+    for line in requires("safe-envs") or ():
+        package = re.match(r"[\w.-]+", line)
+        extra = re.search(r"extra == ['\"]([\w-]+)['\"]", line)
+        name = extra.group(1) if extra else _NEEDED
+        if package and name != "dev":
+            found.setdefault(package.group(), name)
+    return list(found.items())
+
+
+def solvers() -> Iterator[Check]:
+    """Check the solvers on QPs with known answers."""
+    for qp in KNOWN_QPS:
+        yield _check(qp.name, partial(_solve, qp), "reinstall proxsuite, numpy and scipy")
+
+
+def _solve(qp: KnownQP) -> tuple[bool, str]:
+    from safe_envs.wrappers.qp.dispatch import project_floats
+
+    m, k = len(qp.proposed), len(qp.b)
+    low, high, ones = [-qp.bound] * m, [qp.bound] * m, [1.0] * m
+    action, _, _, feasible = project_floats(
+        qp.a, qp.b, list(qp.proposed), low, high, ones, [1.0] * k
+    )
+    if feasible != qp.feasible:
+        return False, f"said to be {'' if feasible else 'in'}feasible, and is not"
+    error = float(np.abs(np.subtract(action, qp.answer)).max())
+    return error <= _TOLERANCE, f"off by {error:.1g}"
+
+
+def envs() -> Iterator[Check]:
+    """Check every registered env with its default filter."""
+    advice = "reinstall safe-envs; if that does not help, it is a fault of its own"
+    for env_id in ENV_IDS:
+        yield _check(env_id, partial(_step, env_id), advice)
+
+
+def _step(env_id: str) -> tuple[bool, str]:
+    from safe_envs.registry import make_env
+    from safe_envs.wrappers import SafetyFilterWrapper
+
+    unfiltered = make_env(env_id)
+    problem = unfiltered.problem
+    env = SafetyFilterWrapper(unfiltered, problem.filter)
+    env.reset(seed=0)
+    low, high = np.transpose(problem.box)
+    inside = True
+    for _ in range(_STEPS):
+        _, reward, terminated, truncated, info = env.step(np.zeros(env.action_space.shape or ()))
+        action = np.asarray(info["safe_action"])
+        inside &= bool(
+            np.isfinite(reward) and (action >= low - 1e-9).all() and (action <= high + 1e-9).all()
+        )
+        if terminated or truncated:
+            env.reset()
+    if not inside:
+        return False, "an action outside of the input bounds, or a reward that is not finite"
+    return True, f"{_STEPS} steps with {problem.filter}"
+
+
+def _check(name: str, look: Callable[[], tuple[bool, str]], advice: str) -> Check:
+    """Return the check of something that may break in any way."""
+    try:
+        ok, found = look()
+    except Exception as error:
+        ok, found = False, f"{type(error).__name__}: {error}"
+    return Check(name, ok, found, "" if ok else advice)
+
+
+def speeds() -> dict[str, float]:
+    """Return the steps per second of single envs on this machine, by what is stepped."""
+    from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
+
+    def scalar() -> gym.Env[Any, Any]:
+        return gym.make(
+            _SPEED_ID, disable_env_checker=True, horizon=1e9, start=[0.0, 0.0, 0.0], noise=0.01
+        )
+
+    def vector() -> Any:
+        return gym.make_vec(_SPEED_ID, num_envs=_NUM_ENVS)
+
+    vector_name = f"vector env of {_NUM_ENVS}"
+    filtered = SafetyFilterVectorWrapper(vector(), _SPEED_FILTER)
+    cases = {
+        "env": (scalar(), 1, 1000),
+        f"env with {_SPEED_FILTER}": (SafetyFilterWrapper(scalar(), _SPEED_FILTER), 1, 500),
+        vector_name: (vector(), _NUM_ENVS, 50),
+        f"{vector_name} with {_SPEED_FILTER}": (filtered, _NUM_ENVS, 50),
+    }
+    found = {}
+    for name, (env, size, steps) in cases.items():
+        env.reset(seed=0)
+        action = np.full(env.action_space.shape, 0.3, dtype=np.float32)
+        seconds = min(timeit.repeat(partial(env.step, action), number=steps, repeat=3))
+        found[name] = size * steps / seconds
+    return found
