@@ -1,14 +1,14 @@
-# make demo   train a small agent, and print safety rates with and without filters
-# make test   the test suite
-# make check  the quick part of it, for every edit
-# make oracle the long comparisons with exact answers, which the suite holds in small
-# make clusters   sweeps on a Dask and on a Ray cluster that are started for it
-# make mutants   wrong versions of the code, each of which the tests must notice
-# make golden    what commands and envs compute, held against stored rows: for changes of names and structure only
-# make lint   style, formatting and types
-# make wheel-test   a wheel, installed without extras in an environment of its own, and used there
-# make docs   the documentation, in site/; nothing is fetched but the packages
-# Each makes its own virtual environment in .venv first.
+# make demo        train a small agent, then print safety rates with and without filters
+# make test        run the test suite
+# make check       run its quick part, after every edit
+# make oracle      run the long comparisons with exact solutions
+# make clusters    run sweeps on local Dask and Ray clusters
+# make mutants     check that the tests fail on faulty versions of the code
+# make golden      compare the output of commands and envs with stored results, when refactoring
+# make lint        check style, formatting, types and the layers of imports
+# make wheel-test  build the wheel, install it without extras, and use it outside the checkout
+# make docs        build the documentation in site/
+# Every target first creates the virtual environment .venv.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -42,6 +42,7 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
+	$(BIN)/lint-imports
 
 wheel-test: $(READY)
 	sh tests/wheel_smoke.sh $(BIN)/python

@@ -1,8 +1,6 @@
-"""A kinematic bicycle that follows a lane and is to stay in it, with a wind from the side and
-longer than its designer believes.
+"""A kinematic bicycle in a lane, in a crosswind, and longer than its designer believes.
 
-    safe-envs evaluate --system examples/bicycle.py:problem --filter none --filter hocbf --filter
-    szcbf
+    safe-envs evaluate --system examples/bicycle.py:problem --filter none --filter hocbf
 
 The model is that of R. Rajamani, "Vehicle Dynamics and Control", Springer (2012), Sec. 2.2, about
 the rear axle; its input is the curvature tan(delta), in which it is affine.
@@ -29,8 +27,11 @@ bicycle = ControlAffineSDE(
 
 
 def problem(*, width: float = 3.5) -> SafetyProblem:
-    """A lane of this width, in m; the nominal controller steers towards a course that swings across
-    its edges."""
+    """State the problem; the nominal controller follows a course that crosses the lane's edges.
+
+    Args:
+        width: Width of the lane in m.
+    """
     course = 0.7 * width * sp.sin(s / 10)
     return state_problem(
         bicycle,

@@ -1,8 +1,6 @@
-"""A cart that balances a pole, pushed by gusts: the pole is to stay within 15 degrees, the cart on
-its track.
+"""A cart-pole pushed by gusts, whose pole must stay within 15 degrees.
 
-    safe-envs evaluate --system examples/cart_pole.py:problem --filter none --filter hocbf --filter
-    szcbf
+    safe-envs evaluate --system examples/cart_pole.py:problem --filter none --filter hocbf
 
 The equations are those of A. G. Barto, R. S. Sutton and C. W. Anderson, "Neuronlike adaptive
 elements that can solve difficult learning control problems", IEEE Trans. SMC 13 (1983), without
@@ -33,8 +31,11 @@ cart_pole = ControlAffineSDE.from_rate(
 
 
 def problem(*, limit: float = 15.0) -> SafetyProblem:
-    """The pole within a limit in degrees; the nominal controller hurries to the middle of the track
-    and leans too far."""
+    """State the problem; the nominal controller hurries to the middle of the track.
+
+    Args:
+        limit: Largest angle of the pole in degrees.
+    """
     widest = math.radians(limit)
     return state_problem(
         cart_pole,

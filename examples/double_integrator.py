@@ -1,5 +1,4 @@
-"""A point in the plane, pushed in both directions, that is to pass a round obstacle on its way to a
-goal behind it.
+"""A point mass in the plane that must avoid a round obstacle on its way to a goal behind it.
 
 safe-envs evaluate --system examples/double_integrator.py:problem --filter none --filter hocbf
 """
@@ -21,7 +20,11 @@ point = ControlAffineSDE(
 
 
 def problem(*, radius: float = 1.0) -> SafetyProblem:
-    """An obstacle of this radius, in m, at the origin, and a goal at (3, 0)."""
+    """State the problem, with the obstacle at the origin and the goal at (3, 0).
+
+    Args:
+        radius: Radius of the obstacle in m.
+    """
     obstacle = Barrier(x**2 + y**2 - radius**2, "obstacle")
     to_goal = (x - 3) ** 2 + y**2
     return state_problem(

@@ -1,10 +1,9 @@
-"""Gymnasium's Pendulum-v1 behind a filter: it may swing up, and over the top, but only slowly.
+"""Gymnasium's Pendulum-v1 behind a filter that limits the speed at the top.
 
     safe-envs evaluate Pendulum-v1 --filter-spec examples/pendulum_v1.py:spec
 
-The barrier bounds the energy: at the top (theta = 0) the rate is to stay below 2 rad/s. A motor
-that does nothing keeps the energy, so that some torque meets the condition everywhere, weak as the
-motor is.
+The barrier bounds the energy: at the top (theta = 0) the rate must stay below 2 rad/s. Without
+torque the energy is constant, so some torque meets the condition everywhere, weak as the motor is.
 """
 
 import numpy as np
@@ -25,7 +24,7 @@ pendulum = ControlAffineSDE(
 
 
 def state(observation: np.ndarray) -> np.ndarray:
-    """The observation is (cos theta, sin theta, rate)."""
+    """Return (theta, rate) from observations (cos theta, sin theta, rate)."""
     return np.stack(
         [np.arctan2(observation[..., 1], observation[..., 0]), observation[..., 2]], axis=-1
     )
@@ -36,5 +35,5 @@ spec = FilterSpec(
     barriers=4 - rate**2 + 30 * (1 - sp.cos(theta)),
     state_fn=state,
     filter="cbf:alpha=2:sampling_margin=15",
-    nominal=2 * sp.tanh(3 * rate),  # swings it up for ever
+    nominal=2 * sp.tanh(3 * rate),  # swings it up
 )

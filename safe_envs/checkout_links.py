@@ -1,20 +1,32 @@
-"""Imports through the links at the top level of a checkout: `wrappers`, `agents` and `scripts` name
-the modules of `safe_envs`."""
+"""Imports through the top-level links of a checkout.
+
+There `wrappers`, `agents` and `scripts` are links into `safe_envs`. Without this module Python would
+load every file a second time under its short name, and `wrappers.CBF` would be another class than
+`safe_envs.wrappers.CBF`.
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.abc import Loader, MetaPathFinder
+from importlib.abc import InspectLoader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from types import ModuleType
+from importlib.util import find_spec
+from types import CodeType, ModuleType
 from typing import Any
 
 
-class _SameModule(Loader):
-    """Return the module of `safe_envs` itself, never a second copy of it, whose classes would be
-    others."""
+class _Alias(MetaPathFinder, InspectLoader):
+    """Give `NAME.module` the module object of `safe_envs.NAME.module`."""
+
+    def __init__(self, name: str) -> None:
+        self._prefix = f"{name}."
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        return ModuleSpec(fullname, self) if fullname.startswith(self._prefix) else None
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         module = import_module(f"safe_envs.{spec.name}")
@@ -22,30 +34,24 @@ class _SameModule(Loader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        # The import system has just written the alias' spec over the module's own.
+        # The import system has just overwritten the module's own spec with that of the alias.
         alias: Any = module.__spec__
         module.__spec__ = alias.loader_state
-        module.__loader__ = module.__spec__.loader if module.__spec__ else None
 
+    def get_source(self, fullname: str) -> None:
+        """Return no source: `get_code` does without."""
 
-class _LinkFinder(MetaPathFinder):
-    """Find the modules below one link."""
-
-    def __init__(self, name: str) -> None:
-        self._below = f"{name}."
-
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        return ModuleSpec(fullname, _SameModule()) if fullname.startswith(self._below) else None
+    def get_code(self, fullname: str) -> CodeType | None:
+        """Return the code for `python -m scripts.evaluate` and the like."""
+        spec: Any = find_spec(f"safe_envs.{fullname}")
+        return spec.loader.get_code(spec.name)
 
 
 def redirect(name: str) -> None:
-    """Make a package that was imported through its link the package of the same name in
-    `safe_envs`.
+    """Replace a package that was imported through its link by that of `safe_envs`.
 
     Args:
-        name: of the link: "wrappers", "agents" or "scripts".
+        name: Name of the link: "wrappers", "agents" or "scripts".
     """
-    sys.meta_path.insert(0, _LinkFinder(name))
+    sys.meta_path.insert(0, _Alias(name))
     sys.modules[name] = import_module(f"safe_envs.{name}")

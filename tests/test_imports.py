@@ -19,7 +19,8 @@ def loaded(*names):
 
 from safe_envs.scripts import cli
 
-assert not loaded("sympy", "scipy", "torch", "matplotlib", "pygame", "safe_envs.agents"), "the command line, for completion"
+LIBRARIES = ("sympy", "scipy", "torch", "matplotlib", "pygame")
+assert not loaded(*LIBRARIES, "safe_envs.agents"), "the command line, for completion"
 for command in ("evaluate", "verify", "identify", "train", "render"):
     cli.app([command, "--help"], standalone_mode=False)
 assert not loaded("safe_envs.agents", "torch", "matplotlib", "pygame"), "help"
@@ -33,11 +34,12 @@ from safe_envs.wrappers.qp import dispatch
 
 box = ([0.0, 0.0], [-1.0, -1.0], [1.0, 1.0], [1.0, 1.0], [1.0, 1.0])
 assert not dispatch.project_floats([[1.0, 0.2], [-1.0, 0.1]], [-0.5, 0.1], *box)[3]
-assert not loaded("scipy", *HEAVY), "programs of two inputs"
+assert not loaded("scipy", *HEAVY), "QPs of two inputs"
 box = ([0.0] * 3, [-1.0] * 3, [1.0] * 3, [1.0] * 3, [1.0, 1.0])
-assert dispatch.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.1], *box)[2] == [True, False]
-assert not loaded("scipy", *HEAVY), "one constraint of several binds"
-assert dispatch.project_floats([[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]], [-0.5, -0.5], *box)[2] == [True, True]
+rows = [[1.0, 0.2, 0.0], [0.3, 1.0, 0.1]]
+assert dispatch.project_floats(rows, [-0.5, -0.1], *box)[2] == [True, False]
+assert not loaded("scipy", *HEAVY), "one active constraint of several"
+assert dispatch.project_floats(rows, [-0.5, -0.5], *box)[2] == [True, True]
 assert loaded("proxsuite")
 
 import gymnasium as gym

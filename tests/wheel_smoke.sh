@@ -1,9 +1,9 @@
 #!/bin/sh
-# Builds a wheel, installs it without extras in an environment of its own, and uses it outside of the repository.
+# Build the wheel, install it without extras in a new environment, and use it outside the checkout.
 #
 #     sh tests/wheel_smoke.sh [PYTHON]
 #
-# The dependencies are those of constraints.txt. It takes minutes, and is no part of the suite.
+# The dependencies are those of constraints.txt. It takes minutes and is not part of the suite.
 set -eu
 
 python=${1:-python3}
@@ -14,10 +14,27 @@ trap 'rm -rf "$work"' EXIT
 step() { echo "== $*"; }
 
 step "wheel"
-# From a copy: a build leaves folders behind.
+# From a copy, since a build leaves folders behind; with the links, as in a checkout.
 mkdir "$work/source"
-(cd "$root" && cp -R safe_envs wrappers agents scripts pyproject.toml README.md LICENSE "$work/source")
+(cd "$root" && cp -RP safe_envs wrappers agents scripts pyproject.toml README.md LICENSE "$work/source")
 "$python" -m pip wheel --quiet --no-deps --wheel-dir "$work/dist" "$work/source"
+
+step "contents of the wheel"
+(cd "$root" && git ls-files safe_envs) > "$work/tracked.txt"
+"$python" - "$work"/dist/safe_envs-*.whl "$work/tracked.txt" <<'END'
+import sys
+from collections import Counter
+from pathlib import Path
+from zipfile import ZipFile
+
+names = [name for name in ZipFile(sys.argv[1]).namelist() if ".dist-info/" not in name]
+tracked = set(Path(sys.argv[2]).read_text().split())
+assert {name.split("/")[0] for name in names} == {"safe_envs"}, names
+assert max(Counter(names).values()) == 1, Counter(names).most_common(3)
+assert tracked <= set(names), f"missing in the wheel: {sorted(tracked - set(names))}"
+stale = {name for name in names if name not in tracked and "__pycache__" not in name}
+assert not stale, f"not tracked: {sorted(stale)}"
+END
 
 step "install"
 "$python" -m venv "$work/venv"
@@ -35,21 +52,21 @@ python - "$work/venv" <<'END'
 import sys
 from importlib.metadata import version
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 
 import safe_envs.agents
-import safe_envs
 import safe_envs.scripts
+import safe_envs.testing
 import safe_envs.wrappers
 
 inside = Path(sys.argv[1]).resolve()
-for package in (safe_envs, wrappers, agents, scripts):
+for package in (safe_envs, safe_envs.wrappers, safe_envs.agents, safe_envs.scripts):
     assert Path(package.__file__).resolve().is_relative_to(inside), package.__file__
-for package in ("safe_envs", "wrappers", "agents"):
-    assert files(package).joinpath("py.typed").is_file(), package
+for name in ("wrappers", "agents", "scripts"):
+    assert find_spec(name) is None, f"a second import root: {name}"
+assert files("safe_envs").joinpath("py.typed").is_file()
 assert safe_envs.__version__ == version("safe-envs")
-for algorithm in ("ppo", "a2c", "sac", "td3"):
-    assert files("agents").joinpath("hyperparams", f"{algorithm}.yml").is_file(), algorithm
 END
 
 step "gym.make"
@@ -60,8 +77,8 @@ import safe_envs
 from safe_envs.wrappers import SafetyFilterWrapper
 
 for env_id in safe_envs.ENV_IDS:
-    bare = gym.make(env_id)
-    env = SafetyFilterWrapper(bare, bare.unwrapped.problem.filter)
+    env = gym.make(env_id)
+    env = SafetyFilterWrapper(env, env.unwrapped.problem.filter)
     env.reset(seed=0)
     env.step(env.action_space.sample())
 try:
@@ -86,7 +103,24 @@ safe-envs evaluate Scalar-v0 --policy agent --filter none --episodes 20 --quiet
 safe-envs reproduce figure-6.2 --quick --jobs 1 --out report
 test -s report/index.html
 
-step "what is missing is named"
+step "plug-ins from files"
+cat > plug_ins.py <<'END'
+from dataclasses import dataclass
+
+from safe_envs.wrappers import SCBF
+
+
+@dataclass(frozen=True)
+class Cautious(SCBF):
+    name = "cautious"
+
+
+def policy(observations):
+    return 0.5 * observations
+END
+safe-envs evaluate Scalar-v0 --filter plug_ins.py:Cautious --policy plug_ins.py:policy --episodes 20 --quiet
+
+step "errors name what is missing"
 refused() {
     expected=$1
     shift
@@ -99,4 +133,4 @@ refused 'safe-envs[tensorboard]' safe-envs train Scalar-v0 --algo ppo --n-timest
 refused 'safe-envs[render]' safe-envs render Scalar-v0 --out film.mp4
 refused "did you mean 'scbf'" safe-envs evaluate Scalar-v0 --filter scfb
 
-step "all is well"
+step "passed"

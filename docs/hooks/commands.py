@@ -1,4 +1,4 @@
-"""The page of the command line, from the commands themselves."""
+"""The page of the command line, generated from the commands."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from safe_envs.scripts.cli import app
 
 _INTRODUCTION = """# Command line
 
-Every command ends with status 0, or with status 2 and one message where the error is the user's. `--help` after a command
-says what stands here. Before a command may stand:
+Every command exits with status 0, or with status 2 and one message for an error that the user can
+correct. `--help` after a command prints its section of this page. These options precede a command:
 """
 
 _LETTERS = {int: "N", Path: "PATH"}
-"""What stands for the value of an option that has no word for it, by the type of its default."""
+"""Placeholders for the values of options without a metavar, by the type of the default."""
 
 
 def commands() -> dict[str, Any]:
-    """All commands by name, as typer has them."""
+    """Return all commands by name, as typer has them."""
     return dict(typer.main.get_command(app).commands)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def options_of(command: Any) -> set[str]:
-    """What may follow a command: `--episodes` and the like."""
+    """Return the options of a command: `--episodes` and the like."""
     return {
         "--help",
         *(
@@ -39,7 +39,7 @@ def options_of(command: Any) -> set[str]:
 
 
 def command_line_page() -> str:
-    """Markdown with a section for each command."""
+    """Return Markdown with a section for each command."""
     common = _table(typer.main.get_command(app))
     return "\n".join(
         [

@@ -1,5 +1,4 @@
-"""The page of the info contract, from the docstring of `safe_envs.envs.info` and what an env
-reports."""
+"""The page of the info contract, from the docstring of `safe_envs.envs.info`."""
 
 from __future__ import annotations
 
@@ -9,5 +8,5 @@ from safe_envs.envs import info
 
 
 def info_page() -> str:
-    """Markdown: the docstring, whose first line is the title's subtitle."""
+    """Return Markdown: a title, and the docstring."""
     return f"# The info contract\n\n{inspect.getdoc(info)}\n"

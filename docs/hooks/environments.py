@@ -1,5 +1,4 @@
-"""A page for each env: its picture, its equations from the symbols that are simulated, and its
-docstring."""
+"""A page for each env: its picture, its equations as simulated, and its docstring."""
 
 from __future__ import annotations
 
@@ -18,10 +17,10 @@ from safe_envs.dynamics.lie import relative_degree
 from safe_envs.wrappers import SafetyFilterWrapper
 
 _SHOWN, _MOST_STEPS = 0.4, 400
-"""Part of an episode after which the picture is taken, and the most steps until then."""
+"""Fraction of an episode after which the picture is taken, and the most steps until then."""
 
 _HEADER = (
-    "| env | what is to be kept safe | states | inputs | degree | filter"
+    "| env | task and safety constraint | states | inputs | degree | filter"
     " |\n|---|---|---|---|---|---|"
 )
 _WORD = re.compile(r"^[A-Za-z]{2,}")
@@ -30,12 +29,12 @@ _LOW = re.compile(r"\\left\(((?:(?!\\left|\\right|\\frac).)*)\\right\)")
 
 
 def short_name(env_id: str) -> str:
-    """The name of an env without its namespace and version."""
+    """Return the name of an env without its namespace and version."""
     return env_id.removeprefix("safe_envs/").removesuffix("-v0")
 
 
 def env_pages() -> dict[str, str | bytes]:
-    """Content by path of all env pages with their pictures, and of the table of envs."""
+    """Return the content by path of all env pages and pictures, and of the table of envs."""
     pages: dict[str, str | bytes] = {}
     rows = []
     for env_id in ENV_IDS:
@@ -51,7 +50,7 @@ def env_pages() -> dict[str, str | bytes]:
 
 
 def _docstring(env: Any) -> tuple[str, str]:
-    """First line and the rest."""
+    """Return the first line and the rest."""
     summary, _, text = (inspect.getdoc(type(env.unwrapped)) or "").partition("\n")
     return summary, text.strip()
 
@@ -71,11 +70,11 @@ def _page(env_id: str, problem: SafetyProblem, summary: str, text: str) -> str:
 env = gym.make("{env_id}")
 ```
 
-Control period {problem.dt:g} s, horizon {problem.horizon:g} s. Relative degree {_degrees(problem)}. Gains {_gains(problem)}, natural filter
-[`{problem.filter}`](../filters/{problem.filter}.md).
+Control period {problem.dt:g} s, horizon {problem.horizon:g} s. Relative degree {_degrees(problem)}.
+Gains {_gains(problem)}, default filter [`{problem.filter}`](../filters/{problem.filter}.md).
 
 {before}
-The plant and the barriers, from the symbols that are simulated:
+The plant and the barriers, as simulated:
 
 {_equations(problem)}
 
@@ -107,7 +106,7 @@ def _gains(problem: SafetyProblem) -> str:
 
 
 def _equations(problem: SafetyProblem) -> str:
-    """Markdown with the plant, a line for each state, and the barriers."""
+    """Return Markdown with the plant, a line for each state, and the barriers."""
     plant = problem.plant
     drift = plant.drift + plant.input_matrix * sp.Matrix(plant.inputs)
     noise = [f"dW_{{{j + 1}}}" for j in range(plant.diffusion.shape[1])]
@@ -125,8 +124,7 @@ def _equations(problem: SafetyProblem) -> str:
 
 
 def _latex(expression: Any) -> str:
-    """LaTeX with short numbers, upright words, room before functions, and no tall parentheses
-    around what is not tall."""
+    """Return LaTeX with short numbers, upright words, and parentheses of fitting height."""
     floats = {
         f: sp.Integer(int(f)) if f == int(f) else sp.Float(f, 4) for f in expression.atoms(sp.Float)
     }
@@ -146,7 +144,7 @@ def _name(text: str) -> str:
 
 
 def _picture(env: Any) -> bytes:
-    """A frame of an episode under the env's own filter."""
+    """Return a frame of an episode under the env's default filter."""
     problem = env.unwrapped.problem
     filtered: Any = SafetyFilterWrapper(env, problem.filter)
     policy = NominalController(problem)

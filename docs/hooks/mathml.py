@@ -1,5 +1,4 @@
-"""Mathematics as MathML, which browsers draw themselves: no script has to be fetched, and no font
-from elsewhere."""
+"""Mathematics as MathML, which browsers draw without fetching a script or a font."""
 
 from __future__ import annotations
 
@@ -14,8 +13,7 @@ _MATH = re.compile(r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>',
 
 
 def font() -> bytes:
-    """A font with the letters of mathematics, which matplotlib brings along, for systems that have
-    none."""
+    """Return matplotlib's font of mathematical letters, for systems that have none."""
     return (Path(mpl.get_data_path()) / "fonts" / "ttf" / "STIXGeneral.ttf").read_bytes()
 
 

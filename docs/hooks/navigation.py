@@ -1,4 +1,4 @@
-"""The navigation: what mkdocs.yml says, and a page for each env and each condition that there is."""
+"""The navigation: that of mkdocs.yml, with a page for each env and each condition."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from safe_envs.wrappers import CONDITIONS, LEARNED
 
 
 def complete(nav: Sequence[dict[str, Any]]) -> None:
-    """Add the pages of envs and conditions to the sections of the navigation that are theirs."""
+    """Add the pages of envs and conditions to their sections of the navigation."""
     for section in nav:
         section.get("Environments", []).extend(
             f"envs/{short_name(env_id)}.md" for env_id in ENV_IDS

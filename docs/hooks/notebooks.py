@@ -1,5 +1,4 @@
-"""The notebooks, which are kept without outputs: executed when the site is built, and shown as
-pages."""
+"""The notebooks: stored without outputs, executed when the site is built, and shown as pages."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ def executed(path: Path) -> Any:
     """Run a notebook in a kernel and a folder of its own, and return it with outputs.
 
     Raises:
-        nbclient.exceptions.CellExecutionError: a cell ended with an error.
+        nbclient.exceptions.CellExecutionError: A cell ended with an error.
     """
     import nbformat
     from nbclient import NotebookClient
@@ -26,7 +25,7 @@ def executed(path: Path) -> Any:
 
     notebook = nbformat.read(path, as_version=4)
     with tempfile.TemporaryDirectory() as folder:
-        # Sockets of the machine's own, which nobody on a network can reach.
+        # Local sockets, which cannot be reached over a network.
         sockets = Config(
             {"AsyncKernelManager": {"transport": "ipc", "ip": str(Path(folder) / "kernel")}}
         )
@@ -41,7 +40,7 @@ def executed(path: Path) -> Any:
 
 
 def notebook_pages() -> dict[str, str | bytes]:
-    """Content by path of a page for each notebook, and of its pictures."""
+    """Return the content by path of a page for each notebook, and of its pictures."""
     pages: dict[str, str | bytes] = {}
     for path in sorted(FOLDER.glob("*.ipynb")):
         parts: list[str] = []
@@ -55,7 +54,7 @@ def notebook_pages() -> dict[str, str | bytes]:
                 if picture:
                     name = f"{path.stem}-{i}-{j}.png"
                     pages[f"notebooks/{name}"] = picture
-                    text = f"![What the cell draws](./{name})"
+                    text = f"![Output of the cell](./{name})"
                 parts.append(text)
         parts.insert(
             1, f"[Download the notebook](./{path.name}); it was run when this site was built."
@@ -65,7 +64,7 @@ def notebook_pages() -> dict[str, str | bytes]:
 
 
 def _joined(outputs: Sequence[Any]) -> list[Any]:
-    """The outputs of a cell, with what is printed in one piece."""
+    """Return the outputs of a cell, with all printed text in one piece."""
     printed = [
         output for output in outputs if output.output_type == "stream" and output.name == "stdout"
     ]
@@ -75,7 +74,7 @@ def _joined(outputs: Sequence[Any]) -> list[Any]:
 
 
 def _output(output: Any) -> tuple[str, bytes | None]:
-    """Markdown of an output, or a picture."""
+    """Return the Markdown of an output, or a picture."""
     if output.output_type == "stream":
         return f"```text\n{output.text.rstrip()}\n```", None
     data = output.get("data", {})

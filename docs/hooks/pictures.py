@@ -1,5 +1,4 @@
-"""The pictures of the page of concepts. Every curve, set and number in them is computed when the
-site is built."""
+"""The pictures of the page of concepts, computed when the site is built."""
 
 from __future__ import annotations
 
@@ -23,21 +22,20 @@ from safe_envs.dynamics.codegen import compile_function
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, UNSAFE
 from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.guarantee import promise
 
 _GRID = 241
 _EPISODES = 1000
 _HORIZON = 10.0
-"""In s, of the picture of what is promised: long enough to see a bound run out."""
+"""In s, of the picture of the bounds: long enough for a bound to decrease to zero."""
 
 
 def pictures() -> dict[str, bytes]:
-    """PNG files by path."""
+    """Return PNG files by path."""
     with mpl.rc_context(STYLE):
         return {
             "assets/chain.png": _written(_chain()),
-            "assets/program.png": _written(_program()),
-            "assets/promise.png": _written(_promise()),
+            "assets/qp.png": _written(_qp()),
+            "assets/bounds.png": _written(_bounds()),
         }
 
 
@@ -53,8 +51,7 @@ def _problem(env_id: str) -> SafetyProblem:
 
 
 def _chain() -> Figure:
-    """C_0, C_1 and where no action meets the condition, in the plane of a Dubins vehicle that heads
-    to the right."""
+    """Draw C_0, C_1 and the infeasible states of a Dubins vehicle that heads to the right."""
     problem = _problem("safe_envs/StochasticDubins-v0")
     figure = Figure(figsize=(10, 4.4))
     for axes, name in zip(figure.subplots(1, 2), ("hocbf", "scbf"), strict=True):
@@ -63,12 +60,14 @@ def _chain() -> Figure:
         states = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
         h, b_1 = _chain_values(safety_filter, problem, states).reshape(2, *x.shape)
         result = safety_filter.filter(states, np.zeros((len(states), 1)))
-        missed = np.where((h > 0) & (b_1 > 0), ~result.feasible.reshape(x.shape), False)
+        infeasible = np.where((h > 0) & (b_1 > 0), ~result.feasible.reshape(x.shape), False)
         axes.contourf(x, y, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35)
         axes.contourf(
             x, y, np.minimum(h, b_1), levels=[0.0, np.inf], colors=[COLORS[4]], alpha=0.45
         )
-        axes.contourf(x, y, missed.astype(float), levels=[0.5, 1.5], colors=[COLORS[3]], alpha=0.8)
+        axes.contourf(
+            x, y, infeasible.astype(float), levels=[0.5, 1.5], colors=[COLORS[3]], alpha=0.8
+        )
         axes.contour(x, y, h, levels=[0.0], colors="black", linewidths=1.3)
         axes.contour(x, y, b_1, levels=[0.0], colors=COLORS[0], linewidths=1.3)
         axes.annotate("", (0.6, -2.4), (-0.6, -2.4), arrowprops={"arrowstyle": "->"})
@@ -77,15 +76,15 @@ def _chain() -> Figure:
             aspect="equal",
             xlabel="x (m)",
             ylabel="y (m)",
-            title=_title(name, missed.sum(), ((h > 0) & (b_1 > 0)).sum()),
+            title=_title(name, infeasible.sum(), ((h > 0) & (b_1 > 0)).sum()),
         )
     figure.legend(
         handles=[
             Line2D([], [], color="black", label="h = 0"),
             Line2D([], [], color=COLORS[0], label="b₁ = 0"),
             Patch(color=UNSAFE, alpha=0.35, label="unsafe"),
-            Patch(color=COLORS[4], alpha=0.45, label="C₀ ∩ C₁, which is kept"),
-            Patch(color=COLORS[3], alpha=0.8, label="no action in the box meets the row"),
+            Patch(color=COLORS[4], alpha=0.45, label="C₀ ∩ C₁, invariant"),
+            Patch(color=COLORS[3], alpha=0.8, label="infeasible within the input bounds"),
         ],
         loc="outside lower center",
         ncols=5,
@@ -93,20 +92,20 @@ def _chain() -> Figure:
     return figure
 
 
-def _title(name: str, missed: int, kept: int) -> str:
-    return f"{name}: in {100 * missed / kept:.0f} % of it no action meets the row"
+def _title(name: str, infeasible: int, total: int) -> str:
+    return f"{name}: infeasible in {100 * infeasible / total:.0f} % of it"
 
 
 def _chain_values(
     safety_filter: SafetyFilter, problem: SafetyProblem, states: np.ndarray
 ) -> np.ndarray:
-    """b_0..b_(r-1) at states (B, n), shape (r, B)."""
+    """Return b_0..b_(r-1) at states (B, n), shape (r, B)."""
     chain = [problem.model.numeric(b) for b in safety_filter.constraints[0].chain]
     return np.array(compile_function(problem.model.states, chain, "arrays")(*states.T))
 
 
 def _point() -> tuple[ControlAffineSDE, Barrier]:
-    """A point in the plane that is pushed, and a round obstacle."""
+    """Return a point mass in the plane, and a round obstacle."""
     x, y, v_x, v_y, a_x, a_y = sp.symbols("x y v_x v_y a_x a_y", real=True)
     gains = [[0, 0], [0, 0], [1, 0], [0, 1]]
     system = ControlAffineSDE(
@@ -119,19 +118,20 @@ def _point() -> tuple[ControlAffineSDE, Barrier]:
     return system, Barrier(x**2 + y**2 - 1)
 
 
-def _program() -> Figure:
-    """The program that a filter solves, in the plane of two inputs: at a state where the row can be
-    met, and where it cannot."""
+def _qp() -> Figure:
+    """Draw the QP of a filter in the plane of two inputs, at a feasible and an infeasible state."""
     system, barrier = _point()
     safety_filter = SafetyFilter(system, [(barrier, HOCBF((2.0, 2.0)))], [(-2.0, 2.0)] * 2)
-    row = safety_filter.constraints[0]
-    compiled = compile_function(system.states, [*row.coefficient, row.offset], "floats")
+    constraint = safety_filter.constraints[0]
+    compiled = compile_function(
+        system.states, [*constraint.coefficient, constraint.offset], "floats"
+    )
     nominal = np.array([1.5, -0.3])
     figure = Figure(figsize=(10, 4.6))
     for axes, speed in zip(figure.subplots(1, 2), (1.1, 2.2), strict=True):
         state = np.array([-2.0, 0.4, speed, 0.0])
         result = safety_filter.filter(state, nominal)
-        _draw_program(axes, np.array(compiled(*state)), nominal, result)
+        _draw_qp(axes, np.array(compiled(*state)), nominal, result)
         verdict = "feasible" if result.feasible else f"infeasible, slack {result.slack[0]:.2f}"
         axes.set_title(f"towards the obstacle at {speed:g} m/s: {verdict}")
     figure.legend(
@@ -140,13 +140,13 @@ def _program() -> Figure:
     return figure
 
 
-def _draw_program(axes: Axes, row: np.ndarray, nominal: np.ndarray, result: Any) -> None:
+def _draw_qp(axes: Axes, constraint: np.ndarray, nominal: np.ndarray, result: Any) -> None:
     u, v = np.meshgrid(*[np.linspace(-3.2, 3.2, _GRID)] * 2)
-    allowed = row[0] * u + row[1] * v + row[2]
+    allowed = constraint[0] * u + constraint[1] * v + constraint[2]
     axes.contourf(u, v, allowed, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35)
     axes.contour(u, v, allowed, levels=[0.0], colors="black", linewidths=1.3)
     axes.add_patch(
-        Rectangle((-2, -2), 4, 4, fill=False, linestyle="--", edgecolor=QUIET, label="box")
+        Rectangle((-2, -2), 4, 4, fill=False, linestyle="--", edgecolor=QUIET, label="input bounds")
     )
     axes.plot(*nominal, "o", color="#D55E00", markersize=8, label="nominal action")
     axes.plot(*result.action, "s", color=COLORS[0], markersize=8, label="executed action")
@@ -165,8 +165,8 @@ def _draw_program(axes: Axes, row: np.ndarray, nominal: np.ndarray, result: Any)
     axes.set(aspect="equal", xlabel="$a_x$ (m/s²)", ylabel="$a_y$ (m/s²)")
 
 
-def _promise() -> Figure:
-    """The measured rate over the horizon beside the bounds, for the thesis' cubic SDE in a disk."""
+def _bounds() -> Figure:
+    """Draw the measured rate and the bounds over the horizon, for the cubic SDE in a disk."""
     problem = _problem("safe_envs/CubicSDEDisk-v0").configured(horizon=_HORIZON)
     evaluation = evaluate(problem, filters=["none", "scbf"], episodes=_EPISODES, seed=0)
     verification = verify(problem, parse_conditions("scbf", problem))
@@ -185,7 +185,9 @@ def _promise() -> Figure:
             label=f"{row['filter']}: measured, {_EPISODES} episodes, with its 95 % band",
         )
     times = np.linspace(0.0, problem.horizon, 41)
-    at_times = zip(*[promise(verification, starts, t) for t in times.tolist()], strict=True)
+    at_times = zip(
+        *[verification.guarantee.applicable_bounds(starts, t) for t in times.tolist()], strict=True
+    )
     for bounds, color in zip(at_times, (QUIET, COLORS[1]), strict=True):
         label = f"{bounds[-1].name.split(',')[0]}: {bounds[-1].status}"
         axes.plot(

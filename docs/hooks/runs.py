@@ -1,12 +1,10 @@
-r"""Examples in pages that are run when the site is built, so that what they print is what the
-program prints.
+r"""Examples in pages, executed when the site is built and followed by what they print.
 
-A fence that begins with ```python run is executed, one after the other in one namespace for each
-page. In ```console run every line that begins with "$ safe-envs" is a command, "\" at its end goes
-on with it. What is printed follows in the page. Options: `lines=N` shows the first N lines of it
-only, `fails` says that the command is to end with an error of the user's. All runs of a page share
-a folder of their own, in which `examples` is that of the repository. A line "<!-- file PATH -->"
-stands for a Python file of it.
+Fences that begin with ```python run are executed in order, in one namespace for each page. In
+```console run every line that begins with "$ safe-envs" is a command; "\" at its end continues it.
+Options: `lines=N` shows the first N lines of output only, `fails` expects the command to end with a
+user's error. All examples of a page share a temporary folder, in which `examples` is that of the
+repository. A line "<!-- file PATH -->" is replaced by a Python file of the repository.
 """
 
 from __future__ import annotations
@@ -29,11 +27,10 @@ _COMMAND = re.compile(r"^\$ (safe-envs(?:[^\n]*\\\n)*[^\n]*)$", re.MULTILINE)
 
 
 def with_output(markdown: str) -> str:
-    """Run the examples of a page, put what they print behind them, and put in the files that it
-    shows.
+    """Run the examples of a page, and insert their output and the files that it shows.
 
     Raises:
-        RuntimeError: a command ended otherwise than its fence says.
+        RuntimeError: A command did not end as its fence says.
     """
     markdown = _FILE.sub(lambda found: f"```python\n{(ROOT / found[1]).read_text()}```", markdown)
     if not _FENCE.search(markdown):
@@ -44,7 +41,7 @@ def with_output(markdown: str) -> str:
 
 
 def run_python(markdown: str) -> None:
-    """Execute all Python of a page in order, shown with its output or not; for tests."""
+    """Execute all Python of a page in order, for tests."""
     names: dict[str, Any] = {}
     with _folder(), contextlib.redirect_stdout(io.StringIO()):
         for kind, code in _ANY_FENCE.findall(markdown):
@@ -53,7 +50,7 @@ def run_python(markdown: str) -> None:
 
 
 def commands_in(markdown: str) -> list[list[str]]:
-    """The words of every `$ safe-envs` command of a page."""
+    """Return the words of every `$ safe-envs` command of a page."""
     return [
         _words(command)
         for kind, code in _ANY_FENCE.findall(markdown)
@@ -68,7 +65,7 @@ def _words(command: str) -> list[str]:
 
 @contextlib.contextmanager
 def _folder() -> Iterator[None]:
-    """A folder for what the examples of a page write, with the repository's examples in it."""
+    """Change to a temporary folder with the repository's examples in it."""
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "examples").symlink_to(ROOT / "examples")
         with contextlib.chdir(folder):
@@ -84,7 +81,7 @@ def _shown(kind: str, options: str, code: str, names: dict[str, Any]) -> str:
         with contextlib.redirect_stdout(printed):
             exec(code, names)
         return f"```python\n{code}```\n\n```text\n{_first(printed.getvalue(), settings)}\n```"
-    # What is printed is no console to Pygments, which would take a % for a prompt.
+    # The output is a fence of its own: in a console, Pygments takes a % for a prompt.
     printed = {
         command: _first(_output(_words(command), "fails" in settings), settings)
         for command in _COMMAND.findall(code)
@@ -101,8 +98,10 @@ def _first(text: str, settings: dict[str, str]) -> str:
 
 
 def _output(words: Sequence[str], fails: bool) -> str:
-    """What a command prints, run in this process, since importing everything again takes longer
-    than most commands."""
+    """Return what a command prints.
+
+    It is run in this process: importing everything again takes longer than most commands.
+    """
     import typer
 
     from safe_envs.scripts.cli import app

@@ -1,4 +1,4 @@
-"""What mkdocs calls: pages made from the program, examples that are run, and mathematics."""
+"""Hooks of mkdocs: generated pages, executed examples, and mathematics."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add the pages and pictures that are made from the program."""
+    """Add the generated pages and pictures."""
     _made.update({**env_pages(), **notebook_pages(), **pictures()})
     _made.update(
         {
@@ -45,7 +45,7 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Run the examples of a page, and put in the table of envs."""
+    """Run the examples of a page, and insert the table of envs."""
     try:
         return with_output(markdown.replace(_TABLE, str(_made["envs/table.md"])))
     except Exception as error:

@@ -1,5 +1,4 @@
-"""The documentation: a page for each env and condition, commands that exist, examples and notebooks
-that run."""
+"""The documentation: a page for each env and condition, valid commands, examples that run."""
 
 from __future__ import annotations
 
@@ -76,11 +75,11 @@ def test_every_page_is_in_the_navigation(pages_in_navigation: list[str]):
 
 
 @pytest.mark.parametrize("name", [*CONDITIONS, *LEARNED])
-def test_page_of_a_condition_has_equation_promise_and_an_example_of_it(name: str, hook: Any):
+def test_page_of_a_condition_has_equation_guarantee_and_example(name: str, hook: Any):
     text = (DOCS / "filters" / f"{name}.md").read_text()
     assert text.startswith(f"# {name}\n\n$$")
     assert all(
-        f"**{part}" in text for part in ("When.", "What it promises.", "Outside its assumptions.")
+        f"**{part}" in text for part in ("When to use.", "Guarantee.", "Outside its assumptions.")
     )
     filters = [word.split(":")[0] for words in hook("runs").commands_in(text) for word in words]
     assert name in filters

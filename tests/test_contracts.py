@@ -1,0 +1,383 @@
+"""Rules that neither ruff nor import-linter can check: words, names, docstrings, sizes.
+
+Each test lists every place that breaks its rule. What a word is replaced by stands next to it.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import io
+import json
+import re
+import tokenize
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+THIS = "tests/test_contracts.py"
+LOG_OF_CHANGES = "CHANGELOG.md"  # names the old words, to say what replaces them
+
+NAMES = {
+    "DriftingEnv": "TiltedNoiseEnv",
+    "Exploration": "SamplingDomain",
+    "FilterResult": "FilterDecision",
+    "Flags": "SafetyBits",
+    "ForeignWorld": "ExternalTarget",
+    "Moment": "EpisodeSnapshot",
+    "OwnWorld": "NativeTarget",
+    "Place": "Backend",
+    "Promised": "GuaranteeAverager",
+    "Setting": "EvaluationSpec",
+    "SixStep": "CostReturnWrapper",
+    "Survey": "SafeSetAnalysis",
+    "Totals": "EpisodeStatistics",
+    "Wave": "EpisodeBatch",
+    "best_length": "optimal_tilt",
+    "climbed": "girsanov_integrals",
+    "drift_derivative": "lie_derivative_f",
+    "input_derivative": "lie_derivative_g",
+    "ito_term": "ito_correction",
+    "load_problem": "make_problem",
+}
+"""Retired names, wherever they occur in code or documentation."""
+
+DEFINITIONS = {
+    "chosen": "assumptions",
+    "corrections": "errata",
+    "doubts": "unverified_assumptions",
+    "elsewhere": "alternative_settings",
+    "kept": "invariant_set",
+    "leading": "control_authority",
+    "lowest": "minimum, sample_minimum",
+    "missed": "max_shortfall",
+    "promise": "guarantee, bound",
+    "promised": "applicable_bounds",
+    "promises": "applicable_bounds, guarantees",
+    "spread": "quadratic_variation_rate, standard deviation",
+    "survey": "safe_set_analysis",
+    "way": "tilt_direction",
+}
+"""Retired as public names of classes, functions, methods and attributes; local variables may have
+them, for they are ordinary words."""
+
+MODULES = {
+    "actors": "sb3_actor",
+    "blocks": "fixed_batch",
+    "craft": "quadrotor",
+    "mistakes": "validation",
+    "places": "object_import",
+    "statement": "builder",
+    "strip": "time_series",
+    "weights": "network",
+}
+"""Retired as names of modules."""
+
+PHRASES = {
+    r"anew": "again",
+    r"any(body|one) else's": "third-party",
+    r"as printed": "the thesis, the printed formula",
+    r"bare(ly)?": "unfiltered",
+    r"beside": "next to, with, and",
+    r"is told": "receives, is given",
+    r"learned anew": "retrained",
+    r"least h": "minimum h",
+    r"missed by": "violated by",
+    r"natural filter": "default filter",
+    r"programs?": "QP",
+    r"promis(e|es|ed|ing)": "guarantee, bound",
+    r"rests? on": "depends on, assumes",
+    r"rows? of (a|an|the|each|its|one|two|several) (QPs?|filters?|conditions?|barriers?)": (
+        "constraint"
+    ),
+    r"(active|binding|affine|single|linear|derived) rows?": "constraint",
+    r"some(body|one) else's": "third-party",
+    r"the prints?": "the thesis, the printed formula",
+    r"what stands": "name the thing",
+}
+"""Retired in prose and messages: the subject's own words say it."""
+
+ALLOWED = (
+    # (path, text around the word, reason)
+    (r".*", r"(dynamic|linear|quadratic|cone|conic|semidefinite|convex) program", "mathematics"),
+    (r".*/(value|promise)[^/]*(/.*)?", r"promis", "the name of that filter"),
+    (r".*", r"`?promise`? (filter|policy)", "the name of that filter"),
+    (r".*", r"single_active_row", "name of a module"),
+    (r"docs/hooks/.*", r"sub-?programs?", "a process"),
+)
+
+
+def sources(*folders: str) -> list[Path]:
+    return sorted(
+        path
+        for folder in folders
+        for path in (ROOT / folder).rglob("*.py")
+        if path.relative_to(ROOT).as_posix() != THIS
+    )
+
+
+def place(path: Path, line: int) -> str:
+    return f"{path.relative_to(ROOT).as_posix()}:{line}"
+
+
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@functools.cache
+def tokens_of(path: Path) -> list[tokenize.TokenInfo]:
+    return list(tokenize.generate_tokens(io.StringIO(path.read_text()).readline))
+
+
+def pages() -> Iterator[tuple[Path, str]]:
+    """Yield files of prose with their text."""
+    for path in sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]):
+        if path.name != LOG_OF_CHANGES:
+            yield path, path.read_text()
+    for path in sorted((ROOT / "docs").rglob("*.ipynb")):
+        cells = json.loads(path.read_text())["cells"]
+        yield path, "\n".join("".join(cell["source"]) for cell in cells)
+    for path in sorted((ROOT / "safe_envs").rglob("*.yaml")):
+        yield path, path.read_text()
+
+
+def prose() -> Iterator[tuple[Path, int, str]]:
+    """Yield comments, docstrings and texts of the source, and the pages, with their first lines."""
+    for path, text in pages():
+        yield path, 1, text
+    for path in sources("safe_envs", "examples", "docs"):
+        comments: list[tuple[int, str]] = []
+        for token in tokens_of(path):
+            if token.type == tokenize.COMMENT:
+                comments.append((token.start[0], token.string.lstrip("# ")))
+            elif token.type == tokenize.STRING:
+                yield path, token.start[0], token.string
+        # A phrase may begin on one line of a comment and end on the next.
+        while comments:
+            first, text = comments.pop(0)
+            last = first
+            while comments and comments[0][0] == last + 1:
+                last, more = comments.pop(0)
+                text += f"\n{more}"
+            yield path, first, text
+
+
+def allowed(path: Path, around: str) -> bool:
+    name = path.relative_to(ROOT).as_posix()
+    return any(
+        re.fullmatch(paths, name) and re.search(text.replace(" ", r"\s+"), around, re.I)
+        for paths, text, _ in ALLOWED
+    )
+
+
+def fail_with(found: list[str], rule: str) -> None:
+    assert not found, f"{rule} ({len(found)} places)\n" + "\n".join(found)
+
+
+def test_retired_names_do_not_occur():
+    found = [
+        f"{place(path, token.start[0])}: {token.string} -> {NAMES[token.string]}"
+        for path in sources("safe_envs", "examples", "docs", "tests")
+        for token in tokens_of(path)
+        if token.type == tokenize.NAME and token.string in NAMES
+    ]
+    # In documentation they count where they are code: most are words of the language as well.
+    names = "|".join(NAMES)
+    for path, text in pages():
+        for number, line in enumerate(text.splitlines(), 1):
+            found += [
+                f"{place(path, number)}: {match[1]} -> {NAMES[match[1]]}"
+                for match in re.finditer(rf"[`.]({names})\b|\b(?:import|class) ({names})\b", line)
+                if match[1]
+            ]
+    fail_with(found, "retired names")
+
+
+def test_retired_names_are_not_defined():
+    found = []
+    for path in sources("safe_envs"):
+        if path.stem in MODULES:
+            found.append(f"{place(path, 1)}: module {path.stem} -> {MODULES[path.stem]}")
+        for node in ast.walk(tree_of(path)):
+            names = []
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                names.append((node.lineno, node.name))
+            if isinstance(node, ast.ClassDef):
+                names += [
+                    (entry.lineno, entry.target.id)
+                    for entry in node.body
+                    if isinstance(entry, ast.AnnAssign) and isinstance(entry.target, ast.Name)
+                ]
+            found += [
+                f"{place(path, line)}: {name} -> {DEFINITIONS[name]}"
+                for line, name in names
+                if name in DEFINITIONS
+            ]
+    fail_with(found, "retired names are defined")
+
+
+def test_retired_words_do_not_occur():
+    pattern = re.compile(
+        r"\b(?:" + "|".join(f"({phrase})" for phrase in PHRASES).replace(" ", r"\s+") + r")\b",
+        re.IGNORECASE,
+    )
+    replacements = list(PHRASES.values())
+    groups = [re.compile(phrase.replace(" ", r"\s+"), re.I) for phrase in PHRASES]
+    found = []
+    for path, first, text in prose():
+        for match in pattern.finditer(text):
+            if allowed(path, text[max(0, match.start() - 30) : match.end() + 30]):
+                continue
+            line = first + text.count("\n", 0, match.start())
+            k = next(k for k, group in enumerate(groups) if group.fullmatch(match[0]))
+            word = " ".join(match[0].split())
+            found.append(f'{place(path, line)}: "{word}" -> {replacements[k]}')
+    fail_with(found, "retired words")
+
+
+def test_a_class_name_has_one_meaning():
+    places = defaultdict(list)
+    for path in sources("safe_envs"):
+        for node in tree_of(path).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places[node.name].append(place(path, node.lineno))
+    found = [f"{name}: {', '.join(at)}" for name, at in sorted(places.items()) if len(at) > 1]
+    fail_with(found, "classes of the same name")
+
+
+def test_modules_have_at_most_300_lines():
+    found = [
+        f"{path.relative_to(ROOT)}: {lines}"
+        for path in sources("safe_envs")
+        if (lines := path.read_text().count("\n")) > 300
+    ]
+    fail_with(found, "modules of more than 300 lines")
+
+
+def test_agents_has_at_most_eight_parts():
+    parts = [
+        path.name
+        for path in (ROOT / "safe_envs" / "agents").iterdir()
+        if path.name not in ("__init__.py", "__pycache__")
+    ]
+    assert len(parts) <= 8, sorted(parts)
+
+
+# --- docstrings -----------------------------------------------------------------------------------
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+@functools.cache
+def classes() -> dict[str, ast.ClassDef]:
+    return {
+        node.name: node
+        for path in sources("safe_envs")
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, ast.ClassDef)
+    }
+
+
+def overrides(owner: ast.ClassDef | None, name: str) -> bool:
+    """Return whether a base class of this project has the method, which documents it then."""
+    bases = (
+        [ast.unparse(base).split("[")[0].split(".")[-1] for base in owner.bases] if owner else []
+    )
+    return any(
+        any(isinstance(entry, Function) and entry.name == name for entry in found.body)
+        or overrides(found, name)
+        for found in (classes().get(base) for base in bases)
+        if found is not None
+    )
+
+
+def public_functions() -> Iterator[tuple[str, ast.ClassDef | None, Function]]:
+    """Yield public functions and methods with a docstring, but no properties."""
+    for path in sources("safe_envs"):
+        for owner in (None, *(n for n in tree_of(path).body if isinstance(n, ast.ClassDef))):
+            if owner is not None and owner.name.startswith("_"):
+                continue
+            for node in (tree_of(path) if owner is None else owner).body:
+                if (
+                    isinstance(node, Function)
+                    and not node.name.startswith("_")
+                    and ast.get_docstring(node)
+                    and not any("property" in ast.unparse(d) for d in node.decorator_list)
+                ):
+                    yield f"{place(path, node.lineno)}: {node.name}", owner, node
+
+
+def arguments_of(node: Function, owner: ast.ClassDef | None) -> list[str]:
+    given = node.args
+    names = [entry.arg for entry in (*given.posonlyargs, *given.args, *given.kwonlyargs)]
+    names += [entry.arg for entry in (given.vararg, given.kwarg) if entry]
+    static = any("staticmethod" in ast.unparse(d) for d in node.decorator_list)
+    return names[1:] if owner is not None and not static else names
+
+
+def is_command(node: Function) -> bool:
+    """Return whether a command line is made of the function: its options have help, and the
+    docstring is that of the command."""
+    arguments = (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
+    return any("typer." in ast.unparse(a.annotation) for a in arguments if a.annotation) or any(
+        "app." in ast.unparse(d) for d in node.decorator_list
+    )
+
+
+def raised_by(node: Function) -> set[str]:
+    """Return the names of errors that the body of a function raises itself, outside any try."""
+    found: set[str] = set()
+
+    def visit(entry: ast.AST) -> None:
+        for child in ast.iter_child_nodes(entry):
+            if isinstance(child, Function | ast.Lambda | ast.ClassDef | ast.Try):
+                continue
+            if isinstance(child, ast.Raise) and isinstance(child.exc, ast.Call):
+                name = ast.unparse(child.exc.func)
+                if name.endswith("Error") and name.isidentifier():
+                    found.add(name)
+            visit(child)
+
+    visit(node)
+    return found - {"AttributeError", "NotImplementedError", "AssertionError"}
+
+
+def test_docstrings_have_the_sections_that_they_need():
+    found = []
+    for where, owner, node in public_functions():
+        text = ast.get_docstring(node) or ""
+        if overrides(owner, node.name) or is_command(node) or re.search(r"\b[Ss]ee `", text):
+            continue
+        arguments = arguments_of(node, owner)
+        if len(arguments) >= 2:
+            section = text.partition("\nArgs:")[2]
+            lacking = [name for name in arguments if not re.search(rf"\b{name}\b", section)]
+            if lacking:
+                found.append(f"{where}: Args lacks {', '.join(lacking)}")
+            nothing = node.returns is None or ast.unparse(node.returns) in ("None", "NoReturn")
+            told = re.match(r"(Return|Yield|Make|Build|Create|Load|Parse|Read)", text) or re.search(
+                r"^(Returns|Yields):", text, re.M
+            )
+            if not nothing and not told:
+                found.append(f"{where}: lacks Returns")
+        unsaid = [name for name in raised_by(node) if name not in text]
+        if unsaid:
+            found.append(f"{where}: Raises lacks {', '.join(sorted(unsaid))}")
+    fail_with(found, "incomplete docstrings")
+
+
+def test_docstrings_of_functions_begin_with_a_verb():
+    # What ruff's D401 does not see, for it knows no such "verbs".
+    no_verb = re.compile(
+        r"(the|an?|whether|what|that|how|where|which|who|when|if|of|by|as|in|on|for|from|to|one|all"
+        r"|each|every|no|not|its|their|such|see:)\b",
+        re.IGNORECASE,
+    )
+    found = [
+        f"{where}: {text.splitlines()[0]}"
+        for where, _, node in public_functions()
+        if (text := ast.get_docstring(node) or "") and no_verb.match(text)
+    ]
+    fail_with(found, "docstrings without a verb")
