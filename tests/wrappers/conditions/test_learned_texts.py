@@ -20,7 +20,7 @@ from safe_envs.wrappers import (
     parse_condition,
     parse_conditions,
 )
-from safe_envs.wrappers.learning.models.files import LearnedFileError
+from safe_envs.wrappers.learning.models.values import LearnedFileError
 from safe_envs.wrappers.verification.estimated_bound import estimated_bound
 from safe_envs.wrappers.verification.feasibility import verify
 from safe_envs.wrappers.verification.formulas import Formulas
