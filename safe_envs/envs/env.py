@@ -9,7 +9,8 @@ from typing import Any, ClassVar
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.envs.info import Info, safety_info
+from safe_envs.envs.episode import Episode
+from safe_envs.envs.info import Info
 from safe_envs.envs.simulation import NoiseStream, Simulation, center_and_half_width, steps_until
 from safe_envs.errors import InvalidInputError, NumericalError
 from safe_envs.problem.factory import build_problem, remembering
@@ -80,9 +81,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self._limit = steps_until(problem, max_episode_steps)
         self.executed: Sequence[float] = ()
         self._x: tuple[float, ...] | None = None
-        self._steps = 0
-        self._h_min = math.inf
-        self._episode_cost = 0.0
+        self._episode = Episode()
 
     @property
     def components(self) -> tuple[float, ...]:
@@ -133,9 +132,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         if seed is not None:
             self._noise.clear()
         self._x = self._simulation.starts.draw(self.np_random)
-        self._steps = 0
-        self._h_min = math.inf
-        self._episode_cost = 0.0
+        self._episode.restart()
         observation, _, _, info = self._observe([c for c, _ in self._scales])
         if self.viewer is not None:
             self.viewer.restart([self._x], [0.0], [0])
@@ -157,15 +154,15 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             self._x = self._simulation.integrator.step(
                 self.components, u, self._noise.next(self.np_random)
             )
-            self._steps += 1
+            self._episode.steps += 1
             observation, reward, terminated, info = self._observe(u)
         except (OverflowError, ZeroDivisionError, ValueError) as error:
             raise NumericalError(
                 f"the simulation of {self.problem.name!r} broke down at {self._x}: {error}"
             ) from error
         if self.viewer is not None:
-            self.viewer.advance([self._x], [self._steps * self.problem.dt], [u])
-        return observation, reward, terminated, self._steps >= self._limit, info
+            self.viewer.advance([self._x], [self._episode.steps * self.problem.dt], [u])
+        return observation, reward, terminated, self._episode.steps >= self._limit, info
 
     def render(self) -> Any:
         """Draw the state, with the trail of the episode and what a filter decided.
@@ -197,7 +194,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
         x = self.components
         features, barriers, reward, outside, goal = self._simulation.measure(
-            x, u, self._steps * self.problem.dt
+            x, u, self._episode.steps * self.problem.dt
         )
         h = min(barriers)
         if not math.isfinite(h + sum(x)):
@@ -205,23 +202,11 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
                 f"the state {x} of {self.problem.name!r} has left the finite numbers; reduce dt or"
                 " raise substeps"
             )
-        violation = h < 0.0
-        cost = 1.0 if violation else 0.0
-        self._episode_cost += cost
-        if h < self._h_min:
-            self._h_min = h
         left = outside > 0.0
         if left:
             features = np.clip(features, self._bounds.low, self._bounds.high)
         observation = np.array(features, dtype=np.float32)
-        info = safety_info(
-            violation=violation,
-            cost=cost,
-            barrier=np.array(barriers),
-            h_min=self._h_min,
-            episode_cost=self._episode_cost,
-        )
-        return observation, reward, left or goal >= 0.0, info
+        return observation, reward, left or goal >= 0.0, self._episode.count(barriers, h)
 
 
 class SystemEnv(SafeEnv):
