@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.systems import CUSTOM_ID, ENV_IDS

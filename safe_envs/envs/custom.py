@@ -6,8 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.envs.system_env import SystemEnv, SystemVectorEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.object_import import resolved
 from safe_envs.problem.factory import Factory, build_problem, load_system

@@ -4,31 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from safe_envs.envs.episode import Episode
 from safe_envs.envs.info import Info
-from safe_envs.envs.simulation import NoiseStream, Simulation, center_and_half_width, steps_until
+from safe_envs.envs.simulation import NoiseStream, Simulation, steps_until
+from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
 from safe_envs.errors import InvalidInputError, NumericalError
-from safe_envs.problem.factory import build_problem, remembering
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 from safe_envs.validators import real_array
-
-
-def observation_box(problem: SafetyProblem) -> gym.spaces.Box:
-    """Observation space of a problem: its features within their bounds."""
-    low = np.array([f.low for f in problem.features], dtype=np.float32)
-    high = np.array([f.high for f in problem.features], dtype=np.float32)
-    return gym.spaces.Box(low, high, dtype=np.float32)
-
-
-def action_box(problem: SafetyProblem) -> gym.spaces.Box:
-    """Action space of a problem: [-1, 1] for each input, which stands for the physical box."""
-    return gym.spaces.Box(-1.0, 1.0, (len(problem.inputs),), dtype=np.float32)
 
 
 class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -207,39 +195,3 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             features = np.clip(features, self._bounds.low, self._bounds.high)
         observation = np.array(features, dtype=np.float32)
         return observation, reward, left or goal >= 0.0, self._episode.count(barriers, h)
-
-
-class SystemEnv(SafeEnv):
-    """Base of the registered envs: a system's problem behind the arguments of `gym.make`.
-
-    Args:
-        max_episode_steps: truncate after so many control periods, if that is before the horizon.
-        render_mode: "rgb_array", "human" or None; see `SafeEnv`.
-        **options: fields of `safe_envs.problem.options.ProblemOptions`; arguments of the barrier
-            may also be given by themselves.
-
-    Raises:
-        ConfigurationError: An argument names something unknown or is out of range.
-    """
-
-    problem_factory: ClassVar[Any]
-    """Builds the problem from the arguments of the barrier; called once for equal arguments."""
-
-    def __init_subclass__(cls, **keywords: Any) -> None:
-        super().__init_subclass__(**keywords)
-        if "problem_factory" in vars(cls):
-            cls.problem_factory = staticmethod(remembering(cls.problem_factory))
-
-    def __init__(
-        self,
-        *,
-        max_episode_steps: int | None = None,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(type(self).make_problem(**options), max_episode_steps, render_mode)
-
-    @classmethod
-    def make_problem(cls, **options: Any) -> SafetyProblem:
-        """Return the problem that the env has with these options, without making the env."""
-        return build_problem(cls.__name__, cls.problem_factory, options)

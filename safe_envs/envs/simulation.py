@@ -137,10 +137,3 @@ def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
             f"max_episode_steps = {max_episode_steps!r}; give a whole number from 1"
         )
     return min(problem.steps, max_episode_steps)
-
-
-def center_and_half_width(problem: SafetyProblem) -> tuple[list[float], list[float]]:
-    """Physical input = center + half width * action, for an action in [-1, 1]."""
-    center = [0.5 * (low + high) for low, high in problem.box]
-    half = [0.5 * (high - low) for low, high in problem.box]
-    return center, half

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from safe_envs.dynamics.codegen import Components, constants, filled, finite, settled, stacked
-from safe_envs.envs.env import SystemEnv, action_box, observation_box
+from safe_envs.dynamics.codegen import Components, filled, finite, settled, stacked
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import Info, with_masks
 from safe_envs.envs.seeding import Generators
-from safe_envs.envs.simulation import NoiseStreams, Simulation, center_and_half_width, steps_until
+from safe_envs.envs.simulation import NoiseStreams, Simulation, steps_until
+from safe_envs.envs.spaces import BatchActions, action_box, observation_box
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
-from safe_envs.validators import real_array
-
-_LOWEST, _HIGHEST = constants((-1.0, 1.0))
 
 VectorStep = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]
 
@@ -83,7 +80,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._simulation = Simulation(problem, "arrays")
         self._noise = NoiseStreams(num_envs, self._simulation.integrator.channels)
-        self._center, self._half = (constants(c) for c in center_and_half_width(problem))
+        self._actions = BatchActions(problem, num_envs)
         observed = {f.expression for f in problem.features}
         self._unobserved = [
             i for i, state in enumerate(problem.plant.states) if state not in observed
@@ -130,32 +127,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Raises:
             InvalidInputError: the actions have another shape, or are not finite real numbers.
         """
-        given = np.asarray(real_array("array of actions", actions), dtype=np.float64)
-        if given.shape != self.action_space.shape:
-            raise InvalidInputError(
-                f"actions have shape {given.shape}; the envs take {self.action_space.shape}"
-            )
-        with np.errstate(over="ignore"):
-            suspicious = not finite(given)
-        if suspicious and not np.isfinite(given).all():
-            bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
-            raise InvalidInputError(
-                f"the actions of envs {bad[:5].tolist()} are not finite; give numbers in [-1, 1]"
-            )
-        clipped = np.minimum(np.maximum(given, _LOWEST), _HIGHEST)
-        return tuple(
-            [
-                c + w * clipped[:, j] if c else w * clipped[:, j]
-                for j, (c, w) in enumerate(zip(self._center, self._half, strict=True))
-            ]
-        )
+        return self._actions.physical(actions)
 
     def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
         """Inverse of `physical_action`, in double precision."""
-        actions = np.empty((self.num_envs, len(physical)))
-        for j, (u, c, w) in enumerate(zip(physical, self._center, self._half, strict=True)):
-            np.divide(u - c, w, out=actions[:, j])
-        return actions
+        return self._actions.normalized(physical)
 
     def reset(
         self,
@@ -173,7 +149,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         mask = self._reset_mask(options)
         self._seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
         self._restart(np.flatnonzero(mask))
-        observation, _, _, _, info = self._observe(tuple(self._center), counted=mask)
+        observation, _, _, _, info = self._observe(tuple(self._actions.center), counted=mask)
         if self.viewer is not None:
             self.viewer.restart(
                 self.state, self.episodes.steps * self.problem.dt, np.flatnonzero(mask).tolist()
@@ -246,7 +222,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if self._autoreset == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):
                 last = self._last_of_episode(ended, observation, info)
-                observation, _, _, _, info = self._observe(tuple(self._center), counted=ended)
+                observation, _, _, _, info = self._observe(
+                    tuple(self._actions.center), counted=ended
+                )
             episodes.begun = ended
         else:
             episodes.ended = ended
@@ -366,28 +344,3 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r}"
                 " have left the finite numbers; reduce dt or raise substeps"
             )
-
-
-class SystemVectorEnv(SafeVectorEnv):
-    """Base of the registered vector envs.
-
-    Args:
-        num_envs: see `SafeVectorEnv`.
-        autoreset_mode: see `SafeVectorEnv`.
-        max_episode_steps: see `SafeVectorEnv`.
-        render_mode: see `SafeVectorEnv`.
-        **options: as for `SystemEnv`.
-    """
-
-    env_class: ClassVar[type[SystemEnv]]
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        max_episode_steps: int | None = None,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        problem = self.env_class.make_problem(**options)
-        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)

@@ -7,7 +7,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF

@@ -8,7 +8,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.initial_distribution import Start

@@ -7,7 +7,7 @@ import math
 
 import sympy as sp
 
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start

@@ -7,7 +7,7 @@ import math
 
 import sympy as sp
 
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier

@@ -22,7 +22,7 @@ from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS, policy_file
 from safe_envs.agents.policies.sb3 import require_spaces
 from safe_envs.atomic_io import write_atomically
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
-from safe_envs.envs.env import action_box, observation_box
+from safe_envs.envs.spaces import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
 from safe_envs.problem.problem import SafetyProblem
 
