@@ -1,5 +1,7 @@
-"""Imports through the links at the top level of a checkout: `wrappers`, `agents` and `scripts` name
-the modules of `safe_envs`."""
+"""Imports through the links at the top level of a checkout.
+
+`wrappers`, `agents` and `scripts` name the modules of `safe_envs`.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,7 @@ from typing import Any
 
 
 class _SameModule(Loader):
-    """Return the module of `safe_envs` itself, never a second copy of it, whose classes would be
-    others."""
+    """Return the module of `safe_envs` itself, never a second copy with other classes."""
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         module = import_module(f"safe_envs.{spec.name}")
@@ -41,8 +42,7 @@ class _LinkFinder(MetaPathFinder):
 
 
 def redirect(name: str) -> None:
-    """Make a package that was imported through its link the package of the same name in
-    `safe_envs`.
+    """Make a package imported through its link the package of that name in `safe_envs`.
 
     Args:
         name: of the link: "wrappers", "agents" or "scripts".

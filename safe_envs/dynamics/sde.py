@@ -17,8 +17,10 @@ _REAL = sp.Symbol("real", real=True).assumptions0
 
 
 def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
-    """Read a list, nested list or matrix as an immutable matrix of the required shape (None: any
-    width)."""
+    """Read a matrix, or lists of its entries, as an immutable matrix of a required shape.
+
+    None as a width allows any.
+    """
     try:
         matrix = sp.ImmutableMatrix(entries)
     except (TypeError, ValueError) as error:
@@ -59,7 +61,7 @@ def _require_real(states: Iterable[Any], inputs: Iterable[Any], parameters: Iter
 
 
 def _declared(symbol: sp.Symbol) -> str:
-    """What a symbol was declared to be, like "positive=True"."""
+    """Return what a symbol was declared to be, like "positive=True"."""
     return ", ".join(
         f"{word}={value}"
         for word, value in getattr(symbol, "_assumptions_orig", symbol.assumptions0).items()
@@ -67,7 +69,7 @@ def _declared(symbol: sp.Symbol) -> str:
 
 
 def _fitting(symbol: sp.Symbol, value: Any) -> float:
-    """The value of a parameter, if it is a finite number and what its symbol is declared to be."""
+    """Return the value of a parameter, checked against the declaration of its symbol."""
     number = finite_number(f"parameter {symbol}", value)
     if symbol.assumptions0 != _REAL:
         exact = sp.Rational(number)
@@ -150,7 +152,7 @@ class ControlAffineSDE:
         diffusion: Any = None,
         parameters: Mapping[sp.Symbol, float] | None = None,
     ) -> ControlAffineSDE:
-        """The system dx = rate(x, u) dt + sigma(x) dW, taken apart into f and g.
+        """Split dx = rate(x, u) dt + sigma(x) dW into f and g.
 
         Args:
             states: n symbols x.
@@ -296,8 +298,7 @@ class ControlAffineSDE:
         return _numeric(given, tuple(self.parameters.items()))
 
     def exact(self, expression: Any) -> Any:
-        """Like `numeric`, with the decimal value of each parameter as a rational, so that terms
-        cancel exactly."""
+        """Like `numeric`, with decimal values as rationals, so that terms cancel exactly."""
         return expression.subs({p: sp.Rational(repr(v)) for p, v in self.parameters.items()})
 
 

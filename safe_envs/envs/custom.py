@@ -16,8 +16,9 @@ _ENTRY = "safe_envs.envs.custom:Custom"
 
 
 def register(env_id: str, system: str | Factory) -> None:
-    """Register an id with Gymnasium for a system of your own: `gym.make`, `gym.make_vec` and all
-    commands know it then.
+    """Register an id for a system of your own.
+
+    `gym.make`, `gym.make_vec` and all commands know it then.
 
     Args:
         env_id: like "my_lab/CartPole-v0"; one that was registered here before is replaced.

@@ -1,4 +1,4 @@
-"""The scalar face of a problem: a Gymnasium env."""
+"""A problem as a Gymnasium env."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         return physical
 
     def normalized_action(self, physical: Sequence[float]) -> np.ndarray:
-        """Inverse of `physical_action`, in double precision."""
+        """Invert `physical_action`: return an action in double precision."""
         return np.array([(u - c) / w for u, (c, w) in zip(physical, self._scales, strict=True)])
 
     def reset(
@@ -136,7 +136,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         return self.step_physical(self.physical_action(action))
 
     def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """`step` for a physical input inside the box, as a filter has it."""
+        """Step with a physical input inside its bounds, as a filter returns it."""
         self.executed = u
         try:
             self._x = self._simulation.integrator.step(

@@ -38,7 +38,7 @@ Info = dict[str, Any]
 def safety_info(
     violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any
 ) -> Info:
-    """What every env reports; values as in the table above."""
+    """Return what every env reports; values as in the table above."""
     return {
         "cost": cost,
         "violation": violation,
@@ -60,7 +60,7 @@ def filter_info(
     episode_interventions: Any,
     episode_infeasible: Any,
 ) -> Info:
-    """What a filter adds; values as in the table above."""
+    """Return what a filter adds; values as in the table above."""
     return {
         "nominal_action": nominal_action,
         "safe_action": safe_action,

@@ -1,4 +1,4 @@
-"""The batched face of a problem: a Gymnasium vector env without a loop over its envs."""
+"""A problem as a Gymnasium vector env, without a loop over its envs."""
 
 from __future__ import annotations
 
@@ -93,8 +93,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     @property
     def components(self) -> Components:
-        """The exact states, an array of shape (num_envs,), not to be written to, for each of the
-        problem's states."""
+        """The exact states: for each state an array (num_envs,), not to be written to."""
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
         return self._x
@@ -121,8 +120,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return tuple(self._generators.seeds)
 
     def physical_action(self, actions: Any) -> Components:
-        """Map actions in [-1, 1], shape (num_envs, m), to the components of the physical inputs,
-        clipped to the box.
+        """Scale actions in [-1, 1] to physical inputs; see `BatchActions.physical`.
 
         Raises:
             InvalidInputError: the actions have another shape, or are not finite real numbers.
@@ -130,7 +128,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self._actions.physical(actions)
 
     def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
-        """Inverse of `physical_action`, in double precision."""
+        """Invert `physical_action`: return actions of shape (num_envs, m) in double precision."""
         return self._actions.normalized(physical)
 
     def reset(
@@ -157,7 +155,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return observation, with_masks(info, mask)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Where each episode stands: arrays with the batch in front, from which `restore` goes on."""
+        """Return where each episode stands, in arrays with the batch in front; see `restore`."""
         return {"state": self.state, **self.episodes.snapshot()}
 
     def restore(
@@ -198,7 +196,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self.step_physical(self.physical_action(actions))
 
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
-        """`step` for the components of physical inputs inside the box, as a filter has them."""
+        """Step with components of physical inputs inside their bounds, as a filter returns them."""
         x = self.components
         self.executed = u
         episodes = self.episodes
@@ -265,7 +263,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self.viewer.frames()
 
     def _last_of_episode(self, ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
-        """Keep what the ended envs showed last, and restart them."""
+        """Keep the last observation and info of the ended envs, and restart them."""
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended).tolist():
             final[i] = observation[i]

@@ -1,5 +1,4 @@
-"""A safety problem: plant, model, barriers, input box, start, timing and task, as one frozen
-statement."""
+"""A safety problem: plant, model, barriers, input bounds, start, timing and task."""
 
 from __future__ import annotations
 
@@ -177,7 +176,7 @@ class SafetyProblem:
             )
 
     def gains_of(self, barrier: int) -> tuple[float, ...]:
-        """Rates p_1..p_r for a barrier, by its index."""
+        """Return the rates p_1..p_r of a barrier, given by its index."""
         gains: Any = self.gains
         return gains[barrier] if isinstance(gains[0], tuple) else gains
 
@@ -188,8 +187,7 @@ class SafetyProblem:
 
     @property
     def duration(self) -> float:
-        """Length of an episode in s as it is simulated: the whole number of control periods that is
-        nearest to the horizon."""
+        """Length of an episode in s as it is simulated, in whole control periods."""
         return self.steps * self.dt
 
     @property
@@ -288,7 +286,7 @@ class SafetyProblem:
 
 
 def _numbers(given: Any) -> np.ndarray:
-    """What the user gave as an array of at least one axis; empty if it holds no numbers."""
+    """Return numbers as an array of at least one axis; empty if there are none."""
     try:
         found = np.asarray(given)
         # NumPy would read numbers out of texts.

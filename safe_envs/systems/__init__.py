@@ -1,5 +1,4 @@
-"""The systems of the thesis and variations of them, one file each, and their registration with
-Gymnasium."""
+"""The systems of the thesis and variations, one file each, and their registration."""
 
 from __future__ import annotations
 

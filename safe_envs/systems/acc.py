@@ -32,7 +32,7 @@ _CLOSENESS = sp.exp(-z / 50)
 
 
 def own_acceleration(speed: sp.Symbol) -> sp.Expr:
-    """-F_r/M without any force of the engine, with the drag F_r = f_0 + f_1 v + f_2 v^2.
+    """Return -F_r/M, without engine force, with the drag F_r = f_0 + f_1 v + f_2 v^2.
 
     Source: thesis Sec. 4.3.1.
     """
@@ -40,13 +40,14 @@ def own_acceleration(speed: sp.Symbol) -> sp.Expr:
 
 
 def near_desired_speed(speed: sp.Symbol) -> sp.Expr:
-    """1/(1 + ((v - 22)/4)^2): 1 at the desired speed, with a slope that is felt from far away."""
+    """Return 1/(1 + ((v - 22)/4)^2): 1 at the desired speed, with a slope far from it too."""
     return 1 / (1 + ((speed - _DESIRED_SPEED) / 4) ** 2)
 
 
 def headway_system() -> ControlAffineSDE:
-    """The car and its lead: dx_1 = (-F_r(x_1) + u)/M dt + sigma_1 dW, dx_2 = 0, dx_3 = (x_2 - x_1)
-    dt.
+    """Return the car and its lead.
+
+    dx_1 = (-F_r(x_1) + u)/M dt + sigma_1 dW, dx_2 = 0, dx_3 = (x_2 - x_1) dt.
 
     Source: thesis Sec. 4.3.1.
     """
@@ -61,8 +62,9 @@ def headway_system() -> ControlAffineSDE:
 
 
 def gap_system() -> ControlAffineSDE:
-    """The car and its gap: dv = (-F_r(v) + u)/M dt + sigma_1 dW_1, dz = (v_f - v) dt + sigma_2
-    dW_2.
+    """Return the car and its gap.
+
+    dv = (-F_r(v) + u)/M dt + sigma_1 dW_1, dz = (v_f - v) dt + sigma_2 dW_2.
 
     Source: thesis Sec. 6.3.2.
     """
@@ -85,8 +87,7 @@ def _cruise(
     slack_weight: float,
     **rest: Any,
 ) -> SafetyProblem:
-    """What both problems have in common: the force's box, and the goal of driving at the desired
-    speed."""
+    """Build what both problems share: the bounds of the force, and the desired speed as goal."""
     clf = CLF(
         (speed - _DESIRED_SPEED) ** 2,
         rate,
@@ -106,7 +107,7 @@ def _cruise(
 
 
 def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> SafetyProblem:
-    """Following a slower car at a time headway.
+    """Build the problem of following a slower car at a time headway.
 
     Args:
         tau: shortest allowed headway, in s.
@@ -144,7 +145,7 @@ def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> S
 def acc_gap(
     *, distance: float = 10.0, power: int = 5, rate: float = 1.0, slack_weight: float = 2.0
 ) -> SafetyProblem:
-    """Following a slower car at a minimum distance.
+    """Build the problem of following a slower car at a minimum distance.
 
     Args:
         distance: D, the shortest allowed gap, in m.
@@ -190,11 +191,13 @@ def acc_gap(
 class ACC(SystemEnv):
     """A car that wants to drive faster than the one ahead is to keep a time headway.
 
-    ## Description The lead drives at 20 m/s and the desired speed is 22 m/s: the gap grows while
-    the car accelerates, then closes, and the desired speed has to be given up.
+    ## Description
+    The lead drives at 20 m/s and the desired speed is 22 m/s: the gap grows while the car
+    accelerates, then closes, and the desired speed has to be given up.
 
-    ## Equations dx_1 = (u - F_r)/M dt + sigma_1 dW, dx_2 = 0, dx_3 = (x_2 - x_1) dt, with the drag
-    F_r = f_0 + f_1 x_1 + f_2 x_1^2; f_0 = .1 N, f_1 = 5 N s/m, f_2 = .25 N s^2/m^2, M = 1650 kg
+    ## Equations
+    dx_1 = (u - F_r)/M dt + sigma_1 dW, dx_2 = 0, dx_3 = (x_2 - x_1) dt, with the drag F_r = f_0 +
+    f_1 x_1 + f_2 x_1^2; f_0 = .1 N, f_1 = 5 N s/m, f_2 = .25 N s^2/m^2, M = 1650 kg
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -211,11 +214,13 @@ class ACC(SystemEnv):
     ## Observation
     The states.
 
-    ## Barrier h = x_3 - tau x_1 with tau = 1.8 s, of relative degree 1. It is unbounded above, so
-    that h/sup h is no bound on the probability of staying safe. Gain 1. Natural filter: `scbf`.
+    ## Barrier
+    h = x_3 - tau x_1 with tau = 1.8 s, of relative degree 1. It is unbounded above, so that h/sup h
+    is no bound on the probability of staying safe. Gain 1. Natural filter: `scbf`.
 
-    ## Noise `sigma_1` = 1 m/s/sqrt(s). Of the printed three-dimensional Wiener process only this
-    channel acts.
+    ## Noise
+    `sigma_1` = 1 m/s/sqrt(s). Of the printed three-dimensional Wiener process only this channel
+    acts.
 
     ## Mismatch
     None.
@@ -223,8 +228,9 @@ class ACC(SystemEnv):
     ## Reward
     1/(1 + ((x_1 - 22)/4)^2) a step, in (0, 1].
 
-    ## Nominal controller Min-norm CLF law of V = (x_1 - 22)^2: AV + 5 V <= d, at the cost 2 u^2/M^2
-    + .02 d^2. With the weights and the condition of the print (1/2 each, AV <= d) u stays near 0.
+    ## Nominal controller
+    Min-norm CLF law of V = (x_1 - 22)^2: AV + 5 V <= d, at the cost 2 u^2/M^2 + .02 d^2. With the
+    weights and the condition of the print (1/2 each, AV <= d) u stays near 0.
 
     ## Start
     `thesis`: (15, 20, 150).
@@ -232,11 +238,13 @@ class ACC(SystemEnv):
     ## Episode end
     Terminated outside the workspace, so at a crash or a stop; truncated after 100 s = 2000 steps.
 
-    ## Arguments `tau=1.8`, the headway in s; `rate=5.0` and `slack_weight=0.02` of the goal; for
-    all others see `SystemEnv`.
+    ## Arguments
+    `tau=1.8`, the headway in s; `rate=5.0` and `slack_weight=0.02` of the goal; for all others see
+    `SystemEnv`.
 
-    ## Source Thesis Sec. 4.3.1. The print does not give tau; and it has tr(Sigma' Sigma V_xx) where
-    tr(Sigma Sigma' V_xx) is meant.
+    ## Source
+    Thesis Sec. 4.3.1. The print does not give tau; and it has tr(Sigma' Sigma V_xx) where tr(Sigma
+    Sigma' V_xx) is meant.
     """
 
     problem_factory = staticmethod(acc)
@@ -245,11 +253,13 @@ class ACC(SystemEnv):
 class ACCGap(SystemEnv):
     """A car that wants to drive faster than the one ahead is to keep a minimum distance.
 
-    ## Description The car of `ACC` with the lead's speed as a parameter and noise in the gap too.
-    It starts 5 m from the edge.
+    ## Description
+    The car of `ACC` with the lead's speed as a parameter and noise in the gap too. It starts 5 m
+    from the edge.
 
-    ## Equations dv = (u - F_r)/M dt + sigma_1 dW_1, dz = (v_f - v) dt + sigma_2 dW_2, with F_r and
-    M as in `ACC` and v_f = 20 m/s
+    ## Equations
+    dv = (u - F_r)/M dt + sigma_1 dW_1, dz = (v_f - v) dt + sigma_2 dW_2, with F_r and M as in `ACC`
+    and v_f = 20 m/s
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -265,9 +275,10 @@ class ACCGap(SystemEnv):
     ## Observation
     The states, and the closeness exp(-z/50), which tells small gaps apart when long ones are about.
 
-    ## Barrier h = (z - D)^5 with D = 10 m, of relative degree 2 and unbounded above. Its
-    derivatives vanish at the edge, and with them what a condition can ask for; z - D (`power` 1) is
-    the plain alternative. Gains 1 and 1. Natural filter: `scbf`.
+    ## Barrier
+    h = (z - D)^5 with D = 10 m, of relative degree 2 and unbounded above. Its derivatives vanish at
+    the edge, and with them what a condition can ask for; z - D (`power` 1) is the plain
+    alternative. Gains 1 and 1. Natural filter: `scbf`.
 
     ## Noise
     `sigma_1` = .5 m/s/sqrt(s), `sigma_2` = .5 m/sqrt(s).
@@ -275,12 +286,14 @@ class ACCGap(SystemEnv):
     ## Mismatch
     None.
 
-    ## Reward exp(-z/50)/(1 + ((v - 22)/4)^2) a step, in (0, 1]: others cut into a long gap. Without
-    the second factor nothing would pull an agent towards the edge, since in the long run it drives
-    as fast as the lead at any gap.
+    ## Reward
+    exp(-z/50)/(1 + ((v - 22)/4)^2) a step, in (0, 1]: others cut into a long gap. Without the
+    second factor nothing would pull an agent towards the edge, since in the long run it drives as
+    fast as the lead at any gap.
 
-    ## Nominal controller Min-norm CLF law of V = (v - 22)^2: AV + V <= d, at the cost 2 u^2/M^2 + 2
-    d^2. The weights are chosen by us, so that the speed is reached within the episode.
+    ## Nominal controller
+    Min-norm CLF law of V = (v - 22)^2: AV + V <= d, at the cost 2 u^2/M^2 + 2 d^2. The weights are
+    chosen by us, so that the speed is reached within the episode.
 
     ## Start
     `thesis`: (10, 15).
@@ -288,11 +301,13 @@ class ACCGap(SystemEnv):
     ## Episode end
     Terminated outside the workspace, so at a crash or a stop; truncated after 30 s = 3000 steps.
 
-    ## Arguments `distance=10.0` in m and `power=5`, an odd exponent, of the barrier; `rate=1.0` and
+    ## Arguments
+    `distance=10.0` in m and `power=5`, an odd exponent, of the barrier; `rate=1.0` and
     `slack_weight=2.0` of the goal; for all others see `SystemEnv`.
 
-    ## Source Thesis Sec. 6.3.2, which does not give v_f. Its b_1 lacks the noise term and its b_2
-    has wrong coefficients; here both are derived.
+    ## Source
+    Thesis Sec. 6.3.2, which does not give v_f. Its b_1 lacks the noise term and its b_2 has wrong
+    coefficients; here both are derived.
     """
 
     problem_factory = staticmethod(acc_gap)

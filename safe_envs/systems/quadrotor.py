@@ -65,7 +65,7 @@ MIXING = sp.ImmutableMatrix(
 
 
 def quadrotor(mass: float) -> ControlAffineSDE:
-    """The rigid body with four rotors; accelerations along x, y and z carry noise.
+    """Return the rigid body with four rotors; accelerations along x, y and z carry noise.
 
     The inputs are the squared speeds of the rotors, in which the system is affine.
 
@@ -97,8 +97,9 @@ def quadrotor(mass: float) -> ControlAffineSDE:
 
 
 def rotor_laws(x_wanted: sp.Expr, x_rate_wanted: sp.Expr) -> tuple[sp.Expr, ...]:
-    """Thrust by the altitude, torques that follow x and hold y and the heading at 0, through the
-    inverse of the mixing.
+    """Return the rotor speeds for thrust and torques, by the inverse of the mixing.
+
+    Thrust controls the altitude; torques follow x and hold y and the heading at 0.
 
     The position loop asks for a horizontal acceleration, which for small tilts is g times an angle:
     that angle is what the attitude loop, about three times as fast, follows.
@@ -118,12 +119,12 @@ def rotor_laws(x_wanted: sp.Expr, x_rate_wanted: sp.Expr) -> tuple[sp.Expr, ...]
 
 
 def start_at(known: Mapping[sp.Symbol, Any], spread: Sequence[sp.Symbol] = ()) -> Start:
-    """Some components of the state, and 0 for all others."""
+    """Return a start with some components of the state, and 0 for all others."""
     return Start(tuple(sp.sympify(known.get(s.symbol, 0)) for s in _STATES), tuple(spread))
 
 
 def rotor_problem(name: str, *, followed: Sequence[Feature] = (), **rest: Any) -> SafetyProblem:
-    """What the problems with all twelve states have in common.
+    """Build what the problems with all twelve states share.
 
     Args:
         name: of the problem.
@@ -149,7 +150,7 @@ def rotor_problem(name: str, *, followed: Sequence[Feature] = (), **rest: Any) -
 
 
 def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyProblem:
-    """All twelve states, for a quadrotor that is heavier than its designer believes.
+    """Build the problem of a quadrotor that is heavier than its designer believes.
 
     Args:
         center: c, the middle of the safe band, in m.
@@ -187,8 +188,9 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
 class Quadrotor(SystemEnv):
     """The altitude of a quadrotor with all its twelve states and four rotors is to stay in a band.
 
-    ## Description The task of `QuadrotorAltitude`, through the full dynamics: the thrust that a
-    filter adds is shared among four rotors, and acts along a body axis that tilts.
+    ## Description
+    The task of `QuadrotorAltitude`, through the full dynamics: the thrust that a filter adds is
+    shared among four rotors, and acts along a body axis that tilts.
 
     ## Equations
     Positions and angles integrate their rates. With noise sigma_i dW_i on the three accelerations,
@@ -219,11 +221,13 @@ class Quadrotor(SystemEnv):
     ## Inputs | symbol | meaning | unit | box | |---|---|---|---| | `rotor_1` to `rotor_4` | squared
     rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the plant's hover, chosen by us |
 
-    ## Observation The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5
-    sin(t), and its rate.
+    ## Observation
+    The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5 sin(t), and its
+    rate.
 
-    ## Barrier h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses
-    its hold on h at z = c, where it is not needed. Gains 2 and 8. Natural filter: `hocbf`.
+    ## Barrier
+    h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold
+    on h at z = c, where it is not needed. Gains 2 and 8. Natural filter: `hocbf`.
 
     ## Noise
     `sigma_x`, `sigma_y`, `sigma_z` of the accelerations in m/s/sqrt(s), all 0.
@@ -234,11 +238,13 @@ class Quadrotor(SystemEnv):
     ## Reward
     exp(-(z - z_ref)^2) a step, in (0, 1].
 
-    ## Nominal controller U_1 as in `QuadrotorAltitude`; PD laws that hold x, y and psi at 0 through
-    the roll and pitch angles, for the torques; and the rotor speeds by the inverse of the mixing.
+    ## Nominal controller
+    U_1 as in `QuadrotorAltitude`; PD laws that hold x, y and psi at 0 through the roll and pitch
+    angles, for the torques; and the rotor speeds by the inverse of the mixing.
 
-    ## Start `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0, all else 0. `thesis`:
-    z = 5 m, all else 0.
+    ## Start
+    `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0, all else 0. `thesis`: z = 5 m,
+    all else 0.
 
     ## Episode end
     Terminated outside the workspace, truncated after 30 s = 600 steps.

@@ -16,7 +16,7 @@ x, u, sigma = sp.symbols("x u sigma", real=True)
 
 
 def scalar_system() -> ControlAffineSDE:
-    """The system: dx = (x + u) dt + sigma dW.
+    """Return the system dx = (x + u) dt + sigma dW.
 
     Source: thesis Sec. 4.2.2.
     """
@@ -31,7 +31,7 @@ def scalar_system() -> ControlAffineSDE:
 
 
 def scalar(*, limit: float = 1.0) -> SafetyProblem:
-    """The half-line below a limit.
+    """Build the problem of the half-line below a limit.
 
     Args:
         limit: the edge of the safe set.
@@ -66,8 +66,9 @@ def scalar(*, limit: float = 1.0) -> SafetyProblem:
 class Scalar(SystemEnv):
     """An unstable scalar system with noise is to stay below a limit.
 
-    ## Description The smallest system on which the conditions differ: near the limit a reciprocal
-    one asks for unbounded control.
+    ## Description
+    The smallest system on which the conditions differ: near the limit a reciprocal one asks for
+    unbounded control.
 
     ## Equations
     dx = (x + u) dt + sigma dW

@@ -1,5 +1,7 @@
-"""The systems in batches: for each env class `X` of this package a class `XVector`, made when it is
-first named."""
+"""The systems in batches: a class `XVector` for each env class `X`.
+
+Each is made when it is first named.
+"""
 
 from __future__ import annotations
 
