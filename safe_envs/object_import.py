@@ -26,8 +26,8 @@ _ADVICE = "give the path of a Python file, as in my_system.py:problem"
 def load_object(place: str) -> Any:
     """Import an object by its place, which runs the code there.
 
-    A file is read anew when it has changed; modules beside it are imported afresh with it, and stay
-    as they are until then.
+    A file is read again when it has changed, together with the modules of its folder that it
+    imports.
 
     Args:
         place: FILE.py:NAME or MODULE:NAME.
@@ -38,7 +38,7 @@ def load_object(place: str) -> Any:
     source, colon, name = place.rpartition(":")
     if not (colon and source and name):
         raise ConfigurationError(
-            f"{shown(place)} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like"
+            f"{shown(place)} is not a place; give FILE.py:NAME or MODULE:NAME, like"
             " my_system.py:problem"
         )
     module = _of_file(Path(source)) if source.endswith(".py") else _of_module(source)
@@ -134,7 +134,7 @@ def _of_module(name: str) -> ModuleType:
 def _running(path: Path | None, what: str) -> Iterator[None]:
     """Run a user's code: its errors become ours, with the line.
 
-    Modules beside its file can be imported, as when Python runs it.
+    Modules in its folder can be imported, as when Python runs it.
     """
     folder = None if path is None else str(path.parent)
     known = set(sys.modules)

@@ -1,4 +1,4 @@
-"""A control-affine stochastic differential equation, stated once, in symbols."""
+"""A control-affine stochastic differential equation, defined once, in symbols."""
 
 from __future__ import annotations
 
@@ -192,7 +192,7 @@ class ControlAffineSDE:
                 )
             if not is_zero(sp.expand(entry)):
                 raise SystemDefinitionError(
-                    f"the rate of {state} is not affine in the inputs: beside f + g u there is"
+                    f"the rate of {state} is not affine in the inputs: besides f + g u there is"
                     f" {entry}. Give f and g themselves where a system has several pieces"
                 )
         return cls(

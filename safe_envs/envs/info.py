@@ -13,16 +13,20 @@ float64 arrays from a scalar env, arrays with the batch in front from a vector e
 
 and with a filter
 
-| key | type | meaning | |---|---|---| | `nominal_action` | float64 (m,) | what the policy proposed,
-or the goal of a joint program asks for, in physical units | | `safe_action` | float64 (m,) | what
-was executed, in physical units | | `intervention` | bool | the two differ | | `filter_active` |
-bool | a barrier row is binding or cannot be met | | `feasible` | bool | some action in the box
-meets every row | | `slack` | float | by how much the worst row is violated by the executed action |
-| `slacks` | float64 (k,) | the same for each row | | `active_barrier` | int | index of the barrier
-that caused the intervention, -1 without one | | `episode_interventions` | int | interventions of
-the episode so far | | `episode_infeasible` | int | infeasible steps of the episode so far |
+| key | type | meaning |
+|---|---|---|
+| `nominal_action` | float64 (m,) | proposed by the policy, or the goal of a joint QP; physical units |
+| `safe_action` | float64 (m,) | executed, in physical units |
+| `intervention` | bool | the two differ |
+| `filter_active` | bool | a constraint is binding or cannot be met |
+| `feasible` | bool | some action within the input bounds meets every constraint |
+| `slack` | float | by how much the executed action violates the worst constraint |
+| `slacks` | float64 (k,) | the same for each constraint |
+| `active_barrier` | int | index of the barrier that caused the intervention, -1 without one |
+| `episode_interventions` | int | interventions of the episode so far |
+| `episode_infeasible` | int | infeasible steps of the episode so far |
 
-At reset, where nothing was executed yet, the actions are the point of the box nearest to 0.
+At reset, where nothing was executed yet, the actions are the point within the input bounds nearest to 0.
 """
 
 from __future__ import annotations

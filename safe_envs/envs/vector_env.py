@@ -37,7 +37,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Args:
         problem: what to simulate.
         num_envs: size of the batch.
-        autoreset_mode: when ended episodes start anew: "NextStep" (Gymnasium's default: the
+        autoreset_mode: when ended episodes restart: "NextStep" (Gymnasium's default: the
             following step ignores the action and returns the reset observation, with reward 0),
             "SameStep" (the last observation and info of the episode are in `infos["final_obs"]` and
             `infos["final_info"]`) or "Disabled" (reset by `options={"reset_mask": mask}`).

@@ -20,7 +20,7 @@ class CLF:
 
         min  w_u |u|^2 + w_d d^2   s.t.   AV + rate V <= d
 
-    The slack d keeps the program feasible: without it AV <= 0 cannot hold at the goal under noise.
+    The slack d keeps the QP feasible: without it AV <= 0 cannot hold at the goal under noise.
 
     Attributes:
         V: Lyapunov function of the states.

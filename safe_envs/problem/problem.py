@@ -47,7 +47,7 @@ class SafetyProblem:
         features: entries of the observation; the states by default.
         goal: the episode ends where this expression is >= 0.
         noise: names of the diffusion parameters, in the order of the `noise` argument.
-        gains: rates p_1..p_r in 1/s that the conditions use unless told otherwise, for all
+        gains: rates p_1..p_r in 1/s that the conditions use by default, for all
             barriers; or such a tuple for each.
         filter: name of the condition that suits the problem.
         substeps: integration steps in a control period.

@@ -18,8 +18,8 @@ class SamplingDomain:
     `SafetyProblem.exploration` completes what is empty.
 
     Attributes:
-        region: (low, high) of each state. States are drawn uniformly from it, and kept where every
-            barrier is positive.
+        region: (low, high) of each state. States are drawn uniformly from it, where every barrier
+            is positive.
         inputs: input vectors that are tried, in physical units; clipped to the box.
         coordinates: expressions of the states that a learned function depends on: cosines and sines
             of angles, relative positions.

@@ -247,7 +247,7 @@ def _doubt_box_of_workspace(problem: SafetyProblem, x: Components) -> None:
 
 
 def _doubt(text: str) -> None:
-    # The statement of the problem stands further up, by a depth that depends on who looks.
+    # The code that builds the problem is further up, by a depth that depends on the caller.
     warnings.warn(text, SystemDefinitionWarning, stacklevel=5)
 
 

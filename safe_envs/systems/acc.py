@@ -207,7 +207,7 @@ class ACC(SystemEnv):
     | `x_3` | gap | m | [0, 1000] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `u` | force at the wheels | N | [-.3 M g, .3 M g] = [-4855.95, 4855.95] |
 
@@ -216,10 +216,10 @@ class ACC(SystemEnv):
 
     ## Barrier
     h = x_3 - tau x_1 with tau = 1.8 s, of relative degree 1. It is unbounded above, so that h/sup h
-    is no bound on the probability of staying safe. Gain 1. Natural filter: `scbf`.
+    is no bound on the probability of staying safe. Gain 1. Default filter: `scbf`.
 
     ## Noise
-    `sigma_1` = 1 m/s/sqrt(s). Of the printed three-dimensional Wiener process only this channel
+    `sigma_1` = 1 m/s/sqrt(s). Of the thesis' three-dimensional Wiener process only this channel
     acts.
 
     ## Mismatch
@@ -230,7 +230,7 @@ class ACC(SystemEnv):
 
     ## Nominal controller
     Min-norm CLF law of V = (x_1 - 22)^2: AV + 5 V <= d, at the cost 2 u^2/M^2 + .02 d^2. With the
-    weights and the condition of the print (1/2 each, AV <= d) u stays near 0.
+    weights and the condition of the thesis (1/2 each, AV <= d) u stays near 0.
 
     ## Start
     `thesis`: (15, 20, 150).
@@ -243,7 +243,7 @@ class ACC(SystemEnv):
     `SystemEnv`.
 
     ## Source
-    Thesis Sec. 4.3.1. The print does not give tau; and it has tr(Sigma' Sigma V_xx) where tr(Sigma
+    Thesis Sec. 4.3.1. It does not give tau, and has tr(Sigma' Sigma V_xx) where tr(Sigma
     Sigma' V_xx) is meant.
     """
 
@@ -268,7 +268,7 @@ class ACCGap(SystemEnv):
     | `z` | gap | m | [0, 500] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `u` | force at the wheels | N | [-.3 M g, .3 M g] = [-4855.95, 4855.95] |
 
@@ -278,7 +278,7 @@ class ACCGap(SystemEnv):
     ## Barrier
     h = (z - D)^5 with D = 10 m, of relative degree 2 and unbounded above. Its derivatives vanish at
     the edge, and with them what a condition can ask for; z - D (`power` 1) is the plain
-    alternative. Gains 1 and 1. Natural filter: `scbf`.
+    alternative. Gains 1 and 1. Default filter: `scbf`.
 
     ## Noise
     `sigma_1` = .5 m/s/sqrt(s), `sigma_2` = .5 m/sqrt(s).

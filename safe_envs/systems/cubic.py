@@ -26,7 +26,7 @@ def cubic(diffusion: Any, noise: Mapping[sp.Symbol, float]) -> ControlAffineSDE:
 
     dx_1 = (-a x_1 - x_2) dt + ..., dx_2 = (x_1^3 + x_2 u) dt + ..., with a = .6.
 
-    Source: thesis Sec. 5.4.2 and 6.3.1. The print writes d of the states' derivatives where d of
+    Source: thesis Sec. 5.4.2 and 6.3.1. The thesis writes d of the states' derivatives where d of
         the states is meant.
     """
     return ControlAffineSDE(
@@ -137,7 +137,7 @@ class CubicSDE(SystemEnv):
     | `x_1`, `x_2` | | 1 | [-6, 6] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `u` | | 1/s | [-10, 10] |
 
@@ -147,7 +147,7 @@ class CubicSDE(SystemEnv):
     ## Barrier
     h = offset - x_1 - x_2^2 with offset 1, of relative degree 1. C is unbounded and so is h, so
     that h/sup h is no bound on the probability of staying safe. The condition cannot be met at x_2
-    = 0, x_1 < 0. Gain 2. Natural filter: `scbf`.
+    = 0, x_1 < 0. Gain 2. Default filter: `scbf`.
 
     ## Noise
     `k` = .1 1/sqrt(s).
@@ -196,7 +196,7 @@ class CubicSDEDisk(SystemEnv):
     | `x_1`, `x_2` | | 1 | [-2 r, 2 r], r = 1 |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `u` | | 1/s | [-10, 10] |
 
@@ -206,7 +206,7 @@ class CubicSDEDisk(SystemEnv):
     ## Barrier
     h = r^2 - x_1^2 - x_2^2, of relative degree 1, with sup h = r^2. The thesis' bound h/sup h does
     not apply: at x_2 = 0, abs(x_1) < .258 the condition cannot be met (Ah(0) = -.08). Gain 2.
-    Natural filter: `scbf`.
+    Default filter: `scbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` = .2 1/sqrt(s).
@@ -215,7 +215,7 @@ class CubicSDEDisk(SystemEnv):
     None by default.
 
     ## Reward
-    exp(-4 (h/r^2)^2) a step, in (0, 1]: as near to the edge as can be. Chosen by us.
+    exp(-4 (h/r^2)^2) a step, in (0, 1]: as near to the edge as can be. Our choice.
 
     ## Nominal controller
     0, as the thesis has it.

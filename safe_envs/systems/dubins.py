@@ -194,9 +194,9 @@ class DubinsDisk(SystemEnv):
     | `theta` | heading | rad | unbounded |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
-    | `omega` | turn rate | rad/s | [-pi, pi], chosen by us |
+    | `omega` | turn rate | rad/s | [-pi, pi] (assumed) |
 
     ## Observation
     x, y, cos(theta), sin(theta).
@@ -205,7 +205,7 @@ class DubinsDisk(SystemEnv):
     h = r^2 - x^2 - y^2, of relative degree 2. Where the heading is radial the input does not reach
     its second derivative: the condition can be met there only if b_2 >= 0 without it, which at the
     centre needs p_1 p_2 >= 2 v^2/r^2. Hence the gains 1 and 2 in place of the thesis' 1 and 1,
-    which miss that for v = .8. Natural filter: `hocbf`.
+    which miss that for v = .8. Default filter: `hocbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` in m/sqrt(s), both 0: the system is deterministic.
@@ -217,14 +217,14 @@ class DubinsDisk(SystemEnv):
     ## Reward
     (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from
     (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise tangent: the
-    circle alone would reward turning on the spot. Chosen by us.
+    circle alone would reward turning on the spot. Our choice.
 
     ## Nominal controller
     Turns towards a course that leads onto that circle and around it.
 
     ## Start
-    `feasible`: uniform in the disk and in heading, kept where b_1 > 0 for the plant's default speed
-    and the default gains, since from elsewhere no filter of these gains is promised to succeed.
+    `feasible`: uniform in the disk and in heading, restricted to where b_1 > 0 for the plant's default speed
+    and the default gains, since from elsewhere no filter of these gains is guaranteed to succeed.
     `uniform`: without that condition. `thesis`: (.9, .1, 0), which is such a start outside the set
     b_1 >= 0, for all gains that the thesis tries. `valid`: (0, .1, 0), which is inside.
 
@@ -257,7 +257,7 @@ class StochasticDubins(SystemEnv):
     | `theta` | heading | rad | unbounded |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `omega` | turn rate | rad/s | [-10, 10] |
 
@@ -265,7 +265,7 @@ class StochasticDubins(SystemEnv):
     x, y, cos(theta), sin(theta).
 
     ## Barrier
-    h = r^2 - x^2 - y^2, of relative degree 2. Natural filter: `scbf`, whose order-2 condition
+    h = r^2 - x^2 - y^2, of relative degree 2. Default filter: `scbf`, whose order-2 condition
     cannot stay feasible on a compact set: with the full box it is met in about four steps of five.
     Gains for the other conditions: 1, 1.
 
@@ -278,13 +278,13 @@ class StochasticDubins(SystemEnv):
     ## Reward
     (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from
     (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise tangent: the
-    circle alone would reward turning on the spot. Chosen by us.
+    circle alone would reward turning on the spot. Our choice.
 
     ## Nominal controller
-    Turns towards a course that leads onto that circle and around it. Chosen by us.
+    Turns towards a course that leads onto that circle and around it. Our choice.
 
     ## Start
-    `inward`: uniform in the disk and in heading, kept where A h > 0 for the model. `uniform`:
+    `inward`: uniform in the disk and in heading, restricted to where A h > 0 for the model. `uniform`:
     without that condition.
 
     ## Episode end

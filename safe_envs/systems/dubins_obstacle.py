@@ -37,7 +37,7 @@ def vehicle_among(
         obstacles: rate of each coordinate, in its unit a second.
         parameters: value of the symbols in the rates.
 
-    Source: thesis Sec. 3.5.1. The print drives the obstacle by the clock and forgets its velocity
+    Source: thesis Sec. 3.5.1. The thesis drives the obstacle by the clock and forgets its velocity
         in the
     derivatives of h; here its position is a state, so that nothing can be forgotten.
     """
@@ -153,9 +153,9 @@ class DubinsObstacle(SystemEnv):
     | `y_o` | | m | [-5, 5] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
-    | `omega` | turn rate | rad/s | [-pi, pi], chosen by us |
+    | `omega` | turn rate | rad/s | [-pi, pi] (assumed) |
 
     ## Observation
     x, y, cos(theta), sin(theta), and the position of the obstacle seen from the vehicle, x_o - x
@@ -163,7 +163,7 @@ class DubinsObstacle(SystemEnv):
 
     ## Barrier
     h = (x - x_o)^2 + (y - y_o)^2 - r_O^2 with r_O = .5 m, of relative degree 2. Gains 1 and 1.
-    Natural filter: `hocbf`.
+    Default filter: `hocbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both 0.

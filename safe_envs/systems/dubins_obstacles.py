@@ -141,7 +141,7 @@ class DubinsObstacles(SystemEnv):
     | `phase_1` to `phase_N` | angle of each obstacle on its circle | rad | unbounded |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `omega` | turn rate | rad/s | [-pi, pi] |
 
@@ -152,8 +152,8 @@ class DubinsObstacles(SystemEnv):
     ## Barrier
     `h_1` to `h_N`: h_i = (x - x_i)^2 + (y - y_i)^2 - r_O^2 with r_O = .4 m, each of relative degree
     2. The input loses its hold on h_i where the vehicle heads straight for the obstacle or away
-    from it. Gains 3 and 5 for each: smaller ones keep such a distance that the rows of several
-    obstacles contradict each other more often. Natural filter: `hocbf`.
+    from it. Gains 3 and 5 for each: smaller ones keep such a distance that the constraints of several
+    obstacles contradict each other more often. Default filter: `hocbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both 0.
@@ -183,7 +183,7 @@ class DubinsObstacles(SystemEnv):
 
     ## Source
     The vehicle of thesis Eq. (3.27) and the barrier of Sec. 3.5.1, which has one obstacle; the
-    field was chosen by us.
+    field is our choice.
     """
 
     problem_factory = staticmethod(dubins_obstacles)

@@ -99,7 +99,7 @@ class Pendulum(SystemEnv):
     | `thetadot` | its rate | rad/s | [-3, 3] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `u` | torque | N m | [-5, 5] |
 
@@ -108,7 +108,7 @@ class Pendulum(SystemEnv):
 
     ## Barrier
     h = c - x' P x with c = .2 and P = [[sqrt(3), 1], [1, sqrt(3)]], of relative degree 1, with sup
-    h = c. In the ellipse abs(theta) and abs(thetadot) stay below .416. Gain 5. Natural filter:
+    h = c. In the ellipse abs(theta) and abs(thetadot) stay below .416. Gain 5. Default filter:
     `scbf`.
 
     ## Noise
@@ -119,7 +119,7 @@ class Pendulum(SystemEnv):
     who neglects it.
 
     ## Reward
-    exp(-(5 (theta - .4))^2) a step, in (0, 1]. Chosen by us: at rest there h = -.08.
+    exp(-(5 (theta - .4))^2) a step, in (0, 1]. Our choice: at rest there h = -.08.
 
     ## Nominal controller
     0, as the thesis has it.

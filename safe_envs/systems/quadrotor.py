@@ -128,7 +128,7 @@ def rotor_problem(name: str, *, followed: Sequence[Feature] = (), **rest: Any) -
 
     Args:
         name: of the problem.
-        followed: references beside that of the altitude.
+        followed: references other than the altitude's.
         **rest: see `altitude_problem`.
     """
     return altitude_problem(
@@ -205,7 +205,7 @@ class Quadrotor(SystemEnv):
         U_1 = k_t (O_1 + O_2 + O_3 + O_4),  U_2 = k_t (O_4 - O_2),  U_3 = k_t (O_1 - O_3)
         U_4 = k_d (O_1 - O_2 + O_3 - O_4),  O_i = Omega_i^2
 
-    Chosen by us, in the range of a small research quadrotor: l = .23 m, I_x = I_y = .0075, I_z =
+    Assumed, in the range of a small research quadrotor: l = .23 m, I_x = I_y = .0075, I_z =
     .013 kg m^2, k_t = 3.13e-5 N s^2, k_d = 7.5e-7 N m s^2.
 
     ## States
@@ -218,8 +218,10 @@ class Quadrotor(SystemEnv):
     | `psi` | yaw | rad | unbounded |
     | `phidot`, `thetadot`, `psidot` | rates | rad/s | [-15, 15] |
 
-    ## Inputs | symbol | meaning | unit | box | |---|---|---|---| | `rotor_1` to `rotor_4` | squared
-    rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the plant's hover, chosen by us |
+    ## Inputs
+    | symbol | meaning | unit | bounds |
+    |---|---|---|---|
+    | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], an assumption |
 
     ## Observation
     The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5 sin(t), and its
@@ -227,7 +229,7 @@ class Quadrotor(SystemEnv):
 
     ## Barrier
     h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold
-    on h at z = c, where it is not needed. Gains 2 and 8. Natural filter: `hocbf`.
+    on h at z = c, where it is not needed. Gains 2 and 8. Default filter: `hocbf`.
 
     ## Noise
     `sigma_x`, `sigma_y`, `sigma_z` of the accelerations in m/s/sqrt(s), all 0.

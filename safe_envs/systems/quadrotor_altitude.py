@@ -136,16 +136,16 @@ class QuadrotorAltitude(SystemEnv):
     | `zdot` | climb rate | m/s | [-10, 10] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
-    | `U_1` | thrust | N | [0, 12], twice the plant's weight, chosen by us |
+    | `U_1` | thrust | N | [0, 12], twice the plant's weight (assumed) |
 
     ## Observation
     z, zdot, the reference z_ref = 5 + 2.5 sin(t) at the time t of the observation, and its rate.
 
     ## Barrier
     h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold
-    on h at z = c, where it is not needed. Gains 2 and 8. Natural filter: `hocbf`.
+    on h at z = c, where it is not needed. Gains 2 and 8. Default filter: `hocbf`.
 
     ## Noise
     `sigma_z` of the acceleration in m/s/sqrt(s), 0.

@@ -110,7 +110,7 @@ class QuadrotorLimits(SystemEnv):
     | `phidot`, `thetadot`, `psidot` | rates | rad/s | [-15, 15] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the hover |
 
@@ -128,7 +128,7 @@ class QuadrotorLimits(SystemEnv):
     The angle from the thrust to the vertical is to stay below a. In level flight no torque reaches
     the second derivative of the last one: the condition can be met there only if phidot^2 +
     thetadot^2 <= p_1 p_2 (1 - cos(a)), so that a limit below about .3 rad needs larger gains.
-    Natural filter: `hocbf`.
+    Default filter: `hocbf`.
 
     ## Noise
     `sigma_x`, `sigma_y`, `sigma_z` of the accelerations in m/s/sqrt(s), all 0.
@@ -154,7 +154,7 @@ class QuadrotorLimits(SystemEnv):
     others see `SystemEnv`.
 
     ## Source
-    The vehicle of thesis Sec. 3.5.2, Eq. (3.29), (3.30); barriers and task were chosen by us.
+    The vehicle of thesis Sec. 3.5.2, Eq. (3.29), (3.30); barriers and task are our choice.
     """
 
     problem_factory = staticmethod(quadrotor_limits)

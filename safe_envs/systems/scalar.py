@@ -79,33 +79,33 @@ class Scalar(SystemEnv):
     | `x` | | 1 | [-3 limit, 2 limit], limit = 1 |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
-    | `u` | | 1/s | [-10, 10], chosen by us |
+    | `u` | | 1/s | [-10, 10] (assumed) |
 
     ## Observation
     The state.
 
     ## Barrier
-    h = limit - x, of relative degree 1 and unbounded above. Gain 1. Natural filter: `scbf`.
+    h = limit - x, of relative degree 1 and unbounded above. Gain 1. Default filter: `scbf`.
 
     ## Noise
-    `sigma` = .2 1/sqrt(s), chosen by us.
+    `sigma` = .2 1/sqrt(s) (assumed).
 
     ## Mismatch
     None.
 
     ## Reward
-    exp(-(2 (x/limit - 1))^2) a step, in (0, 1]: as near to the limit as can be. Chosen by us.
+    exp(-(2 (x/limit - 1))^2) a step, in (0, 1]: as near to the limit as can be. Our choice.
 
     ## Nominal controller
-    u = limit - 2 x: it makes the closed loop dx = (limit - x) dt + sigma dW. Chosen by us.
+    u = limit - 2 x: it makes the closed loop dx = (limit - x) dt + sigma dW. Our choice.
 
     ## Start
-    `spread`: uniform in (-.9 limit, .9 limit). `origin`: 0. Chosen by us.
+    `spread`: uniform in (-.9 limit, .9 limit). `origin`: 0. Our choice.
 
     ## Episode end
-    Terminated outside the workspace, truncated after 5 s = 500 steps. Chosen by us.
+    Terminated outside the workspace, truncated after 5 s = 500 steps. Our choice.
 
     ## Arguments
     `barrier={"limit": 1.0}`; for all others see `SystemEnv`.
