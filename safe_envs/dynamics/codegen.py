@@ -8,7 +8,6 @@ contiguous memory.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, Literal
@@ -17,15 +16,14 @@ import numpy as np
 import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
-from safe_envs.dynamics.printers import SUPPORTED, ArrayPrinter, FloatPrinter
+from safe_envs.dynamics.computable import excerpt, require_computable
+from safe_envs.dynamics.printers import ArrayPrinter, FloatPrinter
 from safe_envs.errors import SystemDefinitionError
 
 Flavour = Literal["floats", "arrays"]
 Components = tuple[Any, ...]
 
 _LARGEST_EXPANDED_POWER = 8
-_LARGEST_FLOAT = sp.Rational(sys.float_info.max)
-_LONGEST_QUOTED = 120
 
 
 _settled: dict[int, np.ndarray] = {}
@@ -130,7 +128,7 @@ def _compile(
         )
     except PrintMethodNotImplementedError as error:
         raise SystemDefinitionError(
-            f"{_shortened(expressions)} has no numerical form: {str(error).splitlines()[0]}"
+            f"{excerpt(expressions)} has no numerical form: {str(error).splitlines()[0]}"
         ) from error
     if isinstance(printer, ArrayPrinter):
         function.__globals__.update(printer.constants)
@@ -152,7 +150,7 @@ def _prepared(
     share takes longest.
     """
     for expression in expressions:
-        _require_computable(expression, arguments)
+        require_computable(expression, arguments)
     names, formulas = in_plain_names(arguments, expressions)
     numbers = tuple(sp.Float(float(sp.N(e, 30)), 17) if e.is_number else e for e in formulas)
     return names, formulas, numbers, _shared_subexpressions(numbers)
@@ -178,50 +176,6 @@ def _piece_by_piece(
             return careful()(*arguments)
 
     return function
-
-
-def _require_computable(expression: Any, arguments: tuple[sp.Symbol, ...]) -> None:
-    unknown = expression.free_symbols - set(arguments)
-    if unknown:
-        raise SystemDefinitionError(
-            f"{_shortened(expression)} holds {', '.join(sorted(map(str, unknown)))}, which is none"
-            f" of {', '.join(map(str, arguments))}"
-        )
-    if len(set(arguments)) < len(arguments):
-        raise SystemDefinitionError(
-            f"a symbol stands for two arguments of {_shortened(expression)}:"
-            f" {', '.join(map(str, arguments))}"
-        )
-    strange = {f.func for f in expression.atoms(sp.Function) if not isinstance(f, SUPPORTED)}
-    if strange:
-        advice = (
-            "; DiracDelta is the derivative of a jump: use a smooth function"
-            if sp.DiracDelta in strange
-            else ""
-        )
-        raise SystemDefinitionError(
-            f"{_shortened(expression)} holds {', '.join(sorted(map(str, strange)))}, which has no"
-            f" numerical form here; write it with {', '.join(f.__name__ for f in SUPPORTED)}, Max"
-            f" and Min{advice}"
-        )
-    if expression.has(sp.I, sp.zoo):
-        raise SystemDefinitionError(
-            f"{_shortened(expression)} is not real everywhere, or has a division by 0; look at its"
-            " numbers"
-        )
-    if any(abs(number) > _LARGEST_FLOAT for number in expression.atoms(sp.Float, sp.Rational)):
-        raise SystemDefinitionError(
-            f"{_shortened(expression)} holds a number beyond {float(_LARGEST_FLOAT):.2g}, the"
-            " largest of floats"
-        )
-
-
-def _shortened(expression: Any) -> str:
-    try:
-        text = str(expression)
-    except ValueError:  # Python does not print whole numbers of thousands of digits.
-        return "an expression"
-    return text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}..."
 
 
 def in_plain_names(

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
 from safe_envs.envs.info import Info, safety_info
+from safe_envs.errors import ConfigurationError
 
 
 class Episode:
@@ -63,6 +66,7 @@ class Episodes:
         self.ended = np.zeros(num_envs, dtype=bool)
         self.begun = self._nowhere = np.zeros(num_envs, dtype=bool)
         self.everywhere = np.ones(num_envs, dtype=bool)
+        self._started = False
 
     def due(self) -> np.ndarray | None:
         """Return the envs that the coming step restarts (next-step autoreset); None without any."""
@@ -70,8 +74,33 @@ class Episodes:
         self.begun = self._nowhere if due is None else due
         return due
 
+    def reset_mask(self, given: Any) -> np.ndarray:
+        """Return the envs that a reset is to restart.
+
+        Args:
+            given: a bool array of shape (num_envs,) with a True in it; None for all.
+
+        Raises:
+            ConfigurationError: The mask is another one.
+            ResetNeeded: At the first reset, some envs are left out.
+        """
+        if given is None:
+            return self.everywhere.copy()
+        mask = np.asarray(given)
+        if mask.shape != self.steps.shape or mask.dtype != np.bool_ or not mask.any():
+            raise ConfigurationError(
+                f"reset_mask must be a bool array of shape {self.steps.shape} with a True in it;"
+                f" given {given!r}"
+            )
+        if not self._started and not mask.all():
+            raise gym.error.ResetNeeded(
+                "some envs have no state yet: the first reset takes no reset_mask"
+            )
+        return mask
+
     def restart(self, envs: np.ndarray) -> None:
         """Begin the episodes of some envs, given by indices or by a mask."""
+        self._started = True
         self.steps[envs] = 0
         self.h_min[envs] = np.inf
         self.cost[envs] = 0.0
@@ -101,6 +130,7 @@ class Episodes:
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Take the counters from a snapshot."""
+        self._started = True
         for name, attribute in _COUNTERS.items():
             setattr(self, attribute, np.array(snapshot[name]))
 

@@ -15,8 +15,8 @@ and with a filter
 
 | key | type | meaning |
 |---|---|---|
-| `nominal_action` | float64 (m,) | proposed by the policy, or the goal of a joint QP; physical units |
-| `safe_action` | float64 (m,) | executed, in physical units |
+| `nominal_action` | float64 (m,) | proposed by the policy, or by the goal of a joint QP |
+| `safe_action` | float64 (m,) | executed; both in physical units |
 | `intervention` | bool | the two differ |
 | `filter_active` | bool | a constraint is binding or cannot be met |
 | `feasible` | bool | some action within the input bounds meets every constraint |
@@ -26,7 +26,7 @@ and with a filter
 | `episode_interventions` | int | interventions of the episode so far |
 | `episode_infeasible` | int | infeasible steps of the episode so far |
 
-At reset, where nothing was executed yet, the actions are the point within the input bounds nearest to 0.
+At reset, before anything is executed, both are the point within the input bounds nearest to 0.
 """
 
 from __future__ import annotations

@@ -9,6 +9,9 @@ from gymnasium.utils import seeding
 
 from safe_envs.errors import ConfigurationError
 
+Seeds = int | Sequence[int | None] | None
+"""A seed of env 0, with env i seeded by seed + i, or a seed (or None) for each env."""
+
 
 class Generators:
     """A random generator for each env of a batch, seeded at the first use.
@@ -23,7 +26,7 @@ class Generators:
         self.rngs: list[np.random.Generator] = []
         self.seeds: list[int] = []
 
-    def spread(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
+    def spread(self, seed: Seeds) -> list[int | None]:
         """Return a seed, or None, for each env.
 
         Args:

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space
 from safe_envs.dynamics.codegen import Components, filled, finite, settled, stacked
 from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import Info, with_masks
-from safe_envs.envs.seeding import Generators
+from safe_envs.envs.seeding import Generators, Seeds
 from safe_envs.envs.simulation import NoiseStreams, Simulation, steps_until
 from safe_envs.envs.spaces import BatchActions, action_box, observation_box
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
@@ -60,13 +60,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ConfigurationError(f"num_envs = {num_envs!r}; give a whole number from 1")
         self.viewer = open_viewer(problem, render_mode, num_envs)
         self.render_mode = render_mode
-        try:
-            self._autoreset = AutoresetMode(autoreset_mode)
-        except ValueError as error:
-            allowed = ", ".join(mode.value for mode in AutoresetMode)
-            raise ConfigurationError(
-                f"autoreset_mode = {autoreset_mode!r}; allowed: {allowed}"
-            ) from error
+        self._autoreset = _mode(autoreset_mode)
         self.problem = problem
         self.num_envs = num_envs
         self.metadata = {
@@ -104,27 +98,19 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return np.stack(self.components, axis=-1)
 
     @property
-    def np_random(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self,
-    ) -> tuple[np.random.Generator, ...]:
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The generator of each env."""
         self._seed([None] * self.num_envs)
         return tuple(self._generators.rngs)
 
     @property
-    def np_random_seed(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self,
-    ) -> tuple[int, ...]:
+    def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The seed of each env."""
         self._seed([None] * self.num_envs)
         return tuple(self._generators.seeds)
 
     def physical_action(self, actions: Any) -> Components:
-        """Scale actions in [-1, 1] to physical inputs; see `BatchActions.physical`.
-
-        Raises:
-            InvalidInputError: the actions have another shape, or are not finite real numbers.
-        """
+        """Scale actions in [-1, 1] to physical inputs; see `BatchActions.physical`."""
         return self._actions.physical(actions)
 
     def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
@@ -132,10 +118,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self._actions.normalized(physical)
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: Seeds = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`.
 
@@ -144,23 +127,19 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             options: may hold "reset_mask", a bool array of shape (num_envs,).
         """
         seeds = self._generators.spread(seed)
-        mask = self._reset_mask(options)
+        mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
         self._seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
         self._restart(np.flatnonzero(mask))
         observation, _, _, _, info = self._observe(tuple(self._actions.center), counted=mask)
         if self.viewer is not None:
-            self.viewer.restart(
-                self.state, self.episodes.steps * self.problem.dt, np.flatnonzero(mask).tolist()
-            )
+            self.viewer.restart(self.state, self._times, np.flatnonzero(mask).tolist())
         return observation, with_masks(info, mask)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return where each episode stands, in arrays with the batch in front; see `restore`."""
         return {"state": self.state, **self.episodes.snapshot()}
 
-    def restore(
-        self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None
-    ) -> None:
+    def restore(self, snapshot: Mapping[str, np.ndarray], seed: Seeds = None) -> None:
         """Put each episode where a snapshot has it.
 
         Args:
@@ -181,9 +160,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._x = tuple(np.array(snapshot["state"], dtype=float).T.copy())
         self.episodes.restore(snapshot)
         if self.viewer is not None:
-            self.viewer.restart(
-                self.state, self.episodes.steps * self.problem.dt, range(self.num_envs)
-            )
+            self.viewer.restart(self.state, self._times, range(self.num_envs))
 
     def step(self, actions: Any) -> VectorStep:
         """Hold an action in each env for one control period.
@@ -227,19 +204,10 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         else:
             episodes.ended = ended
         if self.viewer is not None:
-            self.viewer.advance(
-                self.state,
-                episodes.steps * self.problem.dt,
-                np.stack(u, axis=-1),
-                np.flatnonzero(episodes.begun).tolist(),
-            )
-        return (
-            observation,
-            reward,
-            terminated,
-            truncated,
-            {**with_masks(info, episodes.everywhere.copy()), **last},
-        )
+            begun = np.flatnonzero(episodes.begun).tolist()
+            self.viewer.advance(self.state, self._times, np.stack(u, axis=-1), begun)
+        info = {**with_masks(info, episodes.everywhere.copy()), **last}
+        return observation, reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw every env, with the trail of its episode and what a filter decided.
@@ -258,9 +226,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 ' render_mode="rgb_array"'
             )
             return None
-        if not self._x:
-            raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
-        return self.viewer.frames()
+        return self.viewer.frames() if self.components else None
 
     def _last_of_episode(self, ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
         """Keep the last observation and info of the ended envs, and restart them."""
@@ -270,30 +236,17 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._restart(np.flatnonzero(ended))
         return with_masks({"final_obs": final, "final_info": with_masks(info, ended)}, ended)
 
+    @property
+    def _times(self) -> np.ndarray:
+        return self.episodes.steps * self.problem.dt
+
     def _seed(self, seeds: Sequence[int | None]) -> None:
         self._noise.clear(self._generators.seed(seeds))
 
-    def _reset_mask(self, options: Mapping[str, Any] | None) -> np.ndarray:
-        given = (options or {}).get("reset_mask")
-        if given is None:
-            return self.episodes.everywhere.copy()
-        mask = np.asarray(given)
-        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-            raise ConfigurationError(
-                f"reset_mask must be a bool array of shape ({self.num_envs},) with a True in it;"
-                f" given {given!r}"
-            )
-        if not self._x and not mask.all():
-            raise gym.error.ResetNeeded(
-                "some envs have no state yet: the first reset takes no reset_mask"
-            )
-        return mask
-
     def _restart(self, envs: np.ndarray) -> None:
         """Put some envs at the start of an episode."""
-        start = self._simulation.starts.draw_batch(
-            [self._generators.rngs[i] for i in envs.tolist()]
-        )
+        rngs = [self._generators.rngs[i] for i in envs.tolist()]
+        start = self._simulation.starts.draw_batch(rngs)
         if envs.size == self.num_envs:
             self._x = tuple(start)
         else:
@@ -305,7 +258,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def _observe(self, u: Sequence[Any], counted: np.ndarray | None = None) -> VectorStep:
         """Read the states; `counted` are the envs whose states are new (None: all)."""
         self._x = x = settled(self.components, (self.num_envs,))
-        time = self.episodes.steps * self.problem.dt if self._simulation.timed else 0.0
+        time = self._times if self._simulation.timed else 0.0
         features, barriers, reward, outside, goal = self._simulation.measure(x, u, time)
         rows = np.empty((len(features), self.num_envs), dtype=np.float32)
         for row, feature in zip(rows, features, strict=True):
@@ -325,20 +278,22 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._report_breakdown(h, observation)
         if self.problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
-        return (
-            observation,
-            filled(reward, (self.num_envs,)).copy(),
-            terminated,
-            self.episodes.steps >= self._limit,
-            info,
-        )
+        reward = filled(reward, (self.num_envs,)).copy()
+        return observation, reward, terminated, self.episodes.steps >= self._limit, info
 
     def _report_breakdown(self, h: np.ndarray, observation: np.ndarray) -> None:
-        broken = ~(
-            np.isfinite(self._x).all(axis=0) & np.isfinite(h) & np.isfinite(observation).all(axis=1)
-        )
+        sound = np.isfinite(self._x).all(axis=0) & np.isfinite(observation).all(axis=1)
+        broken = ~(sound & np.isfinite(h))
         if broken.any():
             raise NumericalError(
                 f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r}"
                 " have left the finite numbers; reduce dt or raise substeps"
             )
+
+
+def _mode(given: str | AutoresetMode) -> AutoresetMode:
+    try:
+        return AutoresetMode(given)
+    except ValueError as error:
+        allowed = ", ".join(mode.value for mode in AutoresetMode)
+        raise ConfigurationError(f"autoreset_mode = {given!r}; allowed: {allowed}") from error

@@ -13,7 +13,7 @@ MODULES = {
     "Quadrotor": "quadrotor",
     "QuadrotorLimits": "quadrotor_limits",
     "ACC": "acc",
-    "ACCGap": "acc",
+    "ACCGap": "acc_gap",
     "Pendulum": "pendulum",
     "CubicSDE": "cubic",
     "CubicSDEDisk": "cubic",

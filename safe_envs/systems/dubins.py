@@ -223,10 +223,11 @@ class DubinsDisk(SystemEnv):
     Turns towards a course that leads onto that circle and around it.
 
     ## Start
-    `feasible`: uniform in the disk and in heading, restricted to where b_1 > 0 for the plant's default speed
-    and the default gains, since from elsewhere no filter of these gains is guaranteed to succeed.
-    `uniform`: without that condition. `thesis`: (.9, .1, 0), which is such a start outside the set
-    b_1 >= 0, for all gains that the thesis tries. `valid`: (0, .1, 0), which is inside.
+    `feasible`: uniform in the disk and in heading, restricted to where b_1 > 0 for the plant's
+    default speed and the default gains, since from elsewhere no filter of these gains is guaranteed
+    to succeed. `uniform`: without that condition. `thesis`: (.9, .1, 0), which is such a start
+    outside the set b_1 >= 0, for all gains that the thesis tries. `valid`: (0, .1, 0), which is
+    inside.
 
     ## Episode end
     Terminated outside the workspace, truncated after 50 s = 1000 steps.
@@ -284,8 +285,8 @@ class StochasticDubins(SystemEnv):
     Turns towards a course that leads onto that circle and around it. Our choice.
 
     ## Start
-    `inward`: uniform in the disk and in heading, restricted to where A h > 0 for the model. `uniform`:
-    without that condition.
+    `inward`: uniform in the disk and in heading, restricted to where A h > 0 for the model.
+    `uniform`: without that condition.
 
     ## Episode end
     Terminated outside the workspace, truncated after 5 s = 100 steps. At a control period of 50 ms

@@ -152,8 +152,8 @@ class DubinsObstacles(SystemEnv):
     ## Barrier
     `h_1` to `h_N`: h_i = (x - x_i)^2 + (y - y_i)^2 - r_O^2 with r_O = .4 m, each of relative degree
     2. The input loses its hold on h_i where the vehicle heads straight for the obstacle or away
-    from it. Gains 3 and 5 for each: smaller ones keep such a distance that the constraints of several
-    obstacles contradict each other more often. Default filter: `hocbf`.
+    from it. Gains 3 and 5 for each: smaller ones keep such a distance that the constraints of
+    several obstacles contradict each other more often. Default filter: `hocbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both 0.
