@@ -1,8 +1,7 @@
-"""Gymnasium environments of safety-critical systems under uncertainty; importing this package
-registers their ids.
+"""Gymnasium environments of safety-critical systems under uncertainty.
 
-What is named here is imported when it is asked for: ids, errors and completion in a shell need no
-symbolic algebra.
+Importing this package registers their ids. What is named here is imported when it is first used:
+ids, errors and completion in a shell need no symbolic algebra.
 """
 
 from importlib import import_module

@@ -16,8 +16,9 @@ _STEM = 40
 
 
 def require_writable(path: Path) -> None:
-    """Raise ConfigurationError unless a file can be created at `path`: asked before a long run, not
-    after it.
+    """Raise ConfigurationError unless a file can be created at `path`.
+
+    Call it before a long run, not after it.
     """
     folder, name = path.absolute().parent, shortened(path)
     # The functions of os.path take any text for a path, also one that is too long to be one.
@@ -84,9 +85,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turn what the operating system says of a full disk or a missing permission into a
-    ConfigurationError that names `path`.
-    """
+    """Turn errors of the operating system into a ConfigurationError that names `path`."""
     try:
         yield
     except OSError as error:

@@ -1,6 +1,4 @@
-"""Files of others, read without hanging and without taking all memory: only regular files, up to a
-size.
-"""
+"""Bounded reading of files from outside: regular files only, up to a size."""
 
 from __future__ import annotations
 
@@ -46,8 +44,9 @@ _FLAGS = (
 
 
 def open_regular(path: Path | str, most: int = MOST_BYTES) -> BinaryIO:
-    """Open a regular file to read it. A pipe, which might wait for ever, or a device, which might
-    never end, is refused.
+    """Open a regular file to read it.
+
+    A pipe, which might wait for ever, or a device, which might never end, is refused.
 
     Args:
         path: of the file.
@@ -75,7 +74,7 @@ def open_regular(path: Path | str, most: int = MOST_BYTES) -> BinaryIO:
 
 
 def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
-    """The content of a regular file; arguments and errors as for `open_regular`."""
+    """Return the content of a regular file; arguments and errors as for `open_regular`."""
     with open_regular(path, most) as stream:
         # A file may grow, and those of the kernel have no size.
         content = stream.read(most + 1)
@@ -85,7 +84,7 @@ def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
 
 
 def read_json(path: Path, advice: str) -> Any:
-    """What a JSON file holds.
+    """Return what a JSON file holds.
 
     Args:
         path: of the file.
@@ -107,8 +106,7 @@ def read_json(path: Path, advice: str) -> Any:
 
 
 def open_archive(stream: BinaryIO, most: int = MOST_BYTES) -> zipfile.ZipFile:
-    """Open a zip without unpacking anything, of which all parts together have at most so many
-    bytes.
+    """Open a zip archive without unpacking it, with a limit on the size of its parts together.
 
     Args:
         stream: of the file.

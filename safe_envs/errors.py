@@ -21,7 +21,7 @@ class SystemDefinitionWarning(UserWarning):
 
 
 class RelativeDegreeError(SystemDefinitionError):
-    """The input never appears in the derivatives of a barrier, or not where a condition needs it."""
+    """The input does not appear in the derivatives of a barrier where a condition needs it."""
 
 
 class ConfigurationError(SafeEnvsError, ValueError):
@@ -41,9 +41,7 @@ class WorkersLostError(SafeEnvsError, RuntimeError):
 
 
 def shown(given: Any) -> str:
-    """Return what was given as a message shows it, texts in quotes: without its middle where that
-    is long.
-    """
+    """Return a value as a message shows it: texts in quotes, long ones without their middle."""
     try:
         return shortened(repr(given))
     except ValueError:  # Python writes no whole number of more than 4300 digits.
@@ -51,9 +49,7 @@ def shown(given: Any) -> str:
 
 
 def shortened(given: Any, most: int = 120) -> str:
-    """Return a text, a path or an error as text, without its middle where it is longer than about
-    so many characters.
-    """
+    """Return a value as text, without its middle if it is longer than about `most` characters."""
     text = str(given)
     if len(text) <= most:
         return text
@@ -70,8 +66,9 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
 
 
 def require_whole(name: str, value: Any, least: int) -> None:
-    """Raise ConfigurationError unless a value is a whole number from `least`; NumPy's integers are
-    such, truth values are not.
+    """Raise ConfigurationError unless a value is a whole number from `least`.
+
+    NumPy's integers are whole numbers, truth values are not.
     """
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or int(value) < least:
         raise ConfigurationError(f"{name} = {shown(value)}; give a whole number from {least}")

@@ -58,7 +58,7 @@ def _opened(path: Path, taken: str) -> IO[bytes]:
 
 
 def _lock(file: IO[bytes]) -> None:
-    """Take the lock of an open file; raise OSError if somebody else holds it."""
+    """Lock an open file; raise OSError where another process holds the lock."""
     try:
         import fcntl
     except ImportError:

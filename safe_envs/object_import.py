@@ -1,4 +1,4 @@
-"""What a user states in a Python file or module, found by its place: FILE.py:NAME or MODULE:NAME."""
+"""Import of what users define in a Python file or module: FILE.py:NAME or MODULE:NAME."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _ADVICE = "give the path of a Python file, as in my_system.py:problem"
 
 
 def load_object(place: str) -> Any:
-    """Import what stands at a place, which runs the code there.
+    """Import an object by its place, which runs the code there.
 
-    A file is read anew when it has changed; modules beside it are imported afresh with it, and stay
-    as they are until then.
+    A file is read again when it has changed, together with the modules of its folder that it
+    imports.
 
     Args:
         place: FILE.py:NAME or MODULE:NAME.
@@ -38,7 +38,7 @@ def load_object(place: str) -> Any:
     source, colon, name = place.rpartition(":")
     if not (colon and source and name):
         raise ConfigurationError(
-            f"{shown(place)} is no place of a statement; give FILE.py:NAME or MODULE:NAME, like"
+            f"{shown(place)} is not a place; give FILE.py:NAME or MODULE:NAME, like"
             " my_system.py:problem"
         )
     module = _of_file(Path(source)) if source.endswith(".py") else _of_module(source)
@@ -50,7 +50,7 @@ def load_object(place: str) -> Any:
 
 
 def resolved(place: str) -> str:
-    """The same place with the whole path of its file, so that it holds in any folder."""
+    """Return a place with the full path of its file, so that it holds in any folder."""
     source, _, name = place.rpartition(":")
     return f"{os.path.realpath(source)}:{name}" if source.endswith(".py") else place
 
@@ -66,7 +66,7 @@ def place_of(stated: type) -> str:
 
 
 def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) -> Any:
-    """The value of a function that stands at a place.
+    """Call a function that was imported from a place, and return its value.
 
     Raises:
         ConfigurationError: an argument is missing or unknown, or the code there ends with an error.
@@ -84,9 +84,7 @@ def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) 
 
 
 def _stated_in(module: ModuleType) -> list[str]:
-    """Names of what a module states itself: its functions and classes, and objects that are neither
-    modules nor symbols.
-    """
+    """List what a module defines itself: no modules, classes or symbols."""
     return [
         name
         for name, value in vars(module).items()
@@ -124,10 +122,8 @@ def _module_name(path: Path) -> str:
 
 @lru_cache(maxsize=32)
 def _loaded(path: Path, _changed: int) -> ModuleType:
-    """Remembered until the file changes, so that the symbols of all envs of a file are compiled
-    once.
-    """
-    name = _module_name(path)
+    """Import a file, once until it changes, so that its symbols are compiled once."""
+    name = f"_{path.stem}_{zlib.crc32(bytes(path)):08x}"
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ConfigurationError(f"{path} cannot be read as Python")
@@ -153,8 +149,9 @@ def _of_module(name: str) -> ModuleType:
 
 @contextmanager
 def _running(path: Path | None, what: str) -> Iterator[None]:
-    """Run a user's code: its errors become ours, with the line, and modules beside its file can be
-    imported, as when Python runs it.
+    """Run a user's code: its errors become ours, with the line.
+
+    Modules in its folder can be imported, as when Python runs it.
     """
     folder = None if path is None else str(path.parent)
     known = set(sys.modules)
@@ -182,7 +179,7 @@ def _running(path: Path | None, what: str) -> Iterator[None]:
 
 
 def _line(error: BaseException, path: Path | None) -> str:
-    """The last line of the file that led to an error."""
+    """Return the last line of the file that led to an error."""
     lines, trace = [], error.__traceback__
     while trace is not None:
         if path is not None and trace.tb_frame.f_code.co_filename == str(path):

@@ -1,4 +1,4 @@
-"""From a registered id to its problem."""
+"""Registered ids, and the problems behind them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.systems import CUSTOM_ID, ENV_IDS
@@ -28,7 +28,7 @@ def full_id(env_id: str) -> str:
 
 
 def which_env(env_id: str | None, system: str | None) -> str:
-    """The id of a registered env, or that of a system of one's own.
+    """Return the id of a registered env, or the one that stands for systems from outside.
 
     Args:
         env_id: registered id, if one was given.
@@ -46,7 +46,7 @@ def which_env(env_id: str | None, system: str | None) -> str:
 
 
 def title_of(env_id: str, options: Mapping[str, Any]) -> str:
-    """How results call an env: by its id, or a system of one's own by its place."""
+    """Return how results call an env: its id, or the place of a system from outside."""
     return options.get("system") or env_id
 
 

@@ -1,6 +1,4 @@
-"""What comes from outside as numbers: converted in one place, or refused by an error of this
-project's own.
-"""
+"""Arrays from outside: converted in one place, or refused by an error of this project."""
 
 from __future__ import annotations
 
@@ -13,8 +11,9 @@ from safe_envs.errors import InvalidInputError, shown
 
 
 def real_array(what: str, given: Any) -> np.ndarray:
-    """Return a state, an action or a batch of them as an array of floats; float32 and float64 come
-    back as they are.
+    """Return a state, an action or a batch of them as an array of floats.
+
+    Arrays of float32 and float64 are returned unchanged.
 
     Args:
         what: name of the argument, for the error.

@@ -1,3 +1,1 @@
-"""Control-affine stochastic differential equations: symbols, derivatives, generated code and
-integrators.
-"""
+"""Control-affine stochastic differential equations: symbols, derivatives, code, integrators."""

@@ -8,7 +8,6 @@ contiguous memory.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any, Literal
@@ -17,14 +16,14 @@ import numpy as np
 import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
-from safe_envs.dynamics.printers import SUPPORTED, ArrayPrinter, FloatPrinter
-from safe_envs.errors import SystemDefinitionError, shown
+from safe_envs.dynamics.computable import excerpt, require_computable
+from safe_envs.dynamics.printers import ArrayPrinter, FloatPrinter
+from safe_envs.errors import SystemDefinitionError
 
 Flavour = Literal["floats", "arrays"]
 Components = tuple[Any, ...]
 
 _LARGEST_EXPANDED_POWER = 8
-_LARGEST_FLOAT = sp.Rational(sys.float_info.max)
 
 
 _settled: dict[int, np.ndarray] = {}
@@ -56,7 +55,7 @@ _REMEMBERING = {name: _Remembering(getattr(np, name)) for name in ("sin", "cos")
 
 
 def _elementwise(function: Callable[[float], float]) -> Callable[[Any], np.ndarray]:
-    """What NumPy lacks, one element at a time."""
+    """Return a function of arrays that NumPy lacks, applied to one element at a time."""
     ufunc = np.frompyfunc(function, 1, 1)
     return lambda argument: np.asarray(ufunc(argument), dtype=float)
 
@@ -65,8 +64,7 @@ _ARRAY_FUNCTIONS = {**_REMEMBERING, "erf": _elementwise(math.erf), "erfc": _elem
 
 
 def settled(components: Sequence[Any], shape: tuple[int, ...]) -> Components:
-    """Components as read-only arrays of their own, whose sines and cosines are computed once until
-    the next call.
+    """Return components as read-only arrays whose sines and cosines are computed once.
 
     Args:
         components: arrays that were made for the caller, and that nobody else can write to, or
@@ -130,7 +128,7 @@ def _compile(
         )
     except PrintMethodNotImplementedError as error:
         raise SystemDefinitionError(
-            f"{shown(expressions)} has no numerical form: {str(error).splitlines()[0]}"
+            f"{excerpt(expressions)} has no numerical form: {str(error).splitlines()[0]}"
         ) from error
     if isinstance(printer, ArrayPrinter):
         function.__globals__.update(printer.constants)
@@ -143,14 +141,16 @@ def _compile(
 def _prepared(
     arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...]
 ) -> tuple[tuple[sp.Symbol, ...], Any, Any, Any]:
-    """What both flavours have in common: the arguments and formulas in plain names, these with
-    rounded numbers, and what they share.
+    """Prepare what both flavours share.
+
+    The arguments and formulas have plain names, these with rounded numbers, and common
+    subexpressions are taken out.
 
     An env and a batch of it ask for the same formulas, one after the other, and to find what they
     share takes longest.
     """
     for expression in expressions:
-        _require_computable(expression, arguments)
+        require_computable(expression, arguments)
     names, formulas = in_plain_names(arguments, expressions)
     numbers = tuple(sp.Float(float(sp.N(e, 30)), 17) if e.is_number else e for e in formulas)
     return names, formulas, numbers, _shared_subexpressions(numbers)
@@ -159,8 +159,9 @@ def _prepared(
 def _piece_by_piece(
     quick: Callable[..., Components], names: Sequence[sp.Symbol], formulas: Sequence[Any]
 ) -> Callable[..., Components]:
-    """A function of floats that evaluates the pieces that apply, where a shared subexpression of
-    others has no value.
+    """Return a function of floats that evaluates only the pieces that apply.
+
+    A subexpression that other pieces share may have no value.
     """
     careful = lru_cache(maxsize=1)(
         lambda: sp.lambdify(
@@ -177,47 +178,10 @@ def _piece_by_piece(
     return function
 
 
-def _require_computable(expression: Any, arguments: tuple[sp.Symbol, ...]) -> None:
-    unknown = expression.free_symbols - set(arguments)
-    if unknown:
-        raise SystemDefinitionError(
-            f"{shown(expression)} holds {', '.join(sorted(map(str, unknown)))}, which is none"
-            f" of {', '.join(map(str, arguments))}"
-        )
-    if len(set(arguments)) < len(arguments):
-        raise SystemDefinitionError(
-            f"a symbol stands for two arguments of {shown(expression)}:"
-            f" {', '.join(map(str, arguments))}"
-        )
-    strange = {f.func for f in expression.atoms(sp.Function) if not isinstance(f, SUPPORTED)}
-    if strange:
-        advice = (
-            "; DiracDelta is the derivative of a jump: use a smooth function"
-            if sp.DiracDelta in strange
-            else ""
-        )
-        raise SystemDefinitionError(
-            f"{shown(expression)} holds {', '.join(sorted(map(str, strange)))}, which has no"
-            f" numerical form here; write it with {', '.join(f.__name__ for f in SUPPORTED)}, Max"
-            f" and Min{advice}"
-        )
-    if expression.has(sp.I, sp.zoo):
-        raise SystemDefinitionError(
-            f"{shown(expression)} is not real everywhere, or has a division by 0; look at its"
-            " numbers"
-        )
-    if any(abs(number) > _LARGEST_FLOAT for number in expression.atoms(sp.Float, sp.Rational)):
-        raise SystemDefinitionError(
-            f"{shown(expression)} holds a number beyond {float(_LARGEST_FLOAT):.2g}, the"
-            " largest of floats"
-        )
-
-
 def in_plain_names(
     arguments: Sequence[sp.Symbol], expressions: Sequence[Any]
 ) -> tuple[tuple[sp.Symbol, ...], tuple[Any, ...]]:
-    """The same formulas of arguments a000, a001, ..., so that no name in generated code is a
-    user's.
+    """Rename arguments to a000, a001, ..., so that generated code holds no name of a user's.
 
     A name of the user's may be a keyword, a function, no identifier at all, or one of those that
     common subexpressions get. The new names sort like the old ones, for sympy orders the terms of a
@@ -244,8 +208,9 @@ def in_plain_names(
 def _shared_subexpressions(
     expressions: Any,
 ) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
-    """Common subexpressions, with small integer powers written as products: `pow` is many times
-    slower.
+    """Take out common subexpressions, and write small integer powers as products.
+
+    `pow` is many times slower.
     """
     shared: Any
     reduced: Any
@@ -282,21 +247,20 @@ def _shared_subexpressions(
 
 
 def constants(values: Sequence[float]) -> list[np.ndarray]:
-    """Numbers as arrays without axes: a ufunc converts a Python float anew at every call, for as
-    long as a small batch takes.
+    """Return numbers as arrays without axes.
+
+    A ufunc converts a Python float at every call, which takes as long as a small batch.
     """
     return [np.array(v) for v in values]
 
 
 def filled(component: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """A component as an array of the batch's shape: what does not depend on the arguments comes
-    back as a float.
-    """
+    """Return a component as an array of the batch's shape; constants come as floats."""
     return component if getattr(component, "shape", None) == shape else np.full(shape, component)
 
 
 def stacked(components: Sequence[Any], size: int) -> np.ndarray:
-    """Components side by side, shape (size, len(components)), in memory of their own."""
+    """Return components as columns, shape (size, len(components)), in memory of their own."""
     table = np.empty((len(components), size))
     for row, component in zip(table, components, strict=True):
         row[:] = component
@@ -304,8 +268,6 @@ def stacked(components: Sequence[Any], size: int) -> np.ndarray:
 
 
 def finite(values: np.ndarray) -> bool:
-    """Whether no entry is NaN or infinite; a quick look that may report huge finite entries as
-    infinite.
-    """
+    """Return whether no entry is NaN or infinite; huge finite entries may count as infinite."""
     flat = values.ravel()
     return math.isfinite(flat.dot(flat))

@@ -20,8 +20,7 @@ _SCALES = (1, 1, 3)
 
 
 def is_zero(expression: Any) -> bool:
-    """Whether an expression is zero for all real values of its symbols, but for single points of
-    jumps.
+    """Return whether an expression is zero for all real values, except at points of jumps.
 
     An analytic function that is not zero everywhere is zero at random points with probability 0. An
     expression with kinks and jumps is one in each region of the signs of what switches there: of a
@@ -44,16 +43,14 @@ def is_zero(expression: Any) -> bool:
 
 
 def _rational(expression: Any) -> Any:
-    """The expression with the decimal value of each float as a fraction, so that terms cancel
-    exactly.
-    """
+    """Return the expression with each float as a fraction, so that terms cancel exactly."""
     return expression.xreplace(
         {f: sp.Rational(repr(float(f))) for f in expression.atoms(sp.Float) if f.is_finite}
     )
 
 
 def _nonzero_somewhere(expression: Any) -> bool:
-    """Whether an expression has a value other than zero at one of a few random points."""
+    """Return whether an expression is nonzero at one of a few random points."""
     if expression.is_zero:
         return False
     points = random.Random(0)
@@ -74,8 +71,9 @@ def _told_from_zero(value: Any) -> bool:
 
 
 class _Pieces:
-    """The analytic functions that an expression is made of, one for each region; one symbol where
-    there are too many.
+    """The analytic functions that an expression consists of, one for each region.
+
+    One symbol stands for it where there are too many.
     """
 
     def __init__(self, expression: Any) -> None:
@@ -92,9 +90,7 @@ class _Pieces:
             yield self._expression.xreplace(dict(zip(signs, values, strict=True)))
 
     def _rewritten(self, e: Any) -> Any:
-        """An expression with signs of what switches in place of kinks and jumps, and a symbol for
-        what is not looked into.
-        """
+        """Replace kinks and jumps by signs of what switches, and the unknown by a symbol."""
         if isinstance(e, sp.Piecewise):
             return self._of_pieces(e)
         if not e.args:
@@ -130,7 +126,7 @@ class _Pieces:
         return total
 
     def _indicator(self, condition: Any) -> Any:
-        """1 where a condition holds, 0 elsewhere."""
+        """Return 1 where a condition holds, 0 elsewhere."""
         if condition in (sp.true, sp.false):
             return sp.Integer(condition == sp.true)
         if isinstance(condition, sp.Gt | sp.Ge | sp.Lt | sp.Le):
@@ -147,8 +143,10 @@ class _Pieces:
         return self._symbol(condition)
 
     def _sign(self, switch: Any) -> Any:
-        """The sign of an expression: a symbol, the same one for positive multiples of it, and the
-        opposite for negative ones.
+        """Return the sign of an expression as a symbol.
+
+        It is the same for positive multiples of the expression, and the opposite for
+        negative ones.
         """
         _, switch = sp.expand(switch).as_content_primitive()
         if switch.is_number:
@@ -165,8 +163,7 @@ class _Pieces:
 
 
 def pieces_fit(expression: Any, symbols: Sequence[sp.Symbol], order: int) -> bool:
-    """Whether the pieces of every `Piecewise` meet with the same value and the same derivatives up
-    to an order.
+    """Return whether the pieces of every `Piecewise` meet with equal values and derivatives.
 
     Sympy differentiates each piece by itself, and says nothing of a jump or a kink between two of
     them.

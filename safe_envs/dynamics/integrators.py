@@ -70,9 +70,7 @@ class Integrator:
 def _compiled(
     system: ControlAffineSDE, h: float, flavour: Flavour
 ) -> tuple[int, Callable[..., Components]]:
-    """The number of noise channels, and the state after a step of h in s with them, or the rate of
-    the state without any.
-    """
+    """Compile a step of h in s, or the rate where there is no noise, with the noise channels."""
     diffusion = system.numeric(system.diffusion)
     live = list(system.noise_channels)
     rate = system.numeric(system.drift + system.input_matrix * sp.Matrix(system.inputs))

@@ -37,30 +37,28 @@ _MOST_TERMS = 200
 
 
 def gradient(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
-    """Row of partial derivatives with respect to the states, shape (1, n)."""
+    """Return the row of partial derivatives with respect to the states, shape (1, n)."""
     return _gradient(system.states, expression)
 
 
 @lru_cache(maxsize=512)
 def _gradient(states: tuple[sp.Symbol, ...], expression: sp.Expr) -> sp.ImmutableMatrix:
-    """Remembered: the drift, the input and the noise each ask for the gradient of the same link of
-    a chain.
-    """
+    """Differentiate once: drift, input and noise each need the gradient of a chain's link."""
     return sp.ImmutableMatrix([[sp.diff(expression, s) for s in states]])
 
 
 def lie_derivative_f(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
-    """L_f phi = grad phi . f, the rate of phi along the uncontrolled, noise-free motion."""
+    """Return L_f phi = grad phi . f, the rate of phi without input and noise."""
     return (gradient(system, expression) * system.drift)[0, 0]
 
 
 def lie_derivative_g(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
-    """L_g phi = grad phi . g, shape (1, m): how the input changes the rate of phi."""
+    """Return L_g phi = grad phi . g, shape (1, m): how the input changes the rate of phi."""
     return sp.ImmutableMatrix(gradient(system, expression) * system.input_matrix)
 
 
 def ito_correction(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
-    """1/2 tr(sigma sigma' phi_xx), the drift that the noise gives to a curved function."""
+    """Return 1/2 tr(sigma sigma' phi_xx), the drift that noise gives to a curved function."""
     covariance = system.diffusion * system.diffusion.T
     total = sp.Integer(0)
     for i, row_state in enumerate(system.states):
@@ -76,21 +74,18 @@ def ito_correction(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
 
 
 def quadratic_variation_rate(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
-    """|sigma' grad phi|^2, the variance of phi per s that the noise makes."""
+    """Return |sigma' grad phi|^2, the variance of phi per s that the noise makes."""
     row = gradient(system, expression) * system.diffusion
     return (row * row.T)[0, 0]
 
 
 def has_kinks(expression: Any) -> bool:
-    """Whether functions are in it that are not smooth everywhere, so that its derivatives may not
-    say all.
-    """
+    """Return whether an expression has functions that are not smooth everywhere."""
     return expression.has(*_KINKED)
 
 
 def generator(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
-    """The part of A phi = L_f phi + L_g phi u + 1/2 tr(sigma sigma' phi_xx) that does not contain
-    the input.
+    """Return the input-free part of A phi = L_f phi + L_g phi u + 1/2 tr(sigma sigma' phi_xx).
 
     Source: thesis Eq. (4.4).
     """
@@ -98,7 +93,7 @@ def generator(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
 
 
 def vanishes(system: ControlAffineSDE, expression: Any) -> bool:
-    """Whether an expression is zero at every state, for the system's parameters.
+    """Return whether an expression is zero at every state, for the system's parameters.
 
     Where that can be neither shown nor refuted, the answer is no, which is the safe one: noise that
     may reach h is drawn, and an input that may have a say is not taken for one that has none.
@@ -109,7 +104,7 @@ def vanishes(system: ControlAffineSDE, expression: Any) -> bool:
 def derivatives(
     system: ControlAffineSDE, expression: sp.Expr, order: int, derivative: Derivative
 ) -> tuple[sp.Expr, ...]:
-    """(phi, D phi, ..., D^order phi) for D = `lie_derivative_f` or `generator`."""
+    """Return (phi, D phi, ..., D^order phi) for D = `lie_derivative_f` or `generator`."""
     result = [expression]
     for _ in range(order):
         result.append(derivative(system, result[-1]))
@@ -117,8 +112,9 @@ def derivatives(
 
 
 def tidied(expression: Any) -> sp.Expr:
-    """An equal expression with fewer operations, if sin^2 + cos^2 = 1 and common factors give one
-    quickly.
+    """Return an equal expression with fewer operations, if one is found quickly.
+
+    Only sin^2 + cos^2 = 1 and common factors are tried.
     """
     if expression.count_ops() > _LARGEST_TIDIED or _expanded_terms(expression) > _MOST_TERMS:
         return expression
@@ -130,7 +126,7 @@ def tidied(expression: Any) -> sp.Expr:
 
 
 def _expanded_terms(expression: Any) -> int:
-    """How many terms an expression has at most, once its products and powers are multiplied out."""
+    """Return how many terms an expression has at most once it is multiplied out."""
     parts = [_expanded_terms(part) for part in expression.args]
     if expression.is_Add:
         return sum(parts)
@@ -144,7 +140,7 @@ def _expanded_terms(expression: Any) -> int:
 def relative_degree(
     system: ControlAffineSDE, expression: sp.Expr, derivative: Derivative = lie_derivative_f
 ) -> int:
-    """Smallest r with L_g D^(r-1) h not identically zero.
+    """Return the smallest r with L_g D^(r-1) h not identically zero.
 
     Args:
         system: with the parameters for which the degree is asked.

@@ -1,6 +1,4 @@
-"""Sympy's printers of Python code, where they fall short: what they print has the same values for
-floats and for arrays.
-"""
+"""SymPy's printers of Python code, corrected: floats and arrays give the same values."""
 
 from __future__ import annotations
 
@@ -60,9 +58,7 @@ _SETTINGS = {
 
 
 class FloatPrinter(PythonCodePrinter):
-    """Prints what raises, or gives NaN, where Python itself would answer with a complex number or
-    with None.
-    """
+    """Prints code that raises or gives NaN where Python gives a complex number or None."""
 
     def __init__(self) -> None:
         super().__init__(_SETTINGS)
@@ -82,8 +78,7 @@ class FloatPrinter(PythonCodePrinter):
 
 
 class ArrayPrinter(NumPyPrinter):
-    """Prints Min and Max as nested binary ufuncs, where sympy stacks the operands first, and names
-    the constants.
+    """Prints Min and Max as nested binary ufuncs, and names the constants.
 
     Attributes:
         constants: arrays without axes by name: see `constants`.

@@ -1,4 +1,4 @@
-"""A control-affine stochastic differential equation, stated once, in symbols."""
+"""A control-affine stochastic differential equation, defined once, in symbols."""
 
 from __future__ import annotations
 
@@ -9,81 +9,9 @@ from typing import Any
 
 import sympy as sp
 
+from safe_envs.dynamics.declarations import fitting, read_matrix, require_real
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
-from safe_envs.number_text import finite_number
-
-_REAL = sp.Symbol("real", real=True).assumptions0
-
-
-def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
-    """Read a list, nested list or matrix as an immutable matrix of the required shape (None: any
-    width).
-    """
-    try:
-        matrix = sp.ImmutableMatrix(entries)
-    except (TypeError, ValueError) as error:
-        raise SystemDefinitionError(f"{name} is no matrix of expressions: {error}") from error
-    rows, columns = shape
-    if matrix.rows != rows or (columns is not None and matrix.cols != columns):
-        wanted = f"{rows} x {'any' if columns is None else columns}"
-        raise SystemDefinitionError(
-            f"{name} has shape {matrix.rows} x {matrix.cols}; the states and inputs need {wanted}"
-        )
-    # To sympy 0.0 is not 0, and a channel of such entries would count as noise.
-    return sp.ImmutableMatrix(
-        matrix.applyfunc(lambda entry: sp.Integer(0) if entry.is_Float and entry.is_zero else entry)
-    )
-
-
-def _require_real(states: Iterable[Any], inputs: Iterable[Any], parameters: Iterable[Any]) -> None:
-    """Check that states and inputs are declared real, and nothing more, and parameters real."""
-    wrong = []
-    for symbol in (*states, *inputs, *parameters):
-        if not isinstance(symbol, sp.Symbol):
-            raise SystemDefinitionError(
-                f"{symbol!r} among states, inputs and parameters is no symbol; make it by"
-                " sympy.symbols"
-            )
-        if symbol.assumptions0 != _REAL and not (symbol.is_real and symbol in parameters):
-            wrong.append(symbol)
-    if wrong:
-        told = "; ".join(
-            f"{s} is declared {_declared(s) or 'nothing, so that it may be complex'}" for s in wrong
-        )
-        names = " ".join(s.name for s in wrong)
-        raise SystemDefinitionError(
-            "states and inputs are to be declared real and nothing more, parameters real at least,"
-            f" for sympy simplifies by that: {told}. Make them by sympy.symbols({names!r},"
-            " real=True), in the system and in all that is said of it"
-        )
-
-
-def _declared(symbol: sp.Symbol) -> str:
-    """What a symbol was declared to be, like "positive=True"."""
-    return ", ".join(
-        f"{word}={value}"
-        for word, value in getattr(symbol, "_assumptions_orig", symbol.assumptions0).items()
-    )
-
-
-def _fitting(symbol: sp.Symbol, value: Any) -> float:
-    """The value of a parameter, if it is a finite number and what its symbol is declared to be."""
-    number = finite_number(f"parameter {symbol}", value)
-    if symbol.assumptions0 != _REAL:
-        exact = sp.Rational(number)
-        wrong = [
-            word
-            for word, holds in symbol.assumptions0.items()
-            if getattr(exact, f"is_{word}") is (not holds)
-        ]
-        if wrong:
-            raise ConfigurationError(
-                f"parameter {symbol} = {number:g}, but its symbol is declared {_declared(symbol)},"
-                " and sympy simplifies by that; give another value, or make the symbol by"
-                f" sympy.symbols({symbol.name!r}, real=True)"
-            )
-    return number
 
 
 @dataclass(frozen=True)
@@ -124,7 +52,7 @@ class ControlAffineSDE:
     parameters: Mapping[sp.Symbol, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _require_real(self.states, self.inputs, self.parameters)
+        require_real(self.states, self.inputs, self.parameters)
         n, m = len(self.states), len(self.inputs)
         if not n or not m:
             raise SystemDefinitionError(
@@ -133,10 +61,10 @@ class ControlAffineSDE:
         fields: dict[str, Any] = {
             "states": tuple(self.states),
             "inputs": tuple(self.inputs),
-            "drift": _matrix("drift", self.drift, (n, 1)),
-            "input_matrix": _matrix("input_matrix", self.input_matrix, (n, m)),
-            "diffusion": _matrix("diffusion", self.diffusion, (n, None)),
-            "parameters": {p: _fitting(p, v) for p, v in self.parameters.items()},
+            "drift": read_matrix("drift", self.drift, (n, 1)),
+            "input_matrix": read_matrix("input_matrix", self.input_matrix, (n, m)),
+            "diffusion": read_matrix("diffusion", self.diffusion, (n, None)),
+            "parameters": {p: fitting(p, v) for p, v in self.parameters.items()},
         }
         for name, value in fields.items():
             object.__setattr__(self, name, value)
@@ -151,7 +79,7 @@ class ControlAffineSDE:
         diffusion: Any = None,
         parameters: Mapping[sp.Symbol, float] | None = None,
     ) -> ControlAffineSDE:
-        """The system dx = rate(x, u) dt + sigma(x) dW, taken apart into f and g.
+        """Split dx = rate(x, u) dt + sigma(x) dW into f and g.
 
         Args:
             states: n symbols x.
@@ -167,8 +95,8 @@ class ControlAffineSDE:
             raise SystemDefinitionError(
                 f"states = {states!r} and inputs = {inputs!r}; give lists of symbols, not empty"
             )
-        _require_real(states, inputs, parameters or {})
-        column = _matrix("rate", rate, (len(states), 1))
+        require_real(states, inputs, parameters or {})
+        column = read_matrix("rate", rate, (len(states), 1))
         used = set(inputs)
         effect = column.jacobian(list(inputs)).applyfunc(
             lambda e: sp.simplify(e) if e.free_symbols & used else e
@@ -191,7 +119,7 @@ class ControlAffineSDE:
                 )
             if not is_zero(sp.expand(entry)):
                 raise SystemDefinitionError(
-                    f"the rate of {state} is not affine in the inputs: beside f + g u there is"
+                    f"the rate of {state} is not affine in the inputs: besides f + g u there is"
                     f" {entry}. Give f and g themselves where a system has several pieces"
                 )
         return cls(
@@ -297,9 +225,7 @@ class ControlAffineSDE:
         return _numeric(given, tuple(self.parameters.items()))
 
     def exact(self, expression: Any) -> Any:
-        """Like `numeric`, with the decimal value of each parameter as a rational, so that terms
-        cancel exactly.
-        """
+        """Like `numeric`, with decimal values as rationals, so that terms cancel exactly."""
         return expression.subs({p: sp.Rational(repr(v)) for p, v in self.parameters.items()})
 
 

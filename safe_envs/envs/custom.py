@@ -6,8 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.envs.system_env import SystemEnv, SystemVectorEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.object_import import resolved
 from safe_envs.problem.factory import Factory, build_problem, load_system
@@ -17,8 +16,9 @@ _ENTRY = "safe_envs.envs.custom:Custom"
 
 
 def register(env_id: str, system: str | Factory) -> None:
-    """Register an id with Gymnasium for a system of your own: `gym.make`, `gym.make_vec` and all
-    commands know it then.
+    """Register an id for a system of your own.
+
+    `gym.make`, `gym.make_vec` and all commands know it then.
 
     Args:
         env_id: like "my_lab/CartPole-v0"; one that was registered here before is replaced.

@@ -1,33 +1,22 @@
-"""The scalar face of a problem: a Gymnasium env."""
+"""A problem as a Gymnasium env."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.envs.info import Info, safety_info
-from safe_envs.envs.simulation import NoiseStream, Simulation, center_and_half_width, steps_until
+from safe_envs.envs.episode import Episode
+from safe_envs.envs.info import Info
+from safe_envs.envs.simulation import NoiseStream, Simulation, steps_until
+from safe_envs.envs.spaces import action_box, center_and_half_width, observation_box
 from safe_envs.errors import InvalidInputError, NumericalError
-from safe_envs.problem.factory import build_problem, remembering
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 from safe_envs.validators import real_array
-
-
-def observation_box(problem: SafetyProblem) -> gym.spaces.Box:
-    """Observation space of a problem: its features within their bounds."""
-    low = np.array([f.low for f in problem.features], dtype=np.float32)
-    high = np.array([f.high for f in problem.features], dtype=np.float32)
-    return gym.spaces.Box(low, high, dtype=np.float32)
-
-
-def action_box(problem: SafetyProblem) -> gym.spaces.Box:
-    """Action space of a problem: [-1, 1] for each input, which stands for the physical box."""
-    return gym.spaces.Box(-1.0, 1.0, (len(problem.inputs),), dtype=np.float32)
 
 
 class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -80,9 +69,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self._limit = steps_until(problem, max_episode_steps)
         self.executed: Sequence[float] = ()
         self._x: tuple[float, ...] | None = None
-        self._steps = 0
-        self._h_min = math.inf
-        self._episode_cost = 0.0
+        self._episode = Episode()
 
     @property
     def components(self) -> tuple[float, ...]:
@@ -122,7 +109,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         return physical
 
     def normalized_action(self, physical: Sequence[float]) -> np.ndarray:
-        """Inverse of `physical_action`, in double precision."""
+        """Invert `physical_action`: return an action in double precision."""
         return np.array([(u - c) / w for u, (c, w) in zip(physical, self._scales, strict=True)])
 
     def reset(
@@ -133,9 +120,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         if seed is not None:
             self._noise.clear()
         self._x = self._simulation.starts.draw(self.np_random)
-        self._steps = 0
-        self._h_min = math.inf
-        self._episode_cost = 0.0
+        self._episode.restart()
         observation, _, _, info = self._observe([c for c, _ in self._scales])
         if self.viewer is not None:
             self.viewer.restart([self._x], [0.0], [0])
@@ -151,21 +136,21 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         return self.step_physical(self.physical_action(action))
 
     def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """`step` for a physical input inside the box, as a filter has it."""
+        """Step with a physical input inside its bounds, as a filter returns it."""
         self.executed = u
         try:
             self._x = self._simulation.integrator.step(
                 self.components, u, self._noise.next(self.np_random)
             )
-            self._steps += 1
+            self._episode.steps += 1
             observation, reward, terminated, info = self._observe(u)
         except (OverflowError, ZeroDivisionError, ValueError) as error:
             raise NumericalError(
                 f"the simulation of {self.problem.name!r} broke down at {self._x}: {error}"
             ) from error
         if self.viewer is not None:
-            self.viewer.advance([self._x], [self._steps * self.problem.dt], [u])
-        return observation, reward, terminated, self._steps >= self._limit, info
+            self.viewer.advance([self._x], [self._episode.steps * self.problem.dt], [u])
+        return observation, reward, terminated, self._episode.steps >= self._limit, info
 
     def render(self) -> Any:
         """Draw the state, with the trail of the episode and what a filter decided.
@@ -197,7 +182,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
         x = self.components
         features, barriers, reward, outside, goal = self._simulation.measure(
-            x, u, self._steps * self.problem.dt
+            x, u, self._episode.steps * self.problem.dt
         )
         h = min(barriers)
         if not math.isfinite(h + sum(x)):
@@ -205,56 +190,8 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
                 f"the state {x} of {self.problem.name!r} has left the finite numbers; reduce dt or"
                 " raise substeps"
             )
-        violation = h < 0.0
-        cost = 1.0 if violation else 0.0
-        self._episode_cost += cost
-        if h < self._h_min:
-            self._h_min = h
         left = outside > 0.0
         if left:
             features = np.clip(features, self._bounds.low, self._bounds.high)
         observation = np.array(features, dtype=np.float32)
-        info = safety_info(
-            violation=violation,
-            cost=cost,
-            barrier=np.array(barriers),
-            h_min=self._h_min,
-            episode_cost=self._episode_cost,
-        )
-        return observation, reward, left or goal >= 0.0, info
-
-
-class SystemEnv(SafeEnv):
-    """Base of the registered envs: a system's problem behind the arguments of `gym.make`.
-
-    Args:
-        max_episode_steps: truncate after so many control periods, if that is before the horizon.
-        render_mode: "rgb_array", "human" or None; see `SafeEnv`.
-        **options: fields of `safe_envs.problem.options.ProblemOptions`; arguments of the barrier
-            may also be given by themselves.
-
-    Raises:
-        ConfigurationError: An argument names something unknown or is out of range.
-    """
-
-    problem_factory: ClassVar[Any]
-    """Builds the problem from the arguments of the barrier; called once for equal arguments."""
-
-    def __init_subclass__(cls, **keywords: Any) -> None:
-        super().__init_subclass__(**keywords)
-        if "problem_factory" in vars(cls):
-            cls.problem_factory = staticmethod(remembering(cls.problem_factory))
-
-    def __init__(
-        self,
-        *,
-        max_episode_steps: int | None = None,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(type(self).make_problem(**options), max_episode_steps, render_mode)
-
-    @classmethod
-    def make_problem(cls, **options: Any) -> SafetyProblem:
-        """Return the problem that the env has with these options, without making the env."""
-        return build_problem(cls.__name__, cls.problem_factory, options)
+        return observation, reward, left or goal >= 0.0, self._episode.count(barriers, h)

@@ -13,16 +13,20 @@ float64 arrays from a scalar env, arrays with the batch in front from a vector e
 
 and with a filter
 
-| key | type | meaning | |---|---|---| | `nominal_action` | float64 (m,) | what the policy proposed,
-or the goal of a joint program asks for, in physical units | | `safe_action` | float64 (m,) | what
-was executed, in physical units | | `intervention` | bool | the two differ | | `filter_active` |
-bool | a barrier row is binding or cannot be met | | `feasible` | bool | some action in the box
-meets every row | | `slack` | float | by how much the worst row is violated by the executed action |
-| `slacks` | float64 (k,) | the same for each row | | `active_barrier` | int | index of the barrier
-that caused the intervention, -1 without one | | `episode_interventions` | int | interventions of
-the episode so far | | `episode_infeasible` | int | infeasible steps of the episode so far |
+| key | type | meaning |
+|---|---|---|
+| `nominal_action` | float64 (m,) | proposed by the policy, or by the goal of a joint QP |
+| `safe_action` | float64 (m,) | executed; both in physical units |
+| `intervention` | bool | the two differ |
+| `filter_active` | bool | a constraint is binding or cannot be met |
+| `feasible` | bool | some action within the input bounds meets every constraint |
+| `slack` | float | by how much the executed action violates the worst constraint |
+| `slacks` | float64 (k,) | the same for each constraint |
+| `active_barrier` | int | index of the barrier that caused the intervention, -1 without one |
+| `episode_interventions` | int | interventions of the episode so far |
+| `episode_infeasible` | int | infeasible steps of the episode so far |
 
-At reset, where nothing was executed yet, the actions are the point of the box nearest to 0.
+At reset, before anything is executed, both are the point within the input bounds nearest to 0.
 """
 
 from __future__ import annotations
@@ -38,7 +42,7 @@ Info = dict[str, Any]
 def safety_info(
     violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any
 ) -> Info:
-    """What every env reports; values as in the table above."""
+    """Return what every env reports; values as in the table above."""
     return {
         "cost": cost,
         "violation": violation,
@@ -60,7 +64,7 @@ def filter_info(
     episode_interventions: Any,
     episode_infeasible: Any,
 ) -> Info:
-    """What a filter adds; values as in the table above."""
+    """Return what a filter adds; values as in the table above."""
     return {
         "nominal_action": nominal_action,
         "safe_action": safe_action,

@@ -1,6 +1,4 @@
-"""The one implementation of physics, reward, start and observation, over floats or over a batch of
-arrays.
-"""
+"""The one implementation of physics, reward and observation, over floats or arrays."""
 
 from __future__ import annotations
 
@@ -21,9 +19,7 @@ _CHUNK = 256
 
 
 class Simulation:
-    """The formulas of a problem, compiled: they hold no state, so that one object serves any number
-    of envs.
-    """
+    """The compiled formulas of a problem, without a state: one object serves any number of envs."""
 
     def __init__(self, problem: SafetyProblem, flavour: Flavour) -> None:
         self.problem = problem
@@ -48,7 +44,7 @@ class Simulation:
     def measure(
         self, x: Components, u: Sequence[Any], time: Any
     ) -> tuple[Components, Components, Any, Any, Any]:
-        """Read off a state what there is to see.
+        """Return what can be read off a state.
 
         Args:
             x: components of the state.
@@ -65,19 +61,19 @@ class Simulation:
 
 
 class NoiseStream:
-    """Standard normals of one env, drawn ahead in chunks."""
+    """Standard normal numbers of one env, drawn ahead in chunks."""
 
     def __init__(self, channels: int) -> None:
         self._channels = channels
         self.clear()
 
     def clear(self) -> None:
-        """Forget what was drawn ahead: the generator was seeded anew."""
+        """Forget what was drawn ahead, since the generator has a new seed."""
         self._rows: list[list[float]] = []
         self._position = 0
 
     def next(self, rng: np.random.Generator) -> list[float]:
-        """The draws of the next control period."""
+        """Return the draws of the next control period."""
         if not self._channels:
             return []
         if self._position == len(self._rows):
@@ -88,9 +84,7 @@ class NoiseStream:
 
 
 class NoiseStreams:
-    """The same for a batch: each env keeps its own stream, so that its noise does not depend on its
-    neighbours.
-    """
+    """Standard normal numbers of a batch: each env keeps its own stream."""
 
     def __init__(self, num_envs: int, channels: int) -> None:
         self._buffer = np.empty((num_envs, _CHUNK, channels))
@@ -100,12 +94,12 @@ class NoiseStreams:
         self._before_refill = 0
 
     def clear(self, envs: Sequence[int]) -> None:
-        """Forget what was drawn ahead for some envs: their generators were seeded anew."""
+        """Forget what was drawn ahead for some envs, since their generators have new seeds."""
         self._row[envs] = self._end[envs]
         self._before_refill = 0
 
     def next(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> np.ndarray:
-        """The draws of the next control period, shape (channels, num_envs).
+        """Return the draws of the next control period, shape (channels, num_envs).
 
         Args:
             rngs: generator of each env.
@@ -132,7 +126,7 @@ class NoiseStreams:
 
 
 def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
-    """Control periods until an episode is truncated."""
+    """Return the control periods until an episode is truncated."""
     if max_episode_steps is None:
         return problem.steps
     if not isinstance(max_episode_steps, int) or max_episode_steps < 1:
@@ -140,10 +134,3 @@ def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
             f"max_episode_steps = {max_episode_steps!r}; give a whole number from 1"
         )
     return min(problem.steps, max_episode_steps)
-
-
-def center_and_half_width(problem: SafetyProblem) -> tuple[list[float], list[float]]:
-    """Physical input = center + half width * action, for an action in [-1, 1]."""
-    center = [0.5 * (low + high) for low, high in problem.box]
-    half = [0.5 * (high - low) for low, high in problem.box]
-    return center, half

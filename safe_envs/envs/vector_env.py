@@ -1,28 +1,24 @@
-"""The batched face of a problem: a Gymnasium vector env without a loop over its envs."""
+"""A problem as a Gymnasium vector env, without a loop over its envs."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from safe_envs.dynamics.codegen import Components, constants, filled, finite, settled, stacked
-from safe_envs.envs.env import SystemEnv, action_box, observation_box
-from safe_envs.envs.info import Info, safety_info, with_masks
-from safe_envs.envs.simulation import NoiseStreams, Simulation, center_and_half_width, steps_until
+from safe_envs.dynamics.codegen import Components, filled, finite, settled, stacked
+from safe_envs.envs.episode import Episodes
+from safe_envs.envs.info import Info, with_masks
+from safe_envs.envs.seeding import Generators, Seeds
+from safe_envs.envs.simulation import NoiseStreams, Simulation, steps_until
+from safe_envs.envs.spaces import BatchActions, action_box, observation_box
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
-from safe_envs.validators import real_array
-
-_LOWEST, _HIGHEST = constants((-1.0, 1.0))
-
-_OF_EPISODES = ("steps", "h_min", "episode_cost", "ended")
 
 VectorStep = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]
 
@@ -41,7 +37,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Args:
         problem: what to simulate.
         num_envs: size of the batch.
-        autoreset_mode: when ended episodes start anew: "NextStep" (Gymnasium's default: the
+        autoreset_mode: when ended episodes restart: "NextStep" (Gymnasium's default: the
             following step ignores the action and returns the reset observation, with reward 0),
             "SameStep" (the last observation and info of the episode are in `infos["final_obs"]` and
             `infos["final_info"]`) or "Disabled" (reset by `options={"reset_mask": mask}`).
@@ -64,13 +60,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ConfigurationError(f"num_envs = {num_envs!r}; give a whole number from 1")
         self.viewer = open_viewer(problem, render_mode, num_envs)
         self.render_mode = render_mode
-        try:
-            self._autoreset = AutoresetMode(autoreset_mode)
-        except ValueError as error:
-            allowed = ", ".join(mode.value for mode in AutoresetMode)
-            raise ConfigurationError(
-                f"autoreset_mode = {autoreset_mode!r}; allowed: {allowed}"
-            ) from error
+        self._autoreset = _mode(autoreset_mode)
         self.problem = problem
         self.num_envs = num_envs
         self.metadata = {
@@ -84,27 +74,20 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._simulation = Simulation(problem, "arrays")
         self._noise = NoiseStreams(num_envs, self._simulation.integrator.channels)
-        self._center, self._half = (constants(c) for c in center_and_half_width(problem))
+        self._actions = BatchActions(problem, num_envs)
         observed = {f.expression for f in problem.features}
         self._unobserved = [
             i for i, state in enumerate(problem.plant.states) if state not in observed
         ]
         self._limit = steps_until(problem, max_episode_steps)
-        self._rngs: list[np.random.Generator] = []
-        self._seeds: list[int] = []
+        self._generators = Generators(num_envs)
         self.executed: Sequence[Any] = ()
         self._x: Components = ()
-        self._everywhere = np.ones(num_envs, dtype=bool)
-        self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._h_min = np.full(num_envs, np.inf)
-        self._episode_cost = np.zeros(num_envs)
-        self._ended = np.zeros(num_envs, dtype=bool)
+        self.episodes = Episodes(num_envs)
 
     @property
     def components(self) -> Components:
-        """The exact states, an array of shape (num_envs,), not to be written to, for each of the
-        problem's states.
-        """
+        """The exact states: for each state an array (num_envs,), not to be written to."""
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
         return self._x
@@ -115,60 +98,27 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return np.stack(self.components, axis=-1)
 
     @property
-    def np_random(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self,
-    ) -> tuple[np.random.Generator, ...]:
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The generator of each env."""
         self._seed([None] * self.num_envs)
-        return tuple(self._rngs)
+        return tuple(self._generators.rngs)
 
     @property
-    def np_random_seed(  # pyright: ignore[reportIncompatibleMethodOverride]
-        self,
-    ) -> tuple[int, ...]:
+    def np_random_seed(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         """The seed of each env."""
         self._seed([None] * self.num_envs)
-        return tuple(self._seeds)
+        return tuple(self._generators.seeds)
 
     def physical_action(self, actions: Any) -> Components:
-        """Map actions in [-1, 1], shape (num_envs, m), to the components of the physical inputs,
-        clipped to the box.
-
-        Raises:
-            InvalidInputError: the actions have another shape, or are not finite real numbers.
-        """
-        given = np.asarray(real_array("array of actions", actions), dtype=np.float64)
-        if given.shape != self.action_space.shape:
-            raise InvalidInputError(
-                f"actions have shape {given.shape}; the envs take {self.action_space.shape}"
-            )
-        with np.errstate(over="ignore"):
-            suspicious = not finite(given)
-        if suspicious and not np.isfinite(given).all():
-            bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
-            raise InvalidInputError(
-                f"the actions of envs {bad[:5].tolist()} are not finite; give numbers in [-1, 1]"
-            )
-        clipped = np.minimum(np.maximum(given, _LOWEST), _HIGHEST)
-        return tuple(
-            [
-                c + w * clipped[:, j] if c else w * clipped[:, j]
-                for j, (c, w) in enumerate(zip(self._center, self._half, strict=True))
-            ]
-        )
+        """Scale actions in [-1, 1] to physical inputs; see `BatchActions.physical`."""
+        return self._actions.physical(actions)
 
     def normalized_action(self, physical: Sequence[Any]) -> np.ndarray:
-        """Inverse of `physical_action`, in double precision."""
-        actions = np.empty((self.num_envs, len(physical)))
-        for j, (u, c, w) in enumerate(zip(physical, self._center, self._half, strict=True)):
-            np.divide(u - c, w, out=actions[:, j])
-        return actions
+        """Invert `physical_action`: return actions of shape (num_envs, m) in double precision."""
+        return self._actions.normalized(physical)
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: Seeds = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`.
 
@@ -176,27 +126,20 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             seed: seed of env 0, with env i seeded by seed + i, or a seed (or None) for each env.
             options: may hold "reset_mask", a bool array of shape (num_envs,).
         """
-        seeds = self._one_seed_each(seed)
-        mask = self._reset_mask(options)
+        seeds = self._generators.spread(seed)
+        mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
         self._seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
         self._restart(np.flatnonzero(mask))
-        observation, _, _, _, info = self._observe(tuple(self._center), counted=mask)
+        observation, _, _, _, info = self._observe(tuple(self._actions.center), counted=mask)
         if self.viewer is not None:
-            self.viewer.restart(
-                self.state, self._steps * self.problem.dt, np.flatnonzero(mask).tolist()
-            )
+            self.viewer.restart(self.state, self._times, np.flatnonzero(mask).tolist())
         return observation, with_masks(info, mask)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Where each episode stands: arrays with the batch in front, from which `restore` goes on."""
-        return {
-            "state": self.state,
-            **{name: getattr(self, f"_{name}").copy() for name in _OF_EPISODES},
-        }
+        """Return where each episode stands, in arrays with the batch in front; see `restore`."""
+        return {"state": self.state, **self.episodes.snapshot()}
 
-    def restore(
-        self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None
-    ) -> None:
+    def restore(self, snapshot: Mapping[str, np.ndarray], seed: Seeds = None) -> None:
         """Put each episode where a snapshot has it.
 
         Args:
@@ -213,12 +156,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f"the snapshot has states of shape {shape}; these envs have"
                 f" {(self.num_envs, self.problem.plant.n)}"
             )
-        self._seed(self._one_seed_each(seed))
+        self._seed(self._generators.spread(seed))
         self._x = tuple(np.array(snapshot["state"], dtype=float).T.copy())
-        for name in _OF_EPISODES:
-            setattr(self, f"_{name}", np.array(snapshot[name]))
+        self.episodes.restore(snapshot)
         if self.viewer is not None:
-            self.viewer.restart(self.state, self._steps * self.problem.dt, range(self.num_envs))
+            self.viewer.restart(self.state, self._times, range(self.num_envs))
 
     def step(self, actions: Any) -> VectorStep:
         """Hold an action in each env for one control period.
@@ -231,45 +173,41 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self.step_physical(self.physical_action(actions))
 
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
-        """`step` for the components of physical inputs inside the box, as a filter has them."""
+        """Step with components of physical inputs inside their bounds, as a filter returns them."""
         x = self.components
         self.executed = u
-        anew = self._ended.copy() if np.count_nonzero(self._ended) else None
-        if anew is not None and self._autoreset == AutoresetMode.DISABLED:
+        episodes = self.episodes
+        due = episodes.due()
+        if due is not None and self._autoreset == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(
-                f"the episodes of envs {np.flatnonzero(anew)[:5].tolist()} have ended: reset them"
+                f"the episodes of envs {np.flatnonzero(due)[:5].tolist()} have ended: reset them"
             )
-        draws = self._noise.next(self._rngs, None if anew is None else ~anew)
+        draws = self._noise.next(self._generators.rngs, None if due is None else ~due)
         # A state that overflows is found by `_observe`, which says so better than a warning.
         with np.errstate(over="ignore", invalid="ignore"):
             self._x = self._simulation.integrator.step(x, u, draws)
-            self._steps += 1
-            if anew is not None:
-                self._restart(np.flatnonzero(anew))
+            episodes.steps += 1
+            if due is not None:
+                self._restart(np.flatnonzero(due))
             observation, reward, terminated, truncated, info = self._observe(u)
-        if anew is not None:
-            reward = np.where(anew, 0.0, reward)
+        if due is not None:
+            reward = np.where(due, 0.0, reward)
         ended = terminated | truncated
         last: Info = {}
         if self._autoreset == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):
                 last = self._last_of_episode(ended, observation, info)
-                observation, _, _, _, info = self._observe(tuple(self._center), counted=ended)
-            anew = ended
+                observation, _, _, _, info = self._observe(
+                    tuple(self._actions.center), counted=ended
+                )
+            episodes.begun = ended
         else:
-            self._ended = ended
+            episodes.ended = ended
         if self.viewer is not None:
-            fresh = [] if anew is None else np.flatnonzero(anew).tolist()
-            self.viewer.advance(
-                self.state, self._steps * self.problem.dt, np.stack(u, axis=-1), fresh
-            )
-        return (
-            observation,
-            reward,
-            terminated,
-            truncated,
-            {**with_masks(info, self._everywhere.copy()), **last},
-        )
+            begun = np.flatnonzero(episodes.begun).tolist()
+            self.viewer.advance(self.state, self._times, np.stack(u, axis=-1), begun)
+        info = {**with_masks(info, episodes.everywhere.copy()), **last}
+        return observation, reward, terminated, truncated, info
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Draw every env, with the trail of its episode and what a filter decided.
@@ -288,70 +226,39 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 ' render_mode="rgb_array"'
             )
             return None
-        if not self._x:
-            raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
-        return self.viewer.frames()
+        return self.viewer.frames() if self.components else None
 
     def _last_of_episode(self, ended: np.ndarray, observation: np.ndarray, info: Info) -> Info:
-        """Keep what the ended envs showed last, and restart them."""
+        """Keep the last observation and info of the ended envs, and restart them."""
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended).tolist():
             final[i] = observation[i]
         self._restart(np.flatnonzero(ended))
         return with_masks({"final_obs": final, "final_info": with_masks(info, ended)}, ended)
 
+    @property
+    def _times(self) -> np.ndarray:
+        return self.episodes.steps * self.problem.dt
+
     def _seed(self, seeds: Sequence[int | None]) -> None:
-        first = not self._rngs
-        if first:
-            self._rngs, self._seeds = [None] * self.num_envs, [0] * self.num_envs  # pyright: ignore[reportAttributeAccessIssue]
-        chosen = [i for i, s in enumerate(seeds) if first or s is not None]
-        for i in chosen:
-            self._rngs[i], self._seeds[i] = seeding.np_random(seeds[i])
-        self._noise.clear(chosen)
-
-    def _one_seed_each(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + i for i in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ConfigurationError(f"{len(seed)} seeds were given for {self.num_envs} envs")
-        return [None if s is None else int(s) for s in seed]
-
-    def _reset_mask(self, options: Mapping[str, Any] | None) -> np.ndarray:
-        given = (options or {}).get("reset_mask")
-        if given is None:
-            return self._everywhere.copy()
-        mask = np.asarray(given)
-        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
-            raise ConfigurationError(
-                f"reset_mask must be a bool array of shape ({self.num_envs},) with a True in it;"
-                f" given {given!r}"
-            )
-        if not self._x and not mask.all():
-            raise gym.error.ResetNeeded(
-                "some envs have no state yet: the first reset takes no reset_mask"
-            )
-        return mask
+        self._noise.clear(self._generators.seed(seeds))
 
     def _restart(self, envs: np.ndarray) -> None:
         """Put some envs at the start of an episode."""
-        start = self._simulation.starts.draw_batch([self._rngs[i] for i in envs.tolist()])
+        rngs = [self._generators.rngs[i] for i in envs.tolist()]
+        start = self._simulation.starts.draw_batch(rngs)
         if envs.size == self.num_envs:
             self._x = tuple(start)
         else:
             self._x = tuple([x.copy() for x in self._x])
             for x, fresh in zip(self._x, start, strict=True):
                 x[envs] = fresh
-        self._steps[envs] = 0
-        self._h_min[envs] = np.inf
-        self._episode_cost[envs] = 0.0
-        self._ended[envs] = False
+        self.episodes.restart(envs)
 
     def _observe(self, u: Sequence[Any], counted: np.ndarray | None = None) -> VectorStep:
         """Read the states; `counted` are the envs whose states are new (None: all)."""
         self._x = x = settled(self.components, (self.num_envs,))
-        time = self._steps * self.problem.dt if self._simulation.timed else 0.0
+        time = self._times if self._simulation.timed else 0.0
         features, barriers, reward, outside, goal = self._simulation.measure(x, u, time)
         rows = np.empty((len(features), self.num_envs), dtype=np.float32)
         for row, feature in zip(rows, features, strict=True):
@@ -359,10 +266,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observation = rows.T
         barrier = stacked(barriers, self.num_envs)
         h = barriers[0] if len(barriers) == 1 else barrier.min(axis=1)
-        violation = h < 0.0
-        cost = violation.astype(np.float64)
-        self._episode_cost += cost if counted is None else cost * counted
-        np.minimum(self._h_min, h, out=self._h_min)
+        info = self.episodes.count(barrier, h, counted)
         terminated = filled(outside > 0.0, (self.num_envs,))
         sound = finite(h) and finite(rows)
         for i in self._unobserved:
@@ -374,19 +278,12 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._report_breakdown(h, observation)
         if self.problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
-        info = safety_info(violation, cost, barrier, self._h_min.copy(), self._episode_cost.copy())
-        return (
-            observation,
-            filled(reward, (self.num_envs,)).copy(),
-            terminated,
-            self._steps >= self._limit,
-            info,
-        )
+        reward = filled(reward, (self.num_envs,)).copy()
+        return observation, reward, terminated, self.episodes.steps >= self._limit, info
 
     def _report_breakdown(self, h: np.ndarray, observation: np.ndarray) -> None:
-        broken = ~(
-            np.isfinite(self._x).all(axis=0) & np.isfinite(h) & np.isfinite(observation).all(axis=1)
-        )
+        sound = np.isfinite(self._x).all(axis=0) & np.isfinite(observation).all(axis=1)
+        broken = ~(sound & np.isfinite(h))
         if broken.any():
             raise NumericalError(
                 f"the states of envs {np.flatnonzero(broken)[:5].tolist()} of {self.problem.name!r}"
@@ -394,26 +291,9 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             )
 
 
-class SystemVectorEnv(SafeVectorEnv):
-    """Base of the registered vector envs.
-
-    Args:
-        num_envs: see `SafeVectorEnv`.
-        autoreset_mode: see `SafeVectorEnv`.
-        max_episode_steps: see `SafeVectorEnv`.
-        render_mode: see `SafeVectorEnv`.
-        **options: as for `SystemEnv`.
-    """
-
-    env_class: ClassVar[type[SystemEnv]]
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        max_episode_steps: int | None = None,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        problem = self.env_class.make_problem(**options)
-        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)
+def _mode(given: str | AutoresetMode) -> AutoresetMode:
+    try:
+        return AutoresetMode(given)
+    except ValueError as error:
+        allowed = ", ".join(mode.value for mode in AutoresetMode)
+        raise ConfigurationError(f"autoreset_mode = {given!r}; allowed: {allowed}") from error

@@ -1,3 +1,1 @@
-"""What a safety problem is: plant, model, barriers, bounds, start, task, and how one is built and
-checked.
-"""
+"""Safety problems: plant, model, barriers, bounds, start and task, built and checked."""

@@ -36,7 +36,7 @@ class Barrier:
 
 
 def formula(what: str, given: Any) -> sp.Expr:
-    """A sympy expression, or a number, as an expression.
+    """Return a SymPy expression, or a number as one.
 
     Raises:
         SystemDefinitionError: it is a text, a function, an inequality or something else.

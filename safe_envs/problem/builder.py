@@ -1,6 +1,4 @@
-"""A problem of your own from a system, its barriers and a few numbers; what is left out gets what
-suits.
-"""
+"""A problem from a system, its barriers and a few numbers; the rest has defaults."""
 
 from __future__ import annotations
 
@@ -58,7 +56,7 @@ def state_problem(
     units: Mapping[sp.Symbol, str] | None = None,
     **rest: Any,
 ) -> SafetyProblem:
-    """State a safety problem.
+    """Build a safety problem.
 
     Args:
         system: what is simulated.
@@ -126,7 +124,7 @@ def state_problem(
 
 
 def named_barriers(barriers: Any) -> tuple[Barrier, ...]:
-    """Barriers from one or several expressions or barriers, each with a name.
+    """Return one or several expressions or barriers as barriers, each with a name.
 
     Raises:
         SystemDefinitionError: there is none, or one is no expression.
@@ -144,7 +142,7 @@ def named_barriers(barriers: Any) -> tuple[Barrier, ...]:
 
 
 def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str, Any]:
-    """The attributes noise, gains, filter and plane of a problem, as they suit a system.
+    """Return noise, gains, filter and plane of a problem as they suit a system.
 
     Raises:
         RelativeDegreeError: no input reaches a barrier.
@@ -166,7 +164,7 @@ def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str,
 
 
 def law_of(law: Any, system: ControlAffineSDE) -> sp.Expr:
-    """A law of the states as one of the features, which have symbols of their own."""
+    """Return a law of the states as a law of the features, which have their own symbols."""
     return formula("nominal", law).subs({s: sp.Symbol(s.name, real=True) for s in system.states})
 
 
@@ -251,7 +249,7 @@ def _boxes(system: ControlAffineSDE, box: Any) -> list[Range]:
 
 
 def _ends(what: str, given: Any) -> Range:
-    """(low, high) as floats, possibly infinite."""
+    """Return (low, high) as floats, possibly infinite."""
     try:
         low, high = (float(v) for v in given)
     except (TypeError, ValueError) as error:

@@ -20,7 +20,7 @@ class CLF:
 
         min  w_u |u|^2 + w_d d^2   s.t.   AV + rate V <= d
 
-    The slack d keeps the program feasible: without it AV <= 0 cannot hold at the goal under noise.
+    The slack d keeps the QP feasible: without it AV <= 0 cannot hold at the goal under noise.
 
     Attributes:
         V: Lyapunov function of the states.
@@ -61,13 +61,12 @@ class CLF:
             )
 
     def growth(self, system: ControlAffineSDE) -> tuple[sp.Expr, tuple[sp.Expr, ...]]:
-        """Offset a and coefficients b, one for each input, of AV + rate V = a + b u."""
+        """Return a and b, one for each input, of AV + rate V = a + b u."""
         b: Any = lie_derivative_g(system, self.V)
         return generator(system, self.V) + sp.sympify(self.rate) * self.V, tuple(b)
 
     def min_norm(self, system: ControlAffineSDE) -> tuple[sp.Expr, ...]:
-        """The input of the smallest cost, without a box: an expression of states and parameters for
-        each input.
+        """Return the input of minimum cost without input bounds, one expression for each input.
 
         The only constraint is inactive where a <= 0. Elsewhere the multiplier follows from a + b u
         = d, so that u = -b' max(a, 0) / (b b' + w_u / w_d): there is no division by zero.

@@ -1,6 +1,4 @@
-"""A safety problem: plant, model, barriers, input box, start, timing and task, as one frozen
-statement.
-"""
+"""A safety problem: plant, model, barriers, input bounds, start, timing and task."""
 
 from __future__ import annotations
 
@@ -49,7 +47,7 @@ class SafetyProblem:
         features: entries of the observation; the states by default.
         goal: the episode ends where this expression is >= 0.
         noise: names of the diffusion parameters, in the order of the `noise` argument.
-        gains: rates p_1..p_r in 1/s that the conditions use unless told otherwise, for all
+        gains: rates p_1..p_r in 1/s that the conditions use by default, for all
             barriers; or such a tuple for each.
         filter: name of the condition that suits the problem.
         substeps: integration steps in a control period.
@@ -178,7 +176,7 @@ class SafetyProblem:
             )
 
     def gains_of(self, barrier: int) -> tuple[float, ...]:
-        """Rates p_1..p_r for a barrier, by its index."""
+        """Return the rates p_1..p_r of a barrier, given by its index."""
         gains: Any = self.gains
         return gains[barrier] if isinstance(gains[0], tuple) else gains
 
@@ -189,9 +187,7 @@ class SafetyProblem:
 
     @property
     def duration(self) -> float:
-        """Length of an episode in s as it is simulated: the whole number of control periods that is
-        nearest to the horizon.
-        """
+        """Length of an episode in s as it is simulated, in whole control periods."""
         return self.steps * self.dt
 
     @property
@@ -290,7 +286,7 @@ class SafetyProblem:
 
 
 def _numbers(given: Any) -> np.ndarray:
-    """What the user gave as an array of at least one axis; empty if it holds no numbers."""
+    """Return numbers as an array of at least one axis; empty if there are none."""
     try:
         found = np.asarray(given)
         # NumPy would read numbers out of texts.

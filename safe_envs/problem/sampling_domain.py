@@ -13,12 +13,13 @@ from safe_envs.errors import SystemDefinitionError
 
 @dataclass(frozen=True)
 class SamplingDomain:
-    """What a problem says about learning it; what it leaves empty, `SafetyProblem.exploration`
-    completes.
+    """Where and how a system is excited to learn from it.
+
+    `SafetyProblem.exploration` completes what is empty.
 
     Attributes:
-        region: (low, high) of each state. States are drawn uniformly from it, and kept where every
-            barrier is positive.
+        region: (low, high) of each state. States are drawn uniformly from it, where every barrier
+            is positive.
         inputs: input vectors that are tried, in physical units; clipped to the box.
         coordinates: expressions of the states that a learned function depends on: cosines and sines
             of angles, relative positions.
@@ -35,8 +36,9 @@ class SamplingDomain:
         angles: Sequence[bool],
         box: Sequence[tuple[float, float]],
     ) -> SamplingDomain:
-        """Fill what is empty: the ranges themselves, with a whole turn for an angle; each input
-        halfway to its bounds.
+        """Fill what is empty.
+
+        States get their ranges, an angle a whole turn; inputs go halfway to their bounds.
 
         Args:
             states: symbols.
@@ -82,9 +84,7 @@ class SamplingDomain:
 
 
 def _halfway(box: Sequence[tuple[float, float]]) -> tuple[tuple[float, ...], ...]:
-    """For each input both points halfway from the centre of the box to its bounds, with the others
-    at the centre.
-    """
+    """Return, for each input, the points halfway from its centre to its bounds, others centred."""
     center = [0.5 * (low + high) for low, high in box]
     reach = [0.25 * (high - low) for low, high in box]
     return tuple(

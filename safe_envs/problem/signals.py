@@ -29,7 +29,7 @@ class Variable:
 
 @dataclass(frozen=True)
 class Feature:
-    """An entry of the observation: an expression of the states and of `TIME`, with finite bounds."""
+    """An entry of the observation: an expression of states and `TIME`, with finite bounds."""
 
     name: str
     expression: sp.Expr

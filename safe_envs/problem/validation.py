@@ -1,6 +1,4 @@
-"""Mistakes in the statement of a problem that would only show as wrong results: they are found
-before the first step.
-"""
+"""Mistakes in the definition of a problem, found before they show as wrong results."""
 
 from __future__ import annotations
 
@@ -34,7 +32,7 @@ _sound: weakref.WeakValueDictionary[int, SafetyProblem] = weakref.WeakValueDicti
 
 
 def require_sound(problem: SafetyProblem) -> None:
-    """Look for mistakes in a problem, at its starts mostly; once for each problem.
+    """Look for mistakes in a problem, mostly at its starts; once for each problem.
 
     Wrong are: an input that nothing depends on; a barrier that no input reaches, or that cannot be
     differentiated as often as that takes; gains that are not one positive number for each order;
@@ -76,7 +74,7 @@ def require_sound(problem: SafetyProblem) -> None:
 
 
 def degree_of(system: ControlAffineSDE, h: sp.Expr) -> int:
-    """Relative degree along the Ito generator where the system is noisy, along the drift elsewhere.
+    """Return the relative degree: along the Ito generator with noise, along the drift without.
 
     Raises:
         RelativeDegreeError: no input reaches h.
@@ -85,7 +83,7 @@ def degree_of(system: ControlAffineSDE, h: sp.Expr) -> int:
 
 
 def _values(symbols: Sequence[sp.Symbol], expressions: Sequence[Any], x: Components) -> np.ndarray:
-    """Expressions at states, shape (B, len(expressions)); NaN or infinite where they have no value."""
+    """Evaluate expressions at states: shape (B, len(expressions)), not finite without a value."""
     with np.errstate(all="ignore"):
         return stacked(compile_function(symbols, expressions, "arrays")(*x), len(x[0]))
 
@@ -112,7 +110,7 @@ def _require_gains(gains: Sequence[float], name: str, degree: int) -> None:
 
 
 def _safe_starts(problem: SafetyProblem) -> Components:
-    """The starts that are in the workspace and safe.
+    """Return the starts that are in the workspace and safe.
 
     Raises:
         SystemDefinitionError: there are none.
@@ -179,7 +177,7 @@ def _require_numbers(
 
 
 def _laws(problem: SafetyProblem) -> list[Any] | None:
-    """The nominal controller as expressions of the states; None where it depends on time."""
+    """Return the nominal controller as expressions of the states; None if it depends on time."""
     features = {f.symbol: f.expression for f in problem.features}
     laws = [problem.model.numeric(law).subs(features, simultaneous=True) for law in problem.nominal]
     return None if any(set(law.free_symbols) - set(problem.plant.states) for law in laws) else laws
@@ -202,7 +200,7 @@ def _doubt_box_of_nominal(problem: SafetyProblem, x: Components) -> None:
 
 
 def _doubt_box_of_barriers(problem: SafetyProblem, x: Components) -> None:
-    """Whether b_r, with the gains of the problem, is out of all reach at every start."""
+    """Warn where the condition of a barrier is far out of reach at every start."""
     model = problem.model
     for i, barrier in enumerate(problem.barriers):
         chain, gains = model.numeric(barrier.expression), problem.gains_of(i)
@@ -249,7 +247,7 @@ def _doubt_box_of_workspace(problem: SafetyProblem, x: Components) -> None:
 
 
 def _doubt(text: str) -> None:
-    # The statement of the problem stands further up, by a depth that depends on who looks.
+    # The code that builds the problem is further up, by a depth that depends on the caller.
     warnings.warn(text, SystemDefinitionWarning, stacklevel=5)
 
 

@@ -1,6 +1,4 @@
-"""The systems of the thesis and variations of them, one file each, and their registration with
-Gymnasium.
-"""
+"""The systems of the thesis and variations, one file each, and their registration."""
 
 from __future__ import annotations
 
@@ -15,7 +13,7 @@ MODULES = {
     "Quadrotor": "quadrotor",
     "QuadrotorLimits": "quadrotor_limits",
     "ACC": "acc",
-    "ACCGap": "acc",
+    "ACCGap": "acc_gap",
     "Pendulum": "pendulum",
     "CubicSDE": "cubic",
     "CubicSDEDisk": "cubic",

@@ -1,6 +1,4 @@
-"""What the systems share: checks of the barriers' arguments, and building blocks of start
-distributions.
-"""
+"""Checks of barrier arguments, and building blocks of start distributions."""
 
 from __future__ import annotations
 
@@ -23,16 +21,16 @@ def positive(name: str, value: float) -> float:
 
 
 def uniforms(count: int) -> tuple[sp.Symbol, ...]:
-    """Symbols of independent uniforms on [0, 1)."""
+    """Return symbols of independent uniforms on [0, 1)."""
     return sp.symbols(f"uniform_1:{count + 1}", real=True)
 
 
 def around(center: float, half_width: float, uniform: sp.Symbol) -> sp.Expr:
-    """Uniform on [center - half_width, center + half_width)."""
+    """Return the uniform on [center - half_width, center + half_width)."""
     return center + half_width * (2 * uniform - 1)
 
 
 def in_disk(radius: float, area: sp.Symbol, angle: sp.Symbol) -> tuple[sp.Expr, sp.Expr]:
-    """Uniform in the disk around the origin, from two uniforms."""
+    """Return a uniform point of the disk around the origin, from two uniforms."""
     rho = radius * sp.sqrt(area)
     return rho * sp.cos(2 * sp.pi * angle), rho * sp.sin(2 * sp.pi * angle)

@@ -1,4 +1,4 @@
-"""Cubic planar system: with a parabola for its safe set (CubicSDE) and with a disk (CubicSDEDisk)."""
+"""Cubic planar system: safe in a parabola (CubicSDE) and in a disk (CubicSDEDisk)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.initial_distribution import Start
@@ -22,10 +22,11 @@ a, k, sigma_1, sigma_2 = sp.symbols("a k sigma_1 sigma_2", real=True)
 
 
 def cubic(diffusion: Any, noise: Mapping[sp.Symbol, float]) -> ControlAffineSDE:
-    """The system: dx_1 = (-a x_1 - x_2) dt + ..., dx_2 = (x_1^3 + x_2 u) dt + ..., with a = .6 and
-    the given diffusion.
+    """Return the system with a given diffusion.
 
-    Source: thesis Sec. 5.4.2 and 6.3.1. The print writes d of the states' derivatives where d of
+    dx_1 = (-a x_1 - x_2) dt + ..., dx_2 = (x_1^3 + x_2 u) dt + ..., with a = .6.
+
+    Source: thesis Sec. 5.4.2 and 6.3.1. The thesis writes d of the states' derivatives where d of
         the states is meant.
     """
     return ControlAffineSDE(
@@ -39,7 +40,7 @@ def cubic(diffusion: Any, noise: Mapping[sp.Symbol, float]) -> ControlAffineSDE:
 
 
 def _problem(name: str, *, system: ControlAffineSDE, **rest: Any) -> SafetyProblem:
-    """What both problems have in common."""
+    """Build what both problems share."""
     return SafetyProblem(
         name=name,
         plant=system,
@@ -56,7 +57,7 @@ def _problem(name: str, *, system: ControlAffineSDE, **rest: Any) -> SafetyProbl
 def cubic_sde(
     *, offset: float = 1.0, rate: float = 1.0, slack_weight: float = 1.0
 ) -> SafetyProblem:
-    """The inside of a parabola, with noise that grows with x_2.
+    """Build the problem inside a parabola, with noise that grows with x_2.
 
     Args:
         offset: where the parabola meets the x_1 axis.
@@ -91,7 +92,7 @@ def cubic_sde(
 
 
 def cubic_sde_disk(*, radius: float = 1.0) -> SafetyProblem:
-    """A disk, with additive noise.
+    """Build the problem in a disk, with additive noise.
 
     Args:
         radius: of the safe disk.
@@ -121,11 +122,11 @@ def cubic_sde_disk(*, radius: float = 1.0) -> SafetyProblem:
 
 
 class CubicSDE(SystemEnv):
-    """A cubic planar system, with noise and control that vanish together, is to stay inside a
-    parabola.
+    """A cubic planar system, whose noise and control vanish together, is to stay in a parabola.
 
-    ## Description The state starts near the edge and is to come to the origin. Where x_2 = 0 the
-    input does nothing.
+    ## Description
+    The state starts near the edge and is to come to the origin. Where x_2 = 0 the input does
+    nothing.
 
     ## Equations
     dx_1 = (-a x_1 - x_2) dt, dx_2 = (x_1^3 + x_2 u) dt + k x_2 dW, with a = .6
@@ -136,22 +137,24 @@ class CubicSDE(SystemEnv):
     | `x_1`, `x_2` | | 1 | [-6, 6] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `u` | | 1/s | [-10, 10] |
 
     ## Observation
     The states.
 
-    ## Barrier h = offset - x_1 - x_2^2 with offset 1, of relative degree 1. C is unbounded and so
-    is h, so that h/sup h is no bound on the probability of staying safe. The condition cannot be
-    met at x_2 = 0, x_1 < 0. Gain 2. Natural filter: `scbf`.
+    ## Barrier
+    h = offset - x_1 - x_2^2 with offset 1, of relative degree 1. C is unbounded and so is h, so
+    that h/sup h is no bound on the probability of staying safe. The condition cannot be met at x_2
+    = 0, x_1 < 0. Gain 2. Default filter: `scbf`.
 
     ## Noise
     `k` = .1 1/sqrt(s).
 
-    ## Mismatch None by default. The thesis takes the diffusion as unknown: `model={"k": 0.0}` is a
-    designer who neglects it.
+    ## Mismatch
+    None by default. The thesis takes the diffusion as unknown: `model={"k": 0.0}` is a designer who
+    neglects it.
 
     ## Reward
     exp(-x_1^2 - x_2^2) a step, in (0, 1].
@@ -165,11 +168,13 @@ class CubicSDE(SystemEnv):
     ## Episode end
     Terminated outside the workspace, truncated after 2 s = 200 steps.
 
-    ## Arguments `offset=1.0` of the barrier; `rate=1.0` and `slack_weight=1.0` of the goal; for all
-    others see `SystemEnv`.
+    ## Arguments
+    `offset=1.0` of the barrier; `rate=1.0` and `slack_weight=1.0` of the goal; for all others see
+    `SystemEnv`.
 
-    ## Source Thesis Sec. 5.4.2, which prints the differential of the states' derivatives where that
-    of the states is meant, and calls C compact.
+    ## Source
+    Thesis Sec. 5.4.2, which prints the differential of the states' derivatives where that of the
+    states is meant, and calls C compact.
     """
 
     problem_factory = staticmethod(cubic_sde)
@@ -178,8 +183,9 @@ class CubicSDE(SystemEnv):
 class CubicSDEDisk(SystemEnv):
     """A cubic planar system with additive noise is to stay in a disk.
 
-    ## Description The drift of `CubicSDE` with constant noise in both states. The input works in
-    proportion to x_2, the noise everywhere.
+    ## Description
+    The drift of `CubicSDE` with constant noise in both states. The input works in proportion to
+    x_2, the noise everywhere.
 
     ## Equations
     dx_1 = (-a x_1 - x_2) dt + sigma_1 dW_1, dx_2 = (x_1^3 + x_2 u) dt + sigma_2 dW_2, with a = .6
@@ -190,16 +196,17 @@ class CubicSDEDisk(SystemEnv):
     | `x_1`, `x_2` | | 1 | [-2 r, 2 r], r = 1 |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `u` | | 1/s | [-10, 10] |
 
     ## Observation
     The states.
 
-    ## Barrier h = r^2 - x_1^2 - x_2^2, of relative degree 1, with sup h = r^2. The thesis' bound
-    h/sup h does not apply: at x_2 = 0, abs(x_1) < .258 the condition cannot be met (Ah(0) = -.08).
-    Gain 2. Natural filter: `scbf`.
+    ## Barrier
+    h = r^2 - x_1^2 - x_2^2, of relative degree 1, with sup h = r^2. The thesis' bound h/sup h does
+    not apply: at x_2 = 0, abs(x_1) < .258 the condition cannot be met (Ah(0) = -.08). Gain 2.
+    Default filter: `scbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` = .2 1/sqrt(s).
@@ -208,7 +215,7 @@ class CubicSDEDisk(SystemEnv):
     None by default.
 
     ## Reward
-    exp(-4 (h/r^2)^2) a step, in (0, 1]: as near to the edge as can be. Chosen by us.
+    exp(-4 (h/r^2)^2) a step, in (0, 1]: as near to the edge as can be. Our choice.
 
     ## Nominal controller
     0, as the thesis has it.

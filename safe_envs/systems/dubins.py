@@ -10,7 +10,7 @@ import sympy as sp
 
 from safe_envs.dynamics.lie import generator, lie_derivative_f
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -27,8 +27,9 @@ _UNIFORMS = uniforms(3)
 
 
 def vehicle(speed: float, noise: float) -> ControlAffineSDE:
-    """The vehicle: dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta
-    = omega dt.
+    """Return the vehicle.
+
+    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt.
 
     Source: thesis Eq. (3.27) and Sec. 4.3.2.
     """
@@ -43,8 +44,9 @@ def vehicle(speed: float, noise: float) -> ControlAffineSDE:
 
 
 def turn_rate_towards(wanted_x: sp.Expr, wanted_y: sp.Expr) -> sp.Expr:
-    """Proportional law on the angle from the heading to a wanted course, from the heading's cosine
-    and sine.
+    """Return a law proportional to the angle from the heading to a wanted course.
+
+    It takes cosine and sine of the heading.
     """
     return _HEADING_GAIN * sp.atan2(
         cos_theta * wanted_y - sin_theta * wanted_x, cos_theta * wanted_x + sin_theta * wanted_y
@@ -52,8 +54,9 @@ def turn_rate_towards(wanted_x: sp.Expr, wanted_y: sp.Expr) -> sp.Expr:
 
 
 def _patrol(r: float) -> tuple[sp.Expr, sp.Expr]:
-    """Reward and turn rate for riding a circle that lies partly beyond the edge of the disk,
-    counterclockwise.
+    """Return reward and turn rate for riding a circle that lies partly outside the disk.
+
+    The vehicle rides counterclockwise.
 
     The wanted course is the circle's tangent, turned outward inside the circle and inward beyond
     it, in proportion to the distance from it. The circle is not the edge itself: a filtered vehicle
@@ -80,7 +83,7 @@ def _disk(
     starts: Mapping[str, Start],
     **rest: Any,
 ) -> SafetyProblem:
-    """What both problems in the disk have in common."""
+    """Build what both problems in the disk share."""
     reward, turn_rate = _patrol(r)
     return SafetyProblem(
         name=name,
@@ -110,13 +113,13 @@ def _disk(
 
 
 def _anywhere(r: float) -> tuple[sp.Expr, ...]:
-    """Position uniform in the disk, heading uniform."""
+    """Return a start with position uniform in the disk and heading uniform."""
     area, angle, heading = _UNIFORMS
     return (*in_disk(r, area, angle), 2 * sp.pi * heading)
 
 
 def dubins_disk(*, radius: float = 1.0) -> SafetyProblem:
-    """The disk with a vehicle that is faster than its designer believes.
+    """Build the problem in the disk with a vehicle that is faster than its designer believes.
 
     Args:
         radius: of the safe disk, in m.
@@ -148,7 +151,7 @@ def dubins_disk(*, radius: float = 1.0) -> SafetyProblem:
 
 
 def stochastic_dubins(*, radius: float = 3.0) -> SafetyProblem:
-    """The disk with a vehicle whose position is disturbed by noise.
+    """Build the problem in the disk with a vehicle whose position is noisy.
 
     Args:
         radius: of the safe disk, in m.
@@ -176,9 +179,10 @@ def stochastic_dubins(*, radius: float = 3.0) -> SafetyProblem:
 class DubinsDisk(SystemEnv):
     """A vehicle at constant speed, faster than its designer believes, is to stay in a disk.
 
-    ## Description The vehicle cannot stop or slow down, only turn. Its task is to ride a circle
-    that lies partly beyond the edge of the safe disk, so that a policy that only wants reward
-    leaves the disk in every round.
+    ## Description
+    The vehicle cannot stop or slow down, only turn. Its task is to ride a circle that lies partly
+    beyond the edge of the safe disk, so that a policy that only wants reward leaves the disk in
+    every round.
 
     ## Equations
     dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt
@@ -190,33 +194,37 @@ class DubinsDisk(SystemEnv):
     | `theta` | heading | rad | unbounded |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
-    | `omega` | turn rate | rad/s | [-pi, pi], chosen by us |
+    | `omega` | turn rate | rad/s | [-pi, pi] (assumed) |
 
     ## Observation
     x, y, cos(theta), sin(theta).
 
-    ## Barrier h = r^2 - x^2 - y^2, of relative degree 2. Where the heading is radial the input does
-    not reach its second derivative: the condition can be met there only if b_2 >= 0 without it,
-    which at the centre needs p_1 p_2 >= 2 v^2/r^2. Hence the gains 1 and 2 in place of the thesis'
-    1 and 1, which miss that for v = .8. Natural filter: `hocbf`.
+    ## Barrier
+    h = r^2 - x^2 - y^2, of relative degree 2. Where the heading is radial the input does not reach
+    its second derivative: the condition can be met there only if b_2 >= 0 without it, which at the
+    centre needs p_1 p_2 >= 2 v^2/r^2. Hence the gains 1 and 2 in place of the thesis' 1 and 1,
+    which miss that for v = .8. Default filter: `hocbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` in m/sqrt(s), both 0: the system is deterministic.
 
-    ## Mismatch The plant has v = .8 m/s, the model v = .5 m/s. A filter that trusts the model lets
-    h settle near -2 v_model (v_plant - v_model)/(p_1 p_2) = -.15 m^2.
+    ## Mismatch
+    The plant has v = .8 m/s, the model v = .5 m/s. A filter that trusts the model lets h settle
+    near -2 v_model (v_plant - v_model)/(p_1 p_2) = -.15 m^2.
 
-    ## Reward (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the
-    distance d from (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise
-    tangent: the circle alone would reward turning on the spot. Chosen by us.
+    ## Reward
+    (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from
+    (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise tangent: the
+    circle alone would reward turning on the spot. Our choice.
 
     ## Nominal controller
     Turns towards a course that leads onto that circle and around it.
 
-    ## Start `feasible`: uniform in the disk and in heading, kept where b_1 > 0 for the plant's
-    default speed and the default gains, since from elsewhere no filter of these gains is promised
+    ## Start
+    `feasible`: uniform in the disk and in heading, restricted to where b_1 > 0 for the plant's
+    default speed and the default gains, since from elsewhere no filter of these gains is guaranteed
     to succeed. `uniform`: without that condition. `thesis`: (.9, .1, 0), which is such a start
     outside the set b_1 >= 0, for all gains that the thesis tries. `valid`: (0, .1, 0), which is
     inside.
@@ -250,16 +258,17 @@ class StochasticDubins(SystemEnv):
     | `theta` | heading | rad | unbounded |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `omega` | turn rate | rad/s | [-10, 10] |
 
     ## Observation
     x, y, cos(theta), sin(theta).
 
-    ## Barrier h = r^2 - x^2 - y^2, of relative degree 2. Natural filter: `scbf`, whose order-2
-    condition cannot stay feasible on a compact set: with the full box it is met in about four steps
-    of five. Gains for the other conditions: 1, 1.
+    ## Barrier
+    h = r^2 - x^2 - y^2, of relative degree 2. Default filter: `scbf`, whose order-2 condition
+    cannot stay feasible on a compact set: with the full box it is met in about four steps of five.
+    Gains for the other conditions: 1, 1.
 
     ## Noise
     `sigma_1`, `sigma_2` = .2 m/sqrt(s).
@@ -267,19 +276,21 @@ class StochasticDubins(SystemEnv):
     ## Mismatch
     None: plant and model have v = 2 m/s.
 
-    ## Reward (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the
-    distance d from (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise
-    tangent: the circle alone would reward turning on the spot. Chosen by us.
+    ## Reward
+    (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from
+    (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise tangent: the
+    circle alone would reward turning on the spot. Our choice.
 
     ## Nominal controller
-    Turns towards a course that leads onto that circle and around it. Chosen by us.
+    Turns towards a course that leads onto that circle and around it. Our choice.
 
-    ## Start `inward`: uniform in the disk and in heading, kept where A h > 0 for the model.
+    ## Start
+    `inward`: uniform in the disk and in heading, restricted to where A h > 0 for the model.
     `uniform`: without that condition.
 
-    ## Episode end Terminated outside the workspace, truncated after 5 s = 100 steps. At a control
-    period of 50 ms some short exits go unseen, so that a safety rate is a little higher than with a
-    smaller one.
+    ## Episode end
+    Terminated outside the workspace, truncated after 5 s = 100 steps. At a control period of 50 ms
+    some short exits go unseen, so that a safety rate is a little higher than with a smaller one.
 
     ## Arguments
     `barrier={"radius": 3.0}`, the radius r in m; for all others see `SystemEnv`.

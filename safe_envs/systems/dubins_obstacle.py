@@ -9,7 +9,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -30,15 +30,14 @@ _OBSTACLE_START = (-1.0, 0.0)
 def vehicle_among(
     speed: float, obstacles: Mapping[sp.Symbol, sp.Expr], parameters: Mapping[sp.Symbol, float]
 ) -> ControlAffineSDE:
-    """The vehicle of Eq. (3.27) and obstacles whose coordinates are states with drifts of their
-    own.
+    """Return the vehicle of Eq. (3.27) with obstacles, whose coordinates are states.
 
     Args:
         speed: v of the vehicle, in m/s.
         obstacles: rate of each coordinate, in its unit a second.
         parameters: value of the symbols in the rates.
 
-    Source: thesis Sec. 3.5.1. The print drives the obstacle by the clock and forgets its velocity
+    Source: thesis Sec. 3.5.1. The thesis drives the obstacle by the clock and forgets its velocity
         in the
     derivatives of h; here its position is a state, so that nothing can be forgotten.
     """
@@ -55,7 +54,7 @@ def vehicle_among(
 
 
 def way_to(goal_x: float, goal_y: float) -> dict[str, Any]:
-    """Reward, nominal controller and goal of a vehicle that is to reach a point."""
+    """Return reward, nominal controller and goal of a vehicle that is to reach a point."""
     to_goal_x, to_goal_y = goal_x - x, goal_y - y
     distance = sp.sqrt(
         to_goal_x**2 + to_goal_y**2 + 1e-12
@@ -70,13 +69,14 @@ def way_to(goal_x: float, goal_y: float) -> dict[str, Any]:
 
 
 def separation(x_i: sp.Expr, y_i: sp.Expr, distance: float) -> sp.Expr:
-    """Positive where the vehicle is farther than a distance from a point."""
+    """Return an expression that is positive where the vehicle is farther than a distance away."""
     return (x - x_i) ** 2 + (y - y_i) ** 2 - distance**2
 
 
 def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
-    """The way to the goal with an obstacle in it, for a vehicle that is faster than its designer
-    believes.
+    """Build the problem of reaching a goal past an obstacle.
+
+    The vehicle is faster than its designer believes.
 
     Args:
         radius: r_O of the obstacle, in m.
@@ -135,11 +135,13 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
 class DubinsObstacle(SystemEnv):
     """A vehicle at constant speed heads for a goal, and an obstacle moves across its way.
 
-    ## Description The straight way to the goal leads through the place where the obstacle will be.
-    The vehicle cannot slow down: it has to turn aside. The obstacle does not react.
+    ## Description
+    The straight way to the goal leads through the place where the obstacle will be. The vehicle
+    cannot slow down: it has to turn aside. The obstacle does not react.
 
-    ## Equations dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta =
-    omega dt, dx_o = v_o dt, dy_o = 0
+    ## Equations
+    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt,
+    dx_o = v_o dt, dy_o = 0
 
     ## States
     | symbol | meaning | unit | workspace |
@@ -151,15 +153,17 @@ class DubinsObstacle(SystemEnv):
     | `y_o` | | m | [-5, 5] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
-    | `omega` | turn rate | rad/s | [-pi, pi], chosen by us |
+    | `omega` | turn rate | rad/s | [-pi, pi] (assumed) |
 
-    ## Observation x, y, cos(theta), sin(theta), and the position of the obstacle seen from the
-    vehicle, x_o - x and y_o - y.
+    ## Observation
+    x, y, cos(theta), sin(theta), and the position of the obstacle seen from the vehicle, x_o - x
+    and y_o - y.
 
-    ## Barrier h = (x - x_o)^2 + (y - y_o)^2 - r_O^2 with r_O = .5 m, of relative degree 2. Gains 1
-    and 1. Natural filter: `hocbf`.
+    ## Barrier
+    h = (x - x_o)^2 + (y - y_o)^2 - r_O^2 with r_O = .5 m, of relative degree 2. Gains 1 and 1.
+    Default filter: `hocbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both 0.
@@ -167,24 +171,28 @@ class DubinsObstacle(SystemEnv):
     ## Mismatch
     The plant has v = .8 m/s, the model v = .5 m/s; both know the obstacle's v_o = .5 m/s.
 
-    ## Reward The cosine of the angle between heading and goal a step, in [-1, 1], that is the
-    progress in units of v dt; and 10 on arrival. The sum of the progress is what the distance
-    shrank by: neither circling nor leaving the workspace pays.
+    ## Reward
+    The cosine of the angle between heading and goal a step, in [-1, 1], that is the progress in
+    units of v dt; and 10 on arrival. The sum of the progress is what the distance shrank by:
+    neither circling nor leaving the workspace pays.
 
     ## Nominal controller
     Turns towards the goal with gain 2 1/s.
 
-    ## Start `spread`: vehicle uniform within .5 (m, m, rad) of (-2, -2, 0), obstacle at (-1, 0).
-    `thesis`: exactly there.
+    ## Start
+    `spread`: vehicle uniform within .5 (m, m, rad) of (-2, -2, 0), obstacle at (-1, 0). `thesis`:
+    exactly there.
 
-    ## Episode end Terminated within .3 m of the goal (3, 1.5) or outside the workspace, truncated
-    after 15 s = 300 steps.
+    ## Episode end
+    Terminated within .3 m of the goal (3, 1.5) or outside the workspace, truncated after 15 s = 300
+    steps.
 
     ## Arguments
     `barrier={"radius": 0.5}`, the obstacle's radius r_O in m; for all others see `SystemEnv`.
 
-    ## Source Thesis Sec. 3.5.1, moving obstacle avoidance. The derivatives of h printed there
-    forget the obstacle's velocity; with the obstacle as a state they are right by construction.
+    ## Source
+    Thesis Sec. 3.5.1, moving obstacle avoidance. The derivatives of h printed there forget the
+    obstacle's velocity; with the obstacle as a state they are right by construction.
     """
 
     problem_factory = staticmethod(dubins_obstacle)

@@ -1,6 +1,4 @@
-"""Dubins vehicle on its way to a goal through a field of obstacles that move in circles: one
-barrier for each.
-"""
+"""Dubins vehicle that drives through obstacles moving in circles, each with a barrier."""
 
 from __future__ import annotations
 
@@ -8,7 +6,7 @@ import math
 
 import sympy as sp
 
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
@@ -30,7 +28,7 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 
 def centers(count: int) -> list[tuple[sp.Expr, sp.Expr]]:
-    """Middles of the obstacles' circles, in m, to the centimetre.
+    """Return the middles of the obstacles' circles, in m, to the centimetre.
 
     They lie like the seeds of a sunflower, which fill a disk evenly for any number of them.
     """
@@ -53,7 +51,7 @@ def _number_of_obstacles(given: object) -> int:
 
 
 def dubins_obstacles(*, num_obstacles: int = 5, radius: float = 0.4) -> SafetyProblem:
-    """The way to the goal through the field.
+    """Build the problem of reaching a goal through a field of obstacles.
 
     Args:
         num_obstacles: N, from 1 to 20. The field grows with it, so that its density stays the same.
@@ -118,15 +116,16 @@ def dubins_obstacles(*, num_obstacles: int = 5, radius: float = 0.4) -> SafetyPr
 
 
 class DubinsObstacles(SystemEnv):
-    """A vehicle at constant speed heads for a goal through a field of obstacles that move in
-    circles.
+    """A vehicle heads for a goal through a field of obstacles that move in circles.
 
-    ## Description The vehicle cannot slow down, only turn, and has to find gaps that open and
-    close. The obstacles do not react, and the vehicle is faster than they are. Each has a barrier
-    of its own, so that a filter has to meet N conditions with one input.
+    ## Description
+    The vehicle cannot slow down, only turn, and has to find gaps that open and close. The obstacles
+    do not react, and the vehicle is faster than they are. Each has a barrier of its own, so that a
+    filter has to meet N conditions with one input.
 
-    ## Equations dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta =
-    omega dt, dphase_i = +-w_o dt
+    ## Equations
+    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt,
+    dphase_i = +-w_o dt
 
     Obstacle i is at x_i = c_xi + R_o cos(phase_i), y_i = c_yi + R_o sin(phase_i), where R_o = .6 m
     and w_o = .6 rad/s, so that it moves at .36 m/s; the odd ones turn to the left, the even ones to
@@ -142,42 +141,49 @@ class DubinsObstacles(SystemEnv):
     | `phase_1` to `phase_N` | angle of each obstacle on its circle | rad | unbounded |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `omega` | turn rate | rad/s | [-pi, pi] |
 
-    ## Observation x, y, cos(theta), sin(theta), and the position of each obstacle seen from the
-    vehicle, x_i - x and y_i - y. An obstacle's velocity follows from where it is.
+    ## Observation
+    x, y, cos(theta), sin(theta), and the position of each obstacle seen from the vehicle, x_i - x
+    and y_i - y. An obstacle's velocity follows from where it is.
 
-    ## Barrier `h_1` to `h_N`: h_i = (x - x_i)^2 + (y - y_i)^2 - r_O^2 with r_O = .4 m, each of
-    relative degree 2. The input loses its hold on h_i where the vehicle heads straight for the
-    obstacle or away from it. Gains 3 and 5 for each: smaller ones keep such a distance that the
-    rows of several obstacles contradict each other more often. Natural filter: `hocbf`.
+    ## Barrier
+    `h_1` to `h_N`: h_i = (x - x_i)^2 + (y - y_i)^2 - r_O^2 with r_O = .4 m, each of relative degree
+    2. The input loses its hold on h_i where the vehicle heads straight for the obstacle or away
+    from it. Gains 3 and 5 for each: smaller ones keep such a distance that the constraints of
+    several obstacles contradict each other more often. Default filter: `hocbf`.
 
     ## Noise
     `sigma_1`, `sigma_2` of the vehicle in m/sqrt(s), both 0.
 
-    ## Mismatch None: plant and model have v = .8 m/s and w_o = .6 rad/s. What is hard is the number
-    of barriers.
+    ## Mismatch
+    None: plant and model have v = .8 m/s and w_o = .6 rad/s. What is hard is the number of
+    barriers.
 
-    ## Reward The cosine of the angle between heading and goal a step, in [-1, 1], that is the
-    progress in units of v dt; and 10 on arrival.
+    ## Reward
+    The cosine of the angle between heading and goal a step, in [-1, 1], that is the progress in
+    units of v dt; and 10 on arrival.
 
     ## Nominal controller
     Turns towards the goal with gain 2 1/s, whatever is in the way.
 
-    ## Start `spread`: x uniform in [-E - 1, -E], y within F of 0, heading within .5 rad of 0,
-    phases uniform. No obstacle comes nearer to these places than 1 m, so that the vehicle starts in
-    the set that the filter keeps.
+    ## Start
+    `spread`: x uniform in [-E - 1, -E], y within F of 0, heading within .5 rad of 0, phases
+    uniform. No obstacle comes nearer to these places than 1 m, so that the vehicle starts in the
+    set that the filter keeps.
 
-    ## Episode end Terminated within .3 m of the goal or outside the workspace, truncated after the
-    time for four times E, 26 s for N = 5.
+    ## Episode end
+    Terminated within .3 m of the goal or outside the workspace, truncated after the time for four
+    times E, 26 s for N = 5.
 
     ## Arguments
     `num_obstacles=5`, N, from 1 to 20; `radius=0.4`, r_O in m. For all others see `SystemEnv`.
 
-    ## Source The vehicle of thesis Eq. (3.27) and the barrier of Sec. 3.5.1, which has one
-    obstacle; the field was chosen by us.
+    ## Source
+    The vehicle of thesis Eq. (3.27) and the barrier of Sec. 3.5.1, which has one obstacle; the
+    field is our choice.
     """
 
     problem_factory = staticmethod(dubins_obstacles)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -23,8 +23,9 @@ _TARGET = sp.Rational(2, 5)
 
 
 def inverted_pendulum() -> ControlAffineSDE:
-    """The pendulum: dtheta = thetadot dt + sigma theta dW, dthetadot = (g/l sin(theta) + u/(m l^2))
-    dt.
+    """Return the pendulum.
+
+    dtheta = thetadot dt + sigma theta dW, dthetadot = (g/l sin(theta) + u/(m l^2)) dt.
 
     Source: thesis Sec. 5.4.1.
     """
@@ -39,7 +40,7 @@ def inverted_pendulum() -> ControlAffineSDE:
 
 
 def pendulum(*, level: float = 0.2) -> SafetyProblem:
-    """Upright pendulum in an ellipse.
+    """Build the problem of an upright pendulum in an ellipse.
 
     Args:
         level: c of h = c - x' P x.
@@ -83,8 +84,9 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
 class Pendulum(SystemEnv):
     """An inverted pendulum, with noise that grows with its angle, is to stay near the top.
 
-    ## Description The pendulum falls over when it is left alone. The task is to lean it a little
-    beyond the edge of the safe ellipse.
+    ## Description
+    The pendulum falls over when it is left alone. The task is to lean it a little beyond the edge
+    of the safe ellipse.
 
     ## Equations
     dtheta = thetadot dt + sigma theta dW, dthetadot = (g/l sin(theta) + u/(m l^2)) dt,
@@ -97,25 +99,27 @@ class Pendulum(SystemEnv):
     | `thetadot` | its rate | rad/s | [-3, 3] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `u` | torque | N m | [-5, 5] |
 
     ## Observation
     The states.
 
-    ## Barrier h = c - x' P x with c = .2 and P = [[sqrt(3), 1], [1, sqrt(3)]], of relative degree
-    1, with sup h = c. In the ellipse abs(theta) and abs(thetadot) stay below .416. Gain 5. Natural
-    filter: `scbf`.
+    ## Barrier
+    h = c - x' P x with c = .2 and P = [[sqrt(3), 1], [1, sqrt(3)]], of relative degree 1, with sup
+    h = c. In the ellipse abs(theta) and abs(thetadot) stay below .416. Gain 5. Default filter:
+    `scbf`.
 
     ## Noise
     `sigma` = .1 1/sqrt(s).
 
-    ## Mismatch None by default. The thesis takes the diffusion as unknown: `model={"sigma": 0.0}`
-    is a designer who neglects it.
+    ## Mismatch
+    None by default. The thesis takes the diffusion as unknown: `model={"sigma": 0.0}` is a designer
+    who neglects it.
 
     ## Reward
-    exp(-(5 (theta - .4))^2) a step, in (0, 1]. Chosen by us: at rest there h = -.08.
+    exp(-(5 (theta - .4))^2) a step, in (0, 1]. Our choice: at rest there h = -.08.
 
     ## Nominal controller
     0, as the thesis has it.
@@ -129,8 +133,9 @@ class Pendulum(SystemEnv):
     ## Arguments
     `barrier={"level": 0.2}`, c; for all others see `SystemEnv`.
 
-    ## Source Thesis Sec. 5.4.1, which does not give m. Eq. (5.19) is malformed as a trace; its
-    value is right.
+    ## Source
+    Thesis Sec. 5.4.1, which does not give m. Eq. (5.19) is malformed as a trace; its value is
+    right.
     """
 
     problem_factory = staticmethod(pendulum)

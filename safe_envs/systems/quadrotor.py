@@ -9,7 +9,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
@@ -65,7 +65,7 @@ MIXING = sp.ImmutableMatrix(
 
 
 def quadrotor(mass: float) -> ControlAffineSDE:
-    """The rigid body with four rotors; accelerations along x, y and z carry noise.
+    """Return the rigid body with four rotors; accelerations along x, y and z carry noise.
 
     The inputs are the squared speeds of the rotors, in which the system is affine.
 
@@ -97,8 +97,9 @@ def quadrotor(mass: float) -> ControlAffineSDE:
 
 
 def rotor_laws(x_wanted: sp.Expr, x_rate_wanted: sp.Expr) -> tuple[sp.Expr, ...]:
-    """Thrust by the altitude, torques that follow x and hold y and the heading at 0, through the
-    inverse of the mixing.
+    """Return the rotor speeds for thrust and torques, by the inverse of the mixing.
+
+    Thrust controls the altitude; torques follow x and hold y and the heading at 0.
 
     The position loop asks for a horizontal acceleration, which for small tilts is g times an angle:
     that angle is what the attitude loop, about three times as fast, follows.
@@ -118,16 +119,16 @@ def rotor_laws(x_wanted: sp.Expr, x_rate_wanted: sp.Expr) -> tuple[sp.Expr, ...]
 
 
 def start_at(known: Mapping[sp.Symbol, Any], spread: Sequence[sp.Symbol] = ()) -> Start:
-    """Some components of the state, and 0 for all others."""
+    """Return a start with some components of the state, and 0 for all others."""
     return Start(tuple(sp.sympify(known.get(s.symbol, 0)) for s in _STATES), tuple(spread))
 
 
 def rotor_problem(name: str, *, followed: Sequence[Feature] = (), **rest: Any) -> SafetyProblem:
-    """What the problems with all twelve states have in common.
+    """Build what the problems with all twelve states share.
 
     Args:
         name: of the problem.
-        followed: references beside that of the altitude.
+        followed: references other than the altitude's.
         **rest: see `altitude_problem`.
     """
     return altitude_problem(
@@ -149,7 +150,7 @@ def rotor_problem(name: str, *, followed: Sequence[Feature] = (), **rest: Any) -
 
 
 def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyProblem:
-    """All twelve states, for a quadrotor that is heavier than its designer believes.
+    """Build the problem of a quadrotor that is heavier than its designer believes.
 
     Args:
         center: c, the middle of the safe band, in m.
@@ -187,8 +188,9 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
 class Quadrotor(SystemEnv):
     """The altitude of a quadrotor with all its twelve states and four rotors is to stay in a band.
 
-    ## Description The task of `QuadrotorAltitude`, through the full dynamics: the thrust that a
-    filter adds is shared among four rotors, and acts along a body axis that tilts.
+    ## Description
+    The task of `QuadrotorAltitude`, through the full dynamics: the thrust that a filter adds is
+    shared among four rotors, and acts along a body axis that tilts.
 
     ## Equations
     Positions and angles integrate their rates. With noise sigma_i dW_i on the three accelerations,
@@ -203,7 +205,7 @@ class Quadrotor(SystemEnv):
         U_1 = k_t (O_1 + O_2 + O_3 + O_4),  U_2 = k_t (O_4 - O_2),  U_3 = k_t (O_1 - O_3)
         U_4 = k_d (O_1 - O_2 + O_3 - O_4),  O_i = Omega_i^2
 
-    Chosen by us, in the range of a small research quadrotor: l = .23 m, I_x = I_y = .0075, I_z =
+    Assumed, in the range of a small research quadrotor: l = .23 m, I_x = I_y = .0075, I_z =
     .013 kg m^2, k_t = 3.13e-5 N s^2, k_d = 7.5e-7 N m s^2.
 
     ## States
@@ -216,14 +218,18 @@ class Quadrotor(SystemEnv):
     | `psi` | yaw | rad | unbounded |
     | `phidot`, `thetadot`, `psidot` | rates | rad/s | [-15, 15] |
 
-    ## Inputs | symbol | meaning | unit | box | |---|---|---|---| | `rotor_1` to `rotor_4` | squared
-    rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the plant's hover, chosen by us |
+    ## Inputs
+    | symbol | meaning | unit | bounds |
+    |---|---|---|---|
+    | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], an assumption |
 
-    ## Observation The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5
-    sin(t), and its rate.
+    ## Observation
+    The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5 sin(t), and its
+    rate.
 
-    ## Barrier h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses
-    its hold on h at z = c, where it is not needed. Gains 2 and 8. Natural filter: `hocbf`.
+    ## Barrier
+    h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold
+    on h at z = c, where it is not needed. Gains 2 and 8. Default filter: `hocbf`.
 
     ## Noise
     `sigma_x`, `sigma_y`, `sigma_z` of the accelerations in m/s/sqrt(s), all 0.
@@ -234,11 +240,13 @@ class Quadrotor(SystemEnv):
     ## Reward
     exp(-(z - z_ref)^2) a step, in (0, 1].
 
-    ## Nominal controller U_1 as in `QuadrotorAltitude`; PD laws that hold x, y and psi at 0 through
-    the roll and pitch angles, for the torques; and the rotor speeds by the inverse of the mixing.
+    ## Nominal controller
+    U_1 as in `QuadrotorAltitude`; PD laws that hold x, y and psi at 0 through the roll and pitch
+    angles, for the torques; and the rotor speeds by the inverse of the mixing.
 
-    ## Start `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0, all else 0. `thesis`:
-    z = 5 m, all else 0.
+    ## Start
+    `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0, all else 0. `thesis`: z = 5 m,
+    all else 0.
 
     ## Episode end
     Terminated outside the workspace, truncated after 30 s = 600 steps.

@@ -7,7 +7,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
@@ -42,12 +42,12 @@ FOLLOWED = (
 
 
 def climb_per_thrust() -> sp.Expr:
-    """Vertical acceleration that a newton of thrust adds to -g, in thesis Eq. (3.29) and (3.31)."""
+    """Return the vertical acceleration per newton of thrust in thesis Eq. (3.29) and (3.31)."""
     return sp.cos(phi) * sp.cos(theta) / m
 
 
 def altitude(mass: float) -> ControlAffineSDE:
-    """The altitude: dz = zdot dt, dzdot = (-g + U_1/m) dt + sigma_z dW, in level flight.
+    """Return the altitude in level flight: dz = zdot dt, dzdot = (-g + U_1/m) dt + sigma_z dW.
 
     Source: thesis Eq. (3.31) with phi = theta = 0.
     """
@@ -62,12 +62,12 @@ def altitude(mass: float) -> ControlAffineSDE:
 
 
 def thrust_law() -> sp.Expr:
-    """PD law on the altitude with gravity compensated: m (g + 6 e + 4 edot)."""
+    """Return the PD law on the altitude with gravity compensated: m (g + 6 e + 4 edot)."""
     return m * (g + 6 * (z_ref - z) + 4 * (z_ref_rate - zdot))
 
 
 def band(center: float, half_width: float) -> Barrier:
-    """The barrier h = 1 - ((z - c)/p)^4.
+    """Return the barrier h = 1 - ((z - c)/p)^4.
 
     Source: thesis Eq. (3.32).
     """
@@ -79,7 +79,7 @@ def band(center: float, half_width: float) -> Barrier:
 def altitude_problem(
     name: str, *, reward: sp.Expr = ALTITUDE_REWARD, gains: Any = (2.0, 8.0), **rest: Any
 ) -> SafetyProblem:
-    """What all quadrotors have in common: the task, the timing and the gains."""
+    """Build what all quadrotors share: the task, the timing and the gains."""
     return SafetyProblem(
         name=name, reward=reward, dt=0.05, horizon=30.0, gains=gains, filter="hocbf", **rest
     )
@@ -90,7 +90,7 @@ CLIMB_RATES = (-5.0, 5.0)
 
 
 def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> SafetyProblem:
-    """The altitude alone, for a quadrotor that is heavier than its designer believes.
+    """Build the problem of the altitude alone, with a mass that the designer underestimates.
 
     Args:
         center: c, the middle of the safe band, in m.
@@ -122,8 +122,9 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
 class QuadrotorAltitude(SystemEnv):
     """The altitude of a quadrotor, heavier than its designer believes, is to stay in a band.
 
-    ## Description A quadrotor in level flight follows a sinusoidal altitude that leaves the safe
-    band at both ends.
+    ## Description
+    A quadrotor in level flight follows a sinusoidal altitude that leaves the safe band at both
+    ends.
 
     ## Equations
     dz = zdot dt, dzdot = (-g + U_1/m) dt + sigma_z dW
@@ -135,27 +136,30 @@ class QuadrotorAltitude(SystemEnv):
     | `zdot` | climb rate | m/s | [-10, 10] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
-    | `U_1` | thrust | N | [0, 12], twice the plant's weight, chosen by us |
+    | `U_1` | thrust | N | [0, 12], twice the plant's weight (assumed) |
 
     ## Observation
     z, zdot, the reference z_ref = 5 + 2.5 sin(t) at the time t of the observation, and its rate.
 
-    ## Barrier h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses
-    its hold on h at z = c, where it is not needed. Gains 2 and 8. Natural filter: `hocbf`.
+    ## Barrier
+    h = 1 - ((z - c)/p)^4 with c = 5 m and p = 2 m, of relative degree 2. The input loses its hold
+    on h at z = c, where it is not needed. Gains 2 and 8. Default filter: `hocbf`.
 
     ## Noise
     `sigma_z` of the acceleration in m/s/sqrt(s), 0.
 
-    ## Mismatch The plant has m = .6 kg, the model m = .4 kg: the designer expects half as much
-    acceleration again as the thrust gives.
+    ## Mismatch
+    The plant has m = .6 kg, the model m = .4 kg: the designer expects half as much acceleration
+    again as the thrust gives.
 
     ## Reward
     exp(-(z - z_ref)^2) a step, in (0, 1].
 
-    ## Nominal controller U_1 = m (g + 6 e + 4 edot), e = z_ref - z, with the model's mass. The
-    thesis names a PID controller without its gains.
+    ## Nominal controller
+    U_1 = m (g + 6 e + 4 edot), e = z_ref - z, with the model's mass. The thesis names a PID
+    controller without its gains.
 
     ## Start
     `spread`: z uniform within .5 m of 5 m, zdot within .5 m/s of 0. `thesis`: (5, 0).
@@ -166,8 +170,9 @@ class QuadrotorAltitude(SystemEnv):
     ## Arguments
     `barrier={"center": 5.0, "half_width": 2.0}`, c and p in m; for all others see `SystemEnv`.
 
-    ## Source Thesis Sec. 3.5.2, Eq. (3.31) with phi = theta = 0, (3.32). Eq. (3.33) has wrong signs
-    in L_f^2 h and L_g L_f h, and zdot in place of its square; nothing here depends on it.
+    ## Source
+    Thesis Sec. 3.5.2, Eq. (3.31) with phi = theta = 0, (3.32). Eq. (3.33) has wrong signs in L_f^2
+    h and L_g L_f h, and zdot in place of its square; nothing here depends on it.
     """
 
     problem_factory = staticmethod(quadrotor_altitude)

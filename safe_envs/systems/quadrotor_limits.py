@@ -1,6 +1,4 @@
-"""Quadrotor with all twelve states between a floor and a ceiling, whose tilt is limited: three
-barriers, four inputs.
-"""
+"""Quadrotor between a floor and a ceiling, with limited tilt: three barriers, four inputs."""
 
 from __future__ import annotations
 
@@ -8,7 +6,7 @@ import math
 
 import sympy as sp
 
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
@@ -38,7 +36,7 @@ _REFERENCE = _SWAY * sp.sin(_SWAY_RATE * TIME)
 def quadrotor_limits(
     *, floor: float = 3.0, ceiling: float = 7.0, tilt: float = 0.5
 ) -> SafetyProblem:
-    """A band of altitudes and a cone of tilts, for a quadrotor that its designer knows.
+    """Build the problem of a band of altitudes and a cone of tilts, with a known quadrotor.
 
     Args:
         floor: lowest safe altitude, in m.
@@ -91,12 +89,12 @@ def quadrotor_limits(
 
 
 class QuadrotorLimits(SystemEnv):
-    """A quadrotor is to stay between a floor and a ceiling, and its tilt below a limit, while it is
-    told to do neither.
+    """A quadrotor is to stay between a floor and a ceiling, and its tilt below a limit.
 
-    ## Description The quadrotor follows an altitude that leaves the band at both ends, and sways
-    from side to side faster than the tilt limit allows. Thrust serves the floor and the ceiling,
-    and torques the tilt; the same four rotors, within their speeds, give both.
+    ## Description
+    The quadrotor follows an altitude that leaves the band at both ends, and sways from side to side
+    faster than the tilt limit allows. Thrust serves the floor and the ceiling, and torques the
+    tilt; the same four rotors, within their speeds, give both.
 
     ## Equations
     Those of `Quadrotor`.
@@ -112,12 +110,13 @@ class QuadrotorLimits(SystemEnv):
     | `phidot`, `thetadot`, `psidot` | rates | rad/s | [-15, 15] |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
     | `rotor_1` to `rotor_4` | squared rotor speeds O_i | rad^2/s^2 | [0, 1e5], twice the hover |
 
-    ## Observation The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5
-    sin(t) and its rate, x_ref = 2 sin(1.5 t) and its rate.
+    ## Observation
+    The states, in order, without psi; then cos(psi), sin(psi), z_ref = 5 + 2.5 sin(t) and its rate,
+    x_ref = 2 sin(1.5 t) and its rate.
 
     ## Barrier
     | name | h | relative degree | gains |
@@ -129,7 +128,7 @@ class QuadrotorLimits(SystemEnv):
     The angle from the thrust to the vertical is to stay below a. In level flight no torque reaches
     the second derivative of the last one: the condition can be met there only if phidot^2 +
     thetadot^2 <= p_1 p_2 (1 - cos(a)), so that a limit below about .3 rad needs larger gains.
-    Natural filter: `hocbf`.
+    Default filter: `hocbf`.
 
     ## Noise
     `sigma_x`, `sigma_y`, `sigma_z` of the accelerations in m/s/sqrt(s), all 0.
@@ -143,17 +142,19 @@ class QuadrotorLimits(SystemEnv):
     ## Nominal controller
     That of `Quadrotor`, with x_ref in place of 0.
 
-    ## Start `spread`: z uniform in the middle quarter of the band, zdot within .5 m/s of 0, psi
-    within .5 rad of 0, all else 0.
+    ## Start
+    `spread`: z uniform in the middle quarter of the band, zdot within .5 m/s of 0, psi within .5
+    rad of 0, all else 0.
 
     ## Episode end
     Terminated outside the workspace, truncated after 30 s = 600 steps.
 
-    ## Arguments `floor=3.0`, `ceiling=7.0` in m, within (0, 10); `tilt=0.5` in rad, within (0,
-    pi/3). For all others see `SystemEnv`.
+    ## Arguments
+    `floor=3.0`, `ceiling=7.0` in m, within (0, 10); `tilt=0.5` in rad, within (0, pi/3). For all
+    others see `SystemEnv`.
 
     ## Source
-    The vehicle of thesis Sec. 3.5.2, Eq. (3.29), (3.30); barriers and task were chosen by us.
+    The vehicle of thesis Sec. 3.5.2, Eq. (3.29), (3.30); barriers and task are our choice.
     """
 
     problem_factory = staticmethod(quadrotor_limits)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
@@ -16,7 +16,7 @@ x, u, sigma = sp.symbols("x u sigma", real=True)
 
 
 def scalar_system() -> ControlAffineSDE:
-    """The system: dx = (x + u) dt + sigma dW.
+    """Return the system dx = (x + u) dt + sigma dW.
 
     Source: thesis Sec. 4.2.2.
     """
@@ -31,7 +31,7 @@ def scalar_system() -> ControlAffineSDE:
 
 
 def scalar(*, limit: float = 1.0) -> SafetyProblem:
-    """The half-line below a limit.
+    """Build the problem of the half-line below a limit.
 
     Args:
         limit: the edge of the safe set.
@@ -66,8 +66,9 @@ def scalar(*, limit: float = 1.0) -> SafetyProblem:
 class Scalar(SystemEnv):
     """An unstable scalar system with noise is to stay below a limit.
 
-    ## Description The smallest system on which the conditions differ: near the limit a reciprocal
-    one asks for unbounded control.
+    ## Description
+    The smallest system on which the conditions differ: near the limit a reciprocal one asks for
+    unbounded control.
 
     ## Equations
     dx = (x + u) dt + sigma dW
@@ -78,33 +79,33 @@ class Scalar(SystemEnv):
     | `x` | | 1 | [-3 limit, 2 limit], limit = 1 |
 
     ## Inputs
-    | symbol | meaning | unit | box |
+    | symbol | meaning | unit | bounds |
     |---|---|---|---|
-    | `u` | | 1/s | [-10, 10], chosen by us |
+    | `u` | | 1/s | [-10, 10] (assumed) |
 
     ## Observation
     The state.
 
     ## Barrier
-    h = limit - x, of relative degree 1 and unbounded above. Gain 1. Natural filter: `scbf`.
+    h = limit - x, of relative degree 1 and unbounded above. Gain 1. Default filter: `scbf`.
 
     ## Noise
-    `sigma` = .2 1/sqrt(s), chosen by us.
+    `sigma` = .2 1/sqrt(s) (assumed).
 
     ## Mismatch
     None.
 
     ## Reward
-    exp(-(2 (x/limit - 1))^2) a step, in (0, 1]: as near to the limit as can be. Chosen by us.
+    exp(-(2 (x/limit - 1))^2) a step, in (0, 1]: as near to the limit as can be. Our choice.
 
     ## Nominal controller
-    u = limit - 2 x: it makes the closed loop dx = (limit - x) dt + sigma dW. Chosen by us.
+    u = limit - 2 x: it makes the closed loop dx = (limit - x) dt + sigma dW. Our choice.
 
     ## Start
-    `spread`: uniform in (-.9 limit, .9 limit). `origin`: 0. Chosen by us.
+    `spread`: uniform in (-.9 limit, .9 limit). `origin`: 0. Our choice.
 
     ## Episode end
-    Terminated outside the workspace, truncated after 5 s = 500 steps. Chosen by us.
+    Terminated outside the workspace, truncated after 5 s = 500 steps. Our choice.
 
     ## Arguments
     `barrier={"limit": 1.0}`; for all others see `SystemEnv`.

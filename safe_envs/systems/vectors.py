@@ -1,12 +1,13 @@
-"""The systems in batches: for each env class `X` of this package a class `XVector`, made when it is
-first named.
+"""The systems in batches: a class `XVector` for each env class `X`.
+
+Each is made when it is first named.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 
-from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.envs.system_env import SystemVectorEnv
 from safe_envs.systems import MODULES
 
 

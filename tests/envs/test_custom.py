@@ -119,7 +119,7 @@ def test_modules_beside_the_file_can_be_imported(tmp_path):
         ("wrong", ("", ""), "returned int"),
         ("problem", ("import sympy", "import sympyy"), "in line 2: ModuleNotFoundError"),
         ("problem", ("SIGN *", "1 / 0 +"), "in line 9: ZeroDivisionError"),
-        ("", ("", ""), "no place of a statement"),
+        ("", ("", ""), "is not a place"),
     ],
 )
 def test_what_is_no_statement_is_explained(tmp_path, name, change, says):

@@ -266,7 +266,7 @@ def test_classes_are_documented(env_id):
         "Arguments",
         "Source",
     ):
-        assert f"## {heading}" in text
+        assert f"    ## {heading}\n" in text
 
 
 def test_a_problem_is_stated_once_for_the_same_arguments():

@@ -227,10 +227,10 @@ def test_a_fixed_start_is_that_of_every_env_and_draws_nothing():
     )
     envs.reset(seed=0)
     np.testing.assert_array_equal(envs.state, [[2.0, 1.3, 0.3, 0.5, 1.0]] * 3)
-    before = [rng.bit_generator.state for rng in envs._rngs]
+    before = [rng.bit_generator.state for rng in envs._generators.rngs]
     envs.reset(options={"reset_mask": np.array([True, False, True])})
     np.testing.assert_array_equal(envs.state, [[2.0, 1.3, 0.3, 0.5, 1.0]] * 3)
-    assert [rng.bit_generator.state for rng in envs._rngs] == before
+    assert [rng.bit_generator.state for rng in envs._generators.rngs] == before
 
 
 def test_the_batched_class_is_one_object_by_name(env_id):

@@ -13,7 +13,7 @@ import numpy as np
 from safe_envs.agents.evaluation.rollout import Env
 from safe_envs.agents.policies.registry import POLICIES, Policy, is_data, make_policy, policy_file
 from safe_envs.dynamics.integrators import Integrator
-from safe_envs.envs.simulation import center_and_half_width
+from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem

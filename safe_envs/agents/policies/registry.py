@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.envs.env import action_box, observation_box
+from safe_envs.envs.spaces import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 

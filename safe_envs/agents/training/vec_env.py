@@ -17,7 +17,7 @@ from safe_envs.agents.evaluation.evaluate import BARE
 from safe_envs.agents.training.lazy_info import LazyInfo
 from safe_envs.agents.training.native_vec_env import NativeVecEnv
 from safe_envs.envs.info import Info
-from safe_envs.envs.simulation import center_and_half_width
+from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.registry import env_class, full_id

@@ -1,6 +1,4 @@
-"""The options that say which env is meant: once for all commands that take them, which are handed
-an `EnvOptions`.
-"""
+"""The options that name an env and its problem, once for all commands."""
 
 from __future__ import annotations
 
@@ -97,7 +95,7 @@ class EnvOptions:
         }
 
     def evaluate_command(self, *words: str) -> str:
-        """A command line that evaluates something in the same env, quoted for a shell.
+        """Return a command line that evaluates something in the same env, quoted for a shell.
 
         Args:
             *words: what else is to stand in it.
@@ -112,7 +110,7 @@ class EnvOptions:
 
 
 def with_env(command: Callable[..., None], without: Sequence[str] = ()) -> Callable[..., None]:
-    """The function of a command with the options of an env in place of its parameter `env`.
+    """Return a command's function with the options of an env in place of its parameter `env`.
 
     Args:
         command: the function, which is handed an `EnvOptions`.

@@ -15,7 +15,7 @@ from safe_envs.dynamics.lie import generator, relative_degree
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.systems.acc import acc_gap
+from safe_envs.systems.acc_gap import acc_gap
 from safe_envs.systems.cubic import cubic_sde, cubic_sde_disk
 from safe_envs.systems.dubins import dubins_disk
 from safe_envs.wrappers.learning.bayesian import Prior, fit, identify

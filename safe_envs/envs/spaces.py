@@ -1,0 +1,90 @@
+"""Observation and action spaces of a problem, and actions in physical units."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from safe_envs.dynamics.codegen import Components, constants, finite
+from safe_envs.errors import InvalidInputError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.validators import real_array
+
+_LOWEST, _HIGHEST = constants((-1.0, 1.0))
+
+
+def observation_box(problem: SafetyProblem) -> gym.spaces.Box:
+    """Return the observation space of a problem: its features within their bounds."""
+    low = np.array([f.low for f in problem.features], dtype=np.float32)
+    high = np.array([f.high for f in problem.features], dtype=np.float32)
+    return gym.spaces.Box(low, high, dtype=np.float32)
+
+
+def action_box(problem: SafetyProblem) -> gym.spaces.Box:
+    """Return the action space of a problem: [-1, 1] for each input, scaled to its bounds."""
+    return gym.spaces.Box(-1.0, 1.0, (len(problem.inputs),), dtype=np.float32)
+
+
+def center_and_half_width(problem: SafetyProblem) -> tuple[list[float], list[float]]:
+    """Return c and w of each input: physical input = c + w * action, for an action in [-1, 1]."""
+    center = [0.5 * (low + high) for low, high in problem.box]
+    half = [0.5 * (high - low) for low, high in problem.box]
+    return center, half
+
+
+class BatchActions:
+    """Actions of a batch, scaled to the physical inputs and back.
+
+    Attributes:
+        center: midpoints of the input bounds, as arrays without axes.
+
+    Args:
+        problem: whose inputs they are.
+        num_envs: size of the batch.
+    """
+
+    def __init__(self, problem: SafetyProblem, num_envs: int) -> None:
+        self._shape = (num_envs, len(problem.inputs))
+        self.center, self._half = (constants(c) for c in center_and_half_width(problem))
+
+    def physical(self, actions: Any) -> Components:
+        """Scale actions in [-1, 1], clipped to them.
+
+        Args:
+            actions: shape (num_envs, m).
+
+        Returns:
+            The components of the physical inputs, m arrays of shape (num_envs,).
+
+        Raises:
+            InvalidInputError: The actions have another shape, or are not finite real numbers.
+        """
+        given = np.asarray(real_array("array of actions", actions), dtype=np.float64)
+        if given.shape != self._shape:
+            raise InvalidInputError(
+                f"actions have shape {given.shape}; the envs take {self._shape}"
+            )
+        with np.errstate(over="ignore"):
+            suspicious = not finite(given)
+        if suspicious and not np.isfinite(given).all():
+            bad = np.flatnonzero(~np.isfinite(given).all(axis=1))
+            raise InvalidInputError(
+                f"the actions of envs {bad[:5].tolist()} are not finite; give numbers in [-1, 1]"
+            )
+        clipped = np.minimum(np.maximum(given, _LOWEST), _HIGHEST)
+        return tuple(
+            [
+                c + w * clipped[:, j] if c else w * clipped[:, j]
+                for j, (c, w) in enumerate(zip(self.center, self._half, strict=True))
+            ]
+        )
+
+    def normalized(self, physical: Sequence[Any]) -> np.ndarray:
+        """Invert `physical`: return actions of shape (num_envs, m) in double precision."""
+        actions = np.empty(self._shape)
+        for j, (u, c, w) in enumerate(zip(physical, self.center, self._half, strict=True)):
+            np.divide(u - c, w, out=actions[:, j])
+        return actions

@@ -1,0 +1,73 @@
+"""Bases of the registered envs: a system's problem behind the arguments of `gym.make`."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from gymnasium.vector import AutoresetMode
+
+from safe_envs.envs.env import SafeEnv
+from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.problem.factory import build_problem, remembering
+from safe_envs.problem.problem import SafetyProblem
+
+
+class SystemEnv(SafeEnv):
+    """Base of the registered envs: a system's problem behind the arguments of `gym.make`.
+
+    Args:
+        max_episode_steps: truncate after so many control periods, if that is before the horizon.
+        render_mode: "rgb_array", "human" or None; see `SafeEnv`.
+        **options: fields of `safe_envs.problem.options.ProblemOptions`; arguments of the barrier
+            may also be given by themselves.
+
+    Raises:
+        ConfigurationError: An argument names something unknown or is out of range.
+    """
+
+    problem_factory: ClassVar[Any]
+    """Builds the problem from the arguments of the barrier; called once for equal arguments."""
+
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        if "problem_factory" in vars(cls):
+            cls.problem_factory = staticmethod(remembering(cls.problem_factory))
+
+    def __init__(
+        self,
+        *,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(type(self).make_problem(**options), max_episode_steps, render_mode)
+
+    @classmethod
+    def make_problem(cls, **options: Any) -> SafetyProblem:
+        """Return the problem that the env has with these options, without making the env."""
+        return build_problem(cls.__name__, cls.problem_factory, options)
+
+
+class SystemVectorEnv(SafeVectorEnv):
+    """Base of the registered vector envs.
+
+    Args:
+        num_envs: see `SafeVectorEnv`.
+        autoreset_mode: see `SafeVectorEnv`.
+        max_episode_steps: see `SafeVectorEnv`.
+        render_mode: see `SafeVectorEnv`.
+        **options: as for `SystemEnv`.
+    """
+
+    env_class: ClassVar[type[SystemEnv]]
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        problem = self.env_class.make_problem(**options)
+        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)
