@@ -83,7 +83,7 @@ def _chain() -> Figure:
             Line2D([], [], color="black", label="h = 0"),
             Line2D([], [], color=COLORS[0], label="b₁ = 0"),
             Patch(color=UNSAFE, alpha=0.35, label="unsafe"),
-            Patch(color=COLORS[4], alpha=0.45, label="C₀ ∩ C₁, invariant"),
+            Patch(color=COLORS[4], alpha=0.45, label="C₀ ∩ C₁"),
             Patch(color=COLORS[3], alpha=0.8, label="infeasible within the input bounds"),
         ],
         loc="outside lower center",
@@ -93,7 +93,7 @@ def _chain() -> Figure:
 
 
 def _title(name: str, infeasible: int, total: int) -> str:
-    return f"{name}: infeasible in {100 * infeasible / total:.0f} % of it"
+    return f"{name}: infeasible in {100 * infeasible / total:.0f} % of C₀ ∩ C₁"
 
 
 def _chain_values(
