@@ -17,7 +17,8 @@ _STEM = 40
 
 def require_writable(path: Path) -> None:
     """Raise ConfigurationError unless a file can be created at `path`: asked before a long run, not
-    after it."""
+    after it.
+    """
     folder, name = path.absolute().parent, shortened(path)
     # The functions of os.path take any text for a path, also one that is too long to be one.
     if os.path.isdir(path):
@@ -84,7 +85,8 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 @contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Turn what the operating system says of a full disk or a missing permission into a
-    ConfigurationError that names `path`."""
+    ConfigurationError that names `path`.
+    """
     try:
         yield
     except OSError as error:

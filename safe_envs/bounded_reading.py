@@ -1,5 +1,6 @@
 """Files of others, read without hanging and without taking all memory: only regular files, up to a
-size."""
+size.
+"""
 
 from __future__ import annotations
 

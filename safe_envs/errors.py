@@ -42,7 +42,8 @@ class WorkersLostError(SafeEnvsError, RuntimeError):
 
 def shown(given: Any) -> str:
     """Return what was given as a message shows it, texts in quotes: without its middle where that
-    is long."""
+    is long.
+    """
     try:
         return shortened(repr(given))
     except ValueError:  # Python writes no whole number of more than 4300 digits.
@@ -51,7 +52,8 @@ def shown(given: Any) -> str:
 
 def shortened(given: Any, most: int = 120) -> str:
     """Return a text, a path or an error as text, without its middle where it is longer than about
-    so many characters."""
+    so many characters.
+    """
     text = str(given)
     if len(text) <= most:
         return text
@@ -69,6 +71,7 @@ def nearest(name: str, allowed: Iterable[str]) -> str:
 
 def require_whole(name: str, value: Any, least: int) -> None:
     """Raise ConfigurationError unless a value is a whole number from `least`; NumPy's integers are
-    such, truth values are not."""
+    such, truth values are not.
+    """
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or int(value) < least:
         raise ConfigurationError(f"{name} = {shown(value)}; give a whole number from {least}")

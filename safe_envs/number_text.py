@@ -25,7 +25,8 @@ def real(text: str) -> float:
 
 def whole_or_real(text: str) -> int | float:
     """Read a number: an int where the text has the form of one and a float can hold it, and else a
-    float; errors as for `real`."""
+    float; errors as for `real`.
+    """
     value = real(text)
     return int(text) if _WHOLE.fullmatch(text.strip()) and math.isfinite(value) else value
 

@@ -57,7 +57,8 @@ def resolved(place: str) -> str:
 
 def place_of(stated: type) -> str:
     """Return the place from which `load_object` imports a class: FILE.py:NAME for one of a script or
-    of a file that was loaded by its place, MODULE:NAME for others."""
+    of a file that was loaded by its place, MODULE:NAME for others.
+    """
     name, place = stated.__module__, f"{stated.__module__}:{stated.__qualname__}"
     path = Path(getattr(sys.modules.get(name), "__file__", None) or "/")
     of_file = name in ("__main__", _module_name(path)) and path.suffix == ".py"
@@ -84,7 +85,8 @@ def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) 
 
 def _stated_in(module: ModuleType) -> list[str]:
     """Names of what a module states itself: its functions and classes, and objects that are neither
-    modules nor symbols."""
+    modules nor symbols.
+    """
     return [
         name
         for name, value in vars(module).items()
@@ -123,7 +125,8 @@ def _module_name(path: Path) -> str:
 @lru_cache(maxsize=32)
 def _loaded(path: Path, _changed: int) -> ModuleType:
     """Remembered until the file changes, so that the symbols of all envs of a file are compiled
-    once."""
+    once.
+    """
     name = _module_name(path)
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -151,7 +154,8 @@ def _of_module(name: str) -> ModuleType:
 @contextmanager
 def _running(path: Path | None, what: str) -> Iterator[None]:
     """Run a user's code: its errors become ours, with the line, and modules beside its file can be
-    imported, as when Python runs it."""
+    imported, as when Python runs it.
+    """
     folder = None if path is None else str(path.parent)
     known = set(sys.modules)
     if folder is not None:

@@ -1,5 +1,6 @@
 """What comes from outside as numbers: converted in one place, or refused by an error of this
-project's own."""
+project's own.
+"""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ NAMES = {
     "drift_derivative": "lie_derivative_f",
     "input_derivative": "lie_derivative_g",
     "ito_term": "ito_correction",
-    "load_problem": "make_problem",
+    "make_problem": "make_problem",
 }
 """Retired names, wherever they occur in code or documentation."""
 

@@ -1,2 +1,3 @@
 """Control-affine stochastic differential equations: symbols, derivatives, generated code and
-integrators."""
+integrators.
+"""

@@ -160,7 +160,8 @@ def _piece_by_piece(
     quick: Callable[..., Components], names: Sequence[sp.Symbol], formulas: Sequence[Any]
 ) -> Callable[..., Components]:
     """A function of floats that evaluates the pieces that apply, where a shared subexpression of
-    others has no value."""
+    others has no value.
+    """
     careful = lru_cache(maxsize=1)(
         lambda: sp.lambdify(
             names, tuple(formulas), modules=[math], printer=FloatPrinter(), docstring_limit=0
@@ -244,7 +245,8 @@ def _shared_subexpressions(
     expressions: Any,
 ) -> tuple[list[tuple[sp.Symbol, sp.Expr]], list[sp.Expr]]:
     """Common subexpressions, with small integer powers written as products: `pow` is many times
-    slower."""
+    slower.
+    """
     shared: Any
     reduced: Any
     shared, reduced = sp.cse(expressions, symbols=sp.numbered_symbols("x"), list=False)
@@ -281,13 +283,15 @@ def _shared_subexpressions(
 
 def constants(values: Sequence[float]) -> list[np.ndarray]:
     """Numbers as arrays without axes: a ufunc converts a Python float anew at every call, for as
-    long as a small batch takes."""
+    long as a small batch takes.
+    """
     return [np.array(v) for v in values]
 
 
 def filled(component: Any, shape: tuple[int, ...]) -> np.ndarray:
     """A component as an array of the batch's shape: what does not depend on the arguments comes
-    back as a float."""
+    back as a float.
+    """
     return component if getattr(component, "shape", None) == shape else np.full(shape, component)
 
 
@@ -301,6 +305,7 @@ def stacked(components: Sequence[Any], size: int) -> np.ndarray:
 
 def finite(values: np.ndarray) -> bool:
     """Whether no entry is NaN or infinite; a quick look that may report huge finite entries as
-    infinite."""
+    infinite.
+    """
     flat = values.ravel()
     return math.isfinite(flat.dot(flat))

@@ -45,7 +45,8 @@ def is_zero(expression: Any) -> bool:
 
 def _rational(expression: Any) -> Any:
     """The expression with the decimal value of each float as a fraction, so that terms cancel
-    exactly."""
+    exactly.
+    """
     return expression.xreplace(
         {f: sp.Rational(repr(float(f))) for f in expression.atoms(sp.Float) if f.is_finite}
     )
@@ -74,7 +75,8 @@ def _told_from_zero(value: Any) -> bool:
 
 class _Pieces:
     """The analytic functions that an expression is made of, one for each region; one symbol where
-    there are too many."""
+    there are too many.
+    """
 
     def __init__(self, expression: Any) -> None:
         self._signs: dict[Any, sp.Dummy] = {}
@@ -91,7 +93,8 @@ class _Pieces:
 
     def _rewritten(self, e: Any) -> Any:
         """An expression with signs of what switches in place of kinks and jumps, and a symbol for
-        what is not looked into."""
+        what is not looked into.
+        """
         if isinstance(e, sp.Piecewise):
             return self._of_pieces(e)
         if not e.args:
@@ -145,7 +148,8 @@ class _Pieces:
 
     def _sign(self, switch: Any) -> Any:
         """The sign of an expression: a symbol, the same one for positive multiples of it, and the
-        opposite for negative ones."""
+        opposite for negative ones.
+        """
         _, switch = sp.expand(switch).as_content_primitive()
         if switch.is_number:
             return sp.sign(switch)

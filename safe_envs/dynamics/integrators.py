@@ -71,7 +71,8 @@ def _compiled(
     system: ControlAffineSDE, h: float, flavour: Flavour
 ) -> tuple[int, Callable[..., Components]]:
     """The number of noise channels, and the state after a step of h in s with them, or the rate of
-    the state without any."""
+    the state without any.
+    """
     diffusion = system.numeric(system.diffusion)
     live = list(system.noise_channels)
     rate = system.numeric(system.drift + system.input_matrix * sp.Matrix(system.inputs))

@@ -44,7 +44,8 @@ def gradient(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatri
 @lru_cache(maxsize=512)
 def _gradient(states: tuple[sp.Symbol, ...], expression: sp.Expr) -> sp.ImmutableMatrix:
     """Remembered: the drift, the input and the noise each ask for the gradient of the same link of
-    a chain."""
+    a chain.
+    """
     return sp.ImmutableMatrix([[sp.diff(expression, s) for s in states]])
 
 
@@ -82,7 +83,8 @@ def quadratic_variation_rate(system: ControlAffineSDE, expression: sp.Expr) -> s
 
 def has_kinks(expression: Any) -> bool:
     """Whether functions are in it that are not smooth everywhere, so that its derivatives may not
-    say all."""
+    say all.
+    """
     return expression.has(*_KINKED)
 
 
@@ -116,7 +118,8 @@ def derivatives(
 
 def tidied(expression: Any) -> sp.Expr:
     """An equal expression with fewer operations, if sin^2 + cos^2 = 1 and common factors give one
-    quickly."""
+    quickly.
+    """
     if expression.count_ops() > _LARGEST_TIDIED or _expanded_terms(expression) > _MOST_TERMS:
         return expression
     # An exponential that is taken apart may overflow in one factor and vanish in the other.

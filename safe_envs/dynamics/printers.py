@@ -1,5 +1,6 @@
 """Sympy's printers of Python code, where they fall short: what they print has the same values for
-floats and for arrays."""
+floats and for arrays.
+"""
 
 from __future__ import annotations
 
@@ -60,7 +61,8 @@ _SETTINGS = {
 
 class FloatPrinter(PythonCodePrinter):
     """Prints what raises, or gives NaN, where Python itself would answer with a complex number or
-    with None."""
+    with None.
+    """
 
     def __init__(self) -> None:
         super().__init__(_SETTINGS)

@@ -18,7 +18,8 @@ _REAL = sp.Symbol("real", real=True).assumptions0
 
 def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.ImmutableMatrix:
     """Read a list, nested list or matrix as an immutable matrix of the required shape (None: any
-    width)."""
+    width).
+    """
     try:
         matrix = sp.ImmutableMatrix(entries)
     except (TypeError, ValueError) as error:
@@ -297,7 +298,8 @@ class ControlAffineSDE:
 
     def exact(self, expression: Any) -> Any:
         """Like `numeric`, with the decimal value of each parameter as a rational, so that terms
-        cancel exactly."""
+        cancel exactly.
+        """
         return expression.subs({p: sp.Rational(repr(v)) for p, v in self.parameters.items()})
 
 

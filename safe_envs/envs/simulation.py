@@ -1,5 +1,6 @@
 """The one implementation of physics, reward, start and observation, over floats or over a batch of
-arrays."""
+arrays.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ _CHUNK = 256
 
 class Simulation:
     """The formulas of a problem, compiled: they hold no state, so that one object serves any number
-    of envs."""
+    of envs.
+    """
 
     def __init__(self, problem: SafetyProblem, flavour: Flavour) -> None:
         self.problem = problem
@@ -87,7 +89,8 @@ class NoiseStream:
 
 class NoiseStreams:
     """The same for a batch: each env keeps its own stream, so that its noise does not depend on its
-    neighbours."""
+    neighbours.
+    """
 
     def __init__(self, num_envs: int, channels: int) -> None:
         self._buffer = np.empty((num_envs, _CHUNK, channels))

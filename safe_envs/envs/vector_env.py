@@ -103,7 +103,8 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     @property
     def components(self) -> Components:
         """The exact states, an array of shape (num_envs,), not to be written to, for each of the
-        problem's states."""
+        problem's states.
+        """
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
         return self._x

@@ -1,2 +1,3 @@
 """What a safety problem is: plant, model, barriers, bounds, start, task, and how one is built and
-checked."""
+checked.
+"""

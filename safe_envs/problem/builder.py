@@ -1,5 +1,6 @@
 """A problem of your own from a system, its barriers and a few numbers; what is left out gets what
-suits."""
+suits.
+"""
 
 from __future__ import annotations
 

@@ -19,7 +19,8 @@ _MOST_TRIES = 10_000
 @dataclass(frozen=True)
 class Start:
     """Distribution of the initial state: a map of independent uniforms on [0, 1), restricted to
-    `condition` > 0."""
+    `condition` > 0.
+    """
 
     state: tuple[sp.Expr, ...]
     uniforms: tuple[sp.Symbol, ...] = ()

@@ -1,5 +1,6 @@
 """A safety problem: plant, model, barriers, input box, start, timing and task, as one frozen
-statement."""
+statement.
+"""
 
 from __future__ import annotations
 
@@ -189,7 +190,8 @@ class SafetyProblem:
     @property
     def duration(self) -> float:
         """Length of an episode in s as it is simulated: the whole number of control periods that is
-        nearest to the horizon."""
+        nearest to the horizon.
+        """
         return self.steps * self.dt
 
     @property

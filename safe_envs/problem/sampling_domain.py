@@ -83,7 +83,8 @@ class SamplingDomain:
 
 def _halfway(box: Sequence[tuple[float, float]]) -> tuple[tuple[float, ...], ...]:
     """For each input both points halfway from the centre of the box to its bounds, with the others
-    at the centre."""
+    at the centre.
+    """
     center = [0.5 * (low + high) for low, high in box]
     reach = [0.25 * (high - low) for low, high in box]
     return tuple(

@@ -1,5 +1,6 @@
 """Mistakes in the statement of a problem that would only show as wrong results: they are found
-before the first step."""
+before the first step.
+"""
 
 from __future__ import annotations
 

@@ -29,7 +29,8 @@ def ticks(low: float, high: float, most: int = 6) -> list[float]:
 
 def grown(shown: Range, values: np.ndarray) -> Range:
     """The range, or one that is 2, 4, 8, ... times as wide around the same middle, so that all
-    finite values are in it."""
+    finite values are in it.
+    """
     middle, half = 0.5 * (shown[0] + shown[1]), 0.5 * (shown[1] - shown[0])
     far = np.abs(values[np.isfinite(values)] - middle).max(initial=0.0)
     return (

@@ -32,7 +32,8 @@ _BRUSHES = {
 
 def _font(size: int, bold: bool) -> pygame.font.Font:
     """DejaVu Sans, which has all the letters and comes with matplotlib: the same picture on every
-    machine."""
+    machine.
+    """
     font = _loaded_font(size, bold)
     try:
         font.get_height()
@@ -61,7 +62,8 @@ def _text(text: str, size: int, bold: bool, color: Color, turned: bool) -> pygam
 
 def _apart(points: np.ndarray) -> np.ndarray:
     """Indices of points that lie about a pixel and a half apart along a path, the first and the
-    last among them."""
+    last among them.
+    """
     steps = np.floor(np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))]) / 1.5)
     return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(steps)) + 1, [len(points) - 1]]))
 

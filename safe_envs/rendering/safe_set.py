@@ -1,5 +1,6 @@
 """The safe set in a plane of two states: its edge h = 0, its inside tinted less towards the edge,
-its outside hatched."""
+its outside hatched.
+"""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ class Barriers:
 
     def __call__(self, components: Sequence[np.ndarray | float]) -> np.ndarray:
         """Each barrier at states that broadcast against each other, with the barriers in front; NaN
-        counts as unsafe."""
+        counts as unsafe.
+        """
         shape = np.broadcast_shapes(*(np.shape(c) for c in components))
         with np.errstate(all="ignore"):
             values = self._read(*(np.array(c, dtype=float, ndmin=1) for c in components))
@@ -60,7 +62,8 @@ class Barriers:
 
     def along(self, state: np.ndarray, i: int, values: np.ndarray) -> np.ndarray:
         """The smallest barrier where one state takes other values, shape (k,); of no barrier,
-        infinite."""
+        infinite.
+        """
         if not len(self.chosen):
             return np.full(len(values), np.inf)
         return self([values if j == i else float(v) for j, v in enumerate(state)]).min(axis=0)
@@ -133,7 +136,8 @@ class SafeSet:
 
 def _to_edge(h: np.ndarray) -> np.ndarray:
     """Distance from the edge in pixels, to first order, the least of all barriers: h has shape
-    (barriers, rows, columns)."""
+    (barriers, rows, columns).
+    """
     down, across = np.gradient(h, _CELL, axis=(1, 2))
     slope = np.sqrt(np.maximum(down * down + across * across, 1e-24))
     return (h / slope).min(axis=0).astype(np.float32)

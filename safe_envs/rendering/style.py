@@ -58,7 +58,8 @@ def mix(color: Color, background: Color, share: float) -> Color:
 
 def pretty(name: str) -> str:
     """A name with Greek letters and indices, and rates as such: theta, x_1 and zdot as θ, x₁ and
-    dz/dt."""
+    dz/dt.
+    """
     base = name.removesuffix("dot")
     text = sp.pretty(sp.Symbol(base or name), use_unicode=True)
     return f"d{text}/dt" if base and base != name else text
@@ -101,7 +102,8 @@ def number(value: float, scale: float = 0.0) -> str:
 
 def bound(value: float) -> str:
     """A bound: three digits without zeros behind the point; very small and large ones as `number`
-    writes them."""
+    writes them.
+    """
     return (
         f"{value:.3g}".replace("-", "\u2212")
         if value == 0.0 or 1e-3 <= abs(value) < 999.5

@@ -1,5 +1,6 @@
 """What an env keeps in order to be seen: the history of its episodes, and the picture or the window
-that shows them."""
+that shows them.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +63,8 @@ def open_viewer(
 
 def require_pygame() -> None:
     """Raise gymnasium.error.DependencyNotInstalled, with what to install, if pygame-ce is missing
-    or the other pygame is in its place."""
+    or the other pygame is in its place.
+    """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
         import pygame
@@ -103,7 +105,8 @@ class Viewer:
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy gets: neither the window nor the canvas, which it makes for itself when it
-        draws."""
+        draws.
+        """
         return {**vars(self), "_picture": None, "_window": None}
 
     def announce(self, nominal: Rows, active: Rows, feasible: Rows) -> None:

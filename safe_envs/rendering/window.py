@@ -60,7 +60,8 @@ class Window:
 
     def close(self) -> None:
         """Close the window, and after the last one the display, unless somebody else shows
-        something on it."""
+        something on it.
+        """
         self._window.destroy()
         _OPEN.discard(self)
         if not _OPEN and pygame.display.get_init() and pygame.display.get_surface() is None:

@@ -1,5 +1,6 @@
 """`safe-envs benchmark`: the speed of filters, envs and learning, with a hand-written loop as the
-limit."""
+limit.
+"""
 
 from __future__ import annotations
 

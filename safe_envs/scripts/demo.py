@@ -33,7 +33,8 @@ def demo(
     json: Json = None,
 ) -> None:
     """Train PPO briefly without a filter, then show the safety of it and of the nominal controller,
-    bare and filtered."""
+    bare and filtered.
+    """
     from safe_envs.agents.evaluation.evaluate import evaluate
     from safe_envs.scripts.figures.evaluation_figure import draw
     from safe_envs.scripts.reports.evaluation_report import print_evaluation

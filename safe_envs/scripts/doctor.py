@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 def doctor(json: Json = None) -> None:
     """Check the installation: packages and extras, the solvers against known answers, every env
-    with its filter, and the speed."""
+    with its filter, and the speed.
+    """
     from safe_envs import __version__
     from safe_envs.scripts.reports import installation
 

@@ -186,7 +186,8 @@ def _refuse_collecting(settings: Mapping[str, Any], env: EnvOptions) -> None:
 
 def _of_kind(name: str, value: float | str, hint: Any) -> Any:
     """A value as an argument with a type hint takes it: a word, a list of whole numbers, or a
-    number."""
+    number.
+    """
     parts = (hint, *typing.get_args(hint))
     origins = {typing.get_origin(part) for part in parts}
     if typing.Literal in origins:

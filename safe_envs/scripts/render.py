@@ -1,5 +1,6 @@
 """`safe-envs render`: an episode as a video, an animation or a still, under one filter or several
-side by side."""
+side by side.
+"""
 
 from __future__ import annotations
 

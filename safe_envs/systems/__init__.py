@@ -1,5 +1,6 @@
 """The systems of the thesis and variations of them, one file each, and their registration with
-Gymnasium."""
+Gymnasium.
+"""
 
 from __future__ import annotations
 

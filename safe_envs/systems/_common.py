@@ -1,5 +1,6 @@
 """What the systems share: checks of the barriers' arguments, and building blocks of start
-distributions."""
+distributions.
+"""
 
 from __future__ import annotations
 

@@ -86,7 +86,8 @@ def _cruise(
     **rest: Any,
 ) -> SafetyProblem:
     """What both problems have in common: the force's box, and the goal of driving at the desired
-    speed."""
+    speed.
+    """
     clf = CLF(
         (speed - _DESIRED_SPEED) ** 2,
         rate,

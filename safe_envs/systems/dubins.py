@@ -44,7 +44,8 @@ def vehicle(speed: float, noise: float) -> ControlAffineSDE:
 
 def turn_rate_towards(wanted_x: sp.Expr, wanted_y: sp.Expr) -> sp.Expr:
     """Proportional law on the angle from the heading to a wanted course, from the heading's cosine
-    and sine."""
+    and sine.
+    """
     return _HEADING_GAIN * sp.atan2(
         cos_theta * wanted_y - sin_theta * wanted_x, cos_theta * wanted_x + sin_theta * wanted_y
     )

@@ -1,5 +1,6 @@
 """Dubins vehicle on its way to a goal through a field of obstacles that move in circles: one
-barrier for each."""
+barrier for each.
+"""
 
 from __future__ import annotations
 

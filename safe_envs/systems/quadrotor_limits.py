@@ -1,5 +1,6 @@
 """Quadrotor with all twelve states between a floor and a ceiling, whose tilt is limited: three
-barriers, four inputs."""
+barriers, four inputs.
+"""
 
 from __future__ import annotations
 

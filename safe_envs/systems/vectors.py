@@ -1,5 +1,6 @@
 """The systems in batches: for each env class `X` of this package a class `XVector`, made when it is
-first named."""
+first named.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """The quadratic program of a filter: its rows compiled from the conditions, and solved for a state
-or a batch."""
+or a batch.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +68,8 @@ class UndefinedRowError(ArithmeticError):
 @dataclass(frozen=True)
 class Program:
     """Minimise over the box, subject to the rows; see
-    `safe_envs.wrappers.safety_filter.SafetyFilter`."""
+    `safe_envs.wrappers.safety_filter.SafetyFilter`.
+    """
 
     model: ControlAffineSDE
     constraints: tuple[AffineConstraint, ...]
@@ -81,7 +83,8 @@ class Program:
     @property
     def plain(self) -> bool:
         """Whether the rows are all there is: no demand of a reciprocal condition, no margin, no
-        goal; uncertain only for one input."""
+        goal; uncertain only for one input.
+        """
         return self.clf is None and all(
             c.demand is None and c.change is None and (c.uncertainty is None or self.model.m == 1)
             for c in self.constraints
@@ -227,7 +230,8 @@ class Solver:
 
     def best(self, x: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
         """The input that is best for the goal, without rows; `nothing` is the input 0. Raises as
-        `solve`."""
+        `solve`.
+        """
         return self._best(self._split(self._rows(*self._with_terms(x)))[2], nothing)
 
     def _with_terms(self, x: Sequence[Any]) -> Sequence[Any]:
@@ -254,7 +258,8 @@ class Solver:
         self, values: Components
     ) -> tuple[list[Any], list[Any], Sequence[Any], Sequence[Any], dict[int, Components]]:
         """The rows' a and b, the goal's offset and coefficients, h of reciprocal conditions less
-        its rounding, Q of uncertain rows."""
+        its rounding, Q of uncertain rows.
+        """
         width, count, entries = self._m + 1, self._count, (self._m + 1) * (self._m + 2) // 2
         rows = [values[i * width : (i + 1) * width] for i in range(count)]
         forms_at = len(values) - entries * len(self._uncertain)
@@ -268,7 +273,8 @@ class Solver:
 
     def _demand(self, i: int, x: Sequence[Any], inside: Any) -> Any:
         """What a reciprocal row asks for, where it means something; plain floats have no 1/h or
-        logarithm elsewhere."""
+        logarithm elsewhere.
+        """
         return 0.0 if inside is False else self._demands[i](*x)[0]
 
     def _loss(self, i: int, x: Sequence[Any], action: Sequence[Any], inside: Any) -> Any:
@@ -382,7 +388,8 @@ class Solver:
 
     def _plane(self, form: Components) -> tuple[list[Any], Any]:
         """What `safe_envs.wrappers.qp.second_order_row.majorant` puts above the uncertainty of a
-        row."""
+        row.
+        """
         width = self._m + 1
         place = {
             pair: k
@@ -410,7 +417,8 @@ class Solver:
         inside: dict[int, Any],
     ) -> Any:
         """The active row whose half-space is furthest from the proposed input; one that means
-        nothing is further than any."""
+        nothing is further than any.
+        """
         cause, furthest = -1, -math.inf
         for i, (ai, bi, acts) in enumerate(zip(a, b, active, strict=True)):
             if acts is False or (acts is not True and not np.count_nonzero(acts)):
@@ -466,7 +474,8 @@ class Solver:
 
 def _beyond_rounding(h: sp.Expr) -> sp.Expr:
     """What h is more than its own rounding: where that is not positive, a state and a batch may
-    find h on either side of 0."""
+    find h on either side of 0.
+    """
     return h - sp.Float(ROUNDING, 17) * _size(h)
 
 

@@ -1,5 +1,6 @@
 """A safety filter: from a state and a proposed input to the nearest input that the conditions
-allow. Free of gym."""
+allow. Free of gym.
+"""
 
 from __future__ import annotations
 
@@ -288,14 +289,16 @@ class SafetyFilter:
 
     def _require_values(self, barrier: np.ndarray, x: Sequence[Any]) -> None:
         """Raise NumericalError where a barrier (B, k) at states, given by components, is not
-        finite."""
+        finite.
+        """
         bad = np.flatnonzero(~np.isfinite(barrier).all(axis=1))
         if bad.size:
             raise self._undefined("the barrier", [float(np.atleast_1d(c)[bad[0]]) for c in x])
 
     def decide_floats(self, x: Sequence[float], u: Sequence[float]) -> Decision:
         """Decide for one state, given and returned component by component; the components must be
-        finite."""
+        finite.
+        """
         try:
             found = self._floats.one_row(x, u) if self._single else self._floats.solve(x, u)
         except UndefinedRowError as error:
@@ -317,7 +320,8 @@ class SafetyFilter:
 
     def decide_arrays(self, x: Components, u: Components) -> Decision:
         """Decide for a batch, given and returned component by component, each an array (B,) of
-        finite numbers."""
+        finite numbers.
+        """
         # What overflows or has no value is found below, which says where.
         with np.errstate(all="ignore"):
             return self._decide(x, u)

@@ -97,7 +97,8 @@ class TorchFilter(torch.nn.Module):
         priorities: Sequence[float] | None = None,
     ) -> TorchFilter:
         """The filter for the barriers of a problem; arguments and errors as for
-        `SafetyFilter.for_problem`."""
+        `SafetyFilter.for_problem`.
+        """
         return cls(SafetyFilter.for_problem(problem, conditions, knowledge, priorities=priorities))
 
     def forward(self, x: torch.Tensor, u: torch.Tensor, return_result: bool = False) -> Any:
@@ -153,7 +154,8 @@ class TorchFilter(torch.nn.Module):
         self, states: torch.Tensor, inputs: torch.Tensor, found: Any
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """The actions (B, m) as functions of states (B, n) and inputs (B, m), true near these, and
-        where that holds (B,)."""
+        where that holds (B,).
+        """
         m, k = len(self._low), len(self._priorities)
         action, active, slack = (
             found.action.reshape(-1, m),
@@ -195,7 +197,8 @@ class TorchFilter(torch.nn.Module):
         self, a: np.ndarray, v: np.ndarray, u: np.ndarray, active: np.ndarray, slack: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Inputs that the box holds (R, m), rows that cannot be met and rows that bind (R, k),
-        which are equations."""
+        which are equations.
+        """
         way = self._roots * (u - v)
         near = np.minimum(
             self._high - self._low, np.linalg.norm(way, axis=1, keepdims=True) / self._roots
@@ -220,7 +223,8 @@ class TorchFilter(torch.nn.Module):
 
     def _forced(self, a: np.ndarray, u: np.ndarray, slack: np.ndarray) -> np.ndarray:
         """Inputs (m,) that the rows that cannot be met press against the box, by the sum of their
-        forces; a (k, m), slack (k,)."""
+        forces; a (k, m), slack (k,).
+        """
         forces = (self._priorities * slack)[:, None] * a
         force, size = forces.sum(axis=0), np.abs(forces).sum(axis=0)
         gap = np.where(force > 0.0, self._high - u, u - self._low)
@@ -322,7 +326,8 @@ def _require_plain(safety_filter: SafetyFilter, program: Program) -> None:
 
 class _Printer(TorchPrinter):
     """Writes with Python's operators, or calls of `_FUNCTIONS`, what torch has for tensors only: a
-    part may be a plain number."""
+    part may be a plain number.
+    """
 
     def _print_Pow(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
         return f"({self._print(expr.base)})**({self._print(expr.exp)})"

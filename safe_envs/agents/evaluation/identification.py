@@ -1,5 +1,6 @@
 """What filters rest on that is learned: from files, or learned first, once or for each of several
-repeats."""
+repeats.
+"""
 
 from __future__ import annotations
 
@@ -138,7 +139,8 @@ def describe(
     knowledge: str,
 ) -> dict[str, Any] | None:
     """What a row says of its learning: the method, its cost, and the rate with each identification;
-    None without any."""
+    None without any.
+    """
     models = [model for conditions in identifications for model in learned_of(conditions)]
     if not models:
         return None

@@ -119,7 +119,8 @@ def _of(evaluation: Evaluation, name: str) -> Row:
 
 def _share(progress: Progress | None, i: int) -> Progress | None:
     """From the done part of the i-th evaluation to that of all: an evaluation has as much work as
-    it has steps."""
+    it has steps.
+    """
     if progress is None:
         return None
     before, all_steps = sum(DIVISORS[:i]), sum(DIVISORS)

@@ -1,5 +1,6 @@
 """Several identifications of one filter, as one row: intervals over identifications and over
-episodes."""
+episodes.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ _SUMS = ("episodes", "safe", "violations", "touching")
 
 def pooled(rows: Sequence[Row], confidence: float) -> Row:
     """The rows of several identifications on the same episodes as one: sums, means, and intervals
-    over both."""
+    over both.
+    """
     if len(rows) == 1:
         return dict(rows[0])
     episodes = rows[0]["episodes"]

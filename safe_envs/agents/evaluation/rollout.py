@@ -78,7 +78,8 @@ class Recorder:
 
 class EpisodeBatch:
     """Counts of episodes that run side by side, an array entry for each; ended and surplus ones
-    stay as they are."""
+    stay as they are.
+    """
 
     def __init__(self, size: int, count: int, h: np.ndarray, x: Components, inputs: int) -> None:
         self.watch = Watch(x, h, inputs)
@@ -182,7 +183,8 @@ class EpisodeStatistics:
 
     def row(self, confidence: float) -> Row:
         """The statistics of the episodes, with intervals of a confidence; None where no step
-        counts."""
+        counts.
+        """
         low, high = rate_interval(self.safe, self.episodes, confidence)
         p05, median = self._h_min.quantiles((0.05, 0.5))
         return {

@@ -1,5 +1,6 @@
 """How exactly a barrier is known at a state in floating point: whether an episode violates, or only
-touches h = 0."""
+touches h = 0.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ _NEARLY = 1e-6
 
 def may_touch(lowest: np.ndarray, largest: np.ndarray) -> np.ndarray:
     """Which episodes are worth a look at by `touches`, which compiles formulas, by their smallest
-    and their largest h, shape (B,)."""
+    and their largest h, shape (B,).
+    """
     return lowest >= -_NEARLY * largest
 
 
@@ -50,7 +52,8 @@ def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.nda
 @lru_cache(maxsize=64)
 def _parts(states: tuple[sp.Symbol, ...], barriers: tuple[sp.Expr, ...]) -> tuple[Any, list[int]]:
     """The compiled terms of each barrier, and each state times its slope; and where those of a
-    barrier end, after a 0."""
+    barrier end, after a 0.
+    """
     parts = [
         [*sp.Add.make_args(h), *(s * slope for s in states if not _jumps(slope := sp.diff(h, s)))]
         for h in barriers

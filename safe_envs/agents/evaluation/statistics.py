@@ -273,14 +273,16 @@ class SafetyCurve:
 
     def add(self, first_violation: np.ndarray) -> None:
         """Add episodes by the instants of their first violations, shape (B,); beyond the last for
-        none."""
+        none.
+        """
         self._lost += np.bincount(
             np.searchsorted(self.instants, first_violation), minlength=len(self._lost)
         )
 
     def row(self, dt: float, confidence: float) -> dict[str, list[Any]]:
         """Times in s, and for each the episodes safe up to it, their rate, and its pointwise
-        interval."""
+        interval.
+        """
         episodes = int(self._lost.sum())
         safe = episodes - np.cumsum(self._lost)[:-1]
         low, high = rate_band(safe, episodes, confidence)

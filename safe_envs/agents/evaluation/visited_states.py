@@ -1,5 +1,6 @@
 """Those states of episodes that say something against a bound, or of a violation: kept while the
-episodes run."""
+episodes run.
+"""
 
 from __future__ import annotations
 

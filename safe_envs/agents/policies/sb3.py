@@ -54,7 +54,8 @@ class SB3Policy(BlockPolicy):
 
 def require_archive(path: Path) -> None:
     """Raise ConfigurationError unless a file looks like a whole policy of Stable-Baselines3;
-    nothing in it is run."""
+    nothing in it is run.
+    """
     if not _is_archive(path):
         raise ConfigurationError(
             f"{path} is not a policy that Stable-Baselines3 saved, or damaged, or larger than"

@@ -249,7 +249,8 @@ def _by_drift(
     progress: Progress | None,
 ) -> tuple[Row | None, int]:
     """The estimate by importance sampling, if it promises to be much better, and the control
-    periods that it took."""
+    periods that it took.
+    """
     length, deviation = optimal_tilt(found.girsanov_integrals, found.shares, problem.duration)
     if not _BETTER * deviation / math.sqrt(math.prod(sizes)) < to_beat:
         return None, 0

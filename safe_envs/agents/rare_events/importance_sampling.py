@@ -1,5 +1,6 @@
 """Probabilities of rare violations, by importance sampling: noise that drifts towards smaller h,
-and weights that undo it."""
+and weights that undo it.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +78,8 @@ class TiltedNoiseEnv(SafeVectorEnv):
 
     def drifted(self, draws: np.ndarray) -> np.ndarray:
         """The draws of a period with the drift in them, substep by substep; notes how far they
-        climb."""
+        climb.
+        """
         if not draws.size:
             return draws
         root = math.sqrt(self.problem.dt / self.problem.substeps)
@@ -216,7 +218,8 @@ class Drifting:
 
     def _weights(self, lengths: np.ndarray, spawn_key: tuple[int, ...]) -> tuple[np.ndarray, int]:
         """Density ratio of each episode's noise up to its violation, 0 without one; and the control
-        periods."""
+        periods.
+        """
         seed = np.random.SeedSequence(self.seed, spawn_key=spawn_key)
         env = self.make(lengths)
         world: Any = readable(env)

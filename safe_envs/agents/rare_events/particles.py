@@ -1,5 +1,6 @@
 """Episodes that can be taken up again at each instant at which their score was better than ever
-before."""
+before.
+"""
 
 from __future__ import annotations
 
@@ -63,7 +64,8 @@ class Records:
 
     def first_below(self, levels: np.ndarray, paths: np.ndarray) -> tuple[np.ndarray, ...]:
         """The first records of paths below levels, one for each, in the order of the arguments of
-        `add`."""
+        `add`.
+        """
         # Records fall along the first axis, and what was not filled is lower than all.
         rows = (self._height[:, paths] >= levels).sum(axis=0)
         return tuple(kept[rows, paths] for kept in self._kept)
@@ -163,12 +165,14 @@ class Particles:
 
     def h_at_lowest(self, paths: np.ndarray) -> np.ndarray:
         """The h of paths where their heights were smallest, of several barriers relative to the
-        starts; shape as given."""
+        starts; shape as given.
+        """
         return self.lowest[paths] / self._weights[self._records.last(paths)[1], self._kind[paths]]
 
     def girsanov_integrals(self, paths: np.ndarray) -> np.ndarray:
         """`TiltedNoiseEnv.girsanov_integrals` of paths where their heights were smallest, shape (B,
-        2)."""
+        2).
+        """
         return self._records.last(paths)[5]
 
     def branch(self, paths: np.ndarray, parents: np.ndarray, levels: np.ndarray) -> None:
@@ -208,7 +212,8 @@ class Particles:
         self, env: Env, paths: np.ndarray, observation: np.ndarray, entries: tuple[np.ndarray, ...]
     ) -> np.ndarray:
         """Simulate paths, in the first rows of an env, from entries of `Records.add` until they end
-        or violate; return when."""
+        or violate; return when.
+        """
         world: Any = readable(env)
         count, records, kind = len(paths), self._records, self._kind[paths]
         lowest, time, ended = entries[0].copy(), entries[1].copy(), entries[2]

@@ -157,7 +157,8 @@ class Splitting:
 
 def _spread(estimates: np.ndarray) -> tuple[int, float]:
     """How much estimates differ: first by how many there are none, then by the deviation of the
-    logarithms of the others."""
+    logarithms of the others.
+    """
     found = estimates[estimates > 0.0]
     return len(estimates) - len(found), float(np.std(np.log(found))) if len(found) else 0.0
 
@@ -204,7 +205,8 @@ class _Run:
 
     def violating(self) -> tuple[np.ndarray, np.ndarray]:
         """Of the paths that violate, their `girsanov_integrals`, and the part of the estimated
-        probability for which each stands."""
+        probability for which each stands.
+        """
         violate = self.paths.lowest.reshape(len(self.estimates), self._particles) <= 0.0
         each = self.estimates / (np.maximum(violate.sum(axis=1), 1) * len(self.estimates))
         return self.paths.girsanov_integrals(np.flatnonzero(violate)), np.repeat(
@@ -213,7 +215,8 @@ class _Run:
 
     def _next_level(self, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
         """Whom to kill, whom to continue in their place and from which level; None if the
-        repetition is at its end."""
+        repetition is at its end.
+        """
         own = np.arange(r * self._particles, (r + 1) * self._particles)
         lowest = self.paths.lowest[own]
         place = self._particles - self._rank

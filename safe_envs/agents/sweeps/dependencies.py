@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.registry import policy_files
+from safe_envs.agents.policies.registry import policy_file
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 from safe_envs.wrappers import files_of, with_absolute_paths
 
@@ -17,7 +17,7 @@ from safe_envs.wrappers import files_of, with_absolute_paths
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a cell with paths that mean the same in every process."""
     found = {**settings, "filter": with_absolute_paths(settings["filter"])}
-    if policy_files(settings["policy"]) and os.path.exists(settings["policy"]):
+    if policy_file(settings["policy"]) and os.path.exists(settings["policy"]):
         found["policy"] = os.path.realpath(settings["policy"])
     if "system" in settings:
         file, _, name = settings["system"].rpartition(":")
@@ -33,7 +33,9 @@ def read_by(settings: Mapping[str, Any]) -> Iterator[Path]:
     if "system" in settings:
         yield Path(settings["system"].rpartition(":")[0])
     yield from files_of(settings["filter"])
-    yield from (path for path in policy_files(settings["policy"]) if os.path.exists(path))
+    policy = policy_file(settings["policy"])
+    if policy is not None and os.path.exists(policy):
+        yield policy
 
 
 def with_imported(path: Path) -> list[Path]:

@@ -1,5 +1,6 @@
 """What happens while an agent is trained, for Stable-Baselines3's logger: safety of episodes,
-interventions, infeasible steps."""
+interventions, infeasible steps.
+"""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ from safetensors.numpy import save as serialized
 
 from safe_envs.agents.jobs.store import reading
 from safe_envs.agents.policies.network import save_policy
-from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS
+from safe_envs.agents.policies.registry import POLICY_FILE
 from safe_envs.agents.training.learner_state import (
     Arrays,
     begin,
@@ -47,7 +47,7 @@ _STATE, _LEARNER, _BUFFER, _ENVS = (
     "envs.safetensors",
 )
 _MODEL, _SCALES = "model.zip", "normalization.pkl"
-_OF_THE_POLICY = (_MODEL, _SCALES, TENSORS, DESCRIPTION)
+_OF_THE_POLICY = (_MODEL, _SCALES, POLICY_FILE)
 _CHECKPOINT = "checkpoint_"
 _FORMAT = 2
 _ADVICE = "start the training again in another folder"

@@ -35,7 +35,8 @@ def counters(model: Any) -> dict[str, int]:
 
 def begin(model: Any) -> None:
     """Reset the envs of a new model, so that it has all arrays that one in training has but for
-    those of its optimizers."""
+    those of its optimizers.
+    """
     envs, scales = model.get_env(), model.get_vec_normalize_env()
     model._last_obs = envs.reset()
     model._last_episode_starts = np.ones(envs.num_envs, dtype=bool)
@@ -146,7 +147,8 @@ def restore_buffer(
 
 def env_arrays(envs: VecEnv) -> Arrays:
     """Return where the episodes of a `SafeVecEnv` and of the VecMonitor and VecNormalize over it
-    stand, as arrays by name."""
+    stand, as arrays by name.
+    """
     found = dict(envs.unwrapped.snapshot())  # pyright: ignore[reportAttributeAccessIssue]
     return found | {f"{name}_of_layers": getattr(layer, name) for layer, name in _sums(envs)}
 
@@ -232,7 +234,8 @@ def _variables(model: Any) -> list[str]:
 
 def _shapes_by_parameter(model: Any) -> dict[str, tuple[int, ...]]:
     """The shape of each parameter by NAME/NUMBER, under which an optimizer keeps what belongs to
-    it."""
+    it.
+    """
     found: dict[str, tuple[int, ...]] = {}
     for name, optimizer in _optimizers(model):
         parameters = [

@@ -125,7 +125,8 @@ class FilteredReplayBuffer(ReplayBuffer):
 
     def _executed(self, proposed: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
         """The executed actions in [-1, 1], shape (n_envs, m); the proposals of envs without a
-        filter."""
+        filter.
+        """
         each = _of_each(infos, "safe_action")
         if isinstance(each, np.ndarray):
             return self._normalized(each)

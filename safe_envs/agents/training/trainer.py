@@ -29,7 +29,7 @@ def train(
     """Train an agent, and leave in a folder the agent and the record of its training.
 
     The folder holds `config.json` with the versions, `progress.jsonl` with all that was logged,
-    `evaluations.json`, the policy as `policy.safetensors` with `policy.json` and as
+    `evaluations.json`, the policy as `policy.npz` and as
     Stable-Baselines3's `model.zip` (with `normalization.pkl`, if observations are normalised),
     in `best` those with the highest return in an evaluation, whatever their safety, and the last
     checkpoint. Evaluations have episodes of their own, so that none of them is among those of

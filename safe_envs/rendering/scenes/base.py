@@ -1,5 +1,6 @@
 """What the scenes share: the states that they show, the part of the world that is seen, and the
-trail."""
+trail.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +67,8 @@ class Scene(ABC):
 
     def range_of(self, i: int) -> Range:
         """The workspace of a state; where that has no end, the range that is explored, or else one
-        around the starts."""
+        around the starts.
+        """
         state = self.problem.states[i]
         if math.isfinite(state.low) and math.isfinite(state.high):
             return state.low, state.high
@@ -77,7 +79,8 @@ class Scene(ABC):
 
     def window(self, i: int, j: int) -> tuple[Range, Range]:
         """The part of a plane of two states to look at: around the safe set if that is bounded in
-        it, else the workspace."""
+        it, else the workspace.
+        """
         shown = self.range_of(i), self.range_of(j)
         chosen = barriers_in(self.problem, (i, j))
         if not chosen:

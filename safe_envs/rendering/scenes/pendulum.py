@@ -20,7 +20,8 @@ _PLANE: Box = (76, 244, 504, 242)
 
 class PendulumScene(Scene):
     """The state theta is the angle from the upright, clockwise; the parameter l, if there is one,
-    the length of the rod in m."""
+    the length of the rod in m.
+    """
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem)

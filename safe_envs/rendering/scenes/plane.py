@@ -126,7 +126,8 @@ def _values(snapshot: EpisodeSnapshot, i: int) -> np.ndarray:
 
 class PlaneScene(Scene):
     """The plane of the problem, for the whole scene; to scale where the units of its axes are the
-    same, and it is no long road."""
+    same, and it is no long road.
+    """
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem)

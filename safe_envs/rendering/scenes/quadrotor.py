@@ -36,7 +36,8 @@ _DIAL = (512, 76, 48)
 
 def rotation(phi: float, theta: float, psi: float) -> np.ndarray:
     """From body to world: yaw after pitch after roll, so that the last column is the direction of
-    the thrust."""
+    the thrust.
+    """
     (a, b), (c, d), (e, f) = ((math.cos(angle), math.sin(angle)) for angle in (phi, theta, psi))
     return np.array(
         [
@@ -51,7 +52,8 @@ def draw_quadrotor(
     canvas: Canvas, at: tuple[float, float], attitude: np.ndarray, color: Color
 ) -> None:
     """Draw the symbol of a quadrotor, seen along y from a little above; its size is fixed in
-    pixels."""
+    pixels.
+    """
 
     def seen(points: np.ndarray) -> np.ndarray:
         world = points @ attitude.T
@@ -143,7 +145,8 @@ class SideView(Scene):
 
     def _draw_dial(self, canvas: Canvas, attitude: np.ndarray) -> None:
         """The angle between the thrust and the vertical, in the plane of both, to the side of the
-        thrust that is seen."""
+        thrust that is seen.
+        """
         x, y, radius = _DIAL
         up = attitude[:, 2]
         tilt = math.copysign(math.acos(min(max(float(up[2]), -1.0), 1.0)), float(up[0]))

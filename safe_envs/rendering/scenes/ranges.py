@@ -1,5 +1,6 @@
 """The part of a state's axis to look at first, where neither a workspace nor an exploration says
-it."""
+it.
+"""
 
 from __future__ import annotations
 

@@ -77,7 +77,8 @@ class Road(Scene):
 
     def required(self, states: np.ndarray) -> np.ndarray:
         """The gap at which the smallest barrier vanishes at the other values of some states, shape
-        (k,), by bisection."""
+        (k,), by bisection.
+        """
         low, high = (np.full(len(states), bound) for bound in self.range_of(self._gap))
         columns = [states[:, i] for i in range(states.shape[1])]
         for _ in range(_HALVINGS):
@@ -202,7 +203,8 @@ class Road(Scene):
 @lru_cache(maxsize=8)
 def _furniture(axes: Axes, y_label: str) -> Canvas:
     """The grid of the chart, drawn once, of which few are kept: after the horizon each step has
-    another one."""
+    another one.
+    """
     drawn = Canvas((600, 540), clear=True)
     axes.furnish(drawn, "t [s]", y_label)
     return drawn

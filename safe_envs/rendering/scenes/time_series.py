@@ -23,7 +23,8 @@ _LINE: Box = (484, 20, 96, 466)
 
 def reference_of(problem: SafetyProblem, name: str) -> Callable[[np.ndarray], np.ndarray] | None:
     """The reference that a state is to follow, over times in s: a feature of its name and "_ref",
-    of the time alone; or None."""
+    of the time alone; or None.
+    """
     for feature in problem.features:
         if feature.name == f"{name}_ref" and feature.expression.free_symbols <= {TIME}:
             compiled = compile_function((TIME,), [feature.expression], "arrays")

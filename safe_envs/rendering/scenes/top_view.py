@@ -48,7 +48,8 @@ def circle_of(
     problem: SafetyProblem, expression: sp.Expr, x: sp.Symbol, y: sp.Symbol
 ) -> Circle | None:
     """The circle on which an expression vanishes in the plane of two coordinates; None if it is
-    another curve."""
+    another curve.
+    """
     if not expression.is_polynomial(x, y):
         return None
     polynomial = sp.Poly(expression, x, y)
@@ -146,7 +147,8 @@ class TopView(Scene):
 
     def _draw_hit(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
         """Outline the obstacles that the vehicle was in at the first violation, where they were
-        then; they may be elsewhere now."""
+        then; they may be elsewhere now.
+        """
         if snapshot.violated is None:
             return
         vehicle = snapshot.violated[[self.index("x"), self.index("y")]]

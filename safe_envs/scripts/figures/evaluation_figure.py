@@ -1,5 +1,6 @@
 """The picture of an evaluation: h and the safety rate over time, and trajectories with the safe
-set."""
+set.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from safe_envs.agents.evaluation.evaluate import BARE, Evaluation
-from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS
+from safe_envs.agents.policies.registry import POLICY_FILE
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.problem.problem import SafetyProblem
@@ -60,12 +61,13 @@ def draw(evaluation: Evaluation, path: Path) -> None:
 
 def _policy_name(path: Path) -> str:
     """That of a file or folder; a file of a policy's folder is called as all others are."""
-    return path.parent.name if path.name in (TENSORS, DESCRIPTION) else path.stem
+    return path.parent.name if path.name == POLICY_FILE else path.stem
 
 
 def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
     """A legend of handles with labels below the panels, in as many columns as fit; a label too long
-    for one is written smaller."""
+    for one is written smaller.
+    """
     size, share = mpl.rcParams["font.size"], 1.0
     for columns in range(min(len(handles), _MOST_COLUMNS), 0, -1):
         legend = figure.legend(
@@ -123,7 +125,8 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
 
 def _draw_curve(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
     """Rate of the episodes that are safe so far, with its pointwise band, at least until the last
-    violation."""
+    violation.
+    """
     for row in evaluation.rows:
         curve, color = row["curve"], colors[row["filter"]]
         low, rate, high = (100 * np.array(curve[key]) for key in ("ci_low", "rate", "ci_high"))
@@ -206,7 +209,8 @@ def _limits(
     safe: Callable[[np.ndarray, np.ndarray], np.ndarray], points: np.ndarray, alike: bool
 ) -> np.ndarray:
     """Limits (low, high) of both axes: the trajectories, and the whole safe set if it is bounded
-    and not far larger."""
+    and not far larger.
+    """
     limits = np.stack([np.nanmin(points, axis=0), np.nanmax(points, axis=0)], axis=1)
     width = np.maximum(limits[:, 1] - limits[:, 0], 1e-3)
     horizontal, vertical, h = _on_grid(safe, limits + np.outer(width, (-1.0, 1.0)))

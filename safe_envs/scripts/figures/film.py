@@ -142,7 +142,8 @@ def _write_animation(path: Path, frames: Iterator[np.ndarray], seconds: float) -
 
 def _durations(seconds: float) -> Iterator[int]:
     """How long each frame of an animation is shown, in ms: a frame ends at the multiple of 10 ms
-    nearest to its true end."""
+    nearest to its true end.
+    """
     # The format counts in hundredths of a second. Rounding the ends, not the lengths, carries the
     # error on to the next frame.
     end = 0

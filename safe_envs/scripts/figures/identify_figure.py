@@ -1,5 +1,6 @@
 """The picture of an identification: each learned function against the truth, and what is believed
-of the noise."""
+of the noise.
+"""
 
 from __future__ import annotations
 
@@ -105,7 +106,8 @@ def _constant_noise(found: Identification) -> Diffusion | None:
 
 def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
     """The estimates against a truth that varies, and how often they occur for one that does not;
-    returns what the legend needs."""
+    returns what the legend needs.
+    """
     off = "truth 0" if function.relative is None else f"error {percent(function.relative)}"
     axes.set_title(f"{function.name}: {off}")
     power = _power(np.concatenate([function.truth, function.estimate]))

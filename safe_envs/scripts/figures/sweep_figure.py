@@ -52,7 +52,8 @@ class Layout:
         lines: str | None = None,
     ) -> Layout:
         """The given settings, or else the one with most numbers across, and the filter, or the one
-        with most values, as lines."""
+        with most values, as lines.
+        """
         rest = [
             name
             for name in swept
@@ -212,7 +213,8 @@ def _rate(rows: Sequence[Row]) -> Rate | None:
 
 def _learned(row: Row) -> tuple[str, ...]:
     """Checksums of the models on which the filter of a cell rests; none for one that learned
-    nothing."""
+    nothing.
+    """
     return tuple((json.loads(row["row"])["learning"] or {}).get("sha256", ()))
 
 

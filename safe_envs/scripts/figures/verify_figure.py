@@ -1,5 +1,6 @@
 """The picture of a verification: where no action meets the conditions, h, and the boundaries, over
-a plane of the state."""
+a plane of the state.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +50,7 @@ def draw(title: str, found: Verification, starts: np.ndarray, path: Path) -> Non
     """
     formulas = found.formulas
     problem = formulas.problem
-    worst = (found.kept or found.safe).worst
+    worst = (found.invariant_set or found.safe_set).worst
     several = problem.plant.n > 2
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(12.0, 5.6) if several else (7.4, 5.6))
@@ -70,7 +71,7 @@ def draw(title: str, found: Verification, starts: np.ndarray, path: Path) -> Non
 def _legend(found: Verification) -> list[Patch | Line2D]:
     formulas, missed = (
         found.formulas,
-        (found.safe.shortfall or (found.kept or found.safe).shortfall) > 0.0,
+        (found.safe_set.shortfall or (found.invariant_set or found.safe_set).shortfall) > 0.0,
     )
     degree = max(stage.stop - stage.start for stage in formulas.stages)
     several = formulas.problem.plant.n > 2
@@ -87,7 +88,7 @@ def _legend(found: Verification) -> list[Patch | Line2D]:
         Line2D([], [], color=COLORS[j - 1], linestyle="--", label=f"b_{j} = 0")
         for j in range(1, degree)
     ]
-    cross = "worst state" if (found.kept or found.safe).shortfall else "least to spare"
+    cross = "worst state" if (found.invariant_set or found.safe_set).shortfall else "least to spare"
     handles.append(
         Line2D(
             [],
@@ -117,7 +118,8 @@ def _window(
     found: Verification, axes: tuple[int, ...], starts: np.ndarray, worst: np.ndarray
 ) -> np.ndarray:
     """Limits of the axes, shape (len(axes), 2): C within the workspace with some room, or where it
-    has no end what happens in it."""
+    has no end what happens in it.
+    """
     region, formulas = found.region, found.formulas
     points = region.draw(14, np.random.default_rng(0))
     inside = points[formulas.barrier_level(points) >= 0.0]
@@ -194,7 +196,8 @@ def _draw_shares(
     figure: Figure, axes: Axes, found: Verification, worst: np.ndarray, starts: np.ndarray
 ) -> None:
     """For which part of the other states, within the intersection of the C_j, no action meets the
-    conditions."""
+    conditions.
+    """
     formulas, problem = found.formulas, found.formulas.problem
     plane = _plane(problem)
     # Several conditions take a solver: a coarser picture of a tenth of the states.
@@ -209,8 +212,8 @@ def _draw_shares(
     for values in others:
         x = np.tile(values, (horizontal.size, 1))
         x[:, plane[0]], x[:, plane[1]] = horizontal.ravel(), vertical.ravel()
-        inside += formulas.kept_level(x) >= 0.0
-        missed += _missed(formulas, x, formulas.kept_level) == 1.0
+        inside += formulas.invariant_level(x) >= 0.0
+        missed += _missed(formulas, x, formulas.invariant_level) == 1.0
     with np.errstate(invalid="ignore"):
         share = np.where(inside > 0, 100.0 * missed / inside, np.nan).reshape(horizontal.shape)
     top = max(float(np.nanmax(share)) if np.isfinite(share).any() else 0.0, 1.0)
@@ -228,22 +231,24 @@ def _draw_shares(
 
 def _others(found: Verification, count: int) -> np.ndarray:
     """States whose coordinates outside the plane are tried: evenly spread ones, or of the set where
-    these would rarely be in it."""
+    these would rarely be in it.
+    """
     rng = np.random.default_rng(0)
-    if found.formulas.problem.plant.n == 3 or found.kept is None:
+    if found.formulas.problem.plant.n == 3 or found.invariant_set is None:
         return found.region.draw(count.bit_length() - 1, rng)
     points = sample(
-        "the intersection of the C_j", found.formulas.kept_level, found.region, count, rng
+        "the intersection of the C_j", found.formulas.invariant_level, found.region, count, rng
     ).points
     return points[rng.choice(len(points), count, replace=False)]
 
 
 def _missed(formulas: Formulas, x: np.ndarray, level: Evaluate) -> np.ndarray:
     """1 where a condition is missed and 0 where none is, for states (B, n) with level >= 0; NaN
-    elsewhere."""
+    elsewhere.
+    """
     found, inside = np.full(len(x), np.nan), level(x) >= 0.0
     if inside.any():
-        found[inside] = formulas.missed(x[inside]) > 0.0
+        found[inside] = formulas.shortfall(x[inside]) > 0.0
     return found
 
 

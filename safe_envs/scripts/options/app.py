@@ -55,5 +55,6 @@ def run_alone(name: str, command: Callable[..., None]) -> None:
 @cache
 def _command(app: typer.Typer) -> Any:
     """Build the command with its options; Typer does so at every call, which takes longer than a
-    quick command runs."""
+    quick command runs.
+    """
     return typer.main.get_command(app)

@@ -1,5 +1,6 @@
 """What a shell offers after a part of a word. Nothing heavy is imported: it answers between two
-keystrokes."""
+keystrokes.
+"""
 
 from __future__ import annotations
 

@@ -118,7 +118,8 @@ def quietly(quiet: bool, silent: bool = False) -> Iterator[None]:
 
 def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
     """The function of a command with the option --quiet, strict numbers, and no other output where
-    its --json goes to stdout."""
+    its --json goes to stdout.
+    """
 
     @functools.wraps(command)
     def wrapped(*, quiet: bool = False, **arguments: Any) -> None:
@@ -138,7 +139,8 @@ def with_signature(
     function: Callable[..., None], parameters: Sequence[inspect.Parameter]
 ) -> Callable[..., None]:
     """Let a function have these parameters for typer, which asks its signature and its annotations;
-    returns it."""
+    returns it.
+    """
     function.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
     function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return function
@@ -160,7 +162,8 @@ def say(console: Console, text: str | Text) -> None:
 
 def require_result(path: Path | None) -> None:
     """Raise ConfigurationError if the file of --json cannot be written: asked before a long run,
-    not after it."""
+    not after it.
+    """
     if path is not None and path != STDOUT:
         require_writable(path)
 
@@ -233,7 +236,8 @@ def _drop_output() -> None:
 @contextmanager
 def _terminable() -> Iterator[None]:
     """Let a request to terminate, as job managers send it, end like Ctrl-C: with the processes that
-    were started."""
+    were started.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -260,7 +264,8 @@ def _fail(message: str) -> NoReturn:
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
     """A progress bar on stderr, if that is a terminal: yields the function to tell which part is
-    done, or None."""
+    done, or None.
+    """
     if _Terminal.quiet or not sys.stderr.isatty():
         yield None
         return

@@ -1,5 +1,6 @@
 """The options that say which env is meant: once for all commands that take them, which are handed
-an `EnvOptions`."""
+an `EnvOptions`.
+"""
 
 from __future__ import annotations
 

@@ -57,7 +57,8 @@ def filter_calls() -> dict[str, Case]:
 
 def several_constraints() -> dict[str, Case]:
     """Return filter calls for a point mass in the plane with two inputs, an obstacle, a wall and a
-    speed limit, and for a quadrotor with four rotors."""
+    speed limit, and for a quadrotor with four rotors.
+    """
     x, y, v, w, a, b = sp.symbols("x y v w a b", real=True)
     point = ControlAffineSDE(
         (x, y, v, w), (a, b), [v, w, 0, 0], [[0, 0], [0, 0], [1, 0], [0, 1]], [0, 0, 0, 0]

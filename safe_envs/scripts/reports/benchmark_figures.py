@@ -138,7 +138,8 @@ def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
 
 def _vec_envs() -> Figures:
     """The VecEnv over the native vector env, as a multiple of the speed of DummyVecEnv over 64
-    scalar envs."""
+    scalar envs.
+    """
     from safe_envs.agents.training.vec_env_speed import speeds
 
     found = {}
@@ -152,7 +153,8 @@ def _vec_envs() -> Figures:
 
 def _page_faults(case: Case) -> Figures:
     """How often a step makes the system find new memory, once all is warm; nothing where the system
-    does not count it."""
+    does not count it.
+    """
     try:
         import resource
     except ImportError:  # Not on Windows.

@@ -187,7 +187,8 @@ class Identification:
 
 def compare(learned: LearnedModel, problem: SafetyProblem, seed: int) -> tuple[Function, ...] | str:
     """Hold the learned functions against the plant's at fresh states of the region that is
-    explored; or say why there is no truth."""
+    explored; or say why there is no truth.
+    """
     x = draw_states(problem, STATES, np.random.default_rng([seed, _FRESH]))
     try:
         pairs = learned.compare(problem, x)
@@ -313,7 +314,8 @@ def document(found: Identification) -> dict[str, Any]:
 
 def _errors_table(errors: Mapping[str, float]) -> Table:
     """Errors by name; where all names are of the form "what kind", a row for each what and a column
-    for each kind."""
+    for each kind.
+    """
     split = [tuple(name.rpartition(" ")[::2]) for name in errors]
     whats, kinds = (list(dict.fromkeys(parts)) for parts in zip(*split, strict=True))
     if len(split) < len(whats) * len(kinds) or not all(
@@ -363,7 +365,8 @@ def _setting(value: Any) -> str:
 
 def percent(share: float) -> str:
     """A share with two digits, without an exponent for a large one; a rounding error is only
-    bounded."""
+    bounded.
+    """
     if share < _ROUNDING:
         return f"< {100 * _ROUNDING:g} %"
     return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"

@@ -65,7 +65,8 @@ def packages() -> Iterator[Check]:
 
 def _other_pygame() -> Check | None:
     """Return what is wrong if pygame, or a pygame-ce that is too old, is imported in place of the
-    pygame-ce that draws; else None."""
+    pygame-ce that draws; else None.
+    """
     if find_spec("pygame") is None:
         return None
     try:

@@ -1,5 +1,6 @@
 """What the table of an evaluation says of learning: its time, the worst identification, bounds over
-posteriors, and notes."""
+posteriors, and notes.
+"""
 
 from __future__ import annotations
 
@@ -83,7 +84,8 @@ def _repeats(rows: Sequence[Row]) -> int:
 
 def _may_have_a_bound(problem: SafetyProblem) -> bool:
     """Whether a problem has one barrier, of relative degree 1: for others there is no robust
-    condition, on which such a bound rests."""
+    condition, on which such a bound rests.
+    """
     if len(problem.barriers) != 1:
         return False
     (barrier,) = problem.barriers

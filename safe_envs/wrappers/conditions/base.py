@@ -1,5 +1,6 @@
 """What a condition is: the rule that turns a system and a barrier into an affine constraint on the
-input."""
+input.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ FIRST_ORDER = "first-order"
 
 class Terms(Protocol):
     """Numbers that a row takes from something learned: they stand in its expressions as symbols of
-    their own."""
+    their own.
+    """
 
     @property
     def symbols(self) -> tuple[sp.Symbol, ...]:
@@ -199,7 +201,8 @@ class Condition(ABC):
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
         """The system that the condition differentiates along: the model, unless it has learned
-        another."""
+        another.
+        """
         return model
 
     @abstractmethod
@@ -228,7 +231,8 @@ class Condition(ABC):
 
     def chain_rates(self, degree: int) -> tuple[float, ...] | None:
         """alpha_1..alpha_r of the chain b_j = D b_(j-1) + alpha_j b_(j-1); None where it is not of
-        this form."""
+        this form.
+        """
         return None
 
     @property
@@ -243,7 +247,8 @@ def _constraint(
     condition: Condition, model: ControlAffineSDE, barrier: Barrier
 ) -> AffineConstraint:
     """Remembered, for the bounds of a filter need the rows that it has, and derivatives of long
-    expressions take their time."""
+    expressions take their time.
+    """
     model = condition.believed(model)
     found = condition.derived(model, barrier)
     # The generator differentiates twice each time; only the last derivative may jump.

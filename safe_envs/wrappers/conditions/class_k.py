@@ -43,7 +43,8 @@ def _tanh(argument: Any) -> Any:
 
 def _modulus(argument: Any) -> Any:
     """The modulus of a real number. That of a complex one is real, but floats have no complex
-    number on the way there."""
+    number on the way there.
+    """
     if isinstance(argument, mpmath.mpc):
         raise ValueError("the modulus of a number that is not real")
     return abs(argument)
@@ -103,7 +104,8 @@ class ClassK:
 
     def is_smooth(self, order: int) -> bool:
         """Whether the derivatives up to an order are finite and continuous at 0, the one place
-        where s |s| and the like are not."""
+        where s |s| and the like are not.
+        """
         slopes = [
             sp.diff(self.expression, S, i).replace(sp.DiracDelta, lambda *_: sp.Integer(0))
             for i in range(order + 1)

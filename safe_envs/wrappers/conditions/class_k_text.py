@@ -1,5 +1,6 @@
 """Class-K functions as text: arithmetic of s, read without running code and within bounds on time
-and memory."""
+and memory.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +79,8 @@ def parsed(text: str) -> Any:
 
 def _require_few_parts(tree: ast.expr) -> None:
     """Raise ConfigurationError for more than a person writes; without recursion, for the tree may
-    be as deep as it is large."""
+    be as deep as it is large.
+    """
     parts, functions, left = 0, 0, [(tree, 0)]
     while left:
         node, depth = left.pop()

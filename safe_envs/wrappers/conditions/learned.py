@@ -56,7 +56,8 @@ class LearnedCondition(Condition):
 
     def require_fit(self, problem: SafetyProblem) -> None:
         """Raise ConfigurationError where what it rests on was learned by another method, or of
-        another problem."""
+        another problem.
+        """
         method = getattr(self.learned, "method", None)
         if method != self.method:
             raise ConfigurationError(
@@ -268,7 +269,7 @@ class BayesianSCBF(LearnedCondition):
     for mean - z sqrt(v) >= 0. With `confidence` z is the quantile of Student's distribution, for
     each (x, u) by itself, and sigma the most probable. With `simultaneous` the ellipsoid of theta
     and the intervals of sigma hold together with that probability, hence for all (x, u) at once:
-    then `safe_envs.wrappers.verification.posterior_bound` has a bound for it. Correlated noise
+    then `safe_envs.wrappers.verification.posterior_guarantee` has a bound for it. Correlated noise
     makes v at most its largest eigenvalue larger. Both hold as far as the features and a constant
     sigma fit the data; what does not is in the warnings of the record.
 
@@ -396,7 +397,8 @@ class BayesianSCBF(LearnedCondition):
 
     def _least_ito_term(self, system: ControlAffineSDE, barrier: Barrier) -> sp.Expr:
         """1/2 tr(sigma sigma' h_xx), for the simultaneous form the least that the intervals of the
-        sigma_i allow."""
+        sigma_i allow.
+        """
         if self.simultaneous is None:
             return ito_correction(system, barrier.expression)
         curvatures = [sp.diff(barrier.expression, s, 2) / 2 for s in system.states]

@@ -1,5 +1,6 @@
 """Reciprocal conditions, whose barrier function B grows without bound towards the edge: RCBF,
-SRCBF."""
+SRCBF.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Conditions that know the noise, with the Ito generator A in place of the Lie derivative: SCBF,
-SZCBF."""
+SZCBF.
+"""
 
 from __future__ import annotations
 

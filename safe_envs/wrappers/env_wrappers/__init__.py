@@ -1,2 +1,3 @@
 """Gymnasium wrappers: the safety filter, monitors of third-party envs, and the cost in the return
-of `step`."""
+of `step`.
+"""

@@ -1,5 +1,6 @@
 """How a filter sees an env that was not written for it: a model of it, what is safe, and where its
-state and its input are."""
+state and its input are.
+"""
 
 from __future__ import annotations
 

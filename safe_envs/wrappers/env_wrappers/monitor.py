@@ -1,5 +1,6 @@
 """Safety of envs that know nothing of it: `info` as for this project's own, and their states and
-inputs for a filter."""
+inputs for a filter.
+"""
 
 from __future__ import annotations
 
@@ -86,7 +87,8 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
 
     def normalized_action(self, u: Sequence[float]) -> np.ndarray:
         """Inverse of `physical_action`: the env's action for an input of the model, in the numbers
-        of the action space."""
+        of the action space.
+        """
         return np.clip(self._spec.actions(np.array(u)), self._low, self._high).astype(self._kind)
 
     def reset(

@@ -76,7 +76,8 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     @property
     def components(self) -> Components:
         """The states that the last observations show, an array (num_envs,) for each of the model's
-        states."""
+        states.
+        """
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
         return self._x
@@ -98,7 +99,8 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
     def normalized_action(self, u: Sequence[Any]) -> np.ndarray:
         """Inverse of `physical_action`: the envs' actions for components of inputs, in the numbers
-        of the action space."""
+        of the action space.
+        """
         return np.clip(self._spec.actions(np.stack(u, axis=-1)), self._low, self._high).astype(
             self._kind
         )
@@ -168,7 +170,8 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
     def _of_same_step(self, observation: np.ndarray, ended: np.ndarray, info: Info) -> Info:
         """What is shown after a step that restarted the envs that ended: their last step goes to
-        `final_info`."""
+        `final_info`.
+        """
         if not ended.any():
             return self._seen(observation, self._everywhere)
         last = np.array(observation)
@@ -202,7 +205,8 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
 def _one_of(env: gym.vector.VectorEnv) -> Any:
     """One of the envs of a batch where they are at hand, as in SyncVectorEnv; the batch itself
-    elsewhere."""
+    elsewhere.
+    """
     envs = getattr(env.unwrapped, "envs", None)
     return envs[0].unwrapped if envs else env.unwrapped
 

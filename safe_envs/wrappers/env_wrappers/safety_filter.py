@@ -162,7 +162,8 @@ def unreadable(env: Any, vector: bool) -> ConfigurationError:
 
 def require_foreign(env: object, ours: type[Any], view: Mapping[str, Any], knowledge: str) -> None:
     """Raise ConfigurationError where a filter is told how to see an env of this project, or to know
-    what nobody knows."""
+    what nobody knows.
+    """
     if isinstance(env, ours):
         raise ConfigurationError(
             f"{', '.join(view)}: only for envs of somebody else; {env} has a model and barriers of"
@@ -177,7 +178,8 @@ def require_foreign(env: object, ours: type[Any], view: Mapping[str, Any], knowl
 
 def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv | SafetyMonitor) -> bool:
     """Whether no wrapper between the filter and the env could change a step, so that its input need
-    not be encoded."""
+    not be encoded.
+    """
     while isinstance(env, (OrderEnforcing, PassiveEnvChecker)):
         env = env.env
     return env is inner

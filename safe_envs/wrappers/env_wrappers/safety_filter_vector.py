@@ -162,7 +162,8 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
 
     def _start_anew(self, added: Info, envs: np.ndarray) -> None:
         """Put what is reported at reset in place of a decision, for the envs that were reset in
-        this step."""
+        this step.
+        """
         self._forget(envs)
         for key, value in self._rest.items():
             # The env itself may hold the array of a single input.

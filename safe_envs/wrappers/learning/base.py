@@ -13,15 +13,9 @@ import numpy as np
 
 from safe_envs.errors import require_whole, shortened
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.models.files import (
-    Content,
-    LearnedFileError,
-    Signature,
-    checksum,
-    require_finite,
-    require_text,
-    save,
-)
+from safe_envs.wrappers.learning.models.files import Content, checksum, save
+from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.models.values import LearnedFileError, require_finite, require_text
 
 Progress = Callable[[float], None]
 """Told which part of the work is done, from 0 to 1."""
@@ -114,7 +108,8 @@ class LearnedModel(ABC):
         self, problem: SafetyProblem, x: np.ndarray
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """(truth, estimate) of each learned function at states (B, n), by name, values (B,); the
-        plant is the truth."""
+        plant is the truth.
+        """
 
     def _saved(self) -> dict[str, Any]:
         record = asdict(self.record)
@@ -123,14 +118,16 @@ class LearnedModel(ABC):
     @cached_property
     def sha256(self) -> str:
         """Checksum of the model with its record, but for how long it took: the same seed and data
-        give the same."""
+        give the same.
+        """
         saved = self._saved()
         del saved["record"]["seconds"]
         return checksum(self.method, self.signature, saved, self.arrays())
 
     def save(self, path: Path) -> None:
         """Write the model as data, without pickle; see
-        `safe_envs.wrappers.learning.models.files.save`."""
+        `safe_envs.wrappers.learning.models.files.save`.
+        """
         save(path, self.method, self.signature, self._saved(), self.arrays())
 
     @classmethod

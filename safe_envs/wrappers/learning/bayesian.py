@@ -169,7 +169,8 @@ def _regressed(
     phi: np.ndarray, targets: np.ndarray, count: np.ndarray, prior: np.ndarray
 ) -> Gaussian:
     """Weights of variances per s, from mean squares (G, n) whose own noise is told by what the fit
-    leaves."""
+    leaves.
+    """
     weight = np.sqrt(count)[:, None]
     solution, _, rank, _ = np.linalg.lstsq(phi * weight, targets * weight, rcond=None)
     left = ((targets - phi @ solution) ** 2 * count[:, None]).sum(axis=0) / max(len(phi) - rank, 1)
@@ -178,7 +179,8 @@ def _regressed(
 
 def _variation(rows: Rows, residual: np.ndarray, noise: Diffusion) -> np.ndarray:
     """Part by which the variance of each state varies, as a quadratic of the state, (n,); 0 where
-    that may be chance."""
+    that may be chance.
+    """
     centred = rows.x - rows.x.mean(axis=0)
     scaled = centred / np.maximum(abs(centred).max(axis=0), np.finfo(float).tiny)
     terms = np.column_stack((np.ones(len(scaled)), scaled, scaled**2))
@@ -195,7 +197,8 @@ def _variation(rows: Rows, residual: np.ndarray, noise: Diffusion) -> np.ndarray
 
 def _correlation(white: np.ndarray) -> np.ndarray:
     """Correlations of residuals (R, n) of variance 1; the unit matrix where none is significant,
-    and 0 for a state without noise."""
+    and 0 for a state without noise.
+    """
     n = white.shape[1]
     sizes = np.sqrt((white**2).sum(axis=0))
     sizes[sizes == 0] = 1.0

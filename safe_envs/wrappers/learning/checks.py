@@ -1,5 +1,6 @@
 """What every way of learning asks for before it begins: sizes that fit into memory, the right
-objects; and its randomness."""
+objects; and its randomness.
+"""
 
 from __future__ import annotations
 
@@ -76,7 +77,8 @@ def require_kind(name: str, value: Any, kind: type, source: str) -> None:
 
 def require_degrees(problem: SafetyProblem, given: Any) -> None:
     """Raise ValueError unless these are the relative degrees of a problem's barriers: what a file
-    says is to be so before it is used."""
+    says is to be so before it is used.
+    """
     wanted = [relative_degree(problem.model, b.expression) for b in problem.barriers]
     if given != wanted:
         raise ValueError(f"the degrees {shown(given)}, where the barriers have {wanted}")
@@ -84,5 +86,6 @@ def require_degrees(problem: SafetyProblem, given: Any) -> None:
 
 def require_problem(problem: Any) -> None:
     """Raise ConfigurationError where something else was given for a problem: the id of an env, or
-    an env."""
+    an env.
+    """
     require_kind("problem", problem, SafetyProblem, "make_problem of safe_envs.registry")

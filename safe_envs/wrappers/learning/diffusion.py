@@ -1,5 +1,6 @@
 """The covariance of the noise, learned once from one-step transitions: with a known drift, every
-generator follows from it."""
+generator follows from it.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from safe_envs.wrappers.learning.checks import Purpose, random_stream
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.estimators import by_parts, rounding
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.files import array_of
+from safe_envs.wrappers.learning.models.values import array_of
 
 _DEGREES = (0, 1, 2)
 _HELD_OUT = 0.2
@@ -196,7 +197,8 @@ def covariances(data: Transitions, rate: np.ndarray) -> np.ndarray:
 
 def _designs(problem: SafetyProblem, x: np.ndarray) -> list[tuple[Features, np.ndarray]]:
     """The features of each degree at states (P, n), as far as there are two points for each
-    feature."""
+    feature.
+    """
     candidates = [
         Features.of(problem, degree) for degree in _DEGREES if Features.allowed(problem, degree)
     ]
@@ -207,7 +209,8 @@ def _fit(
     designs: Sequence[tuple[Features, np.ndarray]], values: np.ndarray, may_vanish: bool
 ) -> tuple[Features, np.ndarray] | None:
     """Features and weights of the regression of values (P,) with the least BIC; None for the zero
-    function."""
+    function.
+    """
     # A fit without any residual would win over all others, by an infinite margin.
     floor = len(values) * (_EXACT * np.abs(values).max()) ** 2
 
@@ -246,7 +249,8 @@ def _held_out_errors(
 
 def _projected(matrix: sp.ImmutableMatrix) -> sp.ImmutableMatrix:
     """The positive semidefinite matrix of numbers that is nearest to a symmetric one, with all
-    pivots positive where it is not 0."""
+    pivots positive where it is not 0.
+    """
     numbers = np.array(matrix, dtype=float)
     live = np.flatnonzero(numbers.diagonal())
     values, vectors = np.linalg.eigh(numbers[np.ix_(live, live)])

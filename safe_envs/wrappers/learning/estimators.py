@@ -1,5 +1,6 @@
 """Estimates of what the noise adds to the generator of a function, from one-step transitions; the
-drift is known."""
+drift is known.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +67,8 @@ class Estimate:
 
 def rates(model: ControlAffineSDE, data: Transitions) -> np.ndarray:
     """f(x) + g(x) u of a model at each point under its input, in units of the states per s, shape
-    (P, n)."""
+    (P, n).
+    """
     return _rate_of(model, data)(data.x)
 
 
@@ -123,13 +125,15 @@ def by_parts(data: Transitions) -> Iterator[tuple[slice, list[np.ndarray]]]:
 
 def rounding(data: Transitions, rate: np.ndarray) -> np.ndarray:
     """The largest residual of each state that may be a rounding error, shape (n,); arguments as for
-    `drift_score`."""
+    `drift_score`.
+    """
     return _ROUNDING * (np.abs(data.x) + np.abs(rate) * data.dt[:, None]).max(axis=0)
 
 
 def slack(data: Transitions, rate: np.ndarray, mean: np.ndarray) -> np.ndarray:
     """The largest residual of each state that another way of integrating may make, shape (n,);
-    arguments as for `drift_warnings`."""
+    arguments as for `drift_warnings`.
+    """
     return _MATERIAL * (np.abs(mean - rate) * data.dt[:, None]).max(axis=0)
 
 
@@ -188,7 +192,8 @@ def drift_warnings(
 
 def _factor_warnings(data: Transitions, mean: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
     """The same where the score sees nothing: of a log without repetitions, by regression of the
-    steps on those of the drift."""
+    steps on those of the drift.
+    """
     moved = mean * data.dt[:, None]
     product = (data.successors.mean(axis=1) - data.x - moved) * moved
     size, total, spread = (
@@ -213,7 +218,8 @@ def _factor_warnings(data: Transitions, mean: np.ndarray, names: Sequence[str]) 
 
 def region_warnings(problem: SafetyProblem, data: Transitions) -> tuple[str, ...]:
     """Which states of the data are to a material part outside the region in which a problem is
-    explored."""
+    explored.
+    """
     found = []
     for variable, (low, high), column in zip(
         problem.states, problem.exploration.region, data.x.T, strict=True

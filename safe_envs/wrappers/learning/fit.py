@@ -15,12 +15,10 @@ from safe_envs.errors import ConfigurationError, InvalidInputError, require_whol
 from safe_envs.wrappers.learning.base import Progress
 from safe_envs.wrappers.learning.checks import Purpose, random_stream
 from safe_envs.wrappers.learning.models.network import Activation, Network, require_activation
+from safe_envs.wrappers.learning.models.values import LARGEST
 
 LEAST_ROWS = 10
 """Fewest rows from which anything is learned."""
-
-_LARGEST = 1e100
-"""Largest entry of the data: the sum of its squares is still a number."""
 
 _MOST_PARAMETERS = 10_000_000
 """Of a network: Adam keeps four numbers for each, and half a thousand epochs take hours."""
@@ -171,8 +169,8 @@ def _check_data(inputs: np.ndarray, targets: np.ndarray) -> None:
         )
     if len(inputs) < LEAST_ROWS:
         raise InvalidInputError(f"{len(inputs)} rows to learn from; give at least {LEAST_ROWS}")
-    if not all((np.abs(columns) <= _LARGEST).all() for columns in (inputs, targets)):
-        raise InvalidInputError(f"inputs or targets are not finite, or larger than {_LARGEST:g}")
+    if not all((np.abs(columns) <= LARGEST).all() for columns in (inputs, targets)):
+        raise InvalidInputError(f"inputs or targets are not finite, or larger than {LARGEST:g}")
 
 
 def _standardisation(
@@ -194,7 +192,8 @@ def _standardisation(
 @contextmanager
 def _single_thread() -> Iterator[None]:
     """Let torch use one thread: on small matrices more are slower, and the order of sums would hang
-    on their number."""
+    on their number.
+    """
     import torch
 
     threads = torch.get_num_threads()
@@ -218,7 +217,8 @@ def _fit(
     progress: Progress | None,
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], int, float]:
     """Train on standardised data; return (weights, bias) of each layer, the epochs that were run,
-    and the validation loss."""
+    and the validation loss.
+    """
     import torch
 
     generator = torch.Generator().manual_seed(seed)
@@ -254,7 +254,8 @@ def _fit(
 
 def _first_parameters(shapes: Sequence[tuple[int, ...]], generator: Any) -> Any:
     """Weights and biases of all layers in one tensor, each uniform within 1/sqrt(inputs of the
-    layer)."""
+    layer).
+    """
     import torch
 
     bounds = [weights[1] ** -0.5 for weights in shapes[::2] for _ in range(2)]

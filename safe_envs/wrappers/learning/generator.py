@@ -1,5 +1,6 @@
 """The generator of a barrier under unknown noise, learned from one-step transitions: DDSCBF of the
-thesis, and a shorter way."""
+thesis, and a shorter way.
+"""
 
 from __future__ import annotations
 
@@ -41,8 +42,9 @@ from safe_envs.wrappers.learning.estimators import (
     slack,
 )
 from safe_envs.wrappers.learning.fit import train
-from safe_envs.wrappers.learning.models.files import LearnedFileError, Signature
 from safe_envs.wrappers.learning.models.network import Network
+from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.models.values import LearnedFileError
 
 Way = Literal["network", "direct"]
 """How a generator is learned: see `learn_generator`."""
@@ -99,7 +101,8 @@ class LearnedGenerator:
     @cached_property
     def _chart(self) -> tuple[Callable[..., Components], Callable[..., Components]]:
         """The coordinates, and their derivatives by every state, coordinate by coordinate; over
-        floats, and over arrays."""
+        floats, and over arrays.
+        """
         read = (*self.coordinates, *(sp.diff(c, s) for c in self.coordinates for s in self.states))
         return compile_function(self.states, read, "floats"), compile_function(
             self.states, read, "arrays"
@@ -137,7 +140,8 @@ class LearnedGenerator:
 
     def _by_states(self, slopes: Sequence[Any], chart: Components) -> list[Any]:
         """The chain rule: slopes by the coordinates, and those of the coordinates, to slopes by the
-        states."""
+        states.
+        """
         n = len(self.states)
         return [sum(slope * chart[k * n + i] for k, slope in enumerate(slopes)) for i in range(n)]
 
@@ -388,7 +392,8 @@ def _next_order(
     **how: Any,
 ) -> tuple[LearnedGenerator, dict[str, float]]:
     """Add M_j to M_1..M_(j-1); and its median error at held-out points, labels included, and the
-    labels' standard error."""
+    labels' standard error.
+    """
     model, below, n = problem.model, known.degree, problem.plant.n
     base = model.numeric(derivatives(model, barrier.expression, below, lie_derivative_f)[-1])
     read_base = compile_function(model.states, (base,), "arrays")

@@ -1,5 +1,6 @@
 """What data cannot tell about a system: inputs that are not excited, features that cannot be told
-apart."""
+apart.
+"""
 
 from __future__ import annotations
 
@@ -108,7 +109,8 @@ def misfits(features: Features, misfit: np.ndarray, variation: np.ndarray) -> tu
 
 def term_names(features: Features, inputs: Sequence[str]) -> tuple[str, ...]:
     """Names of the D columns of the regression: monomials of the states, then these times each
-    input."""
+    input.
+    """
     # Whatever the ranges are, the order of the monomials is the same: on [-1, 1] their names are
     # short.
     plain = Features(
@@ -139,7 +141,8 @@ def _steady(features: Features, inputs: Sequence[str], x: np.ndarray, u: np.ndar
 
 def _confounded(terms: Sequence[str], null: np.ndarray) -> str:
     """The groups of terms that mix in the null space with the orthonormal basis `null` (d, D);
-    whatever the basis is."""
+    whatever the basis is.
+    """
     projector = null.T @ null
     involved = np.flatnonzero(projector.diagonal() > _PART)
     count, group = connected_components(
@@ -156,7 +159,8 @@ def _weak(
     terms: Sequence[str], seen: np.ndarray, learned: Gaussian, prior: float
 ) -> list[tuple[str, ...]]:
     """For each output the terms in those directions that the data show, but hardly; `seen` (r, D)
-    is a basis."""
+    is a basis.
+    """
     values, vectors = np.linalg.eigh(seen @ learned.covariance @ seen.T)
     found = []
     for sizes, directions in zip(values, vectors, strict=True):

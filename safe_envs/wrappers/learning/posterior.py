@@ -1,5 +1,6 @@
 """What Bayesian identification knows of a control-affine system: distributions of its drift, input
-matrix and noise."""
+matrix and noise.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +19,10 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.files import (
+from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.models.values import (
     LARGEST,
     LearnedFileError,
-    Signature,
     array_of,
     require_finite,
 )
@@ -67,7 +68,8 @@ class Diffusion:
     @property
     def sigma(self) -> np.ndarray:
         """The most probable constant levels, (n,). A state without any scatter has none, where the
-        prior would say beta/N."""
+        prior would say beta/N.
+        """
         levels = sigma_map(
             self.squares, np.full(len(self.squares), self.count), self.alpha, self.beta
         )
@@ -224,7 +226,8 @@ class Posterior(LearnedModel):
     @cached_property
     def weights(self) -> Gaussian:
         """The weights of `system`: their distribution, given that those of the pruned entries are
-        0."""
+        0.
+        """
         mean, covariance = self.mean.copy(), self.covariance.copy()
         for i, row in enumerate(self.pruned):
             zero = np.flatnonzero(np.repeat([False, *row], self.features.count))
@@ -262,7 +265,8 @@ class Posterior(LearnedModel):
 
     def drift_variance(self, x: np.ndarray) -> np.ndarray:
         """Covariances of (f_i, g_i1, .., g_im) at states (B, n), shape (B, n, 1 + m, 1 + m); also
-        of what is pruned."""
+        of what is pruned.
+        """
         phi = self.features.matrix(x)
         return np.einsum(
             "bipqk,bk->bipq", (phi @ self._stretched).reshape(len(x), *self._blocks), phi
@@ -276,7 +280,8 @@ class Posterior(LearnedModel):
     @cached_property
     def _split_covariance(self) -> np.ndarray:
         """The covariance of the weights with the scales of the inputs in it, axes (n, 1 + m, 1 + m,
-        M, M)."""
+        M, M).
+        """
         n, parts, _, count = self._blocks
         scale = np.array([1.0, *self.input_scale])
         split = self.covariance.reshape(n, parts, count, parts, count).transpose(0, 1, 3, 2, 4)
@@ -292,7 +297,8 @@ class Posterior(LearnedModel):
     @property
     def variance_expressions(self) -> tuple[sp.ImmutableMatrix, ...]:
         """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m) of expressions,
-        multiplied out."""
+        multiplied out.
+        """
         first, second = np.triu_indices(self.features.count)
         phi = self.features.expressions
         products = [
@@ -401,7 +407,8 @@ class Posterior(LearnedModel):
         self, problem: SafetyProblem, x: np.ndarray
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """See `LearnedModel.compare`: f_i and g_ij in the units of the states per s, and the
-        entries of sigma sigma'."""
+        entries of sigma sigma'.
+        """
         truth, estimate = _entries(problem.plant, x), _entries(self.system, x)
         return {name: (truth[name], estimate[name]) for name in truth}
 

@@ -1,5 +1,6 @@
 """Bayesian linear regression: the rows of one-step data, the posterior of weights, and that of a
-noise level."""
+noise level.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +59,8 @@ class Rows:
     @property
     def repeated(self) -> bool:
         """Whether rows repeat often enough that their scatter tells most about the noise, whatever
-        the drift is."""
+        the drift is.
+        """
         return 2 * (len(self.group) - len(self.count)) >= len(self.group)
 
     def design(self, features: Features, input_scale: np.ndarray) -> np.ndarray:

@@ -32,8 +32,8 @@ from safe_envs.wrappers.learning.checks import (
 )
 from safe_envs.wrappers.learning.data.collection import Step, collect_paths, draw_states
 from safe_envs.wrappers.learning.fit import LEAST_ROWS, hidden_widths, train
-from safe_envs.wrappers.learning.models.files import Signature
-from safe_envs.wrappers.learning.models.network import Network
+from safe_envs.wrappers.learning.models.network import Network, require_activation
+from safe_envs.wrappers.learning.models.signature import Signature
 
 _ROUNDING = 1e-12
 
@@ -181,6 +181,7 @@ class ResidualModel(LearnedModel):
         for i, (degree, activation) in enumerate(
             zip(details["degrees"], details["activations"], strict=True)
         ):
+            require_activation(activation)
             network, heldout = (
                 Network.from_arrays(arrays, f"part_{i}", activation),
                 arrays[f"part_{i}_heldout"].astype(float),
@@ -205,7 +206,8 @@ class ResidualModel(LearnedModel):
         self, problem: SafetyProblem, x: np.ndarray
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """(truth, estimate) of each residual at states (B, n), by name, values (B,); the truth
-        symbolic, of plant less model."""
+        symbolic, of plant less model.
+        """
         states, found = np.ascontiguousarray(x.T), {}
         for barrier, part in zip(problem.barriers, self.parts, strict=True):
             systems = (problem.plant, problem.model)
@@ -370,7 +372,8 @@ def _require_label_dt(label_dt: float, dt: float) -> None:
 
 def _split_by_input(problem: SafetyProblem, tried: np.ndarray) -> np.ndarray:
     """The matrix (1 + m, J) that takes values c + a u at J inputs to (c, a) by least squares;
-    raises as `residual_labels`."""
+    raises as `residual_labels`.
+    """
     # Centred and scaled, for inputs may be large and far from 0.
     center = tried.mean(axis=0)
     scale = np.abs(tried - center).max(axis=0)
@@ -390,7 +393,8 @@ def _split_by_input(problem: SafetyProblem, tried: np.ndarray) -> np.ndarray:
 
 def _differences(h: np.ndarray, degree: int, dt: float) -> np.ndarray:
     """Derivatives 1..degree at the beginning of paths with samples (..., S + 1) dt apart, shape
-    (..., degree)."""
+    (..., degree).
+    """
     # Exact rationals, about 1 as sympy has it: weights that miss the sum 0 by a rounding would add
     # that times h/dt^j.
     table = sp.finite_diff_weights(degree, list(range(1, h.shape[-1] + 1)))
@@ -416,7 +420,8 @@ def _lie_derivatives(
     system: ControlAffineSDE, h: sp.Expr, degree: int
 ) -> Callable[[np.ndarray], np.ndarray]:
     """From states (N, n) to h, L_f h, ..., L_f^r h and the m entries of L_g L_f^(r-1) h, side by
-    side (N, 1 + r + m)."""
+    side (N, 1 + r + m).
+    """
     along = derivatives(system, h, degree, lie_derivative_f)
     expressions = [
         system.numeric(e) for e in (*along, *lie_derivative_g(system, along[degree - 1]))

@@ -119,7 +119,8 @@ def _project(
 
 class _Held(NamedTuple):
     """Where a step (m,) ends, the rows (k,) that hold it as equations, and the inputs (m,) at their
-    bounds."""
+    bounds.
+    """
 
     step: np.ndarray
     rows: np.ndarray

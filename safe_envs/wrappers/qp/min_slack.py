@@ -29,7 +29,8 @@ overflow."""
 
 class _Rows(NamedTuple):
     """Rows x u_1 + y u_2 + r in units of the steepest, shapes (k, B), a box and inputs, shapes (2,
-    B)."""
+    B).
+    """
 
     x: np.ndarray
     y: np.ndarray
@@ -101,7 +102,8 @@ def least_violating(
 
 def is_unique(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Whether the rows violated at minimisers u (2, B) cross, so that no other action has the same
-    slacks (B,)."""
+    slacks (B,).
+    """
     first, second = a[0] * u[0], a[1] * u[1]
     violated = first + second + b < -ROUNDING * (np.abs(first) + np.abs(second) + np.abs(b))
     _, _, along = _frame(np.where(violated, a[0], 0.0), np.where(violated, a[1], 0.0))
@@ -116,7 +118,8 @@ def _margin(rows: _Rows) -> tuple[np.ndarray, np.ndarray]:
 
 def _balanced(rows: _Rows, least: np.ndarray, most: np.ndarray) -> np.ndarray:
     """Whether the forces cancel (B,): along both inputs, and along each row, which itself has no
-    part in that."""
+    part in that.
+    """
     nothing = np.zeros_like(rows.u[:1])
     along = (
         np.concatenate([nothing + 1.0, nothing, -rows.y]),
@@ -167,7 +170,8 @@ def _newton(
 
 def _least_squares(rows: _Rows, error: np.ndarray) -> np.ndarray:
     """Where |x d_1 + y d_2 + r|^2, r being known up to an error, is least with u + d in the box:
-    inside, or else on an edge."""
+    inside, or else on an edge.
+    """
     goal = rows.u + _unbounded(rows)
     outside = np.flatnonzero(~((goal >= rows.low) & (goal <= rows.high)).all(axis=0))
     if outside.size:
@@ -179,7 +183,8 @@ def _frame(
     x: np.ndarray, y: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
     """The steepest row (2, B), and each row's components across and along it, these zero where the
-    rows are parallel."""
+    rows are parallel.
+    """
     steepest = np.maximum(np.abs(x), np.abs(y)).argmax(axis=0)[None]
     n1, n2 = [np.take_along_axis(part, steepest, axis=0)[0] for part in (x, y)]
     first, second = y * n1, x * n2
@@ -193,7 +198,8 @@ def _frame(
 
 def _unbounded(rows: _Rows) -> np.ndarray:
     """The least-squares step (2, B), by Gram-Schmidt in the frame of the steepest row; across it
-    alone where all are parallel."""
+    alone where all are parallel.
+    """
     (n1, n2), across, along = _frame(rows.x, rows.y)
     square = total(across * across)
     square = np.where(square > 0.0, square, 1.0)
@@ -208,7 +214,8 @@ def _unbounded(rows: _Rows) -> np.ndarray:
 
 def _best_edge(rows: _Rows, error: np.ndarray) -> np.ndarray:
     """The point of the four edges whose multiplier has the right sign; if several do up to
-    rounding, the least sum and the nearest."""
+    rounding, the least sum and the nearest.
+    """
     u, low, high = rows.u, rows.low, rows.high
     best, least_wrong, least_sum = (
         u.copy(),

@@ -77,7 +77,8 @@ def _project_scalar(
     a: float, b: float, v: float, low: float, high: float
 ) -> tuple[list[float], float, bool, bool]:
     """A single input: the root of the row, if the box holds it, and the end of the box next to it
-    if not."""
+    if not.
+    """
     u = low if v < low else high if v > high else v
     margin = a * u + b
     if margin >= 0.0:

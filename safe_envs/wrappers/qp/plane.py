@@ -39,7 +39,8 @@ def project_floats(
     priority: Sequence[float],
 ) -> tuple[list[float], list[float], list[bool], bool]:
     """Project the input of one state: inputs (2), margins and binding rows (k), whether the rows
-    can be met together."""
+    can be met together.
+    """
     (v1, v2), (l1, l2), (h1, h2) = v, low, high
     c1 = l1 if v1 < l1 else h1 if v1 > h1 else v1
     c2 = l2 if v2 < l2 else h2 if v2 > h2 else v2
@@ -105,7 +106,8 @@ def _onto_line(
     wf: float,
 ) -> tuple[float, float] | None:
     """The minimiser (pivot, free) on a line within the box and the rows before; None where there is
-    none."""
+    none.
+    """
     ap, af, b = line
     if ap == 0.0:
         return None

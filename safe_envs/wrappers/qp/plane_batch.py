@@ -50,7 +50,8 @@ class Plane(NamedTuple):
 
     def scale(self, u: np.ndarray, away: np.ndarray | float = 0.0) -> np.ndarray:
         """How far each input can go (2, B): to the end of its box, or as far as u and `away` in the
-        metric of the objective."""
+        metric of the objective.
+        """
         root = np.sqrt(self.w)
         reach = root[0] * np.abs(u[0]) + root[1] * np.abs(u[1]) + away
         return np.minimum(np.maximum(-self.low, self.high), reach / root)
@@ -108,7 +109,8 @@ def project_arrays(
 
 def _nearest_of_least_violating(plane: Plane, priority: np.ndarray) -> np.ndarray:
     """Of the actions with the least sum of squared slacks, which all have the same slacks, the one
-    nearest to v."""
+    nearest to v.
+    """
     u = least_violating(plane.a, plane.b, plane.low, plane.high, priority, plane.clip(plane.v))
     several = np.flatnonzero(~is_unique(plane.a, plane.b, u))
     if several.size:
@@ -140,7 +142,8 @@ def _nearest(plane: Plane) -> tuple[np.ndarray, np.ndarray]:
 
 def _onto_line(plane: Plane, u: np.ndarray, miss: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Minimisers (2, B) on the line of the last row, which u violates, and whether the rows before
-    and the box leave any (B,)."""
+    and the box leave any (B,).
+    """
     first, second = np.abs(plane.a[:, -1])
     root = np.sqrt(plane.w)
     steepness = first / root[0] + second / root[1]
@@ -176,7 +179,8 @@ def _onto_line(plane: Plane, u: np.ndarray, miss: np.ndarray) -> tuple[np.ndarra
 
 class _OnLine(NamedTuple):
     """Rows slope * u_f + offset >= 0 along a line, shapes (k, B), with the sizes of the terms that
-    they were summed from."""
+    they were summed from.
+    """
 
     slope: np.ndarray
     offset: np.ndarray

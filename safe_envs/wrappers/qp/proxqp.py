@@ -40,7 +40,8 @@ _REACH = 10.0
 
 class Projection(NamedTuple):
     """Arrays over a batch of B states: inputs (B, m), margins and binding rows (B, k), whether all
-    can be met (B,)."""
+    can be met (B,).
+    """
 
     u: np.ndarray
     margin: np.ndarray
@@ -134,7 +135,8 @@ class _Problem(NamedTuple):
         self, rows: np.ndarray, below: np.ndarray, above: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """The minimisers (B, m) that some rows (B, k) and bounds (B, m) hold, and where they are
-        those of the whole problem (B,)."""
+        those of the whole problem (B,).
+        """
         roots, held = np.sqrt(self.w), below | above
         normals = self.a / roots[:, None, :]
         lengths = np.abs(normals).max(axis=2)
@@ -163,7 +165,8 @@ class _Problem(NamedTuple):
 
 def _dot(a: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Products (B, k) of rows (B, k, m) and inputs (B, m), summed in an order that does not depend
-    on the batch."""
+    on the batch.
+    """
     return total(np.moveaxis(a * u[:, None, :], 2, 0))
 
 
@@ -171,7 +174,8 @@ def _units(
     a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Origin and unit of each input (B, m): those of the box, or of the way to the violated rows
-    where the box is too wide."""
+    where the box is too wide.
+    """
     inside = np.clip(v, low, high)
     missed = np.maximum(-(_dot(a, inside) + b), 0.0)
     steepness = np.sqrt((a**2 / w[:, None, :]).sum(axis=2))
@@ -221,7 +225,8 @@ class _Scaled(NamedTuple):
 
 def _solve(scaled: _Scaled) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The rows (B, k) and the lower and upper bounds (B, m) that hold the minimisers, according to
-    ProxQP."""
+    ProxQP.
+    """
     count, k, m = scaled.rows.shape
     # The solver does not come back from numbers that are not finite.
     solvable = np.flatnonzero(

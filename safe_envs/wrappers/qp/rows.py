@@ -49,7 +49,8 @@ def stack(entries: Sequence[Any], size: int) -> np.ndarray:
 
 def total(parts: np.ndarray) -> np.ndarray:
     """Sum over the first axis, in an order that does not depend on the size of the batch, as
-    NumPy's own does."""
+    NumPy's own does.
+    """
     result = parts[0].copy()
     for part in parts[1:]:
         result += part

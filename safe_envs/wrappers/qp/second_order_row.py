@@ -87,7 +87,8 @@ def _nearest(
 
 def _maximiser(a: float, q: Quadratic, v: float, low: float, high: float) -> float:
     """Where c is largest: with w = u + q_1/q_2 and s the least sqrt(q/q_2), a = sqrt(q_2)
-    w/sqrt(w^2 + s^2) there, or at an end."""
+    w/sqrt(w^2 + s^2) there, or at an end.
+    """
     q0, q1, q2 = q
     end = high if a > 0.0 else low
     if q2 == 0.0:
@@ -107,7 +108,8 @@ def _margin(a: float, b: float, q: Quadratic, u: float) -> float:
 
 def _tolerance(a: float, b: float, q: Quadratic, u: float) -> float:
     """As `safe_envs.wrappers.qp.rows.tolerance`, and what the rounding of the form makes of its
-    root."""
+    root.
+    """
     linear, terms = 2.0 * q[1] * u, q[2] * u * u
     form, terms = max(q[0] + linear + terms, 0.0), ROUNDING * (abs(q[0]) + abs(linear) + terms)
     return ROUNDING * abs(b) + ROUNDING * abs(a * u) + math.sqrt(form + terms) - math.sqrt(form)
@@ -298,7 +300,8 @@ def _least_violating(
     priority: Sequence[float],
 ) -> np.ndarray:
     """Of the minimisers of the sum of squared slacks the nearest to v, which lies between the
-    nearest ones of each row."""
+    nearest ones of each row.
+    """
     weights = np.asarray(priority)[:, None]
 
     def derivative(u: np.ndarray) -> np.ndarray:

@@ -68,7 +68,8 @@ class Region:
 
     def draw(self, log2: int, rng: np.random.Generator) -> np.ndarray:
         """Draw 2^log2 points that fill the box evenly: a Sobol sequence, shifted at random; shape
-        (2^log2, n)."""
+        (2^log2, n).
+        """
         from scipy.stats import qmc
 
         unit = qmc.Sobol(len(self.low), scramble=False).random_base2(log2)
@@ -77,13 +78,15 @@ class Region:
 
 def workspace_of(problem: SafetyProblem) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper ends of the workspace, shape (n,); infinite where it has none. To leave it
-    ends an episode."""
+    ends an episode.
+    """
     return np.array([v.low for v in problem.states]), np.array([v.high for v in problem.states])
 
 
 def in_workspace(x: np.ndarray, ends: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     """Which states (B, n) are between the ends of a workspace, which the last step of an episode
-    may leave, shape (B,)."""
+    may leave, shape (B,).
+    """
     low, high = ends
     return np.all((x >= low) & (x <= high), axis=1)
 
@@ -208,7 +211,8 @@ def sample(
 
 def _covers(box: Region, region: Region, points: np.ndarray) -> bool:
     """Whether the points keep away from those ends of a box that are not the region's: then nothing
-    is cut off."""
+    is cut off.
+    """
     width = 0.01 * (box.high - box.low)
     below = (points.min(axis=0) > box.low + width) | (box.low <= region.low)
     above = (points.max(axis=0) < box.high - width) | (box.high >= region.high)
@@ -219,7 +223,8 @@ def _climbed(
     level: Score, tried: np.ndarray, region: Region, rng: np.random.Generator
 ) -> np.ndarray:
     """Points with level >= 0, from the population of a search for the largest level, as soon as
-    there are enough."""
+    there are enough.
+    """
     population, values = search(
         level, tried, region, rng, until=lambda values: int(np.count_nonzero(values >= 0.0)) >= _FEW
     )

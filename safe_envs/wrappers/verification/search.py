@@ -103,7 +103,8 @@ def _joined(
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """A population of the chosen points and random others, which count if there are any; of near
-    ones where there are few."""
+    ones where there are few.
+    """
     counting = np.flatnonzero(np.isfinite(values))
     pool = counting if len(counting) else np.arange(len(points))
     others = rng.choice(pool, min(len(pool), _POPULATION - len(chosen)), replace=False)

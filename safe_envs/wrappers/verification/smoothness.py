@@ -1,5 +1,6 @@
 """Where functions are not smooth, by what they are made of: poles, and roots whose radicand reaches
-0."""
+0.
+"""
 
 from __future__ import annotations
 
@@ -74,7 +75,8 @@ class Asked(NamedTuple):
 
 def asked_of(formulas: Formulas) -> list[Asked]:
     """What the bounds of conditions ask to be smooth: the chains, which without noise need no
-    derivative; the rows need values."""
+    derivative; the rows need values.
+    """
     found = []
     numeric = formulas.system.numeric
     for barrier, row in zip(

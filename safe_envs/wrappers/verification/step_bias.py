@@ -1,5 +1,6 @@
 """What the length of steps does to an identified system: a regression takes the mean of a step for
-the rate at its start."""
+the rate at its start.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +79,8 @@ def _rates(
     posterior: Posterior, x: np.ndarray, u: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """F (B, n), its Jacobian (B, n, n) and 1/2 tr(S F_xx) (B, n) under an input (m,), by
-    differences."""
+    differences.
+    """
     n, parts = len(posterior.mean), 1 + len(posterior.inputs)
     weights = np.einsum(
         "ipk,p->ki",

@@ -109,7 +109,8 @@ def _elsewhere(
 
 def disk_numbers(found: Learnings, printed: float | None = None) -> list[Number]:
     """How many are safe, a fact without an interval, which is all of them only if it is so in every
-    learning; and the smallest h."""
+    learning; and the smallest h.
+    """
     each = zip(RATES, zip(*map(_smallest, found), strict=True), strict=True)
     return [
         Number(SAFE_COUNT, float(min(_counts(found))), printed=printed),
@@ -243,7 +244,8 @@ def binding(problem: SafetyProblem) -> str:
 
 def draw_disk(figure: Figure, outcome: Outcome) -> None:
     """Panels for the printed start, with our estimates and with the printed ones, and for a valid
-    start."""
+    start.
+    """
     colors = dict(zip(RATES, COLORS, strict=False))
     names = ("our estimates", "estimates as printed", "our estimates")
     panels = figure.subplots(1, len(names), sharey=True)

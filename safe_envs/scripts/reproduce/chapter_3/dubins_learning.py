@@ -49,7 +49,8 @@ Ways = Mapping[
 @lru_cache(maxsize=2)
 def passages(sample: Sample, **model: float) -> dict[str, list[Run]]:
     """Trajectories around the obstacle: with learned derivatives for each learning, one each with
-    others and without a filter."""
+    others and without a filter.
+    """
     problem = make_problem(OBSTACLE, start="thesis", model=model or None)
     exact = f"hocbf:p={OBSTACLE_RATES}"
     nominal, none = runs(problem, [exact, "none"])
@@ -146,7 +147,8 @@ def _speeds(each: Sequence[Run], dt: float) -> np.ndarray:
 
 def _chord_speed(problem: SafetyProblem) -> float:
     """Distance over time between control instants in the sharpest turn at full speed, in m/s: a
-    chord is shorter than its arc."""
+    chord is shorter than its arc.
+    """
     return float(SPEED * np.sinc(problem.box[0][1] * problem.dt / (2 * math.pi)))
 
 

@@ -1,5 +1,6 @@
 """What the figures of chapter 3 share: models whose derivatives are learned some times, and single
-trajectories under filters."""
+trajectories under filters.
+"""
 
 from __future__ import annotations
 
@@ -112,7 +113,8 @@ def parameters(system: ControlAffineSDE) -> dict[str, float]:
 @lru_cache(maxsize=8)
 def residuals(env_id: str, sample: Sample, **model: float) -> tuple[ResidualModel, ...]:
     """What is learned of a problem, anew for each repetition; remembered, for two figures show the
-    same."""
+    same.
+    """
     problem = make_problem(env_id, model=model or None)
     states, epochs = settings(sample)
     return tuple(
@@ -154,7 +156,8 @@ def rates_around(
     problem: SafetyProblem, sample: Sample, models: Sequence[ResidualModel], gains: str
 ) -> list[Number]:
     """Safety rates from starts around the printed one, the learned one's interval over learnings
-    too."""
+    too.
+    """
     world, size = problem.configured(start="spread"), sample.size(EPISODES)
 
     def row(name: str, **rest: Any) -> dict[str, Any]:

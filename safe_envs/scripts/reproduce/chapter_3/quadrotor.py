@@ -1,5 +1,6 @@
 """Figure 3.3: the altitude of a quadrotor of unknown mass, under learned derivatives of the HOCBF
-and under Eq. (3.33) as printed."""
+and under Eq. (3.33) as printed.
+"""
 
 from __future__ import annotations
 
@@ -140,7 +141,8 @@ def hover(sample: Sample) -> SafetyProblem:
 
 def altitudes(problem: SafetyProblem, models: Sequence[ResidualModel]) -> dict[str, list[Run]]:
     """Trajectories: with learned derivatives for each learning, one each with others and without a
-    filter."""
+    filter.
+    """
     exact = f"hocbf:p={_GAINS}"
     nominal, none = runs(problem, [exact, "none"])
     learned = [runs(problem, [f"learned-hocbf:p={_GAINS}"], model)[0] for model in models]

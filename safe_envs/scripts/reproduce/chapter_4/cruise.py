@@ -1,5 +1,6 @@
 """Thesis Sec. 4.3.1: safety of SRCBF and SCBF in adaptive cruise control (Table 4.1), and the
-artefacts of that section."""
+artefacts of that section.
+"""
 
 from __future__ import annotations
 
@@ -72,7 +73,8 @@ def safe_with(
     setting: CruiseSettings, text: str, limit: float, episodes: int, seed: int, step: float
 ) -> np.ndarray:
     """Which episodes are safe to the end with a condition and a limit of the force in N, shape
-    (episodes,)."""
+    (episodes,).
+    """
     problem = setting.problem(limit, step)
     return exits(problem, text, NominalController(problem), episodes, seed).safe(problem.steps)
 

@@ -61,7 +61,8 @@ class Run:
     @property
     def peaks(self) -> np.ndarray:
         """Largest effort of each episode where the filter acts, 0 where it never does, shape
-        (episodes,)."""
+        (episodes,).
+        """
         return np.nan_to_num(self.acting).max(axis=0)
 
 
@@ -173,14 +174,16 @@ def outcome_of(runs: Runs, forces: Mapping[str, np.ndarray]) -> Outcome:
 
 def share_of_time(first: Run, second: Run) -> np.ndarray:
     """Share of the instants, in each episode, in which the first effort is the larger one, as long
-    as both runs are safe and under way."""
+    as both runs are safe and under way.
+    """
     both = np.isfinite(first.effort) & np.isfinite(second.effort)
     return (both & (first.effort > second.effort)).sum(axis=0) / np.maximum(both.sum(axis=0), 1)
 
 
 def median_peak(name: str, peaks: np.ndarray) -> Number:
     """Median over episodes of the largest force, between the order statistics that hold it with 95
-    %."""
+    %.
+    """
     force, count = np.sqrt(np.sort(peaks)), len(peaks)
     reach = math.ceil(0.98 * math.sqrt(count))
     low, middle, high = (

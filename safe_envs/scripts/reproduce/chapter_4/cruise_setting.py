@@ -64,14 +64,16 @@ class CruiseSettings:
 
     def most_unsafe(self) -> float:
         """Largest probability of a violation under any controller with A h >= 0: then h >= h_0 -
-        tau sigma_1 W_t."""
+        tau sigma_1 W_t.
+        """
         return float(
             2.0 * ndtr(-(START[2] - self.tau * START[0]) / (self.tau * NOISE * math.sqrt(HORIZON)))
         )
 
     def stricter_below(self) -> float:
         """The h in m below which the SRCBF asks for more than the SCBF: A B <= gamma/B is A h >=
-        (tau sigma_1)^2/h - gamma h^3."""
+        (tau sigma_1)^2/h - gamma h^3.
+        """
         return math.sqrt(self.tau * NOISE) / self.gamma**0.25
 
 

@@ -1,5 +1,6 @@
 """Thesis Sec. 4.3.2: safety of SCBF and SZCBF for a Dubins vehicle against its noise (Figure 4.2),
-and that section's artefacts."""
+and that section's artefacts.
+"""
 
 from __future__ import annotations
 

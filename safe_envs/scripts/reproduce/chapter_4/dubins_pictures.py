@@ -23,7 +23,8 @@ _LABEL = {
 
 def draw_noises(figure: Figure, outcome: Outcome) -> None:
     """Left: safety against noise. Right: over time at the largest noise. Full lines: all starts;
-    dashed: those with A h > 0."""
+    dashed: those with A h > 0.
+    """
     left, right = figure.subplots(1, 2, sharey=True)
     data = outcome.data
     for (kind, rates), dashes in zip(data["rates"].items(), ("-", "--"), strict=True):
@@ -84,7 +85,8 @@ def _draw_band(axes: Axes, along: Any, band: Any, dashes: str, **line: Any) -> N
 
 def draw_points(figure: Figure, outcome: Outcome) -> None:
     """Left: safety from each start, filled at the short horizon, hollow at the long one. Right: the
-    starts."""
+    starts.
+    """
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
     data = outcome.data
     index = np.arange(1, len(data["starts"]) + 1)

@@ -1,5 +1,6 @@
 """Thesis Sec. 4.3.2: safety of SCBF and SZCBF for a Dubins vehicle with noise, from ten random
-starts (Figure 4.3)."""
+starts (Figure 4.3).
+"""
 
 from __future__ import annotations
 
@@ -158,7 +159,8 @@ def _drawn_anew(runs: Sequence[Runs]) -> list[str]:
 
 def printed_and_union_bound(starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Thm. 4.2.10's product and the union bound for ever, at each start, shape (2, starts): 0 where
-    A h <= 0."""
+    A h <= 0.
+    """
     formulas = Formulas(dubins_problem(NOISE, "uniform"), [SCBF()], "model")
     speed = next(
         value for symbol, value in formulas.system.parameters.items() if symbol.name == "v"

@@ -1,5 +1,6 @@
 """Thesis Sec. 4.3.2, a Dubins vehicle with noise in a disk: what is simulated, and how SCBF and
-SZCBF compare."""
+SZCBF compare.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +81,8 @@ Runs = Mapping[str, Exits]
 @dataclass(frozen=True)
 class PrintedSZCBF(Condition):
     """h_1 = A h + alpha_1 h, h_2 = A h_1 + alpha_2 h >= 0, as it is printed: with h in place of h_1
-    in the second term."""
+    in the second term.
+    """
 
     alphas: tuple[float, float] = (1.0, 1.0)
     name = "printed-szcbf"
@@ -147,7 +149,8 @@ def ahead_of(rival: str, runs: Runs, horizon: float, where: str = "") -> Number:
 
 def turning_time(better: Exits, other: Exits) -> float | None:
     """From when on more episodes are safe with the first than with the other, in s; None if not at
-    the end."""
+    the end.
+    """
     ahead = counts(better) > counts(other)
     if not ahead[-1]:
         return None

@@ -1,5 +1,6 @@
 """Thesis Sec. 4.2.2 and Prop. 4.2.8: what a reciprocal condition asks for under noise, and a bound
-that is attained."""
+that is attained.
+"""
 
 from __future__ import annotations
 
@@ -77,7 +78,8 @@ def setting(sample: Sample) -> tuple[str, ...]:
 
 def largest_inputs(text: str, noise: float) -> np.ndarray:
     """The largest u that a condition allows at each of `DISTANCES`: a filter's answer to a far
-    larger one."""
+    larger one.
+    """
     problem = make_problem(SCALAR, noise=noise, box=[-UNBOUNDED, UNBOUNDED])
     answer = SafetyFilter.for_problem(problem, parse_conditions(text, problem))
     state = (1.0 - DISTANCES)[:, None]
@@ -86,7 +88,8 @@ def largest_inputs(text: str, noise: float) -> np.ndarray:
 
 def attaining_problem(start: float) -> SafetyProblem:
     """The system dx = u dt + s x dW with h = 1 - x^2, from a start: without a wish of its own, h is
-    a martingale under the SCBF."""
+    a martingale under the SCBF.
+    """
     x, u, s = sp.symbols("x u s", real=True)
     system = ControlAffineSDE(
         states=(x,),
@@ -264,7 +267,8 @@ def claims_on_inputs(asked: Mapping[str, np.ndarray]) -> list[Claim]:
 
 def _claim_on_edge(sentence: str, asked: np.ndarray, bounded: bool) -> Claim:
     """By the power of h, to the nearest whole one, that the effort asked for goes with: 0 for a
-    bound, less for none."""
+    bound, less for none.
+    """
     power = float(np.polyfit(np.log(DISTANCES[-20:]), np.log(np.abs(asked[-20:])), 1)[0])
     evidence = (
         f"it allows u = {asked[-1]:.6g} at h = {DISTANCES[-1]:g}; |u| goes like"
@@ -293,7 +297,8 @@ def claim_on_limits(bounded: Number, unbounded: Number) -> Claim:
 
 def claim_on_bound(attained: Sequence[Number], bounds: Sequence[float]) -> Claim:
     """Whether a rate is below the bound by more than chance; it is of a finite time, so that it may
-    be above."""
+    be above.
+    """
     below = sum(100 * b > _upper(n) for n, b in zip(attained, bounds, strict=True))
     each = "; ".join(
         f"{_with_interval(n)} against {100 * b:.1f} %"
@@ -344,7 +349,8 @@ def _with_interval(rate: Number) -> str:
 
 def draw(figure: Figure, outcome: Outcome) -> None:
     """Left: what the conditions allow towards the edge. Right: safety over time with its 95 % band,
-    and the bound that is attained."""
+    and the bound that is attained.
+    """
     left, right = figure.subplots(1, 2)
     _draw_inputs(left, outcome.data)
     _draw_bound(right, outcome.data)

@@ -1,5 +1,6 @@
 """The same episodes under several filters: when each is first unsafe, and by how much two filters
-differ."""
+differ.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """The cubic system under unknown noise (thesis Sec. 5.4.2): what is learned of it, and its safety
-rates."""
+rates.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +33,6 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.guarantee import promise
 
 ENV = "safe_envs/CubicSDE-v0"
 LEVELS = (0.1, 0.15)
@@ -119,7 +119,8 @@ def numbers(found: Levels, filters: Mapping[str, str]) -> list[Number]:
 
 def claims(found: Levels) -> list[Claim]:
     """Checks of ours: the text of the thesis says nothing about the table, and its orders are in
-    the numbers."""
+    the numbers.
+    """
     return [
         *(
             close(found[k], PRINTED["SCBF"][i], PRINTED["DDSCBF"][i], f" at k = {k:g}")
@@ -145,7 +146,8 @@ def _fall(found: Levels, name: str) -> float:
 
 def _falls(sample: Sample) -> str:
     """How far the CBF falls from one level to the other, for several class-K rates and every
-    horizon."""
+    horizon.
+    """
     tried = ALPHAS[:1] if sample.quick else ALPHAS
     swept = [
         measured(ENV, {"noise": k}, [f"cbf:alpha={a}" for a in tried], [], sample) for k in LEVELS
@@ -192,12 +194,12 @@ def _no_bound(sample: Sample) -> list[str]:
     if sample.quick:
         return notes
     found = verify(problem, (SCBF(),), samples=1024)
-    reason = promise(found, np.array([FIXED]), problem.duration)[0].reason
+    reason = found.guarantee.applicable_bounds(np.array([FIXED]), problem.duration)[0].reason
     return [
         *notes,
         (
             f"{reason}; no input in the box meets the condition on"
-            f" {100 * found.safe.infeasible:.0f} % of C within the workspace"
+            f" {100 * found.safe_set.infeasible:.0f} % of C within the workspace"
         ),
     ]
 

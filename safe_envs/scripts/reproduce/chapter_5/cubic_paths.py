@@ -86,7 +86,8 @@ def paths(sample: Sample) -> dict[str, Path]:
 
 def alike(found: Mapping[str, Path]) -> np.ndarray:
     """Episodes that end as those of the thesis' text in all pictures; the CLF alone is to be
-    unsafe, or the CBF changes nothing."""
+    unsafe, or the CBF changes nothing.
+    """
     return np.flatnonzero(
         np.all([found[key].safe == safe for key, safe in _WANTED.items()], axis=0)
     )

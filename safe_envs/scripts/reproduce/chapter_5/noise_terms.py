@@ -1,5 +1,6 @@
 """What the noise adds to the generator of a barrier, learned by Algorithm 2 of the thesis (Figures
-5.1, 5.2)."""
+5.1, 5.2).
+"""
 
 from __future__ import annotations
 
@@ -45,7 +46,8 @@ _NETWORK = "rms error of the network"
 @dataclass(frozen=True)
 class Lesson:
     """What an identification learned: models by estimator, and of a whole lesson the labels at the
-    states x of its data."""
+    states x of its data.
+    """
 
     seed: int
     learned: dict[str, GeneratorModel]
@@ -56,7 +58,8 @@ class Lesson:
 @dataclass(frozen=True)
 class _Errors:
     """How far the networks of several identifications are from the true term, each at states of its
-    own, shape (K, P)."""
+    own, shape (K, P).
+    """
 
     truth: np.ndarray
     estimates: np.ndarray
@@ -69,7 +72,8 @@ class _Errors:
     @property
     def number(self) -> Number:
         """Their mean. The states at which one network is looked at are not independent of each
-        other: only networks are."""
+        other: only networks are.
+        """
         return Number.mean(_NETWORK, self.each, "1/s", least=0.0)
 
 
@@ -78,7 +82,8 @@ def lesson(
     env_id: str, noise: float, points: int, repetitions: int, seed: int, whole: bool
 ) -> Lesson:
     """Follow Algorithm 2 at one noise level, by the repaired and by the printed estimator; `whole`
-    adds all labels."""
+    adds all labels.
+    """
     problem = make_problem(env_id, noise=noise)
     data = collect(problem, points, repetitions, [[0.0]], seed=seed)
     estimators: tuple[Estimator, ...] = ("martingale", "printed")
@@ -207,7 +212,8 @@ def _errors(
 
 def as_derived(said: str, term: np.ndarray, printed: np.ndarray) -> Claim:
     """Whether the printed formula of the term is that which follows from the system and h, at some
-    states."""
+    states.
+    """
     largest = float(np.abs(term - printed).max())
     return Claim(
         f"the analytic term is {said}",
@@ -218,7 +224,8 @@ def as_derived(said: str, term: np.ndarray, printed: np.ndarray) -> Claim:
 
 def learnable(errors: Sequence[float], truth: np.ndarray) -> Claim:
     """Whether networks are nearer to the term than the best constant: then they learned something
-    of its shape."""
+    of its shape.
+    """
     constant = float(np.std(truth))
     found = Number.mean("", errors, least=0.0)
     holds = found.high is not None and found.high < constant
@@ -286,7 +293,8 @@ def root_mean_square(name: str, values: np.ndarray) -> Number:
 
 def draw_learning(figure: Figure, outcome: Outcome) -> None:
     """The learned term over the state that it depends on: by the repaired estimator, and by the
-    printed one."""
+    printed one.
+    """
     data = outcome.data
     panels = list(figure.subplots(1, 2))
     for axes, key in zip(panels, ("repaired", "printed"), strict=True):

@@ -55,7 +55,8 @@ class Runs:
 @dataclass(frozen=True)
 class Difference:
     """Of two rates on the same episodes, in points, with its 95 % interval over identifications and
-    episodes."""
+    episodes.
+    """
 
     mean: float
     low: float
@@ -109,13 +110,15 @@ def safer(sentence: str, first: Runs, second: Runs, *, printed: bool) -> Claim:
 
 def resolution(first: float, second: float) -> float:
     """What separate samples of the printed size can tell apart with 95 %, in points, by the two
-    rates in %."""
+    rates in %.
+    """
     return 196 * math.sqrt(sum(p / 100 * (1 - p / 100) for p in (first, second)) / EPISODES)
 
 
 def close(runs: dict[str, Runs], scbf: float, ddscbf: float, where: str = "") -> Claim:
     """Whether learning costs less than the print could have told apart, by the two printed rates in
-    %: a check of ours."""
+    %: a check of ours.
+    """
     limit, apart = resolution(scbf, ddscbf), difference(runs["ddscbf"], runs["scbf"])
     evidence = (
         f"DDSCBF - SCBF = {apart}, over identifications and episodes; limit {limit:.1f} points,"

@@ -1,5 +1,6 @@
 """Chapter 6, the car behind another one: its Bayesian identification, and how safe a controller is
-that rests on it."""
+that rests on it.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
 """Chapter 6, the cubic system in a disk: the posterior of its noise, and how safe a controller is
-that rests on an identification."""
+that rests on an identification.
+"""
 
 from __future__ import annotations
 
@@ -236,7 +237,7 @@ class _Place:
 def _rates(sample: Sample) -> Outcome:
     world = make_problem(ENV)
     models, found = _Models.learn(world, sample), verify(world, [SCBF()], seed=sample.seed)
-    worst = _Worst(float(found.survey.suprema[0]), float(found.survey.missed[0]))
+    worst = _Worst(float(found.analysis.suprema[0]), float(found.analysis.max_shortfall[0]))
     places = [_Place.run(i, world, models, worst, sample) for i in range(len(PLACES))]
     # A quick sample learns nothing of what is only shown beside the table.
     rough = {

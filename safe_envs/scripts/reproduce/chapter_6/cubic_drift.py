@@ -1,5 +1,6 @@
 """Chapter 6, the drift of the cubic system, identified from K repetitions of each step, beside the
-true one."""
+true one.
+"""
 
 from __future__ import annotations
 
@@ -201,7 +202,8 @@ def _drift_errors(sample: Sample) -> Outcome:
 
 def _beside_the_law(problem: SafetyProblem, x: np.ndarray, chosen: range, followed: Study) -> str:
     """The smallest K, from states all over the disk and from as many on trajectories, beside M
-    sigma^2/(K R dt)."""
+    sigma^2/(K R dt).
+    """
     spread_out = study(problem, x, REPETITIONS[0], chosen, STARTS * STEPS, 1)
     sigma = noise_level(problem, "sigma_1")
     law = (

@@ -1,5 +1,6 @@
 """What the figures and tables of chapter 6 share: Bayesian identifications, their numbers, and the
-posterior of the noise levels."""
+posterior of the noise levels.
+"""
 
 from __future__ import annotations
 
@@ -102,14 +103,16 @@ def noise_level(problem: SafetyProblem, name: str) -> float:
 
 def seeds(sample: Sample, full: int) -> range:
     """Seeds of identifications, others for each seed of the sample; a quick sample has a tenth, and
-    three if there are as many."""
+    three if there are as many.
+    """
     count = max(2, min(full, 3), full // 10) if sample.quick else full
     return range(1000 * sample.seed, 1000 * sample.seed + count)
 
 
 def one_more(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
     """The 95 % prediction interval of one more value, where they are normal: mean +- t s sqrt(1 +
-    1/n)."""
+    1/n).
+    """
     mean = float(np.mean(values))
     half = float(
         stdtrit(len(values) - 1, 0.5 + CONFIDENCE / 2) * np.std(values, ddof=1)
@@ -146,7 +149,8 @@ def noise_levels(
     problem: SafetyProblem, sample: Sample, prior: float, unit: tuple[str, ...]
 ) -> Outcome:
     """Sample the posterior of sigma from the residuals of fresh trajectories, with the identified f
-    and g known."""
+    and g known.
+    """
     first, second, *_ = seeds(sample, 2)
     learned = identified(problem, REPETITIONS[-1], first, prior)
     data = collect(problem, sample.work(NOISE_STARTS), 1, AT_REST, steps=NOISE_STEPS, seed=second)
@@ -181,7 +185,8 @@ def noise_levels(
 
 def gathered(every: Sequence[np.ndarray], true: Sequence[float]) -> Claim:
     """That posteriors are around the true values: together in 95 % of all cases, so that each
-    interval holds a little more."""
+    interval holds a little more.
+    """
     levels = _ends(1 - (1 - CONFIDENCE) / len(every))
     found = [tuple(np.quantile(draws, levels).tolist()) for draws in every]
     content = f"{100 * (levels[1] - levels[0]):g} %"

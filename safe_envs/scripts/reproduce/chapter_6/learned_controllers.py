@@ -1,5 +1,6 @@
 """What the tables of controllers of chapter 6 share: rates under a learned filter, a printed row
-and the SCBF that knows the system."""
+and the SCBF that knows the system.
+"""
 
 from __future__ import annotations
 
@@ -165,7 +166,8 @@ def _under(
     problem: SafetyProblem, text: str, model: LearnedModel, how: dict[str, Any]
 ) -> Evaluation:
     """Evaluate a learned filter; the bare env where the input was identified as without any effect,
-    and there is no filter."""
+    and there is no filter.
+    """
     try:
         return evaluate(problem, filters=[text], learned=[model], **how)
     except RelativeDegreeError:

@@ -1,5 +1,6 @@
 """Chapter 6, Table 6.4: how long it takes to learn the car by DDSCBF's recursion, and by Bayesian
-identification."""
+identification.
+"""
 
 from __future__ import annotations
 

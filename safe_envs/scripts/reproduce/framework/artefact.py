@@ -1,5 +1,6 @@
 """What a table or figure of the thesis is here: what is printed, how ours is computed and drawn,
-and what came out."""
+and what came out.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ class Sample:
 
     def size(self, full: int) -> int:
         """Episodes, or other repetitions that make the answer more certain, where the full work has
-        so many."""
+        so many.
+        """
         return self.episodes or self.work(full)
 
     def work(self, full: int) -> int:

@@ -47,7 +47,8 @@ class _Entry:
     @property
     def checks(self) -> list[tuple[str, list[Claim]]]:
         """Claims of the thesis and checks of ours, with their headings; those of another setting by
-        its name."""
+        its name.
+        """
         claims = [*self.outcome.claims]
         for name, found in self.outcome.elsewhere.items():
             claims += [

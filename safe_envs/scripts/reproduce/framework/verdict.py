@@ -122,7 +122,8 @@ def _says_something(outcome: Outcome) -> bool:
 
 def disagreement(number: Number) -> str | None:
     """Why a printed number and ours may not be the same; None where they may be, or none is
-    printed."""
+    printed.
+    """
     if number.printed is None:
         return None
     text = (
@@ -144,7 +145,8 @@ def disagreement(number: Number) -> str | None:
 
 def printed_orders(numbers: Sequence[Number]) -> list[tuple[Number, Number]]:
     """Pairs of printed numbers of one unit, the larger first, that the printed sample sizes can
-    tell apart."""
+    tell apart.
+    """
     return [(a, b) for a, b in permutations(numbers, 2) if a.unit == b.unit and _is_above(a, b)]
 
 

@@ -17,7 +17,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import Progress
 from safe_envs.wrappers.learning.checks import Purpose, random_stream, require_problem, require_room
 from safe_envs.wrappers.learning.data.transitions import Transitions, numbers
-from safe_envs.wrappers.learning.models.files import Signature
+from safe_envs.wrappers.learning.models.signature import Signature
 
 Step = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]
 """From states (B, n), physical inputs (B, m) held and a generator to the states (B, n) one dt
@@ -306,7 +306,8 @@ def _followed(
     problem: SafetyProblem, successors: np.ndarray, points: int, rng: np.random.Generator
 ) -> np.ndarray:
     """The next states (points, n) of trajectories, from their successors (points * J, n) under each
-    input."""
+    input.
+    """
     reached = successors.reshape(points, -1, successors.shape[-1])
     states = reached[np.arange(points), rng.integers(reached.shape[1], size=points)]
     left = ~_explored(problem, states)

@@ -15,7 +15,7 @@ import sympy as sp
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.models.files import require_finite, require_text
+from safe_envs.wrappers.learning.models.values import require_finite, require_text
 
 _MOST = 300
 """Features; a regression holds the square of some multiple of their number, and their symbols take
@@ -144,7 +144,8 @@ def _angles(problem: SafetyProblem) -> tuple[str, ...]:
 
 def _count(states: int, angles: int, degree: int) -> int:
     """Number of features: monomials in as many coordinates as there are states, each times some of
-    the sines."""
+    the sines.
+    """
     return sum(
         math.comb(angles, k) * math.comb(states + degree - k, states)
         for k in range(min(angles, degree) + 1)
