@@ -83,7 +83,7 @@ def _chain() -> Figure:
             Line2D([], [], color="black", label="h = 0"),
             Line2D([], [], color=COLORS[0], label="b₁ = 0"),
             Patch(color=UNSAFE, alpha=0.35, label="unsafe"),
-            Patch(color=COLORS[4], alpha=0.45, label="C₀ ∩ C₁, invariant"),
+            Patch(color=COLORS[4], alpha=0.45, label="C₀ ∩ C₁"),
             Patch(color=COLORS[3], alpha=0.8, label="infeasible within the input bounds"),
         ],
         loc="outside lower center",
@@ -93,7 +93,7 @@ def _chain() -> Figure:
 
 
 def _title(name: str, infeasible: int, total: int) -> str:
-    return f"{name}: infeasible in {100 * infeasible / total:.0f} % of it"
+    return f"{name}: infeasible in {100 * infeasible / total:.0f} % of C₀ ∩ C₁"
 
 
 def _chain_values(
@@ -174,15 +174,15 @@ def _bounds() -> Figure:
     figure = Figure(figsize=(7.5, 4.2))
     axes = figure.subplots()
     for row, color in zip(evaluation.rows, ("#D55E00", COLORS[0]), strict=True):
-        curve = row["curve"]
+        curve = row.curve
         axes.fill_between(
-            curve["time"], curve["ci_low"], curve["ci_high"], color=color, alpha=0.25, linewidth=0
+            curve.time, curve.ci_low, curve.ci_high, color=color, alpha=0.25, linewidth=0
         )
         axes.plot(
-            curve["time"],
-            curve["rate"],
+            curve.time,
+            curve.rate,
             color=color,
-            label=f"{row['filter']}: measured, {_EPISODES} episodes, with its 95 % band",
+            label=f"{row.filter}: measured, {_EPISODES} episodes, with its 95 % band",
         )
     times = np.linspace(0.0, problem.horizon, 41)
     at_times = zip(

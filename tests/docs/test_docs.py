@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 import nbformat
@@ -180,6 +181,17 @@ def test_everything_public_is_in_the_reference(package: Any):
         module = getattr(getattr(package, name), "__module__", "")
         places = {f"{package.__name__}.{name}", f"{module}.{name}", module}
         assert places & shown or f"`{package.__name__}.{name}`" in written, name
+
+
+def test_references_exist():
+    missing = []
+    for page in sorted((DOCS / "reference").glob("*.md")):
+        for path in re.findall(r"^::: (\S+)$", page.read_text(), re.MULTILINE):
+            try:
+                resolve_name(path)
+            except (ImportError, AttributeError):
+                missing.append(f"{name_of(page)}: {path}")
+    assert not missing
 
 
 def test_what_an_example_prints_follows_it(hook: Any):
