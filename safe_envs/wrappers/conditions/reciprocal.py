@@ -11,8 +11,10 @@ from safe_envs.dynamics.lie import quadratic_variation_rate, relative_degree
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import AffineConstraint, Condition, resolved
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.chain import resolved
 from safe_envs.wrappers.conditions.class_k import positive_rates
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 _H = sp.Symbol("h", positive=True)
 _FORMS = {"inverse": 1 / _H, "log": -sp.log(_H / (1 + _H))}

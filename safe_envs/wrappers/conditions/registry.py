@@ -9,13 +9,9 @@ from safe_envs import plugins
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
 from safe_envs.object_import import load_object, place_of
 from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
 from safe_envs.wrappers.conditions.cbf import CBF, ECBF, HOCBF
-from safe_envs.wrappers.conditions.learned import (
-    DDSCBF,
-    BayesianSCBF,
-    LearnedCondition,
-    LearnedHOCBF,
-)
+from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
 from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
 from safe_envs.wrappers.conditions.stochastic import SCBF, SZCBF
 

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from safe_envs.dynamics.lie import generator
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import AffineConstraint, Condition, chain_of
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.chain import chain_of
 from safe_envs.wrappers.conditions.class_k import positive_rates
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 
 @dataclass(frozen=True)
