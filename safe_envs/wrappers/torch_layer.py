@@ -23,7 +23,7 @@ from safe_envs.dynamics.codegen import in_plain_names
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
-from safe_envs.wrappers.filter_qp import Program
+from safe_envs.wrappers.filter_qp import FilterQP
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
 _RANK = 1e-9
@@ -79,14 +79,14 @@ class TorchFilter(torch.nn.Module):
 
     def __init__(self, safety_filter: SafetyFilter) -> None:
         super().__init__()
-        # The filter keeps its program to its solvers, which share it.
-        program = safety_filter.program
-        _require_plain(safety_filter, program)
+        # The filter keeps its qp to its solvers, which share it.
+        qp = safety_filter.qp
+        _require_plain(safety_filter, qp)
         self.safety_filter = safety_filter
-        self._low, self._high = np.array(program.low), np.array(program.high)
-        self._roots = np.sqrt(program.weights)
-        self._priorities = np.array(program.priorities)
-        self._rows = _compiled_rows(program)
+        self._low, self._high = np.array(qp.low), np.array(qp.high)
+        self._roots = np.sqrt(qp.weights)
+        self._priorities = np.array(qp.priorities)
+        self._rows = _compiled_rows(qp)
 
     @classmethod
     def for_problem(
@@ -295,8 +295,8 @@ def _nearest(
     )
 
 
-def _require_plain(safety_filter: SafetyFilter, program: Program) -> None:
-    if program.clf is not None:
+def _require_plain(safety_filter: SafetyFilter, qp: FilterQP) -> None:
+    if qp.clf is not None:
         raise ConfigurationError(
             "a filter with a clf does not depend on the proposed input; use objective = 'nearest'"
             " for a torch layer"
@@ -309,9 +309,7 @@ def _require_plain(safety_filter: SafetyFilter, program: Program) -> None:
         ),
         "terms": "holds a network; use a condition of a model, or a learned one with formulas",
     }
-    for (barrier, condition), constraint in zip(
-        safety_filter.rows, program.constraints, strict=True
-    ):
+    for (barrier, condition), constraint in zip(safety_filter.pairs, qp.constraints, strict=True):
         for attribute, reason in reasons.items():
             if getattr(constraint, attribute) is not None:
                 raise ConfigurationError(
@@ -361,12 +359,10 @@ _FUNCTIONS: dict[str, Any] = {
 }
 
 
-def _compiled_rows(program: Program) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
+def _compiled_rows(qp: FilterQP) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
     """From states (B, n) to the rows' a (B, k, m) and b (B, k)."""
-    model, k = program.model, len(program.constraints)
-    expressions = [
-        model.numeric(e) for c in program.constraints for e in (*c.coefficient, c.offset)
-    ]
+    model, k = qp.model, len(qp.constraints)
+    expressions = [model.numeric(e) for c in qp.constraints for e in (*c.coefficient, c.offset)]
     unknown = {
         f.func
         for e in expressions

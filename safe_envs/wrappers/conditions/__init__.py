@@ -9,6 +9,7 @@ from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, Lear
 from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
 from safe_envs.wrappers.conditions.registry import CONDITIONS, LEARNED, condition_names
 from safe_envs.wrappers.conditions.spec_text import (
+    conditions_for,
     parse_condition,
     parse_conditions,
     require_readable,
@@ -41,6 +42,7 @@ __all__ = [
     "LearnedCondition",
     "LearnedHOCBF",
     "condition_names",
+    "conditions_for",
     "files_of",
     "head_pattern",
     "learned_parts",

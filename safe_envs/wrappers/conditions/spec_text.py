@@ -52,6 +52,35 @@ def parse_conditions(
     )
 
 
+def conditions_for(
+    problem: SafetyProblem, given: Condition | Sequence[Condition] | str
+) -> tuple[Condition, ...]:
+    """Return a condition for every barrier of a problem.
+
+    Args:
+        problem: problem whose barriers and gains are taken.
+        given: one for all barriers, one for each, or their text.
+
+    Raises:
+        ConfigurationError: Their number is wrong, or one is none or does not fit the problem.
+    """
+    count = len(problem.barriers)
+    read = parse_conditions(given, problem) if isinstance(given, str) else given
+    each = (read,) * count if isinstance(read, Condition) else read
+    if not isinstance(each, Sequence) or not all(isinstance(c, Condition) for c in each):
+        raise ConfigurationError(
+            f"condition = {given!r}; give a Condition, one for each barrier, or their text, like"
+            " 'scbf'"
+        )
+    if len(each) != count:
+        raise ConfigurationError(
+            f"{len(each)} conditions for the {count} barriers of {problem.name}; give one for each"
+        )
+    for condition in each:
+        condition.require_fit(problem)
+    return tuple(each)
+
+
 def require_readable(text: str, problem: SafetyProblem) -> None:
     """Raise ConfigurationError where `parse_conditions` would, without reading learned models.
 

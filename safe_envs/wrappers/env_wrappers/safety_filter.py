@@ -208,7 +208,7 @@ def build_filter(
 ) -> tuple[str, SafetyFilter]:
     """Return the filter of one or several conditions for a problem, and the text that names them."""
     safety_filter = SafetyFilter.for_problem(problem, condition, knowledge, objective, priorities)
-    return spec_of([condition for _, condition in safety_filter.rows]), safety_filter
+    return spec_of([condition for _, condition in safety_filter.pairs]), safety_filter
 
 
 def resting_action(problem: SafetyProblem) -> np.ndarray:

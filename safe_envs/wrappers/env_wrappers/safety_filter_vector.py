@@ -22,7 +22,7 @@ from safe_envs.wrappers.env_wrappers.safety_filter import (
     rounding,
     unreadable,
 )
-from safe_envs.wrappers.safety_filter import Decision
+from safe_envs.wrappers.filter_qp import FilterDecision
 
 
 class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
@@ -136,7 +136,7 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         info.update(with_masks(added, info["_cost"]))
         return observation, reward, terminated, truncated, info
 
-    def _decided(self, decision: Decision, active: np.ndarray) -> Info:
+    def _decided(self, decision: FilterDecision, active: np.ndarray) -> Info:
         """Count, and report what was decided."""
         nominal = decision.proposed
         differs = decision.action[0] != nominal[0]

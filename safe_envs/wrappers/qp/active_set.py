@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.qp.bounded_least_squares import least_violating
-from safe_envs.wrappers.qp.rows import tolerances
+from safe_envs.wrappers.qp.rounding import tolerances
 
 _STEPS = 20
 """Steps for each row and input: many times more than were ever seen."""

@@ -7,7 +7,7 @@ minimises sum_i priority_i slack_i^2 with slack_i = max(0, -(a_i . u + b_i)), an
 minimisers it is the one nearest to v. One row, one input and two inputs have exact methods of their
 own, and so has a single row that binds; the rest goes to ProxQP, which is imported on first use.
 Rows can be met where the action that is returned meets them by the tolerance of
-`safe_envs.wrappers.qp.rows`.
+`safe_envs.wrappers.qp.rounding`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp import interval, one_row, plane, plane_batch, single_active_row
-from safe_envs.wrappers.qp.rows import stack
+from safe_envs.wrappers.qp import (
+    interval,
+    one_constraint,
+    plane,
+    plane_batch,
+    single_active_constraint,
+)
+from safe_envs.wrappers.qp.rounding import stack
 
 
 def project_floats(
@@ -46,7 +52,7 @@ def project_floats(
         clipped proposal meets them all), and whether all rows can be met.
     """
     if len(b) == 1:
-        u, margin, active, feasible = one_row.project_floats(a[0], b[0], v, low, high, w)
+        u, margin, active, feasible = one_constraint.project_floats(a[0], b[0], v, low, high, w)
         return u, [margin], [active], feasible
     if len(v) == 2:
         return plane.project_floats(a, b, v, low, high, w, priority)
@@ -85,7 +91,7 @@ def project_arrays(
         As `project_floats`, with an array (B,) for every number.
     """
     if len(b) == 1:
-        u, margin, active, feasible = one_row.project_arrays(a[0], b[0], v, low, high, w)
+        u, margin, active, feasible = one_constraint.project_arrays(a[0], b[0], v, low, high, w)
         return u, [margin], [active], feasible
     if len(v) == 1:
         u, margin, active, feasible = interval.project_arrays(
@@ -114,7 +120,7 @@ def _solver(
     flat = np.array([(row == 0.0).all(axis=0) for row in rows])
     unmet = flat & (offsets < 0.0)
     solvable = np.where(unmet, 0.0, offsets)
-    (u, margin, active, feasible), left = single_active_row.project_arrays(
+    (u, margin, active, feasible), left = single_active_constraint.project_arrays(
         rows, solvable, proposed, lower, upper, w
     )
     if left.size:

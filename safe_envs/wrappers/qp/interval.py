@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp.rows import ROUNDING, stack, tolerance, tolerances, total
+from safe_envs.wrappers.qp.rounding import ROUNDING, stack, tolerance, tolerances, total
 
 
 def project_floats(

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.qp import bounded_least_squares, interval
-from safe_envs.wrappers.qp.rows import ROUNDING, total
+from safe_envs.wrappers.qp.rounding import ROUNDING, total
 
 _STEPS = 20
 _FAR = 1e150

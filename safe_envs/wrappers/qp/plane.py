@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from safe_envs.wrappers.qp import plane_batch
-from safe_envs.wrappers.qp.rows import ROUNDING, tolerance
+from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance
 
 Row = tuple[float, float, float]
 """(a_1, a_2, b) of a row a . u + b >= 0; on a line, the second and first input are the pivot and

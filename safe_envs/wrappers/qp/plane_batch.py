@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.qp.min_slack import is_unique, least_violating
-from safe_envs.wrappers.qp.rows import ROUNDING, stack, tolerances
+from safe_envs.wrappers.qp.rounding import ROUNDING, stack, tolerances
 
 
 class Plane(NamedTuple):

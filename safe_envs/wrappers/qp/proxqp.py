@@ -19,7 +19,7 @@ import numpy as np
 from proxsuite import proxqp  # pyright: ignore[reportMissingImports]
 
 from safe_envs.wrappers.qp import active_set
-from safe_envs.wrappers.qp.rows import ROUNDING, tolerances, total
+from safe_envs.wrappers.qp.rounding import ROUNDING, tolerances, total
 
 _PRECISION = {
     "eps_abs": 1e-9,

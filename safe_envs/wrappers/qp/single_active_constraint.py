@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp.one_row import project_arrays as project_onto_row
-from safe_envs.wrappers.qp.rows import ROUNDING, stack, total
+from safe_envs.wrappers.qp.one_constraint import project_arrays as project_onto_row
+from safe_envs.wrappers.qp.rounding import ROUNDING, stack, total
 
 Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 

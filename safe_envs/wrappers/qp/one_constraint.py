@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp.rows import ROUNDING, tolerance, tolerances
+from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance, tolerances
 
 _EXCESS = 1e3
 """A row that holds with so many times its rounding to spare is not on the nearest action: the
