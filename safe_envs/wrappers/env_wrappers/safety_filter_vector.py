@@ -12,20 +12,17 @@ from gymnasium.vector import AutoresetMode
 from safe_envs.envs.info import Info, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv, VectorStep
 from safe_envs.wrappers.conditions import Condition
-from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
-from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
-from safe_envs.wrappers.env_wrappers.safety_filter import (
-    build_filter,
-    changed_action,
-    require_foreign,
+from safe_envs.wrappers.env_wrappers.layers import (
+    FilterLayer,
     rest_info,
-    rounding,
-    unreadable,
+    state_layer,
+    third_party_spec,
 )
+from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
 from safe_envs.wrappers.filter_qp import FilterDecision
 
 
-class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
+class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     """`SafetyFilterWrapper` for the whole batch at once; same arguments, same info with the batch
     in front.
 
@@ -48,17 +45,11 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         **view: Any,
     ) -> None:
         if view:
-            require_foreign(env.unwrapped, SafeVectorEnv, view, knowledge)
-            env = SafetyMonitorVector(env, FilterSpec.of(view))
+            spec = third_party_spec(env.unwrapped, SafeVectorEnv, view, knowledge)
+            env = SafetyMonitorVector(env, spec)
         inner = readable(env)
-        text, self.safety_filter = build_filter(
-            inner.problem, condition, knowledge, objective, priorities
-        )
-        super().__init__(env)
-        self._inner: Any = inner
-        if inner.viewer is not None:
-            inner.viewer.caption = text
-        self._tolerance = rounding(inner.problem)
+        self.attach(inner, condition, knowledge, objective, priorities)
+        gym.vector.VectorWrapper.__init__(self, env)
         self._rest = rest_info(inner.problem)
         self._mode = env.metadata["autoreset_mode"]
         self._interventions = np.zeros(self.num_envs, dtype=np.int64)
@@ -121,7 +112,7 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
                 decision.action, self._inner.executed, self._tolerance, strict=True
             ):
                 if not np.allclose(u, v, rtol=0.0, atol=tolerance):
-                    raise changed_action(self, decision.action, self._inner.executed)
+                    raise self.changed_action(decision.action)
         added = self._decided(decision, active)
         ended = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
@@ -181,14 +172,7 @@ def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
     Raises:
         ConfigurationError: there is none.
     """
-    layer = env
-    while isinstance(layer, gym.vector.VectorWrapper) and not isinstance(
-        layer, SafetyMonitorVector
-    ):
-        layer = layer.env
-    if not isinstance(layer, SafeVectorEnv | SafetyMonitorVector):
-        raise unreadable(layer, vector=True)
-    return layer
+    return state_layer(env, (SafeVectorEnv, SafetyMonitorVector), vector=True)
 
 
 def _beside(components: Sequence[np.ndarray]) -> np.ndarray:
