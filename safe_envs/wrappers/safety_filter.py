@@ -46,9 +46,10 @@ class SafetyFilter(ComponentFilter):
     answers are right to rounding for coefficients up to a million apart.
 
     With a control Lyapunov function the filter solves its joint QP instead: min w_u |u|^2 + w_d d^2
-    subject to AV + rate V <= d, the constraints and the input bounds (thesis Sec. 4.3.1, 5.4.2). The
-    filter then pursues the goal by itself, whatever is proposed; the action that is best without
-    constraints takes the place of the proposed one. A slack of a barrier is dearer than any d.
+    subject to AV + rate V <= d, the constraints and the input bounds (thesis Sec. 4.3.1, 5.4.2).
+    Then the filter pursues the goal by itself, whatever is proposed; the action that is best
+    without constraints takes the place of the proposed one. A slack of a barrier is dearer than
+    any d.
 
     Args:
         model: system that the filter knows.

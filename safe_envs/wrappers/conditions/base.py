@@ -1,5 +1,4 @@
-"""What a condition is: the rule that turns a system and a barrier into an affine constraint on the
-input."""
+"""Base of the conditions, which turn a system and a barrier into a constraint on the input."""
 
 from __future__ import annotations
 
@@ -123,8 +122,7 @@ class Condition(ABC):
             ) from error
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
-        """The system that the condition differentiates along: the model, unless it has learned
-        another."""
+        """Return the system that the condition differentiates along: the model, or a learned one."""
         return model
 
     @abstractmethod
@@ -133,7 +131,7 @@ class Condition(ABC):
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> Condition:
-        """Return the condition with the rates p_1..p_r of a problem; its defaults if it has none."""
+        """Return the condition with the rates p_1..p_r of a problem, where it has any."""
         return cls()
 
     @property
@@ -152,8 +150,11 @@ class Condition(ABC):
         return None
 
     def chain_rates(self, degree: int) -> tuple[float, ...] | None:
-        """alpha_1..alpha_r of the chain b_j = D b_(j-1) + alpha_j b_(j-1); None where it is not of
-        this form."""
+        """Return alpha_1..alpha_r of the chain b_j = D b_(j-1) + alpha_j b_(j-1).
+
+        Returns:
+            Rates in 1/s; None for another form.
+        """
         return None
 
     @property
@@ -167,8 +168,7 @@ class Condition(ABC):
 def _constraint(
     condition: Condition, model: ControlAffineSDE, barrier: Barrier
 ) -> AffineConstraint:
-    """Remembered, for the bounds of a filter need the rows that it has, and derivatives of long
-    expressions take their time."""
+    """Derive a constraint; remembered, since derivatives of long expressions take their time."""
     model = condition.believed(model)
     found = condition.derived(model, barrier)
     # The generator differentiates twice each time; only the last derivative may jump.

@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BayesianSCBF(LearnedCondition):
-    """A^r h >= 0 for the identified system: for its most probable one, or for those that the data
-    leave possible.
+    """A^r h >= 0 for the identified system.
+
+    This is the most probable system, or each of those that the data leave possible.
 
     With theta Gaussian, A h = a + b u has a mean and a variance v(x, u), and the robust form asks
     for mean - z sqrt(v) >= 0. With `confidence` z is the quantile of Student's distribution, for
@@ -81,7 +82,7 @@ class BayesianSCBF(LearnedCondition):
         return self.confidence is not None or self.simultaneous is not None
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
-        """The identified system."""
+        """Return the identified system."""
         return self.learned.system
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
@@ -164,8 +165,10 @@ class BayesianSCBF(LearnedCondition):
         return 1.0 - (self.simultaneous or 0.0) - self.delta_theta
 
     def _least_ito_term(self, system: ControlAffineSDE, barrier: Barrier) -> sp.Expr:
-        """1/2 tr(sigma sigma' h_xx), for the simultaneous form the least that the intervals of the
-        sigma_i allow."""
+        """Return 1/2 tr(sigma sigma' h_xx).
+
+        For the simultaneous form it is the smallest that the intervals of the sigma_i allow.
+        """
         if self.simultaneous is None:
             return ito_correction(system, barrier.expression)
         curvatures = [sp.diff(barrier.expression, s, 2) / 2 for s in system.states]

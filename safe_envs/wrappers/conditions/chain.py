@@ -1,4 +1,4 @@
-"""Chains of functions b_0 = h, b_1, ... by which conditions treat barriers of any relative degree."""
+"""Chains b_0 = h, b_1, ... by which conditions treat barriers of any relative degree."""
 
 from __future__ import annotations
 
@@ -51,8 +51,9 @@ def chain_of(
 
 
 def resolved(expression: Any, barrier: Barrier) -> sp.Expr:
-    """A derivative of a chain without what sympy adds at the kinks of class-K functions like s |s|,
-    where it has no weight.
+    """Return a derivative of a chain without what sympy adds at kinks of class-K functions.
+
+    At the kink of s |s| and the like, that has no weight.
 
     Raises:
         SystemDefinitionError: the kink is the barrier's own: there the chain would jump, and Ito's

@@ -1,5 +1,4 @@
-"""Class-K functions as text: arithmetic of s, read without running code and within bounds on time
-and memory."""
+"""Class-K functions as text: arithmetic of s, read without running code, in bounded time."""
 
 from __future__ import annotations
 
@@ -77,8 +76,10 @@ def parsed(text: str) -> Any:
 
 
 def _require_few_parts(tree: ast.expr) -> None:
-    """Raise ConfigurationError for more than a person writes; without recursion, for the tree may
-    be as deep as it is large."""
+    """Raise ConfigurationError for an expression larger than a person writes.
+
+    It does not recurse, since the tree may be as deep as it is large.
+    """
     parts, functions, left = 0, 0, [(tree, 0)]
     while left:
         node, depth = left.pop()
@@ -139,8 +140,7 @@ def _number(text: str) -> int | float:
 
 
 def _small(expression: Any, node: ast.expr) -> Any:
-    """An expression, all numbers in which are known to be small: the next operation on it takes no
-    time either.
+    """Return an expression whose numbers are small, so that the next operation takes no time.
 
     Raises:
         ConfigurationError: one is not.

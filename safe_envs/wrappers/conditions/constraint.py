@@ -14,8 +14,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 
 
 class Terms(Protocol):
-    """Numbers that a row takes from something learned: they stand in its expressions as symbols of
-    their own."""
+    """Numbers of a learned model in a constraint, whose expressions hold symbols for them."""
 
     @property
     def symbols(self) -> tuple[sp.Symbol, ...]:
@@ -23,17 +22,17 @@ class Terms(Protocol):
         ...
 
     def floats(self, x: Sequence[float]) -> Sequence[float]:
-        """The values at one state, given by components."""
+        """Return the values at one state, given by components."""
         ...
 
     def arrays(self, x: Components) -> Components:
-        """The values at a batch of states, components of shape (B,) in and out."""
+        """Return the values at a batch of states, components of shape (B,) in and out."""
         ...
 
 
 @dataclass(frozen=True)
 class AffineConstraint:
-    """The row a(x) u + b(x) >= 0 that a condition asks for.
+    """The constraint a(x) u + b(x) >= 0 that a condition asks for.
 
     Attributes:
         coefficient: a, an expression for each input.
@@ -66,7 +65,14 @@ class AffineConstraint:
         offset: sp.Expr,
         demand: sp.Expr | None = None,
     ) -> AffineConstraint:
-        """The constraint L_g b_(r-1) u + offset >= 0, or >= demand, at the end of a chain."""
+        """Return the constraint L_g b_(r-1) u + offset >= 0, or >= demand, at the end of a chain.
+
+        Args:
+            model: system that the chain was derived for.
+            chain: b_0, ..., b_(r-1).
+            offset: part of b_r without the input.
+            demand: see the class.
+        """
         a = lie_derivative_g(model, chain[-1])
         return cls(
             tuple(tidied(a[0, j]) for j in range(model.m)), tidied(offset), tuple(chain), demand

@@ -1,4 +1,4 @@
-"""Conditions that rest on something learned: LearnedHOCBF, DDSCBF, BayesianSCBF."""
+"""Conditions that need a learned model: LearnedHOCBF, DDSCBF."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class LearnedCondition(Condition):
-    """A condition of something learned.
+    """A condition that needs a learned model.
 
     Attributes:
         learned: what it rests on.
@@ -46,8 +46,7 @@ class LearnedCondition(Condition):
     corrects_model = True
 
     def require_fit(self, problem: SafetyProblem) -> None:
-        """Raise ConfigurationError where what it rests on was learned by another method, or of
-        another problem."""
+        """Raise ConfigurationError for a model of another method or another problem."""
         method = getattr(self.learned, "method", None)
         if method != self.method:
             raise ConfigurationError(
@@ -60,7 +59,7 @@ class LearnedCondition(Condition):
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> Condition:
-        """There is none without something learned; see `from_learned`."""
+        """Raise ConfigurationError: the condition needs a learned model; see `from_learned`."""
         raise ConfigurationError(
             f"{cls.name} rests on something learned: {cls.name}:file=FILE, with a file of"
             " `safe-envs identify`"
@@ -93,7 +92,7 @@ class LearnedCondition(Condition):
         }
 
     def _number_of(self, model: ControlAffineSDE, barrier: Barrier) -> int:
-        """Which of the barriers that were learned a barrier is."""
+        """Return which of the learned barriers a barrier is."""
         expression = str(model.numeric(barrier.expression))
         if expression not in self.learned.signature.barriers:
             known = ", ".join(self.learned.signature.barriers)
@@ -129,8 +128,7 @@ def require_share(name: str, value: Any) -> None:
 
 @dataclass(frozen=True)
 class LearnedHOCBF(LearnedCondition):
-    """The HOCBF with the derivatives of h corrected by learned residuals, and a margin for what
-    they miss.
+    """The HOCBF with learned residuals in the derivatives of h, and a margin for their errors.
 
         h^(r) + k_(r-1) h^(r-1) + ... + k_0 h >= e_r + sum_i k_i e_i + e_u |u|
 
@@ -167,7 +165,7 @@ class LearnedHOCBF(LearnedCondition):
     def from_learned(
         cls, learned: ResidualModel, gains: Sequence[float], **settings: Any
     ) -> LearnedHOCBF:
-        """The condition with all rates of a problem, unless others are given."""
+        """Return the condition with all rates of a problem, unless others are given."""
         return cls(learned, **{"p": tuple(gains), **settings})
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
@@ -232,7 +230,7 @@ class DDSCBF(LearnedCondition):
         _at_least_zero("margin", self.margin)
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
-        """The model with the learned diffusion, where that is what was learned."""
+        """Return the model, with the learned diffusion where that was learned."""
         return model if self.learned.diffusion is None else self.learned.diffusion.system(model)
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:

@@ -1,5 +1,4 @@
-"""Reciprocal conditions, whose barrier function B grows without bound towards the edge: RCBF,
-SRCBF."""
+"""Reciprocal conditions, whose barrier function B is unbounded at the edge: RCBF, SRCBF."""
 
 from __future__ import annotations
 
@@ -22,7 +21,7 @@ _FORMS = {"inverse": 1 / _H, "log": -sp.log(_H / (1 + _H))}
 
 @dataclass(frozen=True)
 class _Reciprocal(Condition):
-    """A B <= gamma / B for B = beta(h), as a row on h.
+    """A B <= gamma / B for B = beta(h), as a constraint on the rate of h.
 
     With A B = beta' A h + beta''/2 |sigma' grad h|^2 and beta' < 0, dividing by beta' gives
 

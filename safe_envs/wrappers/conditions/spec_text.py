@@ -1,6 +1,6 @@
 """Conditions as text: `hocbf:p=2,8`, or `hocbf:p=2,8+cbf:alpha=1` for two barriers.
 
-A condition of a user's file is `FILE.py:NAME`, of a module `MODULE:NAME`, and its parameters follow:
+A condition of a user's file is `FILE.py:NAME`, of a module `MODULE:NAME`; parameters follow, as in
 `my_filter.py:Eager:gain=2`.
 """
 

@@ -1,5 +1,4 @@
-"""Conditions that know the noise, with the Ito generator A in place of the Lie derivative: SCBF,
-SZCBF."""
+"""Conditions with the Ito generator A in place of the Lie derivative: SCBF, SZCBF."""
 
 from __future__ import annotations
 
@@ -34,7 +33,7 @@ class SCBF(Condition):
         return AffineConstraint.after(model, *chain_of(model, barrier, None, generator))
 
     def chain_rates(self, degree: int) -> tuple[float, ...]:
-        """Zeros; see `Condition.chain_rates`."""
+        """Return zeros; see `Condition.chain_rates`."""
         return (0.0,) * degree
 
 
@@ -66,9 +65,9 @@ class SZCBF(Condition):
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> SZCBF:
-        """The SZCBF with all rates."""
+        """Return the SZCBF with all rates."""
         return cls(tuple(gains))
 
     def chain_rates(self, degree: int) -> tuple[float, ...]:
-        """The rates; see `Condition.chain_rates`."""
+        """Return the rates; see `Condition.chain_rates`."""
         return self.alphas

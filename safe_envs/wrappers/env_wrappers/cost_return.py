@@ -92,8 +92,7 @@ class CostReturnWrapper:
         )
 
     def _costs(self, info: dict[str, Any]) -> np.ndarray:
-        """The cost of the step of each env, shape (num_envs,), where the info may be that of a
-        reset."""
+        """Return the cost of each env, shape (num_envs,), where the info may be that of a reset."""
         cost = info["cost"]
         if self._mode == AutoresetMode.SAME_STEP and "final_info" in info:
             last = info["final_info"]

@@ -75,15 +75,13 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
     @property
     def components(self) -> Components:
-        """The states that the last observations show, an array (num_envs,) for each of the model's
-        states."""
+        """States that the last observations show, an array (num_envs,) for each component."""
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
         return self._x
 
     def physical_action(self, actions: Any) -> Components:
-        """Components of the model's inputs for actions (num_envs, m); what lies beyond the action
-        space is clipped.
+        """Return the components of the model's inputs for actions (num_envs, m), which are clipped.
 
         Raises:
             InvalidInputError: the actions have another shape or are not finite.
@@ -97,8 +95,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         return _columns(self._spec.inputs(np.clip(given, self._low, self._high)))
 
     def normalized_action(self, u: Sequence[Any]) -> np.ndarray:
-        """Inverse of `physical_action`: the envs' actions for components of inputs, in the numbers
-        of the action space."""
+        """Return the envs' actions for components of inputs; the inverse of `physical_action`."""
         return np.clip(self._spec.actions(np.stack(u, axis=-1)), self._low, self._high).astype(
             self._kind
         )
@@ -153,8 +150,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         return self.step(self.normalized_action(u))
 
     def render(self) -> Any:
-        """The envs' own pictures, in the mode "rgb_array" with what the filter does and the barrier
-        beside each.
+        """Return the envs' pictures, in the mode "rgb_array" next to filter and barrier.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.
@@ -167,8 +163,10 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         )
 
     def _of_same_step(self, observation: np.ndarray, ended: np.ndarray, info: Info) -> Info:
-        """What is shown after a step that restarted the envs that ended: their last step goes to
-        `final_info`."""
+        """Return what is shown after a step that restarted the envs that ended.
+
+        Their last step goes to `final_info`.
+        """
         if not ended.any():
             return self._seen(observation, self._everywhere)
         last = np.array(observation)
@@ -201,8 +199,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
 
 def _one_of(env: gym.vector.VectorEnv) -> Any:
-    """One of the envs of a batch where they are at hand, as in SyncVectorEnv; the batch itself
-    elsewhere."""
+    """Return one of the envs of a batch where they are at hand, else the batch itself."""
     envs = getattr(env.unwrapped, "envs", None)
     return envs[0].unwrapped if envs else env.unwrapped
 

@@ -127,8 +127,10 @@ class SafetyFilterWrapper(
 
 
 def _only_checks_between(env: gym.Env[Any, Any], inner: SafeEnv | SafetyMonitor) -> bool:
-    """Whether no wrapper between the filter and the env could change a step, so that its input need
-    not be encoded."""
+    """Return whether no wrapper between the filter and the env can change a step.
+
+    Then its input need not be encoded.
+    """
     while isinstance(env, (OrderEnforcing, PassiveEnvChecker)):
         env = env.env
     return env is inner

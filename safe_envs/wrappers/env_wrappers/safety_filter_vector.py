@@ -23,8 +23,7 @@ from safe_envs.wrappers.filter_qp import FilterDecision
 
 
 class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
-    """`SafetyFilterWrapper` for the whole batch at once; same arguments, same info with the batch
-    in front.
+    """`SafetyFilterWrapper` for a batch: same arguments, same info with the batch in front.
 
     A step that only resets an env (next-step autoreset) ignores its action: there the filter
     reports what it reports at reset, and counts nothing.
@@ -70,7 +69,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         return observation, {**info, **with_masks(at_rest, present)}
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """That of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
+        """Return that of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
         counts = {
             "interventions": self._interventions.copy(),
             "infeasible": self._infeasible.copy(),
@@ -80,7 +79,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def restore(
         self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None
     ) -> None:
-        """Put each episode where a snapshot of a filtered env has it; see `SafeVectorEnv.restore`."""
+        """Put each episode where a snapshot has it; see `SafeVectorEnv.restore`."""
         self._inner.restore(snapshot, seed)
         self._interventions, self._infeasible = (
             np.array(snapshot[name]) for name in ("interventions", "infeasible")
@@ -152,8 +151,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         )
 
     def _start_anew(self, added: Info, envs: np.ndarray) -> None:
-        """Put what is reported at reset in place of a decision, for the envs that were reset in
-        this step."""
+        """Put what is reported at reset in place of a decision, for the envs that were reset."""
         self._forget(envs)
         for key, value in self._rest.items():
             # The env itself may hold the array of a single input.
@@ -167,7 +165,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
 
 
 def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
-    """The layer of a vector env from which a filter reads the states.
+    """Return the layer of a vector env from which a filter reads the states.
 
     Raises:
         ConfigurationError: there is none.

@@ -58,7 +58,7 @@ class CompiledQP:
             self._weights = [input_weight] * self._m
 
     def _with_terms(self, x: Sequence[Any]) -> Sequence[Any]:
-        """The state, and after it what the learned terms are there."""
+        """Return the state, followed by the learned terms there."""
         return (
             (*x, *[value for term in self._terms for value in term(tuple(x))]) if self._terms else x
         )
@@ -76,8 +76,12 @@ class CompiledQP:
     def _split(
         self, values: Components
     ) -> tuple[list[Any], list[Any], Sequence[Any], Sequence[Any], dict[int, Components]]:
-        """The rows' a and b, the goal's offset and coefficients, h of reciprocal conditions less
-        its rounding, Q of uncertain rows."""
+        """Take values apart.
+
+        Returns:
+            a and b of each constraint, the goal's offset and coefficients, h of reciprocal
+            conditions less its rounding, and Q of uncertain constraints.
+        """
         width, count, entries = self._m + 1, self._count, (self._m + 1) * (self._m + 2) // 2
         rows = [values[i * width : (i + 1) * width] for i in range(count)]
         forms_at = len(values) - entries * len(self._uncertain)
@@ -90,12 +94,11 @@ class CompiledQP:
         return [row[:-1] for row in rows], [row[-1] for row in rows], goal, h, forms
 
     def _demand(self, i: int, x: Sequence[Any], inside: Any) -> Any:
-        """What a reciprocal row asks for, where it means something; plain floats have no 1/h or
-        logarithm elsewhere."""
+        """Return what a reciprocal condition demands; floats have no 1/h outside its domain."""
         return 0.0 if inside is False else self._demands[i](*x)[0]
 
     def _loss(self, i: int, x: Sequence[Any], action: Sequence[Any], inside: Any) -> Any:
-        """Rate at which a row falls under an action, 0 where it rises or means nothing."""
+        """Return the rate at which a constraint falls under an action, else 0."""
         if inside is False:
             return 0.0
         loss = self._larger(-self._changes[i](*x, *action)[0], 0.0)
@@ -103,7 +106,7 @@ class CompiledQP:
 
     @cached_property
     def _values(self) -> Any:
-        """What `_split` takes apart again."""
+        """Values that `_split` takes apart again."""
         p = self._qp
         expressions = [e for c in p.constraints for e in (*c.coefficient, c.offset)]
         if p.clf is not None:
@@ -136,13 +139,15 @@ class CompiledQP:
 
 
 def _beyond_rounding(h: sp.Expr) -> sp.Expr:
-    """What h is more than its own rounding: where that is not positive, a state and a batch may
-    find h on either side of 0."""
+    """Return h less its own rounding.
+
+    Where that is not positive, a state and a batch may find h on either side of 0.
+    """
     return h - sp.Float(ROUNDING, 17) * _size(h)
 
 
 def _size(expression: sp.Expr) -> sp.Expr:
-    """The sum of the sizes of an expression's terms."""
+    """Return the sum of the sizes of an expression's terms."""
     parts: Any = expression.args
     if expression.is_Add or expression.is_Mul:
         return expression.func(*map(_size, parts))

@@ -13,7 +13,7 @@ from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.filter_qp.solver import FilterQPSolver
 
 NO_VALUE = (ArithmeticError, ValueError, TypeError)
-"""Raised by formulas in plain floats: on overflow, outside a domain, or comparing a complex root."""
+"""Raised by formulas in plain floats: on overflow, outside a domain, comparing complex roots."""
 
 
 class ComponentFilter:

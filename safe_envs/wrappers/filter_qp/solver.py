@@ -25,7 +25,7 @@ class FilterQPSolver(CompiledQP):
     """Solves a QP for states given component by component, as floats or as arrays of a batch."""
 
     def solve_single(self, x: Sequence[Any], u: Sequence[Any]) -> FilterDecision:
-        """Solve a plain program of one row; raises as `solve`."""
+        """Solve a plain QP of one constraint; raises as `solve`."""
         values = self._values(*self._with_terms(x))
         if self._uncertain:
             return self._solve_uncertain(values, u)
@@ -70,7 +70,11 @@ class FilterQPSolver(CompiledQP):
         )
 
     def solve(self, x: Sequence[Any], u: Sequence[Any]) -> FilterDecision:
-        """Solve any program.
+        """Solve any QP.
+
+        Args:
+            x: n components of the state.
+            u: m components of the proposed input.
 
         Raises:
             UndefinedConstraintError: A constraint or the goal has no finite value.
@@ -114,8 +118,12 @@ class FilterQPSolver(CompiledQP):
         )
 
     def best(self, x: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
-        """The input that is best for the goal, without rows; `nothing` is the input 0. Raises as
-        `solve`."""
+        """Return the input that is best for the goal, without constraints; raises as `solve`.
+
+        Args:
+            x: n components of the state.
+            nothing: m components of the input 0.
+        """
         return self._best(self._split(self._values(*self._with_terms(x)))[2], nothing)
 
     def _best(self, goal: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
@@ -125,8 +133,11 @@ class FilterQPSolver(CompiledQP):
     def _outwards(
         self, a: Sequence[Any], inside: dict[int, Any], u: Sequence[Any]
     ) -> Sequence[Any]:
-        """The proposed input, and far away where h of a reciprocal condition rises most, if that is
-        not positive.
+        """Return the proposed input, or one far away where h of a reciprocal condition rises most.
+
+        The latter is for states outside its domain. The allowed point nearest to an input so far
+        off is where h rises most among those that the other constraints allow: these are not to
+        suffer from a condition that is undefined.
 
         The point of the box and of the rows nearest to one so far off is where h rises most among
         those that the other rows allow: these are not to suffer from a condition that means
@@ -155,7 +166,7 @@ class FilterQPSolver(CompiledQP):
         return [c + far * rj / wj for c, rj, wj in zip(corner, rise, self._weights, strict=True)]
 
     def _over_largest(self, entries: Sequence[Any]) -> list[Any]:
-        """Entries over the largest of their sizes, whose inverse may overflow."""
+        """Return entries over the largest of their sizes, whose inverse may overflow."""
         size = functools.reduce(self._larger, [abs(entry) for entry in entries])
         return [entry / self._choose(size > 0.0, size, 1.0) for entry in entries]
 
@@ -216,7 +227,7 @@ class FilterQPSolver(CompiledQP):
     def _on_the_safe_side(
         self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components]
     ) -> tuple[list[Any], list[Any]]:
-        """Affine rows that are met only where the uncertain ones are, in the box."""
+        """Return affine constraints that are met only where the uncertain ones are."""
         a, b = list(a), list(b)
         for i, form in forms.items():
             slopes, constant = self._planes[i] if i in self._planes else self._plane(form)
@@ -225,8 +236,7 @@ class FilterQPSolver(CompiledQP):
         return a, b
 
     def _plane(self, form: Components) -> tuple[list[Any], Any]:
-        """What `safe_envs.wrappers.qp.majorant` puts above the uncertainty of a
-        row."""
+        """Return the plane above the uncertainty of a constraint; see `majorant`."""
         width = self._m + 1
         place = {
             pair: k
@@ -237,7 +247,7 @@ class FilterQPSolver(CompiledQP):
 
     @cached_property
     def _planes(self) -> dict[int, tuple[list[Any], Any]]:
-        """Those that are the same at every state."""
+        """Planes that are the same at every state."""
         forms = {i: self._qp.constraints[i].uncertainty or () for i in self._uncertain}
         return {
             i: self._plane(tuple(map(float, form)))
@@ -253,8 +263,10 @@ class FilterQPSolver(CompiledQP):
         active: Sequence[Any],
         inside: dict[int, Any],
     ) -> Any:
-        """The active row whose half-space is furthest from the proposed input; one that means
-        nothing is further than any."""
+        """Return the active constraint whose half-space is furthest from the proposed input.
+
+        A reciprocal one outside its domain is further than any.
+        """
         cause, furthest = -1, -math.inf
         for i, (ai, bi, acts) in enumerate(zip(a, b, active, strict=True)):
             if acts is False or (acts is not True and not np.count_nonzero(acts)):

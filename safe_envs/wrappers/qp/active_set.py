@@ -1,5 +1,4 @@
-"""One state, any number of rows and inputs: the nearest of the actions that violate the rows least,
-to rounding.
+"""The nearest of the least-violating actions, for one state and any number of constraints.
 
 Two steps. The least sum of squared slacks comes from bounded least squares; where it is zero, the
 rows can be met. The slacks are the same at all its minimisers, so that these are the actions inside
@@ -47,8 +46,9 @@ def project(
     w: np.ndarray,
     priority: np.ndarray,
 ) -> np.ndarray:
-    """Return the nearest action (m,) of those that violate the rows least; NaN where the numbers
-    are too large to say.
+    """Return the nearest action (m,) of those that violate the constraints least.
+
+    It is NaN where the numbers are too large to say.
 
     Args:
         a: rows, shape (k, m).
@@ -118,8 +118,7 @@ def _project(
 
 
 class _Held(NamedTuple):
-    """Where a step (m,) ends, the rows (k,) that hold it as equations, and the inputs (m,) at their
-    bounds."""
+    """End of a step (m,), with the constraints (k,) and bounds (m,) that hold it."""
 
     step: np.ndarray
     rows: np.ndarray
@@ -130,8 +129,9 @@ class _Held(NamedTuple):
 def _nearest(
     normals: np.ndarray, spare: np.ndarray, way: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> _Held:
-    """The step nearest to the way to the proposal, with normals . step + spare >= 0 and low <= step
-    <= high; 0 is one.
+    """Return the step nearest to the proposal that the constraints and bounds allow.
+
+    It has normals . step + spare >= 0 and low <= step <= high; 0 is such a step.
 
     Where no step leads nearer, the rest of the way is a sum of the normals of what holds the step.
     What has the wrong sign in it is let go.

@@ -1,5 +1,4 @@
-"""The least sum of squared slacks of one state, for any number of inputs: bounded-variable least
-squares.
+"""The least sum of squared slacks of one state, by bounded-variable least squares.
 
 With p the positive and s the negative part of a row's margin, min |a u + b - p|^2 over u in the box
 and p >= 0 leaves s as the residual. The active-set method of Stark and Parker (1995) solves that:

@@ -1,5 +1,4 @@
-"""Several rows and one input: the rows and the box meet in an interval, into which the proposal is
-clipped.
+"""Several constraints on one input, which meet the input bounds in an interval.
 
     min 1/2 (u - v)^2   subject to   a_i u + b_i >= 0,   low <= u <= high
 
@@ -116,7 +115,7 @@ def _project(
     high: np.ndarray,
     priority: Sequence[float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What `project_arrays` returns, for states that violate a row."""
+    """Return what `project_arrays` does, for states that violate a constraint."""
     root = -b / a
     lo = np.maximum(low, np.where(a > 0.0, root, -np.inf).max(axis=0))
     hi = np.minimum(high, np.where(a < 0.0, root, np.inf).min(axis=0))
@@ -141,8 +140,7 @@ def least_violating(
     high: np.ndarray,
     priority: Sequence[float] | np.ndarray,
 ) -> np.ndarray:
-    """Where sum_i priority_i max(0, -(a_i u + b_i))^2 is least in a box that meets no point of all
-    sloping rows.
+    """Minimise sum_i priority_i max(0, -(a_i u + b_i))^2 where no input meets all constraints.
 
     Args:
         a: coefficients, shape (k, B).

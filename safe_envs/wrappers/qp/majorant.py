@@ -11,8 +11,9 @@ import numpy as np
 def majorant(
     q: Sequence[Sequence[Any]], low: Sequence[Any], high: Sequence[Any]
 ) -> tuple[list[Any], Any]:
-    """A plane c_0 + c . u above sqrt([1, u]' Q [1, u]) on a box of m inputs, so that a row less the
-    plane is on the safe side.
+    """Return a plane c_0 + c . u above sqrt([1, u]' Q [1, u]) within input bounds.
+
+    A constraint less the plane is on the safe side.
 
     Its slopes are the mean differences between the faces of the box, and c_0 is as small as the
     corners allow: the root is convex, so that it is below the plane everywhere if it is at the

@@ -1,5 +1,4 @@
-"""Rows that no action of a planar box meets: the least sum of squared slacks, for a batch of
-states.
+"""The least sum of squared slacks of constraints on two inputs, for a batch of states.
 
 The sum is convex and piecewise quadratic. A Newton step goes to the minimiser, over the box, of the
 quadratic that the rows violated now define; the sum is then minimised along the step. Near the
@@ -28,8 +27,7 @@ overflow."""
 
 
 class _Rows(NamedTuple):
-    """Rows x u_1 + y u_2 + r in units of the steepest, shapes (k, B), a box and inputs, shapes (2,
-    B)."""
+    """Constraints x u_1 + y u_2 + r in units of the steepest (k, B), bounds and inputs (2, B)."""
 
     x: np.ndarray
     y: np.ndarray
@@ -100,8 +98,10 @@ def least_violating(
 
 
 def is_unique(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Whether the rows violated at minimisers u (2, B) cross, so that no other action has the same
-    slacks (B,)."""
+    """Return whether minimisers u (2, B) are the only actions with their slacks, shape (B,).
+
+    They are if the constraints that they violate cross.
+    """
     first, second = a[0] * u[0], a[1] * u[1]
     violated = first + second + b < -ROUNDING * (np.abs(first) + np.abs(second) + np.abs(b))
     _, _, along = _frame(np.where(violated, a[0], 0.0), np.where(violated, a[1], 0.0))
@@ -115,8 +115,10 @@ def _margin(rows: _Rows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _balanced(rows: _Rows, least: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Whether the forces cancel (B,): along both inputs, and along each row, which itself has no
-    part in that."""
+    """Return whether the forces cancel (B,), along both inputs and along each constraint.
+
+    A constraint has no part in the force along itself.
+    """
     nothing = np.zeros_like(rows.u[:1])
     along = (
         np.concatenate([nothing + 1.0, nothing, -rows.y]),
@@ -166,8 +168,10 @@ def _newton(
 
 
 def _least_squares(rows: _Rows, error: np.ndarray) -> np.ndarray:
-    """Where |x d_1 + y d_2 + r|^2, r being known up to an error, is least with u + d in the box:
-    inside, or else on an edge."""
+    """Minimise |x d_1 + y d_2 + r|^2, r being known up to an error, with u + d within its bounds.
+
+    The minimum is inside, or else on an edge.
+    """
     goal = rows.u + _unbounded(rows)
     outside = np.flatnonzero(~((goal >= rows.low) & (goal <= rows.high)).all(axis=0))
     if outside.size:
@@ -178,8 +182,10 @@ def _least_squares(rows: _Rows, error: np.ndarray) -> np.ndarray:
 def _frame(
     x: np.ndarray, y: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-    """The steepest row (2, B), and each row's components across and along it, these zero where the
-    rows are parallel."""
+    """Return the steepest constraint (2, B), and each one's components across and along it.
+
+    The latter are zero where the constraints are parallel.
+    """
     steepest = np.maximum(np.abs(x), np.abs(y)).argmax(axis=0)[None]
     n1, n2 = [np.take_along_axis(part, steepest, axis=0)[0] for part in (x, y)]
     first, second = y * n1, x * n2
@@ -192,8 +198,10 @@ def _frame(
 
 
 def _unbounded(rows: _Rows) -> np.ndarray:
-    """The least-squares step (2, B), by Gram-Schmidt in the frame of the steepest row; across it
-    alone where all are parallel."""
+    """Return the least-squares step (2, B), in the frame of the steepest constraint.
+
+    It is across that alone where all are parallel.
+    """
     (n1, n2), across, along = _frame(rows.x, rows.y)
     square = total(across * across)
     square = np.where(square > 0.0, square, 1.0)
@@ -207,8 +215,10 @@ def _unbounded(rows: _Rows) -> np.ndarray:
 
 
 def _best_edge(rows: _Rows, error: np.ndarray) -> np.ndarray:
-    """The point of the four edges whose multiplier has the right sign; if several do up to
-    rounding, the least sum and the nearest."""
+    """Return the point of the four edges whose multiplier has the right sign.
+
+    If several do up to rounding, it is that of the least sum, and the nearest.
+    """
     u, low, high = rows.u, rows.low, rows.high
     best, least_wrong, least_sum = (
         u.copy(),

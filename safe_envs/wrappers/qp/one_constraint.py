@@ -76,8 +76,7 @@ def project_floats(
 def _project_scalar(
     a: float, b: float, v: float, low: float, high: float
 ) -> tuple[list[float], float, bool, bool]:
-    """A single input: the root of the row, if the box holds it, and the end of the box next to it
-    if not."""
+    """Project a single input: to the root of the constraint, or the bound next to it."""
     u = low if v < low else high if v > high else v
     margin = a * u + b
     if margin >= 0.0:
@@ -99,7 +98,7 @@ def _follow_multiplier(
     high: Sequence[float],
     w: Sequence[float],
 ) -> tuple[list[float], list[float]]:
-    """The minimiser, and the way of each component along a / w, 0 for those that are not free."""
+    """Return the minimiser, and the way of each component along a / w, 0 for those not free."""
     size = max([abs(aj) for aj in a]) or 1.0
     a, b = [aj / size for aj in a], b / size  # so that products neither overflow nor vanish
     d = [aj / wj for aj, wj in zip(a, w, strict=True)]
@@ -146,8 +145,9 @@ def project_arrays(
     high: Sequence[Any],
     w: Sequence[Any],
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
-    """Project the inputs of a batch of B states. A flat row divides by zero: the caller silences
-    that warning.
+    """Project the inputs of a batch of B states.
+
+    A flat constraint divides by zero: the caller silences that warning.
 
     Args:
         a: m entries of the row, each a float or an array (B,).
@@ -222,7 +222,7 @@ def _follow_multipliers(
     w: Sequence[Any],
     rows: np.ndarray,
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """The inputs, and which of the states in `rows` have components that can still move (R,).
+    """Return the inputs, and which states in `rows` have components that can still move (R,).
 
     Components are in front: shape (m, R), kinks in a third axis (m, R, 2m + 1).
     """

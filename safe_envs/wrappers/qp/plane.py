@@ -1,5 +1,4 @@
-"""Several rows and two inputs, one state in plain floats: exact, row by row, in a time that the
-solvers need to start.
+"""Several constraints on two inputs for one state, exact and one by one, in plain floats.
 
     min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a_i . u + b_i >= 0,   low <= u <= high
 
@@ -38,8 +37,12 @@ def project_floats(
     w: Sequence[float],
     priority: Sequence[float],
 ) -> tuple[list[float], list[float], list[bool], bool]:
-    """Project the input of one state: inputs (2), margins and binding rows (k), whether the rows
-    can be met together."""
+    """Project the input of one state.
+
+    Returns:
+        Inputs (2), margins and binding constraints (k), and whether the constraints can be met
+        together.
+    """
     (v1, v2), (l1, l2), (h1, h2) = v, low, high
     c1 = l1 if v1 < l1 else h1 if v1 > h1 else v1
     c2 = l2 if v2 < l2 else h2 if v2 > h2 else v2
@@ -104,8 +107,7 @@ def _onto_line(
     wp: float,
     wf: float,
 ) -> tuple[float, float] | None:
-    """The minimiser (pivot, free) on a line within the box and the rows before; None where there is
-    none."""
+    """Return the minimiser (pivot, free) on a line within the constraints before, or None."""
     ap, af, b = line
     if ap == 0.0:
         return None
@@ -139,7 +141,7 @@ def _onto_line(
 def _meeting_point(
     before: list[Row], alpha: float, beta: float, lo: float, hi: float, aim: float
 ) -> float | None:
-    """The free input where the rows leave an interval once each of them may miss by its rounding."""
+    """Return the free input that the constraints leave once each may miss by rounding."""
     for rp, rf, rb in before:
         slope, offset = rf + rp * beta, rb + rp * alpha
         if abs(slope) > ROUNDING * abs(rf):

@@ -1,5 +1,4 @@
-"""Several rows and two inputs, a batch of states at once: `safe_envs.wrappers.qp.plane` with masks
-in place of branches.
+"""`safe_envs.wrappers.qp.plane` for a batch of states, with masks in place of branches.
 
 The states that violate the row in turn are gathered and moved onto its line, so that the number of
 NumPy calls grows with the number of rows and not with the batch. Every number comes from the same
@@ -37,11 +36,11 @@ class Plane(NamedTuple):
     w: np.ndarray
 
     def take(self, states: np.ndarray) -> Plane:
-        """Some states of the batch."""
+        """Return some states of the batch."""
         return Plane(*[part[..., states] for part in self])
 
     def clip(self, u: np.ndarray) -> np.ndarray:
-        """Inputs (2, B) moved into the box."""
+        """Return inputs (2, B) clipped to their bounds."""
         return np.minimum(np.maximum(u, self.low), self.high)
 
     def margin(self, u: np.ndarray) -> np.ndarray:
@@ -49,8 +48,10 @@ class Plane(NamedTuple):
         return self.a[0] * u[0] + self.a[1] * u[1] + self.b
 
     def scale(self, u: np.ndarray, away: np.ndarray | float = 0.0) -> np.ndarray:
-        """How far each input can go (2, B): to the end of its box, or as far as u and `away` in the
-        metric of the objective."""
+        """Return how far each input can go (2, B).
+
+        It goes to its bound, or as far as u and `away` in the metric of the objective.
+        """
         root = np.sqrt(self.w)
         reach = root[0] * np.abs(u[0]) + root[1] * np.abs(u[1]) + away
         return np.minimum(np.maximum(-self.low, self.high), reach / root)
@@ -107,8 +108,10 @@ def project_arrays(
 
 
 def _nearest_of_least_violating(plane: Plane, priority: np.ndarray) -> np.ndarray:
-    """Of the actions with the least sum of squared slacks, which all have the same slacks, the one
-    nearest to v."""
+    """Return the action nearest to v of those with the least sum of squared slacks.
+
+    All of these have the same slacks.
+    """
     u = least_violating(plane.a, plane.b, plane.low, plane.high, priority, plane.clip(plane.v))
     several = np.flatnonzero(~is_unique(plane.a, plane.b, u))
     if several.size:
@@ -139,8 +142,11 @@ def _nearest(plane: Plane) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _onto_line(plane: Plane, u: np.ndarray, miss: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Minimisers (2, B) on the line of the last row, which u violates, and whether the rows before
-    and the box leave any (B,)."""
+    """Return minimisers (2, B) on the line of the last constraint, which u violates.
+
+    Returns:
+        These, and whether the constraints before and the input bounds leave any (B,).
+    """
     first, second = np.abs(plane.a[:, -1])
     root = np.sqrt(plane.w)
     steepness = first / root[0] + second / root[1]
@@ -175,8 +181,7 @@ def _onto_line(plane: Plane, u: np.ndarray, miss: np.ndarray) -> tuple[np.ndarra
 
 
 class _OnLine(NamedTuple):
-    """Rows slope * u_f + offset >= 0 along a line, shapes (k, B), with the sizes of the terms that
-    they were summed from."""
+    """Constraints slope * u_f + offset >= 0 along a line (k, B), with the sizes of their terms."""
 
     slope: np.ndarray
     offset: np.ndarray
@@ -203,7 +208,7 @@ class _OnLine(NamedTuple):
     def interval(
         self, lo: np.ndarray, hi: np.ndarray, relative: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What the rows leave of [lo, hi] when each may miss by a part of its terms."""
+        """Return what the constraints leave of [lo, hi] if each may miss by part of its terms."""
         offset = self.offset
         if relative:
             offset = offset + relative * (

@@ -39,8 +39,7 @@ _REACH = 10.0
 
 
 class Projection(NamedTuple):
-    """Arrays over a batch of B states: inputs (B, m), margins and binding rows (B, k), whether all
-    can be met (B,)."""
+    """Inputs (B, m), margins and binding constraints (B, k), and whether all can be met (B,)."""
 
     u: np.ndarray
     margin: np.ndarray
@@ -101,8 +100,7 @@ class _Problem(NamedTuple):
         return tolerances(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
 
     def contradictory(self) -> np.ndarray:
-        """Where a row, or two rows of unit length together, miss by more than rounding at every
-        input in the box (B,).
+        """Return where one or two constraints miss by more than rounding at every input (B,).
 
         It finds opposite rows, not every set of rows that cannot be met.
         """
@@ -120,7 +118,7 @@ class _Problem(NamedTuple):
             return (most < -2.0 * (allowed[:, first] + allowed[:, second])).any(axis=1)
 
     def tidied(self, u: np.ndarray) -> np.ndarray:
-        """The inputs without the rounding that other inputs brought in.
+        """Return the inputs without the rounding that other inputs brought in.
 
         An input on which no row depends keeps its proposal. One that is nothing but rounding of the
         way from the proposal is 0, for a row of this input alone may ask for that.
@@ -133,8 +131,11 @@ class _Problem(NamedTuple):
     def certified(
         self, rows: np.ndarray, below: np.ndarray, above: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The minimisers (B, m) that some rows (B, k) and bounds (B, m) hold, and where they are
-        those of the whole problem (B,)."""
+        """Return the minimisers (B, m) that some constraints (B, k) and bounds (B, m) hold.
+
+        Returns:
+            These, and where they are those of the whole problem (B,).
+        """
         roots, held = np.sqrt(self.w), below | above
         normals = self.a / roots[:, None, :]
         lengths = np.abs(normals).max(axis=2)
@@ -162,16 +163,21 @@ class _Problem(NamedTuple):
 
 
 def _dot(a: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Products (B, k) of rows (B, k, m) and inputs (B, m), summed in an order that does not depend
-    on the batch."""
+    """Return products (B, k) of constraints (B, k, m) and inputs (B, m).
+
+    The order of summation does not depend on the batch.
+    """
     return total(np.moveaxis(a * u[:, None, :], 2, 0))
 
 
 def _units(
     a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Origin and unit of each input (B, m): those of the box, or of the way to the violated rows
-    where the box is too wide."""
+    """Return the origin and the unit of each input (B, m).
+
+    They are those of the input bounds, or of the way to the violated constraints where the bounds
+    are too wide.
+    """
     inside = np.clip(v, low, high)
     missed = np.maximum(-(_dot(a, inside) + b), 0.0)
     steepness = np.sqrt((a**2 / w[:, None, :]).sum(axis=2))
@@ -220,8 +226,7 @@ class _Scaled(NamedTuple):
 
 
 def _solve(scaled: _Scaled) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rows (B, k) and the lower and upper bounds (B, m) that hold the minimisers, according to
-    ProxQP."""
+    """Return the constraints (B, k) and bounds (B, m) that hold the minimisers, by ProxQP."""
     count, k, m = scaled.rows.shape
     # The solver does not come back from numbers that are not finite.
     solvable = np.flatnonzero(

@@ -1,5 +1,4 @@
-"""What the solvers share: rows of a batch as one array, and the one tolerance with which a row
-counts as met.
+"""The one tolerance with which a constraint counts as met, and arrays that the solvers share.
 
 A row a . u + b >= 0 is met by an input u if
 
@@ -40,7 +39,7 @@ def tolerances(a: Sequence[Any] | np.ndarray, b: Any, u: Sequence[Any] | np.ndar
 
 
 def stack(entries: Sequence[Any], size: int) -> np.ndarray:
-    """Floats and arrays (B,) as the rows of an array (len(entries), B)."""
+    """Return floats and arrays (B,) as the rows of an array (len(entries), B)."""
     table = np.empty((len(entries), size))
     for row, entry in zip(table, entries, strict=True):
         row[:] = entry
@@ -48,8 +47,7 @@ def stack(entries: Sequence[Any], size: int) -> np.ndarray:
 
 
 def total(parts: np.ndarray) -> np.ndarray:
-    """Sum over the first axis, in an order that does not depend on the size of the batch, as
-    NumPy's own does."""
+    """Return the sum over the first axis, in an order that does not depend on the batch."""
     result = parts[0].copy()
     for part in parts[1:]:
         result += part

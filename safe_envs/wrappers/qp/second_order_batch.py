@@ -170,8 +170,10 @@ def _least_violating(
     v: np.ndarray,
     priority: Sequence[float],
 ) -> np.ndarray:
-    """Of the minimisers of the sum of squared slacks the nearest to v, which lies between the
-    nearest ones of each row."""
+    """Return the minimiser of the sum of squared slacks nearest to v.
+
+    It lies between the nearest ones of each constraint.
+    """
     weights = np.asarray(priority)[:, None]
 
     def derivative(u: np.ndarray) -> np.ndarray:

@@ -1,5 +1,4 @@
-"""Rows with an uncertainty that depends on the single input: each is met on an interval, into which
-the proposal is clipped.
+"""Constraints with an uncertainty that depends on the single input; each is met on an interval.
 
     min 1/2 (u - v)^2   subject to   a_i u + b_i - sqrt(q_i0 + 2 q_i1 u + q_i2 u^2) >= 0,   low <= u
     <= high
@@ -68,7 +67,10 @@ def project_floats(
 
 
 def _in_unit(a: float, b: float, q: Quadratic) -> tuple[float, float, Quadratic]:
-    """A row over its largest coefficient, so that products of four neither overflow nor vanish."""
+    """Return a constraint over its largest coefficient.
+
+    Then products of four neither overflow nor vanish.
+    """
     unit = max(abs(a), abs(b), math.sqrt(abs(q[0])), math.sqrt(abs(q[2]))) or 1.0
     return a / unit, b / unit, [entry / unit / unit for entry in q]
 
@@ -80,15 +82,18 @@ def _nearest(
     low: float,
     high: float,
 ) -> float:
-    """Of the inputs in the box at which a row is missed least the nearest to v."""
+    """Return the input nearest to v of those at which a constraint is violated least."""
     start, end = interval
     u = _maximiser(row[0], row[2], v, low, high) if start == math.inf else max(min(v, end), start)
     return low if u < low else high if u > high else u
 
 
 def _maximiser(a: float, q: Quadratic, v: float, low: float, high: float) -> float:
-    """Where c is largest: with w = u + q_1/q_2 and s the least sqrt(q/q_2), a = sqrt(q_2)
-    w/sqrt(w^2 + s^2) there, or at an end."""
+    """Return where c is largest.
+
+    With w = u + q_1/q_2 and s the least sqrt(q/q_2), a = sqrt(q_2) w/sqrt(w^2 + s^2) there, or it
+    is at an end.
+    """
     q0, q1, q2 = q
     end = high if a > 0.0 else low
     if q2 == 0.0:
@@ -107,15 +112,14 @@ def _margin(a: float, b: float, q: Quadratic, u: float) -> float:
 
 
 def _tolerance(a: float, b: float, q: Quadratic, u: float) -> float:
-    """As `safe_envs.wrappers.qp.rounding.tolerance`, and what the rounding of the form makes of its
-    root."""
+    """Return the tolerance of the linear part, and that of the rounding of the form in its root."""
     linear, terms = 2.0 * q[1] * u, q[2] * u * u
     form, terms = max(q[0] + linear + terms, 0.0), ROUNDING * (abs(q[0]) + abs(linear) + terms)
     return ROUNDING * abs(b) + ROUNDING * abs(a * u) + math.sqrt(form + terms) - math.sqrt(form)
 
 
 def _interval(a: float, b: float, q: Quadratic) -> tuple[float, float]:
-    """Where one row is met; an empty interval begins at infinity."""
+    """Return where one constraint is met; an empty interval begins at infinity."""
     q0, q1, q2 = q
     empty = (math.inf, math.inf)
     if q2 == 0.0:

@@ -1,5 +1,4 @@
-"""Several rows of which a single one binds: its own closed form, where the other rows allow what
-that gives.
+"""Several constraints of which a single one binds: its closed form, where the others allow it.
 
 The minimiser under one row alone is that under all rows, if it meets them: so exact, and many times
 faster than a solver, in most states of most filters.

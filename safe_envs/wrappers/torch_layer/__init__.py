@@ -1,5 +1,4 @@
-"""A safety filter as a layer of a torch network: gradients pass through it to whatever proposed the
-action.
+"""A safety filter as a layer of a torch network, through which gradients pass.
 
 The action is the one that `safe_envs.wrappers.SafetyFilter` returns. What is differentiated is the
 formula that gives it near a state: the rows that bind are equations there, the inputs that the box

@@ -30,8 +30,19 @@ class ActiveSets:
     def of(
         self, a: np.ndarray, v: np.ndarray, u: np.ndarray, active: np.ndarray, slack: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Inputs that the box holds (R, m), rows that cannot be met and rows that bind (R, k),
-        which are equations."""
+        """Return what holds the actions of R states.
+
+        Args:
+            a: coefficients of the constraints, shape (R, k, m).
+            v: proposed inputs, shape (R, m).
+            u: actions, shape (R, m).
+            active: active constraints, shape (R, k).
+            slack: their slacks, shape (R, k).
+
+        Returns:
+            Inputs that are held at their bounds (R, m), constraints that cannot be met, and
+            constraints that bind (R, k), which are equations.
+        """
         way = self.roots * (u - v)
         near = np.minimum(
             self.high - self.low, np.linalg.norm(way, axis=1, keepdims=True) / self.roots
@@ -55,8 +66,10 @@ class ActiveSets:
         return held, missed, binding
 
     def _forced(self, a: np.ndarray, u: np.ndarray, slack: np.ndarray) -> np.ndarray:
-        """Inputs (m,) that the rows that cannot be met press against the box, by the sum of their
-        forces; a (k, m), slack (k,)."""
+        """Return the inputs (m,) that unmet constraints press against their bounds.
+
+        The sum of the forces decides; a (k, m), slack (k,).
+        """
         forces = (self.priorities * slack)[:, None] * a
         force, size = forces.sum(axis=0), np.abs(forces).sum(axis=0)
         gap = np.where(force > 0.0, self.high - u, u - self.low)
@@ -66,8 +79,15 @@ class ActiveSets:
 def nearest_step(
     rows: torch.Tensor, gaps: torch.Tensor, weights: np.ndarray, binding: np.ndarray
 ) -> torch.Tensor:
-    """The shortest steps z (R, m) with rows z + gaps = 0 for the rows that bind, after the least
-    |weights (rows z + gaps)|^2.
+    """Return the shortest steps z (R, m) that meet the binding constraints as equations.
+
+    These are rows z + gaps = 0; before, |weights (rows z + gaps)|^2 is minimised.
+
+    Args:
+        rows: a of the constraints, in units of the weights, shape (R, k, m).
+        gaps: their values at z = 0, shape (R, k).
+        weights: of the constraints that cannot be met, 0 for others, shape (R, k).
+        binding: constraints that bind, shape (R, k).
 
     Rows (R, k, m), gaps (R, k), weights (R, k) of the rows that cannot be met, 0 for others, and
     those that bind (R, k).
@@ -99,8 +119,9 @@ def _held_and_binding(
     missed: np.ndarray,
     binding: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The inputs (m,) and rows (k,) of one state that hold the action where it is, by the signs of
-    their multipliers.
+    """Return the inputs (m,) and constraints (k,) that hold the action of one state where it is.
+
+    The signs of their multipliers say so.
 
     The way from the proposal to the action is a nonnegative sum of the normals of the rows that
     bind and of the box, and of those of the missed rows in either direction, since the way must not

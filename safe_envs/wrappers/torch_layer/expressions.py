@@ -15,8 +15,7 @@ from safe_envs.wrappers.filter_qp import FilterQP
 
 
 class _Printer(TorchPrinter):
-    """Writes with Python's operators, or calls of `_FUNCTIONS`, what torch has for tensors only: a
-    part may be a plain number."""
+    """Writes Python's operators, or `_FUNCTIONS`, where torch takes tensors only."""
 
     def _print_Pow(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
         return f"({self._print(expr.base)})**({self._print(expr.exp)})"
@@ -38,7 +37,7 @@ def _tensors(parts: Sequence[Any]) -> tuple[torch.Tensor, ...]:
 
 
 def _pieces(*parts: Any) -> torch.Tensor:
-    """The first of value, condition, value, condition, ... whose condition holds."""
+    """Return the first of value, condition, value, condition, ... whose condition holds."""
     values, conditions = _tensors(parts[::2]), parts[1::2]
     result = torch.full_like(values[0], float("nan"))
     for value, condition in reversed(list(zip(values, conditions, strict=True))):
@@ -58,7 +57,7 @@ _FUNCTIONS: dict[str, Any] = {
 def compiled_constraints(
     qp: FilterQP,
 ) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
-    """From states (B, n) to the rows' a (B, k, m) and b (B, k)."""
+    """Return the function from states (B, n) to the constraints' a (B, k, m) and b (B, k)."""
     model, k = qp.model, len(qp.constraints)
     expressions = [model.numeric(e) for c in qp.constraints for e in (*c.coefficient, c.offset)]
     unknown = {

@@ -38,8 +38,7 @@ class TorchResult(NamedTuple):
 
 
 class TorchFilter(torch.nn.Module):
-    """A safety filter in physical units, differentiable in the proposed input and in the state. It
-    has no parameters.
+    """A safety filter in physical units, differentiable in the proposed input and in the state.
 
     Where the rows cannot all be met, the action is the least-violating one, and its gradient is
     that of this action: zero along the inputs that stay in a corner of the box, and with several
@@ -74,8 +73,7 @@ class TorchFilter(torch.nn.Module):
         knowledge: str = "model",
         priorities: Sequence[float] | None = None,
     ) -> TorchFilter:
-        """The filter for the barriers of a problem; arguments and errors as for
-        `SafetyFilter.for_problem`."""
+        """Return the filter for the barriers of a problem; see `SafetyFilter.for_problem`."""
         return cls(SafetyFilter.for_problem(problem, conditions, knowledge, priorities=priorities))
 
     def forward(self, x: torch.Tensor, u: torch.Tensor, return_result: bool = False) -> Any:
@@ -130,8 +128,11 @@ class TorchFilter(torch.nn.Module):
     def _formula(
         self, states: torch.Tensor, inputs: torch.Tensor, found: Any
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The actions (B, m) as functions of states (B, n) and inputs (B, m), true near these, and
-        where that holds (B,)."""
+        """Return the actions (B, m) as functions of states (B, n) and inputs (B, m).
+
+        Returns:
+            The formulas, which hold near these states and inputs, and where they do (B,).
+        """
         sets = self._sets
         m, k = len(sets.low), len(sets.priorities)
         action, active, slack = (
