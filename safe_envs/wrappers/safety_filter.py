@@ -64,7 +64,8 @@ class SafetyFilter(ComponentFilter):
     Raises:
         SystemDefinitionError: There is no constraint, or a barrier does not fit the model.
         RelativeDegreeError: A condition does not suit a barrier.
-        ConfigurationError: The box, a weight or a priority is not allowed, or dt is missing.
+        ConfigurationError: The input bounds, a weight or a priority is not allowed, or dt is
+            missing.
     """
 
     def __init__(

@@ -44,12 +44,12 @@ class Condition(ABC):
     """Base of the conditions, which are small frozen dataclasses of their parameters.
 
     A condition holds in continuous time, but an input is held for a control period dt. Along the
-    held input the row psi = a u + b changes by dt psi' + O(dt^2), with psi' the derivative along
-    the flow (for stochastic conditions the generator: then it is the expectation that changes).
-    `sampling_margin` "first-order" therefore asks for psi + dt min(psi', 0) >= 0, so that psi stays
-    nonnegative over the period up to O(dt^2); psi' is quadratic in u and is taken at the action
-    that the condition without a margin allows, which is O(dt) away. A number asks for psi >= that
-    number.
+    held input the constraint psi = a u + b changes by dt psi' + O(dt^2), with psi' the derivative
+    along the flow (for stochastic conditions the generator: then it is the expectation that
+    changes). `sampling_margin` "first-order" therefore asks for psi + dt min(psi', 0) >= 0, so that
+    psi stays nonnegative over the period up to O(dt^2); psi' is quadratic in u and is taken at the
+    action that the condition without a margin allows, which is O(dt) away. A number asks for psi >=
+    that number.
 
     Attributes:
         name: under which messages show it; by default that of the class. Names of
@@ -60,7 +60,7 @@ class Condition(ABC):
         corrects_model: whether it corrects what the model gets wrong, so that it is of no use to a
             filter that knows the plant.
         method: by which the models that it needs are learned; None if it needs none.
-        sampling_margin: "none", "first-order", or a number >= 0 in the units of the row.
+        sampling_margin: "none", "first-order", or a number >= 0 in the units of the constraint.
 
     Raises:
         ConfigurationError: a parameter is out of its range.
@@ -122,7 +122,7 @@ class Condition(ABC):
             ) from error
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
-        """Return the system that the condition differentiates along: the model, or a learned one."""
+        """Return the system to differentiate along: the model, or a learned one."""
         return model
 
     @abstractmethod

@@ -41,9 +41,9 @@ class AffineConstraint:
             itself.
         demand: of a reciprocal condition, which asks for a u + b >= demand where h > 0 and has no
             meaning elsewhere. There a u + b is the rate of h, and all that is left is to make that
-            as large as the other rows allow.
-        change: rate of the row while the input is held, an expression of states and inputs, where a
-            margin of first order is asked for.
+            as large as the other constraints allow.
+        change: rate of the constraint while the input is held, an expression of states and inputs,
+            where a margin of first order is asked for.
         uncertainty: where a and b are known up to an error only, the entries (i, j), i <= j, of the
             symmetric Q(x) with which the condition asks for a u + b >= sqrt([1, u]' Q [1, u]).
         terms: what stands for numbers of something learned in the expressions, besides the states.

@@ -37,7 +37,7 @@ class LearnedCondition(Condition):
     """A condition that needs a learned model.
 
     Attributes:
-        learned: what it rests on.
+        learned: the learned model.
         method: by which that is learned.
     """
 
@@ -50,10 +50,10 @@ class LearnedCondition(Condition):
         method = getattr(self.learned, "method", None)
         if method != self.method:
             raise ConfigurationError(
-                f"{self.name} rests on what the method {self.method} learns; given is"
+                f"{self.name} needs what the method {self.method} learns; given is"
                 f" {method or repr(self.learned)}"
             )
-        # There may be further barriers; each row looks its own one up.
+        # There may be further barriers; each constraint looks its own one up.
         barriers = tuple(str(problem.model.numeric(b.expression)) for b in problem.barriers)
         type(self.learned).check(replace(self.learned.signature, barriers=barriers), problem)
 
@@ -61,7 +61,7 @@ class LearnedCondition(Condition):
     def for_gains(cls, gains: Sequence[float]) -> Condition:
         """Raise ConfigurationError: the condition needs a learned model; see `from_learned`."""
         raise ConfigurationError(
-            f"{cls.name} rests on something learned: {cls.name}:file=FILE, with a file of"
+            f"{cls.name} needs a learned model: {cls.name}:file=FILE, with a file of"
             " `safe-envs identify`"
         )
 
@@ -105,8 +105,8 @@ class LearnedCondition(Condition):
     def _require_no_first_order(self) -> None:
         if self.sampling_margin == FIRST_ORDER:
             raise ConfigurationError(
-                f"{self.name} with a network in its row has no sampling margin of first order; give"
-                " a number"
+                f"{self.name} with a network in its constraint has no sampling margin of first order;"
+                " give a number"
             )
 
 
@@ -143,9 +143,9 @@ class LearnedHOCBF(LearnedCondition):
         level: quantile of the held-out errors that e is, for each residual.
         eps: one number for all e in its place; 0 for no margin.
 
-    Source: thesis Eq. (3.18), (3.20), Prop. 3.3.2. The print takes one e for residuals of different
-        units, and the largest |u| of the
-    box; Eq. (3.26) forgets the margin, and an error e then settles at h = -e/(p_1 ... p_r).
+    Source: thesis Eq. (3.18), (3.20), Prop. 3.3.2. The thesis takes one e for residuals of
+        different units, and the largest |u| within the input bounds. Eq. (3.26) forgets the margin;
+        an error e then settles at h = -e/(p_1 ... p_r).
     """
 
     learned: ResidualModel  # pyright: ignore[reportIncompatibleVariableOverride]  (narrower, and frozen)

@@ -27,9 +27,9 @@ class _Reciprocal(Condition):
 
         A h >= (gamma/beta - beta''/2 |sigma' grad h|^2)/beta'
 
-    whose slack has the units of h per s. It means something where h > 0 only, by more than the
-    rounding of h: beyond the edge the inequality would turn round, so that there the row is A h
-    alone.
+    whose slack has the units of h per s. It is defined where h > 0 only, by more than the
+    rounding of h: beyond the edge the inequality would turn round, so that there the constraint is
+    A h alone.
     """
 
     gamma: float = 1.0

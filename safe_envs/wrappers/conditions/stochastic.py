@@ -18,11 +18,10 @@ from safe_envs.wrappers.conditions.constraint import AffineConstraint
 class SCBF(Condition):
     """A^r h >= 0, with the Ito generator A and the stochastic relative degree r.
 
-    What it promises: `safe_envs.wrappers.verification.bounds`.
+    Its bounds: `safe_envs.wrappers.verification.bounds`.
 
-    Source: thesis Def. 4.2.6, Prop. 4.2.8, Thm. 4.2.10. The print defines the relative degree by
-        A^j h = 0; what is
-    meant is that L_g A^(j-1) h = 0 below r.
+    Source: thesis Def. 4.2.6, Prop. 4.2.8, Thm. 4.2.10. The thesis defines the relative degree by
+        A^j h = 0; it means that L_g A^(j-1) h = 0 below r.
     """
 
     name = "scbf"
@@ -41,14 +40,13 @@ class SCBF(Condition):
 class SZCBF(Condition):
     """h_0 = h, h_j = A h_(j-1) + alpha_j h_(j-1), and h_r(x, u) >= 0, with the Ito generator A.
 
-    What it promises: `safe_envs.wrappers.verification.bounds`.
+    Its bounds: `safe_envs.wrappers.verification.bounds`.
 
     Attributes:
         alphas: rates alpha_1..alpha_r in 1/s, as many as the relative degree.
 
-    Source: thesis Def. 4.2.4, Prop. 4.2.5 and, for higher degrees, Sec. 4.3.2, which prints h_2 = A
-        h_1 + alpha_2 h:
-    with that even noise-free trajectories can leave the set.
+    Source: thesis Def. 4.2.4, Prop. 4.2.5 and, for higher degrees, Sec. 4.3.2, whose
+        h_2 = A h_1 + alpha_2 h lets even noise-free trajectories leave the set.
     """
 
     alphas: tuple[float, ...] = (1.0,)

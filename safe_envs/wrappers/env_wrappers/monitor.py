@@ -33,7 +33,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
     Keys of the same names that the env reports itself are replaced.
 
     Args:
-        env: any env with a box of actions.
+        env: any env with a Box action space.
         spec: how its state is seen, and what is safe; or FILE.py:NAME of that, with which an env's
             own spec can be written as JSON.
 
@@ -170,7 +170,7 @@ def named_and_limited(env: Any) -> tuple[str, int | None]:
 
 
 def ends_of(space: Any) -> tuple[np.ndarray, np.ndarray, Any]:
-    """Return the bounds of a box of actions in double precision, and the type of its numbers."""
+    """Return the bounds of a Box action space in double precision, and the type of its numbers."""
     return space.low.astype(np.float64), space.high.astype(np.float64), space.dtype
 
 

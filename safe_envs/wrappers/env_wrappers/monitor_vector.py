@@ -32,7 +32,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     same-step autoreset the last step of an episode is in `final_info`.
 
     Args:
-        env: any vector env with a box of actions, SyncVectorEnv and AsyncVectorEnv among them.
+        env: any vector env with a Box action space, SyncVectorEnv and AsyncVectorEnv among them.
         spec: how the states are seen, and what is safe; or FILE.py:NAME of that.
 
     Attributes:

@@ -31,21 +31,21 @@ class SafetyFilterWrapper(
     The wrapper takes and passes on actions in [-1, 1]; `info` gains the keys of
     `safe_envs.envs.info`, in physical units.
 
-    Over an env of somebody else the filter is told what it needs by name, as the fields of
+    Over a third-party env the filter is told what it needs by name, as the fields of
     `FilterSpec`; then actions are the env's own, and `info` gains the keys of this project's envs
     too.
 
     Args:
-        env: one of this project's envs, possibly wrapped; or any env with a box of actions.
+        env: one of this project's envs, possibly wrapped; or any env with a Box action space.
         condition: a `Condition` for every barrier, one for each, or their text, like "scbf",
             "hocbf:p=2,8" or "hocbf:p=2,8+cbf:alpha=1"; without parameters it takes the env's.
         knowledge: "model" (what the designer believes) or "plant" (the true system).
-        objective: "nearest" to the policy's action; or "clf" for the joint program with the env's
+        objective: "nearest" to the policy's action; or "clf" for the joint QP with the env's
             goal, in which the policy has no say: `info["nominal_action"]` is what the goal alone
             asks for.
         priorities: of the barriers where not all can be kept: weights of their squared slacks, ones
             by default.
-        **view: for an env of somebody else `model`, `barriers`, `state_fn`, and what else of
+        **view: for a third-party env `model`, `barriers`, `state_fn`, and what else of
           `FilterSpec` is needed.
 
     Raises:

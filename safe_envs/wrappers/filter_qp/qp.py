@@ -24,7 +24,7 @@ class FilterQP:
         weights: m weights of the inputs.
         priorities: k weights of the squared slacks.
         dt: control period in s, 0 where no constraint needs it.
-        clf: goal of the joint program, if there is one.
+        clf: goal of the joint QP, if there is one.
     """
 
     model: ControlAffineSDE
@@ -57,10 +57,11 @@ class FilterQP:
             weights: m weights of the inputs.
             priorities: k weights of the squared slacks.
             dt: control period in s.
-            clf: goal of the joint program.
+            clf: goal of the joint QP.
 
         Raises:
-            ConfigurationError: The box, a weight or a priority is not allowed, or dt is missing.
+            ConfigurationError: The input bounds, a weight or a priority is not allowed, or dt is
+                missing.
         """
         return cls(
             model,

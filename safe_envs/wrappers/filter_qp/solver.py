@@ -139,9 +139,9 @@ class FilterQPSolver(CompiledQP):
         off is where h rises most among those that the other constraints allow: these are not to
         suffer from a condition that is undefined.
 
-        The point of the box and of the rows nearest to one so far off is where h rises most among
-        those that the other rows allow: these are not to suffer from a condition that means
-        nothing.
+        The point of the input bounds and of the constraints nearest to one so far off is where h
+        rises most among those that the other constraints allow: these are not to suffer from a
+        condition that is undefined.
         """
         if all(
             defined is True or (defined is not False and defined.all())
@@ -197,8 +197,8 @@ class FilterQPSolver(CompiledQP):
         if not goal:
             return self._project(a, b, u, self._low, self._high, self._weights, p.priorities)
         # The goal's slack d = unit e, in a unit in which it weighs as much as an input: its square
-        # would overflow before d does. Twice the most that the box can make d always meets the
-        # goal's row, also after rounding.
+        # would overflow before d does. Twice the most that the input bounds can make d always meets
+        # the goal's constraint, also after rounding.
         growth, along = goal[0], goal[1:]
         most = growth + sum(
             [
@@ -218,7 +218,7 @@ class FilterQPSolver(CompiledQP):
             rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities
         )
         action, margin, active = action[: self._m], margin[: len(a)], active[: len(a)]
-        # The goal's row, which can always be met, has no say in that, nor has its rounding.
+        # The goal's constraint, which can always be met, has no say in that, nor has its rounding.
         feasible: Any = True
         for ai, bi, g in zip(a, b, margin, strict=True):
             feasible = feasible & (g >= -self._tolerance(ai, bi, action))

@@ -2,9 +2,9 @@
 
     min 1/2 (u - v)^2   subject to   a_i u + b_i >= 0,   low <= u <= high
 
-Where the interval is empty, the sum of squared slacks has a single minimiser in the box, found from
-its derivative, which is piecewise linear with a kink at the root of each row. A row with a_i = 0
-has no say in the input.
+Where the interval is empty, the sum of squared slacks has a single minimiser within the input
+bounds, found from its derivative, which is piecewise linear with a kink at the root of each
+constraint. A constraint with a_i = 0 has no say in the input.
 """
 
 from __future__ import annotations
@@ -89,8 +89,8 @@ def project_arrays(
         priority: k positive weights of the squared slacks.
 
     Returns:
-        Inputs (B,), margins (k, B), rows that bind or cannot be met (k, B), and whether all rows
-        can be met (B,).
+        Inputs (B,), margins (k, B), constraints that bind or cannot be met (k, B), and whether all
+        constraints can be met (B,).
     """
     size = len(v)
     slope, offset = stack(a, size), stack(b, size)
@@ -119,7 +119,7 @@ def _project(
     root = -b / a
     lo = np.maximum(low, np.where(a > 0.0, root, -np.inf).max(axis=0))
     hi = np.minimum(high, np.where(a < 0.0, root, np.inf).min(axis=0))
-    # Two rows that meet in one point may miss each other by the rounding of their roots.
+    # Two constraints that meet in one point may miss each other by the rounding of their roots.
     u = np.minimum(np.maximum(np.minimum(np.maximum(v, lo), hi), low), high)
     margin, allowed = a * u + b, tolerances((a,), b, (u,))
     missed = margin < -allowed

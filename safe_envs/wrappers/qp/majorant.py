@@ -15,9 +15,9 @@ def majorant(
 
     A constraint less the plane is on the safe side.
 
-    Its slopes are the mean differences between the faces of the box, and c_0 is as small as the
-    corners allow: the root is convex, so that it is below the plane everywhere if it is at the
-    corners.
+    Its slopes are the mean differences between the faces of the input bounds, and c_0 is as small
+    as the corners allow: the root is convex, so that it is below the plane everywhere if it is at
+    the corners.
 
     Args:
         q: symmetric Q, (1 + m) x (1 + m), floats or arrays (B,).

@@ -1,14 +1,15 @@
 """The least sum of squared slacks of constraints on two inputs, for a batch of states.
 
-The sum is convex and piecewise quadratic. A Newton step goes to the minimiser, over the box, of the
-quadratic that the rows violated now define; the sum is then minimised along the step. Near the
-minimiser the violated rows no longer change and the step is exact. A state is done when the forces
-of the rows, slack times coefficient, balance with those of the box.
+The sum is convex and piecewise quadratic. A Newton step goes to the minimiser, over the input
+bounds, of the quadratic that the constraints violated now define; the sum is then minimised along
+the step. Near the minimiser the violated constraints no longer change and the step is exact. A
+state is done when the forces of the constraints, slack times coefficient, balance with those of the
+input bounds.
 
-Rows count in their own units, so that one may be 1e9 times as steep as another: its slack at the
-minimiser is then below the rounding of its margin, and it acts as a wall. What the other rows ask
-for along the wall must not drown in its rounding. Hence the frame of a step is that of the steepest
-row, and a force is known as an interval, judged along the walls.
+Constraints count in their own units, so that one may be 1e9 times as steep as another: its slack at
+the minimiser is then below the rounding of its margin, and it acts as a wall. What the other
+constraints ask for along the wall must not drown in its rounding. Hence the frame of a step is that
+of the steepest constraint, and a force is known as an interval, judged along the walls.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def least_violating(
         low: lower bounds, shape (2, B).
         high: upper bounds, shape (2, B).
         priority: positive weights, shape (k,).
-        start: inputs to begin with, shape (2, B), inside the box.
+        start: inputs to begin with, shape (2, B), inside the input bounds.
 
     Returns:
         Minimisers, shape (2, B).
@@ -75,7 +76,7 @@ def least_violating(
     )
     for _ in range(_STEPS):
         margin, error = _margin(rows)
-        # The smallest and the largest slack of each row that rounding allows.
+        # The smallest and the largest slack of each constraint that rounding allows.
         least, most = np.maximum(-margin - error, 0.0), np.maximum(-margin + error, 0.0)
         moving = np.flatnonzero(~_balanced(rows, least, most))
         if not moving.size:
@@ -109,7 +110,7 @@ def is_unique(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def _margin(rows: _Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Margins of the rows and what rounding may make of them."""
+    """Margins of the constraints and what rounding may make of them."""
     first, second = rows.x * rows.u[0], rows.y * rows.u[1]
     return first + second + rows.r, ROUNDING * (np.abs(first) + np.abs(second) + np.abs(rows.r))
 
@@ -130,7 +131,7 @@ def _balanced(rows: _Rows, least: np.ndarray, most: np.ndarray) -> np.ndarray:
     error *= most[:, None]
     down, up = total(np.minimum(*ends) - error), total(np.maximum(*ends) + error)
     for j in (0, 1):
-        # A face of the box pushes inwards, as strongly as it takes.
+        # A face of the input bounds pushes inwards, as strongly as it takes.
         down = np.where(
             (rows.u[j] <= rows.low[j]) & (along[j] < 0.0)
             | (rows.u[j] >= rows.high[j]) & (along[j] > 0.0),

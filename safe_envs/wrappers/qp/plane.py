@@ -2,15 +2,17 @@
 
     min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a_i . u + b_i >= 0,   low <= u <= high
 
-Seidel's incremental scheme. The proposal clipped into the box is the minimiser without rows. Where
-it violates the next row, the new minimiser lies on that row's line: the box and the rows before
-leave an interval of the line, and the point of the line nearest to v is clipped into it. An empty
-interval means that no action meets the rows.
+Seidel's incremental scheme. The proposal clipped into the input bounds is the minimiser without
+constraints. Where it violates the next constraint, the new minimiser lies on that constraint's
+line: the input bounds and the constraints before leave an interval of the line, and the point of
+the line nearest to v is clipped into it. An empty interval means that no action meets the
+constraints.
 
-A line is written u_p = alpha + beta u_f. The free input f is the one that adds less to the row,
-given how far each input can go: to the end of its box, or as far in the metric of the objective as
-the line is away, since a box may be endless. So neither term is much larger than u_p, and rounding
-stays small. Every test compares a sum with its own terms: rows may have any size.
+A line is written u_p = alpha + beta u_f. The free input f is the one that adds less to the
+constraint, given how far each input can go: to the end of the input bounds, or as far in the metric
+of the objective as the line is away, since a box may be endless. So neither term is much larger
+than u_p, and rounding stays small. Every test compares a sum with its own terms: constraints may
+have any size.
 """
 
 from __future__ import annotations
@@ -24,8 +26,8 @@ from safe_envs.wrappers.qp import plane_batch
 from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance
 
 Row = tuple[float, float, float]
-"""(a_1, a_2, b) of a row a . u + b >= 0; on a line, the second and first input are the pivot and
-the free one."""
+"""(a_1, a_2, b) of a constraint a . u + b >= 0; on a line, the second and first input are the pivot
+and the free one."""
 
 
 def project_floats(
@@ -150,7 +152,7 @@ def _meeting_point(
             lo, hi = (max(lo, end), hi) if slope > 0.0 else (lo, min(hi, end))
     free = min(max(aim, lo), hi)
     # The ends may lie so far off that their rounding is large: what counts is the rounding of the
-    # rows at the point itself.
+    # constraints at the point itself.
     for rp, rf, rb in before:
         terms = abs(rb) + abs(rp * alpha) + (abs(rf) + abs(rp * beta)) * abs(free)
         if not (rf + rp * beta) * free + (rb + rp * alpha) >= -2.0 * ROUNDING * terms:

@@ -1,8 +1,8 @@
 """`safe_envs.wrappers.qp.plane` for a batch of states, with masks in place of branches.
 
-The states that violate the row in turn are gathered and moved onto its line, so that the number of
-NumPy calls grows with the number of rows and not with the batch. Every number comes from the same
-operations in the same order as for one state.
+The states that violate the constraint in turn are gathered and moved onto its line, so that the
+number of NumPy calls grows with the number of constraints and not with the batch. Every number
+comes from the same operations in the same order as for one state.
 """
 
 from __future__ import annotations
@@ -57,11 +57,11 @@ class Plane(NamedTuple):
         return np.minimum(np.maximum(-self.low, self.high), reach / root)
 
     def met(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Whether all rows are met (B,)."""
+        """Whether all constraints are met (B,)."""
         return (margin >= -tolerances(self.a, self.b, u)).all(axis=0)
 
     def binds(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Whether a row's margin exceeds zero by no more than rounding."""
+        """Whether a constraint's margin exceeds zero by no more than rounding."""
         s1, s2 = self.scale(u)
         return (margin <= 0.0) | (
             margin <= ROUNDING * (np.abs(self.b) + np.abs(self.a[0]) * s1 + np.abs(self.a[1]) * s2)
@@ -81,8 +81,8 @@ def project_arrays(
     """Project the inputs of B states.
 
     Returns:
-        Inputs (2, B), margins (k, B), rows that bind or cannot be met (k, B), and whether all rows
-        can be met (B,).
+        Inputs (2, B), margins (k, B), constraints that bind or cannot be met (k, B), and whether
+        all constraints can be met (B,).
     """
     size = len(v[0])
     a_of_input = np.array([stack([row[j] for row in a], size) for j in (0, 1)])
@@ -125,7 +125,7 @@ def _nearest_of_least_violating(plane: Plane, priority: np.ndarray) -> np.ndarra
 
 
 def _nearest(plane: Plane) -> tuple[np.ndarray, np.ndarray]:
-    """Minimisers (2, B), of no meaning where the rows cannot be met, and whether they can (B,)."""
+    """Return minimisers (2, B), undefined where constraints cannot be met, and whether they can."""
     u = plane.clip(plane.v)
     met = np.ones(u.shape[1], dtype=bool)
     for i, (a1, a2, b) in enumerate(zip(*plane.a, plane.b, strict=True)):
@@ -202,7 +202,7 @@ class _OnLine(NamedTuple):
 
     @property
     def crosses(self) -> np.ndarray:
-        """Whether no row lies parallel to the line on its wrong side (B,)."""
+        """Whether no constraint lies parallel to the line on its wrong side (B,)."""
         return np.all(~self.parallel | (self.offset >= -ROUNDING * self.offset_terms), axis=0)
 
     def interval(
@@ -221,6 +221,6 @@ class _OnLine(NamedTuple):
         )
 
     def holds(self, free: np.ndarray) -> np.ndarray:
-        """Whether every row is met up to rounding where the free input is as given (B,)."""
+        """Whether every constraint is met up to rounding where the free input is as given (B,)."""
         terms = self.offset_terms + self.slope_terms * np.abs(free)
         return np.all(self.slope * free + self.offset >= -2.0 * ROUNDING * terms, axis=0)

@@ -1,15 +1,15 @@
 """The one tolerance with which a constraint counts as met, and arrays that the solvers share.
 
-A row a . u + b >= 0 is met by an input u if
+A constraint a . u + b >= 0 is met by an input u if
 
     a . u + b >= -ROUNDING (|b| + sum_j |a_j u_j|)
 
 A sum of n floating-point products differs from the exact one by at most n eps times the sum of
 their sizes; ROUNDING leaves room for the coefficients, which were rounded themselves. The sizes are
-those of the terms at u, so that neither the unit of a row nor that of an input matters.
+those of the terms at u, so that neither the unit of a constraint nor that of an input matters.
 
 Every solver, for one state and for a batch, says `feasible` where the action that it returns meets
-all rows in this sense.
+all constraints in this sense.
 """
 
 from __future__ import annotations
@@ -21,11 +21,17 @@ from typing import Any
 import numpy as np
 
 ROUNDING = 16.0 * sys.float_info.epsilon
-"""Relative error of a row's value."""
+"""Relative error of a constraint's value."""
 
 
 def tolerance(a: Sequence[float], b: float, u: Sequence[float]) -> float:
-    """Return by how much a row of m coefficients may miss at m inputs and be met all the same."""
+    """Return by how much a constraint may be violated at m inputs and count as met.
+
+    Args:
+        a: m coefficients.
+        b: offset.
+        u: m inputs.
+    """
     # Each term is scaled by itself, so that their sum does not overflow.
     return ROUNDING * abs(b) + sum([ROUNDING * abs(aj * uj) for aj, uj in zip(a, u, strict=True)])
 

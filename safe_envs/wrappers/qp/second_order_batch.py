@@ -35,8 +35,8 @@ def project_arrays(
         priority: k positive weights of the squared slacks.
 
     Returns:
-        Inputs (B,), margins c_i (k, B), rows that bind or cannot be met (k, B), and whether all
-        rows can be met (B,).
+        Inputs (B,), margins c_i (k, B), constraints that bind or cannot be met (k, B), and whether
+        all constraints can be met (B,).
     """
     size = len(v)
     slope, offset = stack(a, size), stack(b, size)

@@ -3,11 +3,11 @@
     min 1/2 (u - v)^2   subject to   a_i u + b_i - sqrt(q_i0 + 2 q_i1 u + q_i2 u^2) >= 0,   low <= u
     <= high
 
-The left-hand side c_i is concave, so that the rows and the box meet in an interval. Its ends are
-roots of (a^2 - q_2) u^2 + 2 (a b - q_1) u + b^2 - q_0 with a u + b >= 0. Where it is empty, a
-single row is missed least at the maximiser of c_1; for several rows the sum of squared slacks is
-convex, and its minimisers are found by bisection of its derivative between the inputs at which each
-row alone is missed least.
+The left-hand side c_i is concave, so that the constraints and the input bounds meet in an interval.
+Its ends are roots of (a^2 - q_2) u^2 + 2 (a b - q_1) u + b^2 - q_0 with a u + b >= 0. Where it is
+empty, a single constraint is violated least at the maximiser of c_1; for several constraints the
+sum of squared slacks is convex, and its minimisers are found by bisection of its derivative between
+the inputs at which each constraint alone is violated least.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from safe_envs.wrappers.qp import second_order_batch
 from safe_envs.wrappers.qp.rounding import ROUNDING
 
 Quadratic = Sequence[Any]
-"""q_0, q_1 and q_2 of a row, a positive semidefinite form of (1, u)."""
+"""q_0, q_1 and q_2 of a constraint, a positive semidefinite form of (1, u)."""
 
 
 def project_floats(

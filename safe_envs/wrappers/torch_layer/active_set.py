@@ -9,11 +9,11 @@ import torch
 from safe_envs.wrappers.filter_qp import FilterQP
 
 _RANK = 1e-9
-"""Singular values below this share of the largest are the rounding of rows that depend on each
-other."""
+"""Singular values below this share of the largest are the rounding of constraints that depend on
+each other."""
 
 _EXACT = 1e-11
-"""How near an input at its bound is, as a share of its way there or of the box."""
+"""How near an input at its bound is, as a share of its way there or of the input bounds."""
 
 _NOTHING = 1e-8
 """Share of a force that is rounding."""
@@ -49,10 +49,10 @@ class ActiveSets:
         )
         missed = slack > 0.0
         binding = active & ~missed
-        # A single row presses every input on which it depends.
+        # A single constraint presses every input on which it depends.
         pressed = (way != 0.0) | ((a != 0.0) & active[:, :, None]).any(axis=1)
         held = pressed & ((u - self.low <= _EXACT * near) | (self.high - u <= _EXACT * near))
-        # Several rows may not all be needed.
+        # Several constraints may not all be needed.
         several = (np.count_nonzero(active, axis=1) > 1) | (missed.any(axis=1) & (a.shape[1] > 1))
         for i in np.flatnonzero(several):
             forced = self._forced(a[i], u[i], slack[i])
@@ -88,9 +88,6 @@ def nearest_step(
         gaps: their values at z = 0, shape (R, k).
         weights: of the constraints that cannot be met, 0 for others, shape (R, k).
         binding: constraints that bind, shape (R, k).
-
-    Rows (R, k, m), gaps (R, k), weights (R, k) of the rows that cannot be met, 0 for others, and
-    those that bind (R, k).
     """
     step = rows.new_zeros(rows.shape[0], rows.shape[2])
     walls = rows
@@ -99,7 +96,7 @@ def nearest_step(
         compromise = lost[:, :, None] * rows
         inverse = torch.linalg.pinv(compromise, rtol=_RANK)
         step = -(inverse @ (lost * gaps)[:, :, None])[:, :, 0]
-        # Along these directions nothing changes for the rows that cannot be met.
+        # Along these directions nothing changes for the constraints that cannot be met.
         walls = rows - (rows @ inverse) @ compromise
     sizes = torch.linalg.vector_norm(rows.detach(), dim=-1)
     scale = torch.from_numpy(binding) / torch.where(sizes > 0.0, sizes, 1.0)
@@ -123,9 +120,10 @@ def _held_and_binding(
 
     The signs of their multipliers say so.
 
-    The way from the proposal to the action is a nonnegative sum of the normals of the rows that
-    bind and of the box, and of those of the missed rows in either direction, since the way must not
-    change what these miss. Nonnegative least squares uses independent ones only.
+    The way from the proposal to the action is a nonnegative sum of the normals of the constraints
+    that bind and of the input bounds, and of those of the missed constraints in either direction,
+    since the way must not change what these miss. Nonnegative least squares uses independent ones
+    only.
 
     Args:
         rows: in units of the weights, shape (k, m).
@@ -133,8 +131,8 @@ def _held_and_binding(
         low: inputs that may be held at their lower bounds, shape (m,).
         high: inputs that may be held at their upper bounds, shape (m,).
         fixed: inputs that are held in any case, shape (m,).
-        missed: rows that cannot be met, shape (k,).
-        binding: rows that may bind, shape (k,).
+        missed: constraints that cannot be met, shape (k,).
+        binding: constraints that may bind, shape (k,).
     """
     left, m = ~fixed, len(way)
     size = np.abs(way[left]).max(initial=0.0)

@@ -24,7 +24,8 @@ class _Printer(TorchPrinter):
         return f"({self._print(expr.lhs)}) {expr.rel_op} ({self._print(expr.rhs)})"
 
     def _print_Piecewise(self, expr: Any) -> str:  # noqa: N802
-        return f"Piecewise({', '.join(self._print(part) for piece in expr.args for part in piece.args)})"
+        parts = [self._print(part) for piece in expr.args for part in piece.args]
+        return f"Piecewise({', '.join(parts)})"
 
     def _named(self, expr: Any) -> str:
         return f"{expr.func.__name__}({', '.join(map(self._print, expr.args))})"
@@ -69,8 +70,8 @@ def compiled_constraints(
     unknown -= {sp.Piecewise, sp.Heaviside}
     if unknown:
         raise ConfigurationError(
-            f"torch has no {', '.join(sorted(map(str, unknown)))}, which a row holds; write it with"
-            " other functions"
+            f"torch has no {', '.join(sorted(map(str, unknown)))}, which a constraint holds;"
+            " write it with other functions"
         )
     # Torch's functions take no plain numbers.
     numbers = [

@@ -17,16 +17,17 @@ from safe_envs.wrappers.torch_layer.active_set import ActiveSets, nearest_step
 from safe_envs.wrappers.torch_layer.expressions import compiled_constraints
 
 _AGREED = 1e-6
-"""How far apart, as a share of the box, an action and its formula are, at most."""
+"""How far apart, as a share of the input bounds, an action and its formula are, at most."""
 
 
 class TorchResult(NamedTuple):
-    """What a filter decides, for a batch with leading axes `...`, m inputs and k rows.
+    """What a filter decides, for a batch with leading axes `...`, m inputs and k constraints.
 
     Attributes:
-        action: executed input, shape (..., m), in the box; only this one has a gradient.
-        feasible: whether some action in the box meets every row, shape (...).
-        active: rows that bind or cannot be met, shape (..., k).
+        action: executed input, shape (..., m), within the input bounds; only this one has a
+            gradient.
+        feasible: whether some action within the input bounds meets every constraint, shape (...).
+        active: constraints that bind or cannot be met, shape (..., k).
         differentiable: whether the gradient is that of the action, shape (...); where not, it is
             zero. It says so whether or not a gradient was asked for.
     """
@@ -40,10 +41,11 @@ class TorchResult(NamedTuple):
 class TorchFilter(torch.nn.Module):
     """A safety filter in physical units, differentiable in the proposed input and in the state.
 
-    Where the rows cannot all be met, the action is the least-violating one, and its gradient is
-    that of this action: zero along the inputs that stay in a corner of the box, and with several
-    rows that of their weighted compromise. Where the formula does not give the action, as it may
-    not where its equations are nearly dependent, the gradient is zero, and the result says so.
+    Where the constraints cannot all be met, the action is the least-violating one, and its gradient
+    is that of this action: zero along the inputs that stay in a corner of the input bounds, and
+    with several constraints that of their weighted compromise. Where the formula does not give the
+    action, as it may not where its equations are nearly dependent, the gradient is zero, and the
+    result says so.
 
     It runs on the CPU and in double precision, whatever the tensors are.
 
@@ -51,9 +53,9 @@ class TorchFilter(torch.nn.Module):
         safety_filter: whose actions are returned.
 
     Raises:
-        ConfigurationError: a row is not a plain one: uncertain, reciprocal, with a network or a
-            sampling margin of first order; or the filter pursues a goal; or a row holds a function
-            that torch does not have.
+        ConfigurationError: a constraint is not a plain one: uncertain, reciprocal, with a network
+            or a sampling margin of first order; or the filter pursues a goal; or a constraint holds
+            a function that torch does not have.
     """
 
     def __init__(self, safety_filter: SafetyFilter) -> None:
@@ -90,7 +92,7 @@ class TorchFilter(torch.nn.Module):
 
         Raises:
             InvalidInputError: a shape or a type does not fit, or an entry is not finite.
-            NumericalError: a row has no finite value at a state.
+            NumericalError: a constraint has no finite value at a state.
         """
         if not (isinstance(x, torch.Tensor) and isinstance(u, torch.Tensor)):
             raise InvalidInputError(
@@ -140,7 +142,7 @@ class TorchFilter(torch.nn.Module):
             found.active.reshape(-1, k),
             found.slack.reshape(-1, k),
         )
-        # Where no row acts, the state's gradient is zero, and not missing.
+        # Where no constraint acts, the state's gradient is zero, and not missing.
         result = (
             inputs.clamp(torch.from_numpy(sets.low), torch.from_numpy(sets.high))
             + 0.0 * states[:, :1]
@@ -190,6 +192,6 @@ def _require_plain(safety_filter: SafetyFilter, qp: FilterQP) -> None:
         for attribute, reason in reasons.items():
             if getattr(constraint, attribute) is not None:
                 raise ConfigurationError(
-                    f"the row {condition.name} on {barrier.name} {reason}: a torch layer takes"
-                    " plain rows only"
+                    f"the constraint {condition.name} on {barrier.name} {reason}: a torch layer"
+                    " takes plain constraints only"
                 )
