@@ -46,7 +46,7 @@ _MOST_BITS = 1100
 
 
 def parsed(text: str) -> Any:
-    """Evaluate arithmetic of s without Python's eval, which would run whatever stands in a spec.
+    """Evaluate arithmetic of s without Python's eval, which would run any code in a text.
 
     Nothing is evaluated whose size is not known to be small before: sympy would compute 9**9**9 for
     days.
@@ -166,7 +166,7 @@ def _is_small(number: Any) -> bool:
 
 def _is_real(constant: Any) -> bool:
     """Whether a float holds a constant."""
-    # The division by 0 is told of the whole function.
+    # The error of a division by 0 names the whole function.
     if constant.has(sp.zoo, sp.nan, sp.oo):
         return True
     try:

@@ -18,7 +18,7 @@ class Terms(Protocol):
 
     @property
     def symbols(self) -> tuple[sp.Symbol, ...]:
-        """What stands for them."""
+        """Symbols of the numbers."""
         ...
 
     def floats(self, x: Sequence[float]) -> Sequence[float]:
@@ -46,7 +46,7 @@ class AffineConstraint:
             where a margin of first order is asked for.
         uncertainty: where a and b are known up to an error only, the entries (i, j), i <= j, of the
             symmetric Q(x) with which the condition asks for a u + b >= sqrt([1, u]' Q [1, u]).
-        terms: what stands for numbers of something learned in the expressions, besides the states.
+        terms: learned numbers in the expressions, whose symbols are no states.
     """
 
     coefficient: tuple[sp.Expr, ...]

@@ -146,7 +146,7 @@ def _of_model(
 
 
 def _made(part: Part, make: Callable[..., Condition], *args: Any, **given: Any) -> Condition:
-    """Call what makes a condition; an error of a user's class becomes one of ours."""
+    """Call what makes a condition; any error of its class becomes a ConfigurationError."""
     try:
         return make(*args, **given)
     except SafeEnvsError:

@@ -62,7 +62,7 @@ class FilterSpec:
         filter: text of the filter where an evaluation names none, like "hocbf:p=2,8"; None for what
             suits the model.
         dt: control period in s; None for the env's own attribute `dt`.
-        gains: rates that the conditions use unless told otherwise; ones by default. See
+        gains: rates of conditions whose text sets none; ones by default. See
             `SafetyProblem`.
         nominal: a controller to be kept safe, an expression of the model's states and parameters
             for each input; if any.

@@ -105,19 +105,19 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`."""
         # Gymnasium's own vector envs take the mask out of the mapping that they are given.
-        anew = np.array((options or {}).get("reset_mask", self._everywhere), dtype=bool)
+        restarted = np.array((options or {}).get("reset_mask", self._everywhere), dtype=bool)
         observation, info = self.env.reset(
             seed=seed, options=None if options is None else dict(options)
         )
-        self._forget(anew)
-        seen = self._seen(observation, anew)
+        self._forget(restarted)
+        seen = self._seen(observation, restarted)
         if self.viewer is not None:
             self.viewer.restart(
                 np.stack(self._x, axis=-1),
                 self._steps * self.problem.dt,
-                np.flatnonzero(anew).tolist(),
+                np.flatnonzero(restarted).tolist(),
             )
-        return observation, {**info, **with_masks(seen, anew)}
+        return observation, {**info, **with_masks(seen, restarted)}
 
     def step(self, actions: Any) -> VectorStep:
         """Pass on actions, and look at what comes of them."""
@@ -125,15 +125,15 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         observation, reward, terminated, truncated, info = self.env.step(actions)
         ended = terminated | truncated
         if self._mode == AutoresetMode.SAME_STEP:
-            anew, shown = ended, self._of_same_step(observation, ended, info)
+            restarted, shown = ended, self._of_same_step(observation, ended, info)
         else:
-            anew = self._ended
-            self._forget(anew)
+            restarted = self._ended
+            self._forget(restarted)
             self._ended = ended.copy()
             shown = self._seen(observation, self._everywhere)
         if self.viewer is not None:
-            self._steps += ~anew
-            times, begun = self._steps * self.problem.dt, np.flatnonzero(anew).tolist()
+            self._steps += ~restarted
+            times, begun = self._steps * self.problem.dt, np.flatnonzero(restarted).tolist()
             self.viewer.advance(
                 np.stack(self._x, axis=-1), times, np.stack(self.executed, axis=-1), begun
             )

@@ -31,9 +31,8 @@ class SafetyFilterWrapper(
     The wrapper takes and passes on actions in [-1, 1]; `info` gains the keys of
     `safe_envs.envs.info`, in physical units.
 
-    Over a third-party env the filter is told what it needs by name, as the fields of
-    `FilterSpec`; then actions are the env's own, and `info` gains the keys of this project's envs
-    too.
+    Over a third-party env the fields of `FilterSpec` are given by name. Then actions are the env's
+    own, and `info` gains the keys of this project's envs too.
 
     Args:
         env: one of this project's envs, possibly wrapped; or any env with a Box action space.

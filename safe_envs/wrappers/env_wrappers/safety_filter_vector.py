@@ -118,10 +118,10 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             info["final_info"].update(
                 with_masks({key: value.copy() for key, value in added.items()}, ended)
             )
-            self._start_anew(added, ended)
+            self._restart(added, ended)
         elif self._mode == AutoresetMode.NEXT_STEP:
             if np.count_nonzero(self._ended):
-                self._start_anew(added, self._ended)
+                self._restart(added, self._ended)
             self._ended = ended
         info.update(with_masks(added, info["_cost"]))
         return observation, reward, terminated, truncated, info
@@ -136,21 +136,21 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
         self._interventions += differs
         self._infeasible += ~decision.feasible
         return filter_info(
-            nominal_action=_beside(nominal),
-            safe_action=_beside(decision.action),
+            nominal_action=_as_columns(nominal),
+            safe_action=_as_columns(decision.action),
             intervention=differs,
             filter_active=active,
             feasible=decision.feasible,
             slack=(
                 decision.slack[0] if len(decision.slack) == 1 else np.maximum.reduce(decision.slack)
             ),
-            slacks=_beside(decision.slack),
+            slacks=_as_columns(decision.slack),
             active_barrier=np.where(differs, decision.cause, -1),
             episode_interventions=self._interventions.copy(),
             episode_infeasible=self._infeasible.copy(),
         )
 
-    def _start_anew(self, added: Info, envs: np.ndarray) -> None:
+    def _restart(self, added: Info, envs: np.ndarray) -> None:
         """Put what is reported at reset in place of a decision, for the envs that were reset."""
         self._forget(envs)
         for key, value in self._rest.items():
@@ -173,6 +173,6 @@ def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
     return state_layer(env, (SafeVectorEnv, SafetyMonitorVector), vector=True)
 
 
-def _beside(components: Sequence[np.ndarray]) -> np.ndarray:
+def _as_columns(components: Sequence[np.ndarray]) -> np.ndarray:
     """Fresh components as columns; a single one needs no copy."""
     return components[0].reshape(-1, 1) if len(components) == 1 else np.stack(components, axis=-1)
