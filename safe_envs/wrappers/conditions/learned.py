@@ -105,8 +105,8 @@ class LearnedCondition(Condition):
     def _require_no_first_order(self) -> None:
         if self.sampling_margin == FIRST_ORDER:
             raise ConfigurationError(
-                f"{self.name} with a network in its constraint has no sampling margin of first order;"
-                " give a number"
+                f"{self.name} with a network in its constraint has no sampling margin of first"
+                " order; give a number"
             )
 
 

@@ -30,6 +30,10 @@ Row = tuple[float, float, float]
 and the free one."""
 
 
+Input = tuple[float, float, float, float]
+"""Proposal, lower and upper bound, and weight of an input."""
+
+
 def project_floats(
     a: Sequence[Sequence[float]],
     b: Sequence[float],
@@ -62,20 +66,10 @@ def project_floats(
         steepness = abs(a1) / r1 + abs(a2) / r2
         reach = r1 * abs(u1) + r2 * abs(u2) - (miss / steepness if steepness > 0.0 else miss)
         if abs(a1) * min(e1, reach / r1) >= abs(a2) * min(e2, reach / r2):
-            u = _onto_line(rows[i], rows[:i], v1, v2, l1, h1, l2, h2, w[0], w[1])
+            u = _onto_line(rows[i], rows[:i], (v1, l1, h1, w[0]), (v2, l2, h2, w[1]))
         else:
-            found = _onto_line(
-                (a2, a1, bi),
-                [(q2, q1, q0) for q1, q2, q0 in rows[:i]],
-                v2,
-                v1,
-                l2,
-                h2,
-                l1,
-                h1,
-                w[1],
-                w[0],
-            )
+            before = [(q2, q1, q0) for q1, q2, q0 in rows[:i]]
+            found = _onto_line((a2, a1, bi), before, (v2, l2, h2, w[1]), (v1, l1, h1, w[0]))
             u = found and (found[1], found[0])
         if u is None:
             return _one_of_batch(a, b, v, low, high, w, priority)
@@ -100,16 +94,12 @@ def project_floats(
 def _onto_line(
     line: Row,
     before: list[Row],
-    vp: float,
-    vf: float,
-    lp: float,
-    hp: float,
-    lf: float,
-    hf: float,
-    wp: float,
-    wf: float,
+    pivot_input: Input,
+    free_input: Input,
 ) -> tuple[float, float] | None:
     """Return the minimiser (pivot, free) on a line within the constraints before, or None."""
+    vp, lp, hp, wp = pivot_input
+    vf, lf, hf, wf = free_input
     ap, af, b = line
     if ap == 0.0:
         return None
