@@ -77,7 +77,7 @@ def check_condition(
     low, high = np.array(problem.box).T
     u = rng.uniform(1.5 * low - 0.5 * high, 1.5 * high - 0.5 * low, (samples, len(low)))
     for (barrier, one), constraint in zip(
-        safety_filter.rows, safety_filter.constraints, strict=True
+        safety_filter.pairs, safety_filter.constraints, strict=True
     ):
         what = f"{one.name} on {barrier.name}"
         found = _Constraint(one.believed(safety_filter.model), one, constraint, what)
@@ -88,7 +88,7 @@ def check_condition(
     for share in (1.0, _TIGHT):
         bounds = np.stack([middle - share * half, middle + share * half])
         tight = SafetyFilter(
-            safety_filter.model, safety_filter.rows, bounds.T.tolist(), dt=problem.dt
+            safety_filter.model, safety_filter.pairs, bounds.T.tolist(), dt=problem.dt
         )
         _check_decisions(tight, x, u, *bounds)
 
@@ -246,7 +246,7 @@ def _check_decisions(
     low: np.ndarray,
     high: np.ndarray,
 ) -> None:
-    name = ", ".join(sorted({condition.name for _, condition in safety_filter.rows}))
+    name = ", ".join(sorted({condition.name for _, condition in safety_filter.pairs}))
     try:
         found = safety_filter.filter(x, u)
         single = [safety_filter.filter(x[i], u[i]) for i in range(min(_SINGLE, len(x)))]

@@ -34,7 +34,8 @@ from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
 from safe_envs.wrappers.env_wrappers.safety_filter import SafetyFilterWrapper
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import SafetyFilterVectorWrapper
-from safe_envs.wrappers.safety_filter import FilterResult, SafetyFilter
+from safe_envs.wrappers.filter_qp import FilterDecision
+from safe_envs.wrappers.safety_filter import SafetyFilter
 
 __all__ = [
     "CBF",
@@ -52,7 +53,7 @@ __all__ = [
     "BayesianSCBF",
     "ClassK",
     "Condition",
-    "FilterResult",
+    "FilterDecision",
     "FilterSpec",
     "LearnedCondition",
     "LearnedHOCBF",

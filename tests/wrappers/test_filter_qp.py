@@ -233,7 +233,7 @@ def test_barrier_slack_is_dearer_than_any_goal():
 
 
 def test_goals_are_checked():
-    with pytest.raises(ConfigurationError, match="weights of a joint program"):
+    with pytest.raises(ConfigurationError, match="weights of a joint QP"):
         SafetyFilter(
             plane(), [(Barrier(1 - x), CBF(1.0))], [(-1.0, 1.0)] * 2, [1.0, 1.0], clf=CLF(x**2)
         )

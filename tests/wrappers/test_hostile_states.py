@@ -15,7 +15,7 @@ from safe_envs import Barrier, ControlAffineSDE, NumericalError
 from safe_envs.dynamics.codegen import compile_function, filled
 from safe_envs.systems import ENV_IDS
 from safe_envs.wrappers import CBF, RCBF, SCBF, SafetyFilter
-from safe_envs.wrappers.qp.rows import ROUNDING
+from safe_envs.wrappers.qp.rounding import ROUNDING
 from tests.conftest import problem_of
 
 FILTERS = {
@@ -83,10 +83,10 @@ def assert_sound(safety_filter, x, u):
     assert (one is None) == (batch is None)
     if one is None:
         return
-    low, high = safety_filter.program.low, safety_filter.program.high
+    low, high = safety_filter.qp.low, safety_filter.qp.high
     with np.errstate(all="ignore"):
         gains = [filled(c, (1,))[0] for c in gains_of(safety_filter)(*[np.array([c]) for c in x])]
-    for action, barrier, margin, active, feasible, slack, cause in (one, batch):
+    for action, margin, active, feasible, slack, cause, _, barrier in (one, batch):
         assert all(np.isfinite(part).all() for part in (action, barrier, margin, slack))
         assert np.all((low <= action) & (action <= high))
         assert (cause >= 0) <= active.any()
@@ -98,7 +98,7 @@ def assert_sound(safety_filter, x, u):
             assert not slack.any()
         else:
             assert active.any()
-    assert one[4] == batch[4]
+    assert one[3] == batch[3]
     np.testing.assert_allclose(
         one[0], batch[0], rtol=1e-9, atol=1e-9 * max(map(abs, [*low, *high]))
     )
@@ -109,7 +109,7 @@ def situations(draw, names):
     safety_filter = filter_of(*draw(st.sampled_from(names)))
     n, ends = (
         safety_filter.model.n,
-        zip(safety_filter.program.low, safety_filter.program.high, strict=True),
+        zip(safety_filter.qp.low, safety_filter.qp.high, strict=True),
     )
     x, near = (
         draw(st.lists(ENTRY, min_size=n, max_size=n)),
@@ -138,7 +138,7 @@ def test_answers_of_every_filter_are_sound_or_errors():
                 continue  # of another relative degree, or without a goal
             n, (low, high) = (
                 safety_filter.model.n,
-                map(np.array, (safety_filter.program.low, safety_filter.program.high)),
+                map(np.array, (safety_filter.qp.low, safety_filter.qp.high)),
             )
             for top in rng.choice([3, 8, 60, 90, 170, 300], 200):
                 x = rng.choice([-1, 1], n) * 10.0 ** rng.uniform(rng.choice([-5, -320]), top, n)
@@ -180,7 +180,7 @@ def test_a_tiny_gain_decides_where_h_rises():
     gain = gains_of(safety_filter)(2.0, 1e-160)[0]
     found = safety_filter.filter([2.0, 1e-160], [0.0])
     assert found.action.tolist() == [
-        safety_filter.program.high[0] if gain > 0 else safety_filter.program.low[0]
+        safety_filter.qp.high[0] if gain > 0 else safety_filter.qp.low[0]
     ]
     assert found.cause == 0
     assert not found.feasible

@@ -12,7 +12,7 @@ from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import ConfigurationError, NumericalError
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.filter_qp import Program, Solver, UndefinedRowError
+from safe_envs.wrappers.filter_qp import FilterQP, FilterQPSolver, UndefinedConstraintError
 
 
 class CLFController(Policy):
@@ -46,10 +46,8 @@ class CLFController(Policy):
         self._columns = _columns_of_states(problem)
         self._center, self._half = center_and_half_width(problem)
         low, high = [pair[0] for pair in problem.box], [pair[1] for pair in problem.box]
-        program = Program(
-            problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal
-        )
-        self._floats, self._arrays = Solver(program, "floats"), Solver(program, "arrays")
+        qp = FilterQP(problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal)
+        self._floats, self._arrays = FilterQPSolver(qp, "floats"), FilterQPSolver(qp, "arrays")
 
     def predict(
         self,
@@ -58,7 +56,7 @@ class CLFController(Policy):
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
-        """Solve the program; see `Policy.predict`. Actions are in double precision.
+        """Solve the QP; see `Policy.predict`. Actions are in double precision.
 
         Raises:
             InvalidInputError: the observation has another shape than (k,) or (B, k).
@@ -75,7 +73,7 @@ class CLFController(Policy):
         except (ArithmeticError, ValueError) as error:
             row = (
                 given[error.index]
-                if given.ndim == 2 and isinstance(error, UndefinedRowError)
+                if given.ndim == 2 and isinstance(error, UndefinedConstraintError)
                 else given
             )
             raise NumericalError(

@@ -1,28 +1,28 @@
 """Conditions: rules that turn a system and a barrier into a constraint on the input."""
 
-from safe_envs.wrappers.conditions.base import AffineConstraint, Condition
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
 from safe_envs.wrappers.conditions.cbf import CBF, ECBF, HOCBF
 from safe_envs.wrappers.conditions.class_k import ClassK, power
-from safe_envs.wrappers.conditions.learned import (
-    DDSCBF,
-    BayesianSCBF,
-    LearnedCondition,
-    LearnedHOCBF,
-)
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
+from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
 from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
 from safe_envs.wrappers.conditions.registry import CONDITIONS, LEARNED, condition_names
 from safe_envs.wrappers.conditions.spec_text import (
+    conditions_for,
+    parse_condition,
+    parse_conditions,
+    require_readable,
+    spec_of,
+)
+from safe_envs.wrappers.conditions.stochastic import SCBF, SZCBF
+from safe_envs.wrappers.conditions.text_parts import (
     files_of,
     head_pattern,
     learned_parts,
-    parse_condition,
-    parse_conditions,
     require_known,
-    require_readable,
-    spec_of,
     with_absolute_paths,
 )
-from safe_envs.wrappers.conditions.stochastic import SCBF, SZCBF
 
 __all__ = [
     "CBF",
@@ -42,6 +42,7 @@ __all__ = [
     "LearnedCondition",
     "LearnedHOCBF",
     "condition_names",
+    "conditions_for",
     "files_of",
     "head_pattern",
     "learned_parts",

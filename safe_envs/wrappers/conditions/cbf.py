@@ -15,8 +15,10 @@ from safe_envs.dynamics.lie import derivatives, lie_derivative_f, relative_degre
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, shortened, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import AffineConstraint, Condition, chain_of
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.chain import chain_of
 from safe_envs.wrappers.conditions.class_k import ClassK, Rate, positive_rates, rates
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 _STEPS = 100
 """Of the search for poles. Gains of real negative ones need fewer; others could keep it busy for
@@ -53,11 +55,11 @@ class CBF(Condition):
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> CBF:
-        """The CBF with the first rate."""
+        """Return the CBF with the first rate."""
         return cls(gains[0])
 
     def chain_rates(self, degree: int) -> tuple[float, ...] | None:
-        """Alpha where it is linear; see `Condition.chain_rates`."""
+        """Return alpha where it is linear; see `Condition.chain_rates`."""
         return None if isinstance(self.alpha, ClassK) else (self.alpha,)
 
 
@@ -88,11 +90,11 @@ class HOCBF(Condition):
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> HOCBF:
-        """The HOCBF with all rates."""
+        """Return the HOCBF with all rates."""
         return cls(tuple(gains))
 
     def chain_rates(self, degree: int) -> tuple[float, ...] | None:
-        """The rates where all are linear; see `Condition.chain_rates`."""
+        """Return the rates where all are linear; see `Condition.chain_rates`."""
         linear = tuple(p for p in self.p if not isinstance(p, ClassK))
         return linear if len(linear) == len(self.p) else None
 
@@ -153,11 +155,11 @@ class ECBF(Condition):
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> ECBF:
-        """The ECBF with its poles at minus the rates."""
+        """Return the ECBF with its poles at minus the rates."""
         return cls(poles=tuple(-rate for rate in gains))
 
     def chain_rates(self, degree: int) -> tuple[float, ...]:
-        """Minus the poles, the slowest first; see `Condition.chain_rates`."""
+        """Return minus the poles, the slowest first; see `Condition.chain_rates`."""
         return tuple(sorted(-pole for pole in self.poles or _real_negative_roots(self.k or ())))
 
     @property

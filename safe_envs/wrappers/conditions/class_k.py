@@ -27,7 +27,7 @@ _SATURATED = 20
 
 
 def _guarded(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """A function of mpmath that refuses arguments at which it would take long."""
+    """Return a function of mpmath that refuses arguments at which it would take long."""
 
     def value(argument: Any) -> Any:
         if mpmath.mag(argument) > _MOST_BITS:
@@ -42,8 +42,9 @@ def _tanh(argument: Any) -> Any:
 
 
 def _modulus(argument: Any) -> Any:
-    """The modulus of a real number. That of a complex one is real, but floats have no complex
-    number on the way there.
+    """Return the modulus of a number.
+
+    That of a complex number is real, but floats have no complex number on the way there.
     """
     if isinstance(argument, mpmath.mpc):
         raise ValueError("the modulus of a number that is not real")
@@ -103,8 +104,9 @@ class ClassK:
         return self.expression.subs(S, value)
 
     def is_smooth(self, order: int) -> bool:
-        """Whether the derivatives up to an order are finite and continuous at 0, the one place
-        where s |s| and the like are not.
+        """Return whether the derivatives up to an order are finite and continuous at 0.
+
+        That is the one place where those of s |s| and the like are not.
         """
         slopes = [
             sp.diff(self.expression, S, i).replace(sp.DiracDelta, lambda *_: sp.Integer(0))
@@ -139,7 +141,7 @@ class _Printer(StrPrinter):
 
 
 def power(rate: float, exponent: float) -> ClassK:
-    """The function rate s |s|^(exponent - 1), which is rate s^exponent where that is odd.
+    """Return the function rate s |s|^(exponent - 1), which is rate s^exponent for an odd exponent.
 
     Args:
         rate: positive.
@@ -165,8 +167,7 @@ Rate = float | ClassK
 
 
 def rates(name: str, given: Any) -> tuple[Rate, ...]:
-    """Return class-K functions, the linear ones as positive floats in 1/s, or say which one is
-    none.
+    """Return class-K functions, the linear ones as positive floats in 1/s.
 
     Raises:
         ConfigurationError: there is none, or one is neither a positive number nor a class-K

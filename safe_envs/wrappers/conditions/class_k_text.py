@@ -1,6 +1,4 @@
-"""Class-K functions as text: arithmetic of s, read without running code and within bounds on time
-and memory.
-"""
+"""Class-K functions as text: arithmetic of s, read without running code, in bounded time."""
 
 from __future__ import annotations
 
@@ -48,7 +46,7 @@ _MOST_BITS = 1100
 
 
 def parsed(text: str) -> Any:
-    """Evaluate arithmetic of s without Python's eval, which would run whatever stands in a spec.
+    """Evaluate arithmetic of s without Python's eval, which would run any code in a text.
 
     Nothing is evaluated whose size is not known to be small before: sympy would compute 9**9**9 for
     days.
@@ -78,8 +76,9 @@ def parsed(text: str) -> Any:
 
 
 def _require_few_parts(tree: ast.expr) -> None:
-    """Raise ConfigurationError for more than a person writes; without recursion, for the tree may
-    be as deep as it is large.
+    """Raise ConfigurationError for an expression larger than a person writes.
+
+    It does not recurse, since the tree may be as deep as it is large.
     """
     parts, functions, left = 0, 0, [(tree, 0)]
     while left:
@@ -141,8 +140,7 @@ def _number(text: str) -> int | float:
 
 
 def _small(expression: Any, node: ast.expr) -> Any:
-    """An expression, all numbers in which are known to be small: the next operation on it takes no
-    time either.
+    """Return an expression whose numbers are small, so that the next operation takes no time.
 
     Raises:
         ConfigurationError: one is not.
@@ -168,7 +166,7 @@ def _is_small(number: Any) -> bool:
 
 def _is_real(constant: Any) -> bool:
     """Whether a float holds a constant."""
-    # The division by 0 is told of the whole function.
+    # The error of a division by 0 names the whole function.
     if constant.has(sp.zoo, sp.nan, sp.oo):
         return True
     try:

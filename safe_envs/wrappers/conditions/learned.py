@@ -1,4 +1,4 @@
-"""Conditions that rest on something learned: LearnedHOCBF, DDSCBF, BayesianSCBF."""
+"""Conditions that need a learned model: LearnedHOCBF, DDSCBF."""
 
 from __future__ import annotations
 
@@ -7,46 +7,37 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.lie import (
     derivatives,
     generator,
-    gradient,
-    ito_correction,
     lie_derivative_f,
     lie_derivative_g,
-    relative_degree,
     tidied,
 )
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import (
-    FIRST_ORDER,
-    AffineConstraint,
-    Condition,
-    CredibleSet,
-    chain_of,
-)
+from safe_envs.wrappers.conditions.base import FIRST_ORDER, Condition
 from safe_envs.wrappers.conditions.cbf import gains_of_poles
+from safe_envs.wrappers.conditions.chain import chain_of
 from safe_envs.wrappers.conditions.class_k import positive_rates
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
     from safe_envs.wrappers.learning.base import LearnedModel
     from safe_envs.wrappers.learning.generator import GeneratorModel
-    from safe_envs.wrappers.learning.posterior import Posterior
     from safe_envs.wrappers.learning.residual import ResidualModel
 
 
 @dataclass(frozen=True)
 class LearnedCondition(Condition):
-    """A condition of something learned.
+    """A condition that needs a learned model.
 
     Attributes:
-        learned: what it rests on.
+        learned: the learned model.
         method: by which that is learned.
     """
 
@@ -55,24 +46,22 @@ class LearnedCondition(Condition):
     corrects_model = True
 
     def require_fit(self, problem: SafetyProblem) -> None:
-        """Raise ConfigurationError where what it rests on was learned by another method, or of
-        another problem.
-        """
+        """Raise ConfigurationError for a model of another method or another problem."""
         method = getattr(self.learned, "method", None)
         if method != self.method:
             raise ConfigurationError(
-                f"{self.name} rests on what the method {self.method} learns; given is"
+                f"{self.name} needs what the method {self.method} learns; given is"
                 f" {method or repr(self.learned)}"
             )
-        # There may be further barriers; each row looks its own one up.
+        # There may be further barriers; each constraint looks its own one up.
         barriers = tuple(str(problem.model.numeric(b.expression)) for b in problem.barriers)
         type(self.learned).check(replace(self.learned.signature, barriers=barriers), problem)
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> Condition:
-        """There is none without something learned; see `from_learned`."""
+        """Raise ConfigurationError: the condition needs a learned model; see `from_learned`."""
         raise ConfigurationError(
-            f"{cls.name} rests on something learned: {cls.name}:file=FILE, with a file of"
+            f"{cls.name} needs a learned model: {cls.name}:file=FILE, with a file of"
             " `safe-envs identify`"
         )
 
@@ -103,7 +92,7 @@ class LearnedCondition(Condition):
         }
 
     def _number_of(self, model: ControlAffineSDE, barrier: Barrier) -> int:
-        """Which of the barriers that were learned a barrier is."""
+        """Return which of the learned barriers a barrier is."""
         expression = str(model.numeric(barrier.expression))
         if expression not in self.learned.signature.barriers:
             known = ", ".join(self.learned.signature.barriers)
@@ -116,8 +105,8 @@ class LearnedCondition(Condition):
     def _require_no_first_order(self) -> None:
         if self.sampling_margin == FIRST_ORDER:
             raise ConfigurationError(
-                f"{self.name} with a network in its row has no sampling margin of first order; give"
-                " a number"
+                f"{self.name} with a network in its constraint has no sampling margin of first"
+                " order; give a number"
             )
 
 
@@ -126,15 +115,20 @@ def _at_least_zero(name: str, value: Any) -> None:
         raise ConfigurationError(f"{name} = {shown(value)}; give a number >= 0")
 
 
-def _share(name: str, value: Any) -> None:
+def require_share(name: str, value: Any) -> None:
+    """Raise ConfigurationError unless a value is a number between 0 and 1.
+
+    Args:
+        name: what the message calls it.
+        value: what was given.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1:
         raise ConfigurationError(f"{name} = {shown(value)}; give a number above 0 and below 1")
 
 
 @dataclass(frozen=True)
 class LearnedHOCBF(LearnedCondition):
-    """The HOCBF with the derivatives of h corrected by learned residuals, and a margin for what
-    they miss.
+    """The HOCBF with learned residuals in the derivatives of h, and a margin for their errors.
 
         h^(r) + k_(r-1) h^(r-1) + ... + k_0 h >= e_r + sum_i k_i e_i + e_u |u|
 
@@ -149,9 +143,9 @@ class LearnedHOCBF(LearnedCondition):
         level: quantile of the held-out errors that e is, for each residual.
         eps: one number for all e in its place; 0 for no margin.
 
-    Source: thesis Eq. (3.18), (3.20), Prop. 3.3.2. The print takes one e for residuals of different
-        units, and the largest |u| of the
-    box; Eq. (3.26) forgets the margin, and an error e then settles at h = -e/(p_1 ... p_r).
+    Source: thesis Eq. (3.18), (3.20), Prop. 3.3.2. The thesis takes one e for residuals of
+        different units, and the largest |u| within the input bounds. Eq. (3.26) forgets the margin;
+        an error e then settles at h = -e/(p_1 ... p_r).
     """
 
     learned: ResidualModel  # pyright: ignore[reportIncompatibleVariableOverride]  (narrower, and frozen)
@@ -163,7 +157,7 @@ class LearnedHOCBF(LearnedCondition):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "p", positive_rates("p", self.p))
-        _share("level", self.level)
+        require_share("level", self.level)
         if self.eps is not None:
             _at_least_zero("eps", self.eps)
 
@@ -171,7 +165,7 @@ class LearnedHOCBF(LearnedCondition):
     def from_learned(
         cls, learned: ResidualModel, gains: Sequence[float], **settings: Any
     ) -> LearnedHOCBF:
-        """The condition with all rates of a problem, unless others are given."""
+        """Return the condition with all rates of a problem, unless others are given."""
         return cls(learned, **{"p": tuple(gains), **settings})
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
@@ -236,7 +230,7 @@ class DDSCBF(LearnedCondition):
         _at_least_zero("margin", self.margin)
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
-        """The model with the learned diffusion, where that is what was learned."""
+        """Return the model, with the learned diffusion where that was learned."""
         return model if self.learned.diffusion is None else self.learned.diffusion.system(model)
 
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
@@ -257,155 +251,4 @@ class DDSCBF(LearnedCondition):
             eta[-1] + term - margin,
             (barrier.expression,),
             terms=part,
-        )
-
-
-@dataclass(frozen=True)
-class BayesianSCBF(LearnedCondition):
-    """A^r h >= 0 for the identified system: for its most probable one, or for those that the data
-    leave possible.
-
-    With theta Gaussian, A h = a + b u has a mean and a variance v(x, u), and the robust form asks
-    for mean - z sqrt(v) >= 0. With `confidence` z is the quantile of Student's distribution, for
-    each (x, u) by itself, and sigma the most probable. With `simultaneous` the ellipsoid of theta
-    and the intervals of sigma hold together with that probability, hence for all (x, u) at once:
-    then `safe_envs.wrappers.verification.posterior_guarantee` has a bound for it. Correlated noise
-    makes v at most its largest eigenvalue larger. Both hold as far as the features and a constant
-    sigma fit the data; what does not is in the warnings of the record.
-
-    Attributes:
-        learned: the posterior.
-        confidence: of the form that is robust at each state by itself.
-        simultaneous: of the form that is robust at all states at once.
-
-    Raises:
-        ConfigurationError: both are given, or one is not between 0 and 1.
-
-    Source: thesis Sec. 6.2.5, Eq. (6.12), for the most probable system.
-    """
-
-    learned: Posterior  # pyright: ignore[reportIncompatibleVariableOverride]
-    confidence: float | None = None
-    simultaneous: float | None = None
-    name = "bayesian-scbf"
-    method = "bayesian"
-    corrects_model = False
-    stochastic = True
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.confidence is not None and self.simultaneous is not None:
-            raise ConfigurationError("bayesian-scbf takes confidence or simultaneous, not both")
-        for field in ("confidence", "simultaneous"):
-            if getattr(self, field) is not None:
-                _share(field, getattr(self, field))
-
-    @property
-    def credible_set(self) -> CredibleSet | None:
-        """The systems of the simultaneous form; None of the others."""
-        if self.simultaneous is None:
-            return None
-        return CredibleSet(self.learned, self.delta_theta + self.delta_sigma)
-
-    @property
-    def robust(self) -> bool:
-        """Whether it is met for more than the most probable system."""
-        return self.confidence is not None or self.simultaneous is not None
-
-    def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
-        """The identified system."""
-        return self.learned.system
-
-    def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
-        """Derive the constraint.
-
-        Raises:
-            RelativeDegreeError: there is no relative degree, or it is not 1 and the robust form is
-                asked for.
-        """
-        if self.learned.pruned.all():
-            raise RelativeDegreeError(
-                "no input acts on the identified system: learn from more data, or under larger"
-                " inputs"
-            )
-        if not self.robust:
-            return AffineConstraint.after(model, *chain_of(model, barrier, None, generator))
-        degree = relative_degree(model, barrier.expression, generator)
-        if degree != 1:
-            raise RelativeDegreeError(
-                f"barrier {barrier.name} has relative degree {degree}, where A^r h is not linear in"
-                " the weights and its distribution not known: the robust form is for relative"
-                " degree 1. Leave out confidence and simultaneous"
-            )
-        if self.sampling_margin == FIRST_ORDER:
-            raise ConfigurationError(
-                "the robust form has no sampling margin of first order; give a number"
-            )
-        # What the most probable system prunes may yet differ from 0 a little, and a large input
-        # makes that much.
-        mean = self.learned.mean_system
-        slopes: Any = gradient(mean, barrier.expression)
-        a: Any = lie_derivative_g(mean, barrier.expression)
-        factors = self.variance_factors(np.array([entry != 0 for entry in slopes])).tolist()
-        total: Any = sp.zeros(mean.m + 1)
-        for slope, factor, form in zip(
-            slopes, factors, self.learned.variance_expressions, strict=True
-        ):
-            total = total + sp.Float(factor, 17) * slope**2 * form
-        return AffineConstraint(
-            tuple(a[0, j] for j in range(mean.m)),
-            lie_derivative_f(mean, barrier.expression) + self._least_ito_term(mean, barrier),
-            (barrier.expression,),
-            uncertainty=tuple(total[i, j] for i in range(mean.m + 1) for j in range(i, mean.m + 1)),
-        )
-
-    def variance_factors(self, outputs: np.ndarray) -> np.ndarray:
-        """By what the variance of each f_i + g_i u is multiplied, z^2 among others, shape (n,).
-
-        Args:
-            outputs: whether the barrier depends on each state, (n,).
-        """
-        from scipy import stats
-
-        noise = self.learned.diffusion
-        if self.confidence is not None:
-            z = max(stats.t.ppf(self.confidence, noise.count), 0.0)
-            correlated = np.linalg.eigvalsh(noise.correlation[np.ix_(outputs, outputs)])[-1]
-            return np.full(len(outputs), z**2 * correlated)
-        # The variance of the weights is that of the noise, which may be as large as its interval
-        # allows: more than estimated, since the interval leaves out a quarter at most of what is
-        # smaller, and the median of a chi^2 lies below its mean.
-        largest, estimated = (
-            noise.sigma_intervals(self.delta_sigma)[:, 1] ** 2,
-            noise.squares / noise.count,
-        )
-        allowed = np.divide(largest, estimated, out=np.ones(len(largest)), where=estimated > 0)
-        return (
-            stats.chi2.ppf(1.0 - self.delta_theta, outputs.sum() * self.learned.mean.shape[1])
-            * allowed
-        )
-
-    @property
-    def delta_theta(self) -> float:
-        """Probability that the ellipsoid of the simultaneous form misses theta."""
-        return 0.5 * (1.0 - (self.simultaneous or 0.0))
-
-    @property
-    def delta_sigma(self) -> float:
-        """Probability that its intervals miss a sigma."""
-        return 1.0 - (self.simultaneous or 0.0) - self.delta_theta
-
-    def _least_ito_term(self, system: ControlAffineSDE, barrier: Barrier) -> sp.Expr:
-        """1/2 tr(sigma sigma' h_xx), for the simultaneous form the least that the intervals of the
-        sigma_i allow.
-        """
-        if self.simultaneous is None:
-            return ito_correction(system, barrier.expression)
-        curvatures = [sp.diff(barrier.expression, s, 2) / 2 for s in system.states]
-        intervals = self.learned.diffusion.sigma_intervals(self.delta_sigma).tolist()
-        return sp.Add(
-            *[
-                sp.Min(c * low**2, c * high**2)
-                for c, (low, high) in zip(curvatures, intervals, strict=True)
-            ]
         )

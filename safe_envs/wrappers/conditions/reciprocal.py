@@ -1,6 +1,4 @@
-"""Reciprocal conditions, whose barrier function B grows without bound towards the edge: RCBF,
-SRCBF.
-"""
+"""Reciprocal conditions, whose barrier function B is unbounded at the edge: RCBF, SRCBF."""
 
 from __future__ import annotations
 
@@ -12,8 +10,10 @@ from safe_envs.dynamics.lie import quadratic_variation_rate, relative_degree
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import AffineConstraint, Condition, resolved
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.chain import resolved
 from safe_envs.wrappers.conditions.class_k import positive_rates
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 _H = sp.Symbol("h", positive=True)
 _FORMS = {"inverse": 1 / _H, "log": -sp.log(_H / (1 + _H))}
@@ -21,15 +21,15 @@ _FORMS = {"inverse": 1 / _H, "log": -sp.log(_H / (1 + _H))}
 
 @dataclass(frozen=True)
 class _Reciprocal(Condition):
-    """A B <= gamma / B for B = beta(h), as a row on h.
+    """A B <= gamma / B for B = beta(h), as a constraint on the rate of h.
 
     With A B = beta' A h + beta''/2 |sigma' grad h|^2 and beta' < 0, dividing by beta' gives
 
         A h >= (gamma/beta - beta''/2 |sigma' grad h|^2)/beta'
 
-    whose slack has the units of h per s. It means something where h > 0 only, by more than the
-    rounding of h: beyond the edge the inequality would turn round, so that there the row is A h
-    alone.
+    whose slack has the units of h per s. It is defined where h > 0 only, by more than the
+    rounding of h: beyond the edge the inequality would turn round, so that there the constraint is
+    A h alone.
     """
 
     gamma: float = 1.0

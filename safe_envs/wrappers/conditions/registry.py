@@ -1,4 +1,4 @@
-"""Condition classes by name: those of this package, of installed packages, and of a user's files."""
+"""Condition classes by name: built-in ones, those of installed packages, those of users' files."""
 
 from __future__ import annotations
 
@@ -9,13 +9,9 @@ from safe_envs import plugins
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
 from safe_envs.object_import import load_object, place_of
 from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
 from safe_envs.wrappers.conditions.cbf import CBF, ECBF, HOCBF
-from safe_envs.wrappers.conditions.learned import (
-    DDSCBF,
-    BayesianSCBF,
-    LearnedCondition,
-    LearnedHOCBF,
-)
+from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
 from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
 from safe_envs.wrappers.conditions.stochastic import SCBF, SZCBF
 
@@ -39,13 +35,13 @@ def condition_names() -> tuple[str, ...]:
 
 
 def condition_class(name: str) -> type[Condition]:
-    """Return the class of a condition, for which a user's file is run.
+    """Return the class of a condition; a user's file is run for it.
 
     Args:
         name: one of `condition_names`, or FILE.py:NAME or MODULE:NAME.
 
     Raises:
-        ConfigurationError: There is none of that name, or it is no concrete subclass of `Condition`.
+        ConfigurationError: There is none of that name, or it is no concrete `Condition`.
     """
     if name in _BUILT_IN:
         return _BUILT_IN[name]

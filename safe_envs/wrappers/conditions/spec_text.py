@@ -1,53 +1,30 @@
 """Conditions as text: `hocbf:p=2,8`, or `hocbf:p=2,8+cbf:alpha=1` for two barriers.
 
-A condition of a user's file is `FILE.py:NAME`, of a module `MODULE:NAME`, and its parameters follow:
+A condition of a user's file is `FILE.py:NAME`, of a module `MODULE:NAME`; parameters follow, as in
 `my_filter.py:Eager:gain=2`.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
-import os
-import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shortened, shown
 from safe_envs.number_text import real_or_complex
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.base import Condition
-from safe_envs.wrappers.conditions.registry import (
-    condition_class,
-    condition_names,
-    name_of,
-    unknown_filter,
-)
+from safe_envs.wrappers.conditions.registry import condition_class, name_of
+from safe_envs.wrappers.conditions.text_parts import Part, part_of, parts_of
 from safe_envs.wrappers.learning import LearnedModel, load_learned
 
 _MOST_ENTRIES = 12
 """Of a parameter, as for the longest chain of integrators that anybody filters: the poles of a
 dozen gains take a second."""
 
-_FILE = r"(?:\.{0,2}/[^:]{0,4096}?|[^+:,/][^+:,]{0,4096}?)\.py:[A-Za-z_]\w*"
-"""FILE.py:NAME; only a path from / or ./ may hold a "+" or a comma, for these divide conditions."""
-
-_MODULE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(?=\s*(?:[:+,]|$))"
-"""MODULE:NAME; a parameter is none, for a "=" follows its name."""
-
 Learned = Mapping[str, LearnedModel]
 """Learned models by method."""
-
-
-class _Part(NamedTuple):
-    """The text of one condition, taken apart: its name or place, and what sets its parameters."""
-
-    text: str
-    name: str
-    settings: list[str]
 
 
 def parse_conditions(
@@ -75,6 +52,35 @@ def parse_conditions(
     )
 
 
+def conditions_for(
+    problem: SafetyProblem, given: Condition | Sequence[Condition] | str
+) -> tuple[Condition, ...]:
+    """Return a condition for every barrier of a problem.
+
+    Args:
+        problem: problem whose barriers and gains are taken.
+        given: one for all barriers, one for each, or their text.
+
+    Raises:
+        ConfigurationError: Their number is wrong, or one is none or does not fit the problem.
+    """
+    count = len(problem.barriers)
+    read = parse_conditions(given, problem) if isinstance(given, str) else given
+    each = (read,) * count if isinstance(read, Condition) else read
+    if not isinstance(each, Sequence) or not all(isinstance(c, Condition) for c in each):
+        raise ConfigurationError(
+            f"condition = {given!r}; give a Condition, one for each barrier, or their text, like"
+            " 'scbf'"
+        )
+    if len(each) != count:
+        raise ConfigurationError(
+            f"{len(each)} conditions for the {count} barriers of {problem.name}; give one for each"
+        )
+    for condition in each:
+        condition.require_fit(problem)
+    return tuple(each)
+
+
 def require_readable(text: str, problem: SafetyProblem) -> None:
     """Raise ConfigurationError where `parse_conditions` would, without reading learned models.
 
@@ -97,7 +103,7 @@ def parse_condition(text: str, gains: Sequence[float]) -> Condition:
         ConfigurationError: The name or a parameter is unknown or comes twice, or a value is not
             allowed.
     """
-    part = _part(text, re.compile(head_pattern()))
+    part = part_of(text)
     return _of_model(part, *_settings(part), gains)
 
 
@@ -111,110 +117,10 @@ def spec_of(conditions: Condition | Sequence[Condition]) -> str:
     return texts[0] if len(set(texts)) == 1 else "+".join(texts)
 
 
-def learned_parts(text: str) -> list[tuple[str, str | None]]:
-    """Return the method and the file, None without one, of each condition that needs a model."""
-    return [
-        (method, next((s[len("file=") :] for s in part.settings if s.startswith("file=")), None))
-        for part in _parts(text)
-        if _is_known(part.name) and (method := condition_class(part.name).method) is not None
-    ]
-
-
-def files_of(text: str) -> tuple[Path, ...]:
-    """Return the files that the text of a filter names, of Python or of a learned model.
-
-    Nothing is run and no file is opened.
-    """
-    parts = _parts(text)
-    sources = [part.name.rpartition(":")[0] for part in parts]
-    settings = [s.partition("=") for part in parts for s in part.settings]
-    return tuple(
-        Path(path)
-        for path in (
-            *(source for source in sources if source.endswith(".py")),
-            *(value for key, _, value in settings if key == "file"),
-        )
-    )
-
-
-def with_absolute_paths(text: str) -> str:
-    """Return the text of a filter with the whole paths of its files, as it holds in any folder."""
-    return "+".join(
-        ":".join(
-            [
-                f"{os.path.realpath(source)}:{name}" if source.endswith(".py") else part.name,
-                *(
-                    f"file={os.path.realpath(setting[len('file=') :])}"
-                    if setting.startswith("file=")
-                    else setting
-                    for setting in part.settings
-                ),
-            ]
-        )
-        for part in _parts(text)
-        for source, _, name in [part.name.rpartition(":")]
-    )
-
-
-def head_pattern(*more: str) -> str:
-    """Return the regular expression of what the text of a condition begins with.
-
-    Args:
-        more: names that are accepted besides those of conditions.
-    """
-    names = sorted((*more, *condition_names()), key=len, reverse=True)
-    return rf"(?:(?:{'|'.join(map(re.escape, names))})(?=\s*(?:[:+,]|$))|{_FILE}|{_MODULE})"
-
-
-def require_known(text: str, *more: str) -> None:
-    """Raise ConfigurationError unless the text of a filter begins with a condition.
-
-    Args:
-        text: as for `parse_conditions`.
-        more: names that the message lists besides those of conditions.
-    """
-    name = _parts(text)[0].name
-    if not _is_known(name):
-        raise unknown_filter(name, *more)
-
-
-def _is_known(name: str) -> bool:
-    return ":" in name or name in condition_names()
-
-
-def _parts(text: str) -> list[_Part]:
-    """Take the text of a filter apart: a "+" divides where the head of a condition follows it."""
-    head = re.compile(head_pattern())
-    start = len(_head(text, head))
-    # A class-K function, a complex pole or the path of a file may hold a "+" too.
-    first, *others = re.split(rf"\+(?={head.pattern})", text[start:])
-    return [_part(part, head) for part in (text[:start] + first, *others)]
-
-
-def _part(text: str, head: re.Pattern[str]) -> _Part:
-    name = _head(text, head)
-    rest, *settings = text[len(name) :].split(":")
-    return _Part(text, name + rest, settings)
-
-
-def _head(text: str, head: re.Pattern[str]) -> str:
-    """Return the name or the place at the beginning of a text."""
-    found = head.match(text)
-    name = found.group() if found else ""
-    source, colon, _ = name.rpartition(":")
-    is_there = found and (not colon or source.endswith(".py") or _has_module(source))
-    return name if is_there else text.split(":")[0]
-
-
-def _has_module(name: str) -> bool:
-    top = name.split(".")[0]
-    return top in sys.modules or importlib.util.find_spec(top) is not None
-
-
 def _parsed(
     text: str, problem: SafetyProblem, learned_for: Callable[[Any, str | None], Any]
 ) -> tuple[Condition, ...]:
-    parts, count = _parts(text), len(problem.barriers)
+    parts, count = parts_of(text), len(problem.barriers)
     if len(parts) not in (1, count):
         allowed = "one" if count == 1 else f"one for all {count} barriers, or one for each"
         raise ConfigurationError(
@@ -232,15 +138,15 @@ def _parsed(
 
 
 def _of_model(
-    part: _Part, condition: Any, given: dict[str, Any], gains: Sequence[float]
+    part: Part, condition: Any, given: dict[str, Any], gains: Sequence[float]
 ) -> Condition:
     if condition.method is not None or set(given) <= {"sampling_margin"}:
         return replace(_made(part, condition.for_gains, gains), **given)
     return _made(part, condition, **given)
 
 
-def _made(part: _Part, make: Callable[..., Condition], *args: Any, **given: Any) -> Condition:
-    """Call what makes a condition; an error of a user's class becomes one of ours."""
+def _made(part: Part, make: Callable[..., Condition], *args: Any, **given: Any) -> Condition:
+    """Call what makes a condition; any error of its class becomes a ConfigurationError."""
     try:
         return make(*args, **given)
     except SafeEnvsError:
@@ -265,7 +171,7 @@ def _learned_for(
     return learned[condition.method]
 
 
-def _settings(part: _Part) -> tuple[Any, dict[str, Any]]:
+def _settings(part: Part) -> tuple[Any, dict[str, Any]]:
     """Return the class of a condition, and the arguments that its text sets."""
     condition = condition_class(part.name)
     parameters = dict(inspect.signature(condition).parameters)

@@ -1,6 +1,4 @@
-"""Conditions that know the noise, with the Ito generator A in place of the Lie derivative: SCBF,
-SZCBF.
-"""
+"""Conditions with the Ito generator A in place of the Lie derivative: SCBF, SZCBF."""
 
 from __future__ import annotations
 
@@ -10,19 +8,20 @@ from dataclasses import dataclass
 from safe_envs.dynamics.lie import generator
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import AffineConstraint, Condition, chain_of
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.chain import chain_of
 from safe_envs.wrappers.conditions.class_k import positive_rates
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 
 @dataclass(frozen=True)
 class SCBF(Condition):
     """A^r h >= 0, with the Ito generator A and the stochastic relative degree r.
 
-    What it promises: `safe_envs.wrappers.verification.bounds`.
+    Its bounds: `safe_envs.wrappers.verification.bounds`.
 
-    Source: thesis Def. 4.2.6, Prop. 4.2.8, Thm. 4.2.10. The print defines the relative degree by
-        A^j h = 0; what is
-    meant is that L_g A^(j-1) h = 0 below r.
+    Source: thesis Def. 4.2.6, Prop. 4.2.8, Thm. 4.2.10. The thesis defines the relative degree by
+        A^j h = 0; it means that L_g A^(j-1) h = 0 below r.
     """
 
     name = "scbf"
@@ -33,7 +32,7 @@ class SCBF(Condition):
         return AffineConstraint.after(model, *chain_of(model, barrier, None, generator))
 
     def chain_rates(self, degree: int) -> tuple[float, ...]:
-        """Zeros; see `Condition.chain_rates`."""
+        """Return zeros; see `Condition.chain_rates`."""
         return (0.0,) * degree
 
 
@@ -41,14 +40,13 @@ class SCBF(Condition):
 class SZCBF(Condition):
     """h_0 = h, h_j = A h_(j-1) + alpha_j h_(j-1), and h_r(x, u) >= 0, with the Ito generator A.
 
-    What it promises: `safe_envs.wrappers.verification.bounds`.
+    Its bounds: `safe_envs.wrappers.verification.bounds`.
 
     Attributes:
         alphas: rates alpha_1..alpha_r in 1/s, as many as the relative degree.
 
-    Source: thesis Def. 4.2.4, Prop. 4.2.5 and, for higher degrees, Sec. 4.3.2, which prints h_2 = A
-        h_1 + alpha_2 h:
-    with that even noise-free trajectories can leave the set.
+    Source: thesis Def. 4.2.4, Prop. 4.2.5 and, for higher degrees, Sec. 4.3.2, whose
+        h_2 = A h_1 + alpha_2 h lets even noise-free trajectories leave the set.
     """
 
     alphas: tuple[float, ...] = (1.0,)
@@ -65,9 +63,9 @@ class SZCBF(Condition):
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> SZCBF:
-        """The SZCBF with all rates."""
+        """Return the SZCBF with all rates."""
         return cls(tuple(gains))
 
     def chain_rates(self, degree: int) -> tuple[float, ...]:
-        """The rates; see `Condition.chain_rates`."""
+        """Return the rates; see `Condition.chain_rates`."""
         return self.alphas

@@ -1,3 +1,1 @@
-"""Gymnasium wrappers: the safety filter, monitors of third-party envs, and the cost in the return
-of `step`.
-"""
+"""Gymnasium wrappers: safety filters, monitors of third-party envs, costs returned by `step`."""

@@ -1,4 +1,4 @@
-"""The interface of safety-gymnasium, whose `step` returns the cost beside the reward."""
+"""The interface of safety-gymnasium, whose `step` returns the cost after the reward."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ class CostReturnWrapper:
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Start an episode, as in Gymnasium."""
-        anew = (options or {}).get("reset_mask", True)
-        self._ended = self._ended & ~np.asarray(anew, dtype=bool)
+        restarted = (options or {}).get("reset_mask", True)
+        self._ended = self._ended & ~np.asarray(restarted, dtype=bool)
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: Any) -> SixTuple:
@@ -92,9 +92,7 @@ class CostReturnWrapper:
         )
 
     def _costs(self, info: dict[str, Any]) -> np.ndarray:
-        """The cost of the step of each env, shape (num_envs,), where the info may be that of a
-        reset.
-        """
+        """Return the cost of each env, shape (num_envs,), where the info may be that of a reset."""
         cost = info["cost"]
         if self._mode == AutoresetMode.SAME_STEP and "final_info" in info:
             last = info["final_info"]

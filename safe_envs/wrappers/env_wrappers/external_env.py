@@ -1,6 +1,4 @@
-"""How a filter sees an env that was not written for it: a model of it, what is safe, and where its
-state and its input are.
-"""
+"""How a filter sees a third-party env: a model of it, what is safe, where state and input are."""
 
 from __future__ import annotations
 
@@ -55,7 +53,7 @@ class ActionMap(NamedTuple):
 
 @dataclass(frozen=True)
 class FilterSpec:
-    """What a filter has to be told of somebody else's env.
+    """What a filter needs to know of a third-party env.
 
     Attributes:
         model: of the env, continuous in time; nobody checks that the env obeys it.
@@ -67,7 +65,7 @@ class FilterSpec:
         filter: text of the filter where an evaluation names none, like "hocbf:p=2,8"; None for what
             suits the model.
         dt: control period in s; None for the env's own attribute `dt`.
-        gains: rates that the conditions use unless told otherwise; ones by default. See
+        gains: rates of conditions whose text sets none; ones by default. See
             `SafetyProblem`.
         nominal: a controller to be kept safe, an expression of the model's states and parameters
             for each input; if any.
@@ -110,7 +108,7 @@ class FilterSpec:
 
     @classmethod
     def of(cls, view: dict[str, Any]) -> FilterSpec:
-        """A spec from arguments by name.
+        """Return a spec from arguments by name.
 
         Raises:
             ConfigurationError: a name is unknown, or one that is needed is missing.
@@ -144,7 +142,7 @@ class FilterSpec:
         return named_barriers(self.barriers)
 
     def state(self, observation: Any, batch: tuple[int, ...] = ()) -> np.ndarray:
-        """The state (n,) that an observation shows, or the states (B, n) of a batch.
+        """Return the state (n,) that an observation shows, or the states (B, n) of a batch.
 
         Args:
             observation: of an env, or of a batch of them.
@@ -173,14 +171,14 @@ class FilterSpec:
         return x
 
     def inputs(self, actions: np.ndarray) -> np.ndarray:
-        """The model's inputs (..., m) for the env's actions."""
+        """Return the model's inputs (..., m) for the env's actions."""
         return np.asarray(
             actions if self.action_map is None else self.action_map.to_input(actions),
             dtype=np.float64,
         )
 
     def actions(self, inputs: np.ndarray) -> np.ndarray:
-        """The env's actions (..., m) for the model's inputs."""
+        """Return the env's actions (..., m) for the model's inputs."""
         return np.asarray(
             inputs if self.action_map is None else self.action_map.to_action(inputs),
             dtype=np.float64,
@@ -189,8 +187,7 @@ class FilterSpec:
     def problem(
         self, env: Any, action_space: gym.Space[Any], name: str, steps: int | None
     ) -> SafetyProblem:
-        """The model as a problem of its own, for all that needs one: conditions, the filter, an
-        evaluation.
+        """Return the model as a problem of its own, for conditions, the filter and evaluations.
 
         Args:
             env: where the attribute `dt` may be found.

@@ -1,6 +1,4 @@
-"""Safety of envs that know nothing of it: `info` as for this project's own, and their states and
-inputs for a filter.
-"""
+"""Safety of third-party envs: `info` as for this project's envs, states and inputs for a filter."""
 
 from __future__ import annotations
 
@@ -29,13 +27,14 @@ _CHANGE_SIGHT = (
 
 
 class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.RecordConstructorArgs):
-    """Adds cost, violation, barrier, h_min and episode_cost to `info`, by a model's barriers;
-    actions go through unchanged.
+    """Adds cost, violation, barrier, h_min and episode_cost to `info`, by a model's barriers.
+
+    Actions pass unchanged.
 
     Keys of the same names that the env reports itself are replaced.
 
     Args:
-        env: any env with a box of actions.
+        env: any env with a Box action space.
         spec: how its state is seen, and what is safe; or FILE.py:NAME of that, with which an env's
             own spec can be written as JSON.
 
@@ -72,7 +71,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         return self._x
 
     def physical_action(self, action: Any) -> list[float]:
-        """The model's input for an action; what lies beyond the action space is clipped.
+        """Return the model's input for an action, which is clipped to the action space.
 
         Raises:
             InvalidInputError: the action has another shape, or does not hold finite real numbers.
@@ -85,9 +84,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         return self._spec.inputs(np.clip(given, self._low, self._high)).tolist()
 
     def normalized_action(self, u: Sequence[float]) -> np.ndarray:
-        """Inverse of `physical_action`: the env's action for an input of the model, in the numbers
-        of the action space.
-        """
+        """Return the env's action for an input of the model; the inverse of `physical_action`."""
         return np.clip(self._spec.actions(np.array(u)), self._low, self._high).astype(self._kind)
 
     def reset(
@@ -117,8 +114,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         return self.step(self.normalized_action(u))
 
     def render(self) -> Any:
-        """The env's own picture, in the mode "rgb_array" with what the filter does and the barrier
-        beside it.
+        """Return the env's picture, in the mode "rgb_array" next to the filter and the barrier.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.
@@ -160,7 +156,7 @@ def doubt_layers(env: gym.Env[Any, Any]) -> None:
 
 
 def named_and_limited(env: Any) -> tuple[str, int | None]:
-    """Name of an env, and the number of steps after which it is truncated."""
+    """Return the name of an env, and the number of steps after which it is truncated."""
     spec = env.spec
     return (
         (type(env.unwrapped).__name__, None) if spec is None else (spec.id, spec.max_episode_steps)
@@ -168,12 +164,12 @@ def named_and_limited(env: Any) -> tuple[str, int | None]:
 
 
 def ends_of(space: Any) -> tuple[np.ndarray, np.ndarray, Any]:
-    """Lower and upper ends of a box of actions in double precision, and the kind of its numbers."""
+    """Return the bounds of a Box action space in double precision, and the type of its numbers."""
     return space.low.astype(np.float64), space.high.astype(np.float64), space.dtype
 
 
 def barriers_of(spec: FilterSpec, flavour: Flavour) -> Any:
-    """The barriers of a spec, compiled."""
+    """Return the barriers of a spec, compiled."""
     return compile_function(
         spec.model.states, [spec.model.numeric(b.expression) for b in spec.named], flavour
     )
@@ -186,7 +182,7 @@ def _undefined(name: str, x: Sequence[float]) -> NumericalError:
 
 
 def barrier_table(barriers: Any, name: str, x: Components) -> np.ndarray:
-    """Values of the barriers at a batch of states, shape (B, k).
+    """Return the values of the barriers at a batch of states, shape (B, k).
 
     Raises:
         NumericalError: one is not finite.

@@ -33,7 +33,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     same-step autoreset the last step of an episode is in `final_info`.
 
     Args:
-        env: any vector env with a box of actions, SyncVectorEnv and AsyncVectorEnv among them.
+        env: any vector env with a Box action space, SyncVectorEnv and AsyncVectorEnv among them.
         spec: how the states are seen, and what is safe; or FILE.py:NAME of that.
 
     Attributes:
@@ -72,16 +72,13 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
     @property
     def components(self) -> Components:
-        """The states that the last observations show, an array (num_envs,) for each of the model's
-        states.
-        """
+        """States that the last observations show, an array (num_envs,) for each component."""
         if not self._x:
             raise gym.error.ResetNeeded("the envs have no state yet: call reset() first")
         return self._x
 
     def physical_action(self, actions: Any) -> Components:
-        """Components of the model's inputs for actions (num_envs, m); what lies beyond the action
-        space is clipped.
+        """Return the components of the model's inputs for actions (num_envs, m), which are clipped.
 
         Raises:
             InvalidInputError: the actions have another shape or are not finite.
@@ -95,9 +92,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         return _columns(self._spec.inputs(np.clip(given, self._low, self._high)))
 
     def normalized_action(self, u: Sequence[Any]) -> np.ndarray:
-        """Inverse of `physical_action`: the envs' actions for components of inputs, in the numbers
-        of the action space.
-        """
+        """Return the envs' actions for components of inputs; the inverse of `physical_action`."""
         return np.clip(self._spec.actions(np.stack(u, axis=-1)), self._low, self._high).astype(
             self._kind
         )
@@ -107,19 +102,19 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`."""
         # Gymnasium's own vector envs take the mask out of the mapping that they are given.
-        anew = np.array((options or {}).get("reset_mask", self.episodes.everywhere), dtype=bool)
+        restarted = np.array((options or {}).get("reset_mask", self._everywhere), dtype=bool)
         observation, info = self.env.reset(
             seed=seed, options=None if options is None else dict(options)
         )
-        self.episodes.restart(anew)
-        seen = self._seen(observation, anew)
+        self._forget(restarted)
+        seen = self._seen(observation, restarted)
         if self.viewer is not None:
             self.viewer.restart(
                 np.stack(self._x, axis=-1),
-                self.episodes.steps * self.problem.dt,
-                np.flatnonzero(anew).tolist(),
+                self._steps * self.problem.dt,
+                np.flatnonzero(restarted).tolist(),
             )
-        return observation, {**info, **with_masks(seen, anew)}
+        return observation, {**info, **with_masks(seen, restarted)}
 
     def step(self, actions: Any) -> VectorStep:
         """Pass on actions, and look at what comes of them."""
@@ -128,15 +123,15 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         ended, episodes = terminated | truncated, self.episodes
         episodes.steps += 1
         if self._mode == AutoresetMode.SAME_STEP:
-            shown = self._of_same_step(observation, ended, info)
-            episodes.begun = ended
+            restarted, shown = ended, self._of_same_step(observation, ended, info)
         else:
-            due = episodes.due()
-            if due is not None:
-                episodes.restart(due)
-            episodes.ended = ended
-            shown = self._seen(observation, episodes.everywhere)
+            restarted = self._ended
+            self._forget(restarted)
+            self._ended = ended.copy()
+            shown = self._seen(observation, self._everywhere)
         if self.viewer is not None:
+            self._steps += ~restarted
+            times, begun = self._steps * self.problem.dt, np.flatnonzero(restarted).tolist()
             self.viewer.advance(
                 np.stack(self._x, axis=-1),
                 episodes.steps * self.problem.dt,
@@ -156,8 +151,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         return self.step(self.normalized_action(u))
 
     def render(self) -> Any:
-        """The envs' own pictures, in the mode "rgb_array" with what the filter does and the barrier
-        beside each.
+        """Return the envs' pictures, in the mode "rgb_array" next to filter and barrier.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.
@@ -170,8 +164,9 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         )
 
     def _of_same_step(self, observation: np.ndarray, ended: np.ndarray, info: Info) -> Info:
-        """What is shown after a step that restarted the envs that ended: their last step goes to
-        `final_info`.
+        """Return what is shown after a step that restarted the envs that ended.
+
+        Their last step goes to `final_info`.
         """
         if not ended.any():
             return self._seen(observation, self.episodes.everywhere)
@@ -193,9 +188,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
 
 
 def _one_of(env: gym.vector.VectorEnv) -> Any:
-    """One of the envs of a batch where they are at hand, as in SyncVectorEnv; the batch itself
-    elsewhere.
-    """
+    """Return one of the envs of a batch where they are at hand, else the batch itself."""
     envs = getattr(env.unwrapped, "envs", None)
     return envs[0].unwrapped if envs else env.unwrapped
 

@@ -12,22 +12,18 @@ from gymnasium.vector import AutoresetMode
 from safe_envs.envs.info import Info, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv, VectorStep
 from safe_envs.wrappers.conditions import Condition
-from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
-from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
-from safe_envs.wrappers.env_wrappers.safety_filter import (
-    build_filter,
-    changed_action,
-    require_foreign,
+from safe_envs.wrappers.env_wrappers.layers import (
+    FilterLayer,
     rest_info,
-    rounding,
-    unreadable,
+    state_layer,
+    third_party_spec,
 )
-from safe_envs.wrappers.safety_filter import Decision
+from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
+from safe_envs.wrappers.filter_qp import FilterDecision
 
 
-class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
-    """`SafetyFilterWrapper` for the whole batch at once; same arguments, same info with the batch
-    in front.
+class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
+    """`SafetyFilterWrapper` for a batch: same arguments, same info with the batch in front.
 
     A step that only resets an env (next-step autoreset) ignores its action: there the filter
     reports what it reports at reset, and counts nothing.
@@ -48,17 +44,11 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         **view: Any,
     ) -> None:
         if view:
-            require_foreign(env.unwrapped, SafeVectorEnv, view, knowledge)
-            env = SafetyMonitorVector(env, FilterSpec.of(view))
+            spec = third_party_spec(env.unwrapped, SafeVectorEnv, view, knowledge)
+            env = SafetyMonitorVector(env, spec)
         inner = readable(env)
-        text, self.safety_filter = build_filter(
-            inner.problem, condition, knowledge, objective, priorities
-        )
-        super().__init__(env)
-        self._inner: Any = inner
-        if inner.viewer is not None:
-            inner.viewer.caption = text
-        self._tolerance = rounding(inner.problem)
+        self.attach(inner, condition, knowledge, objective, priorities)
+        gym.vector.VectorWrapper.__init__(self, env)
         self._rest = rest_info(inner.problem)
         self._mode = env.metadata["autoreset_mode"]
         self._interventions = np.zeros(self.num_envs, dtype=np.int64)
@@ -78,7 +68,7 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         return observation, {**info, **with_masks(at_rest, present)}
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """That of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
+        """Return that of the env, and the counts of each episode; see `SafeVectorEnv.snapshot`."""
         counts = {
             "interventions": self._interventions.copy(),
             "infeasible": self._infeasible.copy(),
@@ -88,7 +78,7 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
     def restore(
         self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None
     ) -> None:
-        """Put each episode where a snapshot of a filtered env has it; see `SafeVectorEnv.restore`."""
+        """Put each episode where a snapshot has it; see `SafeVectorEnv.restore`."""
         self._inner.restore(snapshot, seed)
         self._interventions, self._infeasible = (
             np.array(snapshot[name]) for name in ("interventions", "infeasible")
@@ -119,18 +109,22 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
                 decision.action, self._inner.executed, self._tolerance, strict=True
             ):
                 if not np.allclose(u, v, rtol=0.0, atol=tolerance):
-                    raise changed_action(self, decision.action, self._inner.executed)
+                    raise self.changed_action(decision.action)
         added = self._decided(decision, active)
-        begun = self._inner.episodes.begun
-        if np.count_nonzero(begun):
-            if self._mode == AutoresetMode.SAME_STEP:
-                last = {key: value.copy() for key, value in added.items()}
-                info["final_info"].update(with_masks(last, begun))
-            self._start_anew(added, begun)
+        ended = terminated | truncated
+        if self._mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
+            info["final_info"].update(
+                with_masks({key: value.copy() for key, value in added.items()}, ended)
+            )
+            self._restart(added, ended)
+        elif self._mode == AutoresetMode.NEXT_STEP:
+            if np.count_nonzero(self._ended):
+                self._restart(added, self._ended)
+            self._ended = ended
         info.update(with_masks(added, info["_cost"]))
         return observation, reward, terminated, truncated, info
 
-    def _decided(self, decision: Decision, active: np.ndarray) -> Info:
+    def _decided(self, decision: FilterDecision, active: np.ndarray) -> Info:
         """Count, and report what was decided."""
         nominal = decision.proposed
         differs = decision.action[0] != nominal[0]
@@ -140,24 +134,22 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         self._interventions += differs
         self._infeasible += ~decision.feasible
         return filter_info(
-            nominal_action=_beside(nominal),
-            safe_action=_beside(decision.action),
+            nominal_action=_as_columns(nominal),
+            safe_action=_as_columns(decision.action),
             intervention=differs,
             filter_active=active,
             feasible=decision.feasible,
             slack=(
                 decision.slack[0] if len(decision.slack) == 1 else np.maximum.reduce(decision.slack)
             ),
-            slacks=_beside(decision.slack),
+            slacks=_as_columns(decision.slack),
             active_barrier=np.where(differs, decision.cause, -1),
             episode_interventions=self._interventions.copy(),
             episode_infeasible=self._infeasible.copy(),
         )
 
-    def _start_anew(self, added: Info, envs: np.ndarray) -> None:
-        """Put what is reported at reset in place of a decision, for the envs that were reset in
-        this step.
-        """
+    def _restart(self, added: Info, envs: np.ndarray) -> None:
+        """Put what is reported at reset in place of a decision, for the envs that were reset."""
         self._forget(envs)
         for key, value in self._rest.items():
             # The env itself may hold the array of a single input.
@@ -170,21 +162,14 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
 
 
 def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:
-    """The layer of a vector env from which a filter reads the states.
+    """Return the layer of a vector env from which a filter reads the states.
 
     Raises:
         ConfigurationError: there is none.
     """
-    layer = env
-    while isinstance(layer, gym.vector.VectorWrapper) and not isinstance(
-        layer, SafetyMonitorVector
-    ):
-        layer = layer.env
-    if not isinstance(layer, SafeVectorEnv | SafetyMonitorVector):
-        raise unreadable(layer, vector=True)
-    return layer
+    return state_layer(env, (SafeVectorEnv, SafetyMonitorVector), vector=True)
 
 
-def _beside(components: Sequence[np.ndarray]) -> np.ndarray:
+def _as_columns(components: Sequence[np.ndarray]) -> np.ndarray:
     """Fresh components as columns; a single one needs no copy."""
     return components[0].reshape(-1, 1) if len(components) == 1 else np.stack(components, axis=-1)

@@ -1,15 +1,15 @@
-"""One state, any number of rows and inputs: the nearest of the actions that violate the rows least,
-to rounding.
+"""The nearest of the least-violating actions, for one state and any number of constraints.
 
 Two steps. The least sum of squared slacks comes from bounded least squares; where it is zero, the
-rows can be met. The slacks are the same at all its minimisers, so that these are the actions inside
-the box which violate no row by more. Among them the nearest one to the proposal is found by a
-primal active-set method, which begins at the one at hand and never leaves them (Nocedal and Wright,
-Numerical Optimization, Sec. 16.5). Distances are those of y = sqrt(w) u, where the objective is |y
-- y_v|^2 and rows have unit length.
+constraints can be met. The slacks are the same at all its minimisers, so that these are the actions
+inside the input bounds which violate no constraint by more. Among them the nearest one to the
+proposal is found by a primal active-set method, which begins at the one at hand and never leaves
+them (Nocedal and Wright, Numerical Optimization, Sec. 16.5). Distances are those of y = sqrt(w) u,
+where the objective is |y - y_v|^2 and constraints have unit length.
 
-Rounding counts: with rows or inputs whose sizes differ by more than about a million, the action may
-be somewhat worse than the best. It stays in the box, and is flagged where a row is missed.
+Rounding counts: with constraints or inputs whose sizes differ by more than about a million, the
+action may be somewhat worse than the best. It stays within the input bounds, and is flagged where a
+constraint is missed.
 """
 
 from __future__ import annotations
@@ -19,22 +19,22 @@ from typing import NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.qp.bounded_least_squares import least_violating
-from safe_envs.wrappers.qp.rows import tolerances
+from safe_envs.wrappers.qp.rounding import tolerances
 
 _STEPS = 20
-"""Steps for each row and input: many times more than were ever seen."""
+"""Steps for each constraint and input: many times more than were ever seen."""
 
 _PARALLEL = 1e-13
-"""Part of a step along which a row changes by rounding only."""
+"""Part of a step along which a constraint changes by rounding only."""
 
 _NOTHING = 1e-13
 """Part of the way to the proposal that is rounding."""
 
 _LOST = 4.0
-"""How many tolerances of a row the way to the nearest action may cost."""
+"""How many tolerances of a constraint the way to the nearest action may cost."""
 
 _CORRECTIONS = 2
-"""How often the rows that hold the action are evaluated there: the first time takes back the
+"""How often the constraints that hold the action are evaluated there: the first time takes back the
 rounding of the way to it."""
 
 
@@ -47,11 +47,12 @@ def project(
     w: np.ndarray,
     priority: np.ndarray,
 ) -> np.ndarray:
-    """Return the nearest action (m,) of those that violate the rows least; NaN where the numbers
-    are too large to say.
+    """Return the nearest action (m,) of those that violate the constraints least.
+
+    It is NaN where the numbers are too large to say.
 
     Args:
-        a: rows, shape (k, m).
+        a: constraints, shape (k, m).
         b: offsets, shape (k,).
         v: proposed inputs, shape (m,).
         low: lower bounds, shape (m,).
@@ -60,8 +61,8 @@ def project(
         priority: positive weights of the squared slacks, shape (k,).
     """
     u = np.clip(v, low, high)
-    # An input on which no row depends keeps its proposal, and a row that depends on no input has no
-    # say.
+    # An input on which no constraint depends keeps its proposal, and a constraint that depends on
+    # no input has no say.
     rows, inputs = (a != 0.0).any(axis=1), (a != 0.0).any(axis=0)
     if not rows.any():
         return u
@@ -109,8 +110,8 @@ def _project(
         excess = (a @ u + b + slack)[binding] / unit[binding]
         u[free] -= np.linalg.lstsq(normals[np.ix_(binding, free)], excess)[0] / roots[free]
     u = np.clip(u, low, high)
-    # Where rows or inputs differ by many orders of magnitude, rounding may lead astray: then the
-    # least-violating action itself is safer.
+    # Where constraints or inputs differ by many orders of magnitude, rounding may lead astray: then
+    # the least-violating action itself is safer.
     worse = np.maximum(-(a @ u + b), 0.0) - np.maximum(-margin, 0.0)
     return (
         u if (worse <= _LOST * (tolerances(a.T, b, u) + tolerances(a.T, b, start))).all() else start
@@ -118,9 +119,7 @@ def _project(
 
 
 class _Held(NamedTuple):
-    """Where a step (m,) ends, the rows (k,) that hold it as equations, and the inputs (m,) at their
-    bounds.
-    """
+    """End of a step (m,), with the constraints (k,) and bounds (m,) that hold it."""
 
     step: np.ndarray
     rows: np.ndarray
@@ -131,8 +130,9 @@ class _Held(NamedTuple):
 def _nearest(
     normals: np.ndarray, spare: np.ndarray, way: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> _Held:
-    """The step nearest to the way to the proposal, with normals . step + spare >= 0 and low <= step
-    <= high; 0 is one.
+    """Return the step nearest to the proposal that the constraints and bounds allow.
+
+    It has normals . step + spare >= 0 and low <= step <= high; 0 is such a step.
 
     Where no step leads nearer, the rest of the way is a sum of the normals of what holds the step.
     What has the wrong sign in it is let go.

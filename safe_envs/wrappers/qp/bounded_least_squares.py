@@ -1,11 +1,11 @@
-"""The least sum of squared slacks of one state, for any number of inputs: bounded-variable least
-squares.
+"""The least sum of squared slacks of one state, by bounded-variable least squares.
 
-With p the positive and s the negative part of a row's margin, min |a u + b - p|^2 over u in the box
-and p >= 0 leaves s as the residual. The active-set method of Stark and Parker (1995) solves that:
-rows with p = 0 take part in a least-squares problem, those with p > 0 do not, and a step ends where
-an input meets its bound or a row without a part its zero. SciPy's version stops where a step is too
-short to change the sum, and so too early where several bounds meet in a point.
+With p the positive and s the negative part of a constraint's margin, min |a u + b - p|^2 over u
+within the input bounds and p >= 0 leaves s as the residual. The active-set method of Stark and
+Parker (1995) solves that: constraints with p = 0 take part in a least-squares problem, those with p
+> 0 do not, and a step ends where an input meets its bound or a constraint without a part its zero.
+SciPy's version stops where a step is too short to change the sum, and so too early where several
+bounds meet in a point.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 _STEPS = 20
-"""Steps for each row and input: many times more than were ever seen."""
+"""Steps for each constraint and input: many times more than were ever seen."""
 
 _NOTHING = 1e-12
 """Part of the forces on an input that is rounding."""
@@ -30,12 +30,12 @@ def least_violating(
     """Return an action of least sum_i priority_i slack_i^2.
 
     Args:
-        a: rows, shape (k, m).
+        a: constraints, shape (k, m).
         b: offsets, shape (k,).
         low: lower bounds, shape (m,).
         high: upper bounds, shape (m,).
         priority: positive weights of the squared slacks, shape (k,).
-        start: an action inside the box, shape (m,).
+        start: an action inside the input bounds, shape (m,).
     """
     units = np.sqrt(priority)
     size = (units[:, None] * np.abs(a)).max() or 1.0  # so that squares neither overflow nor vanish
@@ -43,8 +43,8 @@ def least_violating(
     margin = a @ u + b
     k, m = a.shape
     missed, held = margin < 0.0, np.zeros(m, dtype=bool)
-    # What was let go last, rows first and then inputs; and what came back at once, because the
-    # force on it was rounding.
+    # What was let go last, constraints first and then inputs; and what came back at once, because
+    # the force on it was rounding.
     freed, barred = -1, np.zeros(k + m, dtype=bool)
     for _ in range(_STEPS * (k + m)):
         step = np.zeros(len(u))
@@ -83,8 +83,8 @@ def least_violating(
             held[freed - k] = False
         else:
             break
-    # The margins are those of a long way; a last step along the same rows takes back its rounding,
-    # or leads astray.
+    # The margins are those of a long way; a last step along the same constraints takes back its
+    # rounding, or leads astray.
     last = u.copy()
     last[~held] += np.linalg.lstsq(a[np.ix_(missed, ~held)], -margin[missed])[0]
     return min(

@@ -1,13 +1,13 @@
-"""Any number of rows and inputs: each QP goes to the method that is exact for its size.
+"""Any number of constraints and inputs: each QP goes to the method that is exact for its size.
 
     min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a_i . u + b_i >= 0,   low <= u <= high
 
-Where the rows cannot be met together, the answer is the least-violating action, flagged: it
+Where the constraints cannot be met together, the answer is the least-violating action, flagged: it
 minimises sum_i priority_i slack_i^2 with slack_i = max(0, -(a_i . u + b_i)), and among the
-minimisers it is the one nearest to v. One row, one input and two inputs have exact methods of their
-own, and so has a single row that binds; the rest goes to ProxQP, which is imported on first use.
-Rows can be met where the action that is returned meets them by the tolerance of
-`safe_envs.wrappers.qp.rows`.
+minimisers it is the one nearest to v. One constraint, one input and two inputs have exact methods
+of their own, and so has a single constraint that binds; the rest goes to ProxQP, which is imported
+on first use. Constraints can be met where the action that is returned meets them by the tolerance
+of `safe_envs.wrappers.qp.rounding`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp import interval, one_row, plane, plane_batch, single_active_row
-from safe_envs.wrappers.qp.rows import stack
+from safe_envs.wrappers.qp import (
+    interval,
+    one_constraint,
+    plane,
+    plane_batch,
+    single_active_constraint,
+)
+from safe_envs.wrappers.qp.rounding import stack
 
 
 def project_floats(
@@ -33,7 +39,7 @@ def project_floats(
     """Project the proposed input of one state.
 
     Args:
-        a: k rows of m coefficients.
+        a: k constraints of m coefficients.
         b: k offsets.
         v: m proposed inputs.
         low: m lower bounds.
@@ -42,11 +48,11 @@ def project_floats(
         priority: k positive weights of the squared slacks.
 
     Returns:
-        Inputs (m), margins a_i . u + b_i (k), rows that bind or cannot be met (k; none where the
-        clipped proposal meets them all), and whether all rows can be met.
+        Inputs (m), margins a_i . u + b_i (k), constraints that bind or cannot be met (k; none where
+        the clipped proposal meets them all), and whether all constraints can be met.
     """
     if len(b) == 1:
-        u, margin, active, feasible = one_row.project_floats(a[0], b[0], v, low, high, w)
+        u, margin, active, feasible = one_constraint.project_floats(a[0], b[0], v, low, high, w)
         return u, [margin], [active], feasible
     if len(v) == 2:
         return plane.project_floats(a, b, v, low, high, w, priority)
@@ -73,7 +79,7 @@ def project_arrays(
     """Project the proposed inputs of a batch of B states.
 
     Args:
-        a: k rows of m coefficients, each a float or an array (B,).
+        a: k constraints of m coefficients, each a float or an array (B,).
         b: k offsets, likewise.
         v: m arrays (B,) of proposed inputs.
         low: m lower bounds, each a float or an array (B,).
@@ -85,7 +91,7 @@ def project_arrays(
         As `project_floats`, with an array (B,) for every number.
     """
     if len(b) == 1:
-        u, margin, active, feasible = one_row.project_arrays(a[0], b[0], v, low, high, w)
+        u, margin, active, feasible = one_constraint.project_arrays(a[0], b[0], v, low, high, w)
         return u, [margin], [active], feasible
     if len(v) == 1:
         u, margin, active, feasible = interval.project_arrays(
@@ -110,11 +116,12 @@ def _solver(
     size = len(v[0])
     rows = [stack(ai, size) for ai in a]
     offsets, proposed, lower, upper = [stack(part, size) for part in (b, v, low, high)]
-    # A row that says nothing of the input is met or not, exactly, whatever the solver's precision.
+    # A constraint that says nothing of the input is met or not, exactly, whatever the solver's
+    # precision.
     flat = np.array([(row == 0.0).all(axis=0) for row in rows])
     unmet = flat & (offsets < 0.0)
     solvable = np.where(unmet, 0.0, offsets)
-    (u, margin, active, feasible), left = single_active_row.project_arrays(
+    (u, margin, active, feasible), left = single_active_constraint.project_arrays(
         rows, solvable, proposed, lower, upper, w
     )
     if left.size:

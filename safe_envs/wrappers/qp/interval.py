@@ -1,11 +1,10 @@
-"""Several rows and one input: the rows and the box meet in an interval, into which the proposal is
-clipped.
+"""Several constraints on one input, which meet the input bounds in an interval.
 
     min 1/2 (u - v)^2   subject to   a_i u + b_i >= 0,   low <= u <= high
 
-Where the interval is empty, the sum of squared slacks has a single minimiser in the box, found from
-its derivative, which is piecewise linear with a kink at the root of each row. A row with a_i = 0
-has no say in the input.
+Where the interval is empty, the sum of squared slacks has a single minimiser within the input
+bounds, found from its derivative, which is piecewise linear with a kink at the root of each
+constraint. A constraint with a_i = 0 has no say in the input.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp.rows import ROUNDING, stack, tolerance, tolerances, total
+from safe_envs.wrappers.qp.rounding import ROUNDING, stack, tolerance, tolerances, total
 
 
 def project_floats(
@@ -90,8 +89,8 @@ def project_arrays(
         priority: k positive weights of the squared slacks.
 
     Returns:
-        Inputs (B,), margins (k, B), rows that bind or cannot be met (k, B), and whether all rows
-        can be met (B,).
+        Inputs (B,), margins (k, B), constraints that bind or cannot be met (k, B), and whether all
+        constraints can be met (B,).
     """
     size = len(v)
     slope, offset = stack(a, size), stack(b, size)
@@ -116,11 +115,11 @@ def _project(
     high: np.ndarray,
     priority: Sequence[float],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What `project_arrays` returns, for states that violate a row."""
+    """Return what `project_arrays` does, for states that violate a constraint."""
     root = -b / a
     lo = np.maximum(low, np.where(a > 0.0, root, -np.inf).max(axis=0))
     hi = np.minimum(high, np.where(a < 0.0, root, np.inf).min(axis=0))
-    # Two rows that meet in one point may miss each other by the rounding of their roots.
+    # Two constraints that meet in one point may miss each other by the rounding of their roots.
     u = np.minimum(np.maximum(np.minimum(np.maximum(v, lo), hi), low), high)
     margin, allowed = a * u + b, tolerances((a,), b, (u,))
     missed = margin < -allowed
@@ -141,8 +140,7 @@ def least_violating(
     high: np.ndarray,
     priority: Sequence[float] | np.ndarray,
 ) -> np.ndarray:
-    """Where sum_i priority_i max(0, -(a_i u + b_i))^2 is least in a box that meets no point of all
-    sloping rows.
+    """Minimise sum_i priority_i max(0, -(a_i u + b_i))^2 where no input meets all constraints.
 
     Args:
         a: coefficients, shape (k, B).

@@ -1,15 +1,15 @@
-"""Rows that no action of a planar box meets: the least sum of squared slacks, for a batch of
-states.
+"""The least sum of squared slacks of constraints on two inputs, for a batch of states.
 
-The sum is convex and piecewise quadratic. A Newton step goes to the minimiser, over the box, of the
-quadratic that the rows violated now define; the sum is then minimised along the step. Near the
-minimiser the violated rows no longer change and the step is exact. A state is done when the forces
-of the rows, slack times coefficient, balance with those of the box.
+The sum is convex and piecewise quadratic. A Newton step goes to the minimiser, over the input
+bounds, of the quadratic that the constraints violated now define; the sum is then minimised along
+the step. Near the minimiser the violated constraints no longer change and the step is exact. A
+state is done when the forces of the constraints, slack times coefficient, balance with those of the
+input bounds.
 
-Rows count in their own units, so that one may be 1e9 times as steep as another: its slack at the
-minimiser is then below the rounding of its margin, and it acts as a wall. What the other rows ask
-for along the wall must not drown in its rounding. Hence the frame of a step is that of the steepest
-row, and a force is known as an interval, judged along the walls.
+Constraints count in their own units, so that one may be 1e9 times as steep as another: its slack at
+the minimiser is then below the rounding of its margin, and it acts as a wall. What the other
+constraints ask for along the wall must not drown in its rounding. Hence the frame of a step is that
+of the steepest constraint, and a force is known as an interval, judged along the walls.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.qp import bounded_least_squares, interval
-from safe_envs.wrappers.qp.rows import ROUNDING, total
+from safe_envs.wrappers.qp.rounding import ROUNDING, total
 
 _STEPS = 20
 _FAR = 1e150
@@ -28,9 +28,7 @@ overflow."""
 
 
 class _Rows(NamedTuple):
-    """Rows x u_1 + y u_2 + r in units of the steepest, shapes (k, B), a box and inputs, shapes (2,
-    B).
-    """
+    """Constraints x u_1 + y u_2 + r in units of the steepest (k, B), bounds and inputs (2, B)."""
 
     x: np.ndarray
     y: np.ndarray
@@ -59,7 +57,7 @@ def least_violating(
         low: lower bounds, shape (2, B).
         high: upper bounds, shape (2, B).
         priority: positive weights, shape (k,).
-        start: inputs to begin with, shape (2, B), inside the box.
+        start: inputs to begin with, shape (2, B), inside the input bounds.
 
     Returns:
         Minimisers, shape (2, B).
@@ -78,7 +76,7 @@ def least_violating(
     )
     for _ in range(_STEPS):
         margin, error = _margin(rows)
-        # The smallest and the largest slack of each row that rounding allows.
+        # The smallest and the largest slack of each constraint that rounding allows.
         least, most = np.maximum(-margin - error, 0.0), np.maximum(-margin + error, 0.0)
         moving = np.flatnonzero(~_balanced(rows, least, most))
         if not moving.size:
@@ -101,8 +99,9 @@ def least_violating(
 
 
 def is_unique(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Whether the rows violated at minimisers u (2, B) cross, so that no other action has the same
-    slacks (B,).
+    """Return whether minimisers u (2, B) are the only actions with their slacks, shape (B,).
+
+    They are if the constraints that they violate cross.
     """
     first, second = a[0] * u[0], a[1] * u[1]
     violated = first + second + b < -ROUNDING * (np.abs(first) + np.abs(second) + np.abs(b))
@@ -111,14 +110,15 @@ def is_unique(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def _margin(rows: _Rows) -> tuple[np.ndarray, np.ndarray]:
-    """Margins of the rows and what rounding may make of them."""
+    """Margins of the constraints and what rounding may make of them."""
     first, second = rows.x * rows.u[0], rows.y * rows.u[1]
     return first + second + rows.r, ROUNDING * (np.abs(first) + np.abs(second) + np.abs(rows.r))
 
 
 def _balanced(rows: _Rows, least: np.ndarray, most: np.ndarray) -> np.ndarray:
-    """Whether the forces cancel (B,): along both inputs, and along each row, which itself has no
-    part in that.
+    """Return whether the forces cancel (B,), along both inputs and along each constraint.
+
+    A constraint has no part in the force along itself.
     """
     nothing = np.zeros_like(rows.u[:1])
     along = (
@@ -131,7 +131,7 @@ def _balanced(rows: _Rows, least: np.ndarray, most: np.ndarray) -> np.ndarray:
     error *= most[:, None]
     down, up = total(np.minimum(*ends) - error), total(np.maximum(*ends) + error)
     for j in (0, 1):
-        # A face of the box pushes inwards, as strongly as it takes.
+        # A face of the input bounds pushes inwards, as strongly as it takes.
         down = np.where(
             (rows.u[j] <= rows.low[j]) & (along[j] < 0.0)
             | (rows.u[j] >= rows.high[j]) & (along[j] > 0.0),
@@ -169,8 +169,9 @@ def _newton(
 
 
 def _least_squares(rows: _Rows, error: np.ndarray) -> np.ndarray:
-    """Where |x d_1 + y d_2 + r|^2, r being known up to an error, is least with u + d in the box:
-    inside, or else on an edge.
+    """Minimise |x d_1 + y d_2 + r|^2, r being known up to an error, with u + d within its bounds.
+
+    The minimum is inside, or else on an edge.
     """
     goal = rows.u + _unbounded(rows)
     outside = np.flatnonzero(~((goal >= rows.low) & (goal <= rows.high)).all(axis=0))
@@ -182,8 +183,9 @@ def _least_squares(rows: _Rows, error: np.ndarray) -> np.ndarray:
 def _frame(
     x: np.ndarray, y: np.ndarray
 ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
-    """The steepest row (2, B), and each row's components across and along it, these zero where the
-    rows are parallel.
+    """Return the steepest constraint (2, B), and each one's components across and along it.
+
+    The latter are zero where the constraints are parallel.
     """
     steepest = np.maximum(np.abs(x), np.abs(y)).argmax(axis=0)[None]
     n1, n2 = [np.take_along_axis(part, steepest, axis=0)[0] for part in (x, y)]
@@ -197,8 +199,9 @@ def _frame(
 
 
 def _unbounded(rows: _Rows) -> np.ndarray:
-    """The least-squares step (2, B), by Gram-Schmidt in the frame of the steepest row; across it
-    alone where all are parallel.
+    """Return the least-squares step (2, B), in the frame of the steepest constraint.
+
+    It is across that alone where all are parallel.
     """
     (n1, n2), across, along = _frame(rows.x, rows.y)
     square = total(across * across)
@@ -213,8 +216,9 @@ def _unbounded(rows: _Rows) -> np.ndarray:
 
 
 def _best_edge(rows: _Rows, error: np.ndarray) -> np.ndarray:
-    """The point of the four edges whose multiplier has the right sign; if several do up to
-    rounding, the least sum and the nearest.
+    """Return the point of the four edges whose multiplier has the right sign.
+
+    If several do up to rounding, it is that of the least sum, and the nearest.
     """
     u, low, high = rows.u, rows.low, rows.high
     best, least_wrong, least_sum = (

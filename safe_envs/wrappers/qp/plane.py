@@ -1,17 +1,18 @@
-"""Several rows and two inputs, one state in plain floats: exact, row by row, in a time that the
-solvers need to start.
+"""Several constraints on two inputs for one state, exact and one by one, in plain floats.
 
     min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a_i . u + b_i >= 0,   low <= u <= high
 
-Seidel's incremental scheme. The proposal clipped into the box is the minimiser without rows. Where
-it violates the next row, the new minimiser lies on that row's line: the box and the rows before
-leave an interval of the line, and the point of the line nearest to v is clipped into it. An empty
-interval means that no action meets the rows.
+Seidel's incremental scheme. The proposal clipped into the input bounds is the minimiser without
+constraints. Where it violates the next constraint, the new minimiser lies on that constraint's
+line: the input bounds and the constraints before leave an interval of the line, and the point of
+the line nearest to v is clipped into it. An empty interval means that no action meets the
+constraints.
 
-A line is written u_p = alpha + beta u_f. The free input f is the one that adds less to the row,
-given how far each input can go: to the end of its box, or as far in the metric of the objective as
-the line is away, since a box may be endless. So neither term is much larger than u_p, and rounding
-stays small. Every test compares a sum with its own terms: rows may have any size.
+A line is written u_p = alpha + beta u_f. The free input f is the one that adds less to the
+constraint, given how far each input can go: to the end of the input bounds, or as far in the metric
+of the objective as the line is away, since a box may be endless. So neither term is much larger
+than u_p, and rounding stays small. Every test compares a sum with its own terms: constraints may
+have any size.
 """
 
 from __future__ import annotations
@@ -22,11 +23,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from safe_envs.wrappers.qp import plane_batch
-from safe_envs.wrappers.qp.rows import ROUNDING, tolerance
+from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance
 
 Row = tuple[float, float, float]
-"""(a_1, a_2, b) of a row a . u + b >= 0; on a line, the second and first input are the pivot and
-the free one."""
+"""(a_1, a_2, b) of a constraint a . u + b >= 0; on a line, the second and first input are the pivot
+and the free one."""
+
+
+Input = tuple[float, float, float, float]
+"""Proposal, lower and upper bound, and weight of an input."""
 
 
 def project_floats(
@@ -38,8 +43,11 @@ def project_floats(
     w: Sequence[float],
     priority: Sequence[float],
 ) -> tuple[list[float], list[float], list[bool], bool]:
-    """Project the input of one state: inputs (2), margins and binding rows (k), whether the rows
-    can be met together.
+    """Project the input of one state.
+
+    Returns:
+        Inputs (2), margins and binding constraints (k), and whether the constraints can be met
+        together.
     """
     (v1, v2), (l1, l2), (h1, h2) = v, low, high
     c1 = l1 if v1 < l1 else h1 if v1 > h1 else v1
@@ -58,20 +66,10 @@ def project_floats(
         steepness = abs(a1) / r1 + abs(a2) / r2
         reach = r1 * abs(u1) + r2 * abs(u2) - (miss / steepness if steepness > 0.0 else miss)
         if abs(a1) * min(e1, reach / r1) >= abs(a2) * min(e2, reach / r2):
-            u = _onto_line(rows[i], rows[:i], v1, v2, l1, h1, l2, h2, w[0], w[1])
+            u = _onto_line(rows[i], rows[:i], (v1, l1, h1, w[0]), (v2, l2, h2, w[1]))
         else:
-            found = _onto_line(
-                (a2, a1, bi),
-                [(q2, q1, q0) for q1, q2, q0 in rows[:i]],
-                v2,
-                v1,
-                l2,
-                h2,
-                l1,
-                h1,
-                w[1],
-                w[0],
-            )
+            before = [(q2, q1, q0) for q1, q2, q0 in rows[:i]]
+            found = _onto_line((a2, a1, bi), before, (v2, l2, h2, w[1]), (v1, l1, h1, w[0]))
             u = found and (found[1], found[0])
         if u is None:
             return _one_of_batch(a, b, v, low, high, w, priority)
@@ -96,18 +94,12 @@ def project_floats(
 def _onto_line(
     line: Row,
     before: list[Row],
-    vp: float,
-    vf: float,
-    lp: float,
-    hp: float,
-    lf: float,
-    hf: float,
-    wp: float,
-    wf: float,
+    pivot_input: Input,
+    free_input: Input,
 ) -> tuple[float, float] | None:
-    """The minimiser (pivot, free) on a line within the box and the rows before; None where there is
-    none.
-    """
+    """Return the minimiser (pivot, free) on a line within the constraints before, or None."""
+    vp, lp, hp, wp = pivot_input
+    vf, lf, hf, wf = free_input
     ap, af, b = line
     if ap == 0.0:
         return None
@@ -141,7 +133,7 @@ def _onto_line(
 def _meeting_point(
     before: list[Row], alpha: float, beta: float, lo: float, hi: float, aim: float
 ) -> float | None:
-    """The free input where the rows leave an interval once each of them may miss by its rounding."""
+    """Return the free input that the constraints leave once each may miss by rounding."""
     for rp, rf, rb in before:
         slope, offset = rf + rp * beta, rb + rp * alpha
         if abs(slope) > ROUNDING * abs(rf):
@@ -150,7 +142,7 @@ def _meeting_point(
             lo, hi = (max(lo, end), hi) if slope > 0.0 else (lo, min(hi, end))
     free = min(max(aim, lo), hi)
     # The ends may lie so far off that their rounding is large: what counts is the rounding of the
-    # rows at the point itself.
+    # constraints at the point itself.
     for rp, rf, rb in before:
         terms = abs(rb) + abs(rp * alpha) + (abs(rf) + abs(rp * beta)) * abs(free)
         if not (rf + rp * beta) * free + (rb + rp * alpha) >= -2.0 * ROUNDING * terms:

@@ -1,9 +1,8 @@
-"""Several rows and two inputs, a batch of states at once: `safe_envs.wrappers.qp.plane` with masks
-in place of branches.
+"""`safe_envs.wrappers.qp.plane` for a batch of states, with masks in place of branches.
 
-The states that violate the row in turn are gathered and moved onto its line, so that the number of
-NumPy calls grows with the number of rows and not with the batch. Every number comes from the same
-operations in the same order as for one state.
+The states that violate the constraint in turn are gathered and moved onto its line, so that the
+number of NumPy calls grows with the number of constraints and not with the batch. Every number
+comes from the same operations in the same order as for one state.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.qp.min_slack import is_unique, least_violating
-from safe_envs.wrappers.qp.rows import ROUNDING, stack, tolerances
+from safe_envs.wrappers.qp.rounding import ROUNDING, stack, tolerances
 
 
 class Plane(NamedTuple):
@@ -37,11 +36,11 @@ class Plane(NamedTuple):
     w: np.ndarray
 
     def take(self, states: np.ndarray) -> Plane:
-        """Some states of the batch."""
+        """Return some states of the batch."""
         return Plane(*[part[..., states] for part in self])
 
     def clip(self, u: np.ndarray) -> np.ndarray:
-        """Inputs (2, B) moved into the box."""
+        """Return inputs (2, B) clipped to their bounds."""
         return np.minimum(np.maximum(u, self.low), self.high)
 
     def margin(self, u: np.ndarray) -> np.ndarray:
@@ -49,19 +48,20 @@ class Plane(NamedTuple):
         return self.a[0] * u[0] + self.a[1] * u[1] + self.b
 
     def scale(self, u: np.ndarray, away: np.ndarray | float = 0.0) -> np.ndarray:
-        """How far each input can go (2, B): to the end of its box, or as far as u and `away` in the
-        metric of the objective.
+        """Return how far each input can go (2, B).
+
+        It goes to its bound, or as far as u and `away` in the metric of the objective.
         """
         root = np.sqrt(self.w)
         reach = root[0] * np.abs(u[0]) + root[1] * np.abs(u[1]) + away
         return np.minimum(np.maximum(-self.low, self.high), reach / root)
 
     def met(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Whether all rows are met (B,)."""
+        """Whether all constraints are met (B,)."""
         return (margin >= -tolerances(self.a, self.b, u)).all(axis=0)
 
     def binds(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Whether a row's margin exceeds zero by no more than rounding."""
+        """Whether a constraint's margin exceeds zero by no more than rounding."""
         s1, s2 = self.scale(u)
         return (margin <= 0.0) | (
             margin <= ROUNDING * (np.abs(self.b) + np.abs(self.a[0]) * s1 + np.abs(self.a[1]) * s2)
@@ -81,8 +81,8 @@ def project_arrays(
     """Project the inputs of B states.
 
     Returns:
-        Inputs (2, B), margins (k, B), rows that bind or cannot be met (k, B), and whether all rows
-        can be met (B,).
+        Inputs (2, B), margins (k, B), constraints that bind or cannot be met (k, B), and whether
+        all constraints can be met (B,).
     """
     size = len(v[0])
     a_of_input = np.array([stack([row[j] for row in a], size) for j in (0, 1)])
@@ -108,8 +108,9 @@ def project_arrays(
 
 
 def _nearest_of_least_violating(plane: Plane, priority: np.ndarray) -> np.ndarray:
-    """Of the actions with the least sum of squared slacks, which all have the same slacks, the one
-    nearest to v.
+    """Return the action nearest to v of those with the least sum of squared slacks.
+
+    All of these have the same slacks.
     """
     u = least_violating(plane.a, plane.b, plane.low, plane.high, priority, plane.clip(plane.v))
     several = np.flatnonzero(~is_unique(plane.a, plane.b, u))
@@ -124,7 +125,7 @@ def _nearest_of_least_violating(plane: Plane, priority: np.ndarray) -> np.ndarra
 
 
 def _nearest(plane: Plane) -> tuple[np.ndarray, np.ndarray]:
-    """Minimisers (2, B), of no meaning where the rows cannot be met, and whether they can (B,)."""
+    """Return minimisers (2, B), undefined where constraints cannot be met, and whether they can."""
     u = plane.clip(plane.v)
     met = np.ones(u.shape[1], dtype=bool)
     for i, (a1, a2, b) in enumerate(zip(*plane.a, plane.b, strict=True)):
@@ -141,8 +142,10 @@ def _nearest(plane: Plane) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _onto_line(plane: Plane, u: np.ndarray, miss: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Minimisers (2, B) on the line of the last row, which u violates, and whether the rows before
-    and the box leave any (B,).
+    """Return minimisers (2, B) on the line of the last constraint, which u violates.
+
+    Returns:
+        These, and whether the constraints before and the input bounds leave any (B,).
     """
     first, second = np.abs(plane.a[:, -1])
     root = np.sqrt(plane.w)
@@ -178,9 +181,7 @@ def _onto_line(plane: Plane, u: np.ndarray, miss: np.ndarray) -> tuple[np.ndarra
 
 
 class _OnLine(NamedTuple):
-    """Rows slope * u_f + offset >= 0 along a line, shapes (k, B), with the sizes of the terms that
-    they were summed from.
-    """
+    """Constraints slope * u_f + offset >= 0 along a line (k, B), with the sizes of their terms."""
 
     slope: np.ndarray
     offset: np.ndarray
@@ -201,13 +202,13 @@ class _OnLine(NamedTuple):
 
     @property
     def crosses(self) -> np.ndarray:
-        """Whether no row lies parallel to the line on its wrong side (B,)."""
+        """Whether no constraint lies parallel to the line on its wrong side (B,)."""
         return np.all(~self.parallel | (self.offset >= -ROUNDING * self.offset_terms), axis=0)
 
     def interval(
         self, lo: np.ndarray, hi: np.ndarray, relative: float
     ) -> tuple[np.ndarray, np.ndarray]:
-        """What the rows leave of [lo, hi] when each may miss by a part of its terms."""
+        """Return what the constraints leave of [lo, hi] if each may miss by part of its terms."""
         offset = self.offset
         if relative:
             offset = offset + relative * (
@@ -220,6 +221,6 @@ class _OnLine(NamedTuple):
         )
 
     def holds(self, free: np.ndarray) -> np.ndarray:
-        """Whether every row is met up to rounding where the free input is as given (B,)."""
+        """Whether every constraint is met up to rounding where the free input is as given (B,)."""
         terms = self.offset_terms + self.slope_terms * np.abs(free)
         return np.all(self.slope * free + self.offset >= -2.0 * ROUNDING * terms, axis=0)

@@ -1,12 +1,12 @@
-"""Several constraint rows and a box: ProxQP for the batch, each answer checked and made precise.
+"""Several constraints and input bounds: ProxQP for a batch, each answer checked and refined.
 
 ProxQP's defaults return feasible points that are not the minimisers, and an infeasible problem ends
 at the iteration limit. So the settings ask for the duality gap and cap the iterations. Of its
-answer only the rows and bounds that hold it are taken: the minimiser is the point of these
-equations nearest to the proposal, if it meets all rows, and if what holds it presses in the right
-direction. So its precision is that of these equations, not that of the solver. States without such
-a certificate, among them all with contradicting rows, go to `safe_envs.wrappers.qp.active_set` one
-by one.
+answer only the constraints and bounds that hold it are taken: the minimiser is the point of these
+equations nearest to the proposal, if it meets all constraints, and if what holds it presses in the
+right direction. So its precision is that of these equations, not that of the solver. States without
+such a certificate, among them all with contradicting constraints, go to
+`safe_envs.wrappers.qp.active_set` one by one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 from proxsuite import proxqp  # pyright: ignore[reportMissingImports]
 
 from safe_envs.wrappers.qp import active_set
-from safe_envs.wrappers.qp.rows import ROUNDING, tolerances, total
+from safe_envs.wrappers.qp.rounding import ROUNDING, tolerances, total
 
 _PRECISION = {
     "eps_abs": 1e-9,
@@ -30,18 +30,16 @@ _PRECISION = {
 _SETTINGS = {**_PRECISION, "eps_primal_inf": 1e-14, "max_iter": 200, "max_iter_in": 50}
 _INFINITY = 1e20
 _PRESSES = 1e-7
-"""The row or bound of a multiplier binds from this share of the largest."""
+"""The constraint or bound of a multiplier binds from this share of the largest."""
 _WIDE = 1e3
-"""A box that reaches this many times further than the violated rows is too wide to be a unit of
-length."""
+"""A box that reaches this many times further than the violated constraints is too wide to be a unit
+of length."""
 _REACH = 10.0
-"""The unit then, in ways to the violated rows."""
+"""The unit then, in ways to the violated constraints."""
 
 
 class Projection(NamedTuple):
-    """Arrays over a batch of B states: inputs (B, m), margins and binding rows (B, k), whether all
-    can be met (B,).
-    """
+    """Inputs (B, m), margins and binding constraints (B, k), and whether all can be met (B,)."""
 
     u: np.ndarray
     margin: np.ndarray
@@ -58,10 +56,10 @@ def project(
     w: np.ndarray,
     priority: np.ndarray,
 ) -> Projection:
-    """Project proposed inputs, which violate a row, onto k rows a u + b >= 0 and a box.
+    """Project proposed inputs, which violate a constraint, onto k constraints a u + b >= 0.
 
     Args:
-        a: rows, shape (B, k, m).
+        a: constraints, shape (B, k, m).
         b: offsets, shape (B, k).
         v: proposed inputs, shape (B, m).
         low: lower bounds, shape (B, m).
@@ -71,7 +69,7 @@ def project(
     """
     problem = _Problem(a, b, v, low, high, w)
     u, certain = np.empty_like(v), np.zeros(len(v), dtype=bool)
-    # ProxQP takes long to say that rows cannot be met, and its answer is of no use then.
+    # ProxQP takes long to say that constraints cannot be met, and its answer is of no use then.
     left = np.flatnonzero(~problem.contradictory())
     if left.size:
         part = _Problem(*[numbers[left] for numbers in problem])
@@ -94,18 +92,17 @@ class _Problem(NamedTuple):
     w: np.ndarray
 
     def margin(self, u: np.ndarray) -> Any:
-        """Values (B, k) of the rows at inputs (B, m)."""
+        """Values (B, k) of the constraints at inputs (B, m)."""
         return _dot(self.a, u) + self.b
 
     def tolerance(self, u: np.ndarray) -> Any:
-        """By how much the rows may miss there (B, k)."""
+        """By how much the constraints may miss there (B, k)."""
         return tolerances(np.moveaxis(self.a, 2, 0), self.b, u.T[:, :, None])
 
     def contradictory(self) -> np.ndarray:
-        """Where a row, or two rows of unit length together, miss by more than rounding at every
-        input in the box (B,).
+        """Return where one or two constraints miss by more than rounding at every input (B,).
 
-        It finds opposite rows, not every set of rows that cannot be met.
+        It finds opposite constraints, not every set of constraints that cannot be met.
         """
         with np.errstate(all="ignore"):
             lengths = np.linalg.norm(self.a, axis=2)
@@ -121,10 +118,10 @@ class _Problem(NamedTuple):
             return (most < -2.0 * (allowed[:, first] + allowed[:, second])).any(axis=1)
 
     def tidied(self, u: np.ndarray) -> np.ndarray:
-        """The inputs without the rounding that other inputs brought in.
+        """Return the inputs without the rounding that other inputs brought in.
 
-        An input on which no row depends keeps its proposal. One that is nothing but rounding of the
-        way from the proposal is 0, for a row of this input alone may ask for that.
+        An input on which no constraint depends keeps its proposal. One that is nothing but rounding
+        of the way from the proposal is 0, for a constraint of this input alone may ask for that.
         """
         roots, start = np.sqrt(self.w), np.clip(self.v, self.low, self.high)
         way = (np.abs(u - self.v) * roots).max(axis=1, keepdims=True)
@@ -134,8 +131,10 @@ class _Problem(NamedTuple):
     def certified(
         self, rows: np.ndarray, below: np.ndarray, above: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The minimisers (B, m) that some rows (B, k) and bounds (B, m) hold, and where they are
-        those of the whole problem (B,).
+        """Return the minimisers (B, m) that some constraints (B, k) and bounds (B, m) hold.
+
+        Returns:
+            These, and where they are those of the whole problem (B,).
         """
         roots, held = np.sqrt(self.w), below | above
         normals = self.a / roots[:, None, :]
@@ -164,8 +163,9 @@ class _Problem(NamedTuple):
 
 
 def _dot(a: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Products (B, k) of rows (B, k, m) and inputs (B, m), summed in an order that does not depend
-    on the batch.
+    """Return products (B, k) of constraints (B, k, m) and inputs (B, m).
+
+    The order of summation does not depend on the batch.
     """
     return total(np.moveaxis(a * u[:, None, :], 2, 0))
 
@@ -173,8 +173,10 @@ def _dot(a: np.ndarray, u: np.ndarray) -> np.ndarray:
 def _units(
     a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Origin and unit of each input (B, m): those of the box, or of the way to the violated rows
-    where the box is too wide.
+    """Return the origin and the unit of each input (B, m).
+
+    They are those of the input bounds, or of the way to the violated constraints where the bounds
+    are too wide.
     """
     inside = np.clip(v, low, high)
     missed = np.maximum(-(_dot(a, inside) + b), 0.0)
@@ -187,7 +189,7 @@ def _units(
 
 
 class _Scaled(NamedTuple):
-    """The problem in z = (u - center) / half, with z of order one and rows of unit length."""
+    """The problem in z = (u - center) / half, with constraints of unit length."""
 
     rows: np.ndarray
     offsets: np.ndarray
@@ -203,7 +205,7 @@ class _Scaled(NamedTuple):
         rows = a * half[:, None, :]
         offsets = b + _dot(a, center)
         lengths = np.linalg.norm(rows, axis=2)
-        # A flat row says nothing of the input: its offset alone decides, in its own units.
+        # A flat constraint says nothing of the input: its offset alone decides, in its own units.
         lengths = np.where(
             lengths > np.finfo(float).tiny, lengths, np.maximum(np.abs(offsets), 1.0)
         )
@@ -218,15 +220,13 @@ class _Scaled(NamedTuple):
         )
 
     def objective(self, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Hessian and gradient, scaled down where the proposal lies far outside the box."""
+        """Return Hessian and gradient, scaled down where the proposal lies far outside."""
         size = max(1.0, float(np.abs(self.target[i]).max()))
         return np.diag(self.curvature[i] / size), -self.curvature[i] * self.target[i] / size
 
 
 def _solve(scaled: _Scaled) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rows (B, k) and the lower and upper bounds (B, m) that hold the minimisers, according to
-    ProxQP.
-    """
+    """Return the constraints (B, k) and bounds (B, m) that hold the minimisers, by ProxQP."""
     count, k, m = scaled.rows.shape
     # The solver does not come back from numbers that are not finite.
     solvable = np.flatnonzero(

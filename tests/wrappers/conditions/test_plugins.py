@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -213,6 +214,22 @@ def test_an_evaluation_names_the_condition_and_where_it_is(stated):
     assert [row["filter"] for row in found.rows] == ["none", name]
     (spec,) = (f["spec"] for f in found.config["filters"] if f["name"] == name)
     assert spec.startswith(f"{stated.resolve()}/my_filter.py:Eager:gain=2.0")
+
+
+def test_a_condition_of_a_script_is_known_by_its_file_and_stated_once(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        STATED
+        + """
+from safe_envs.wrappers import parse_condition, spec_of
+
+text = spec_of(Eager(2.0))
+assert type(parse_condition(text, ())) is Eager
+print(text)
+"""
+    )
+    ran = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, check=True)
+    assert ran.stdout.startswith(f"{script.resolve()}:Eager:gain=2.0")
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,7 @@ def test_outside_the_action_raises_h_most_and_is_flagged(condition, state):
         safety_filter.filter([[state], [0.0]], [[2.0], [0.1]]),
     ):
         first = [np.asarray(part).reshape(-1)[0] for part in result]
-        action, barrier, margin, active, feasible, slack, cause = first
+        action, margin, active, feasible, slack, cause, _, barrier = first
         assert action == -3.0
         assert not feasible
         assert active

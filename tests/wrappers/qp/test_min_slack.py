@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from safe_envs.wrappers.qp import proxqp
 from safe_envs.wrappers.qp.dispatch import project_arrays, project_floats
-from safe_envs.wrappers.qp.rows import ROUNDING, tolerance
+from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance
 from tests.oracles.rational_oracle import nearest_of_least_violating
 
 KINDS = ["plain", "flat", "integers", "parallel", "sides", "sizes", "far", "weights", "endless"]

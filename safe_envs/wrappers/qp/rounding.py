@@ -1,16 +1,15 @@
-"""What the solvers share: rows of a batch as one array, and the one tolerance with which a row
-counts as met.
+"""The one tolerance with which a constraint counts as met, and arrays that the solvers share.
 
-A row a . u + b >= 0 is met by an input u if
+A constraint a . u + b >= 0 is met by an input u if
 
     a . u + b >= -ROUNDING (|b| + sum_j |a_j u_j|)
 
 A sum of n floating-point products differs from the exact one by at most n eps times the sum of
 their sizes; ROUNDING leaves room for the coefficients, which were rounded themselves. The sizes are
-those of the terms at u, so that neither the unit of a row nor that of an input matters.
+those of the terms at u, so that neither the unit of a constraint nor that of an input matters.
 
 Every solver, for one state and for a batch, says `feasible` where the action that it returns meets
-all rows in this sense.
+all constraints in this sense.
 """
 
 from __future__ import annotations
@@ -22,11 +21,17 @@ from typing import Any
 import numpy as np
 
 ROUNDING = 16.0 * sys.float_info.epsilon
-"""Relative error of a row's value."""
+"""Relative error of a constraint's value."""
 
 
 def tolerance(a: Sequence[float], b: float, u: Sequence[float]) -> float:
-    """Return by how much a row of m coefficients may miss at m inputs and be met all the same."""
+    """Return by how much a constraint may be violated at m inputs and count as met.
+
+    Args:
+        a: m coefficients.
+        b: offset.
+        u: m inputs.
+    """
     # Each term is scaled by itself, so that their sum does not overflow.
     return ROUNDING * abs(b) + sum([ROUNDING * abs(aj * uj) for aj, uj in zip(a, u, strict=True)])
 
@@ -40,7 +45,7 @@ def tolerances(a: Sequence[Any] | np.ndarray, b: Any, u: Sequence[Any] | np.ndar
 
 
 def stack(entries: Sequence[Any], size: int) -> np.ndarray:
-    """Floats and arrays (B,) as the rows of an array (len(entries), B)."""
+    """Return floats and arrays (B,) as the rows of an array (len(entries), B)."""
     table = np.empty((len(entries), size))
     for row, entry in zip(table, entries, strict=True):
         row[:] = entry
@@ -48,9 +53,7 @@ def stack(entries: Sequence[Any], size: int) -> np.ndarray:
 
 
 def total(parts: np.ndarray) -> np.ndarray:
-    """Sum over the first axis, in an order that does not depend on the size of the batch, as
-    NumPy's own does.
-    """
+    """Return the sum over the first axis, in an order that does not depend on the batch."""
     result = parts[0].copy()
     for part in parts[1:]:
         result += part

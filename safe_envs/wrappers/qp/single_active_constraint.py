@@ -1,8 +1,7 @@
-"""Several rows of which a single one binds: its own closed form, where the other rows allow what
-that gives.
+"""Several constraints of which a single one binds: its closed form, where the others allow it.
 
-The minimiser under one row alone is that under all rows, if it meets them: so exact, and many times
-faster than a solver, in most states of most filters.
+The minimiser under one constraint alone is that under all constraints, if it meets them: so exact,
+and many times faster than a solver, in most states of most filters.
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp.one_row import project_arrays as project_onto_row
-from safe_envs.wrappers.qp.rows import ROUNDING, stack, total
+from safe_envs.wrappers.qp.one_constraint import project_arrays as project_onto_row
+from safe_envs.wrappers.qp.rounding import ROUNDING, stack, total
 
 Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -26,10 +25,10 @@ def project_arrays(
     high: np.ndarray,
     w: Sequence[Any],
 ) -> tuple[Answer, np.ndarray]:
-    """Project the proposed inputs of the states in which at most one row binds.
+    """Project the proposed inputs of the states in which at most one constraint binds.
 
     Args:
-        a: k rows, each (m, B).
+        a: k constraints, each (m, B).
         b: offsets, shape (k, B).
         v: proposed inputs, shape (m, B).
         low: lower bounds, shape (m, B).
@@ -37,8 +36,8 @@ def project_arrays(
         w: m positive weights, each a float or an array (B,).
 
     Returns:
-        Inputs (m, B), margins and binding rows (k, B) and feasibility (B,), as far as solved; and
-        the states (indices) that are left for a solver.
+        Inputs (m, B), margins and binding constraints (k, B) and feasibility (B,), as far as
+        solved; and the states (indices) that are left for a solver.
     """
     u = np.minimum(np.maximum(v, low), high)
     margin, active, feasible = (

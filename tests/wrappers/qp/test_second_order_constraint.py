@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from safe_envs.wrappers.qp import interval
-from safe_envs.wrappers.qp.second_order_row import majorant, project_arrays, project_floats
+from safe_envs.wrappers.qp.majorant import majorant
+from safe_envs.wrappers.qp.second_order_batch import project_arrays
+from safe_envs.wrappers.qp.second_order_constraint import project_floats
 
 EPS = float(np.finfo(float).eps)
 LOW, HIGH = -2.0, 1.5

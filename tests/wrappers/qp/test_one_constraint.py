@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import qpsolvers
 
-from safe_envs.wrappers.qp.one_row import project_arrays, project_floats
+from safe_envs.wrappers.qp.one_constraint import project_arrays, project_floats
 
 project_arrays = np.errstate(divide="ignore")(project_arrays)
 

@@ -1,11 +1,11 @@
-"""One constraint row and a box: the exact projection, in closed form, for one state or a batch.
+"""The exact projection onto one constraint and input bounds, in closed form.
 
     min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a . u + b >= 0,   low <= u <= high
 
 The minimiser is u(l) = clip(v + l a / w) for the smallest multiplier l >= 0 at which phi(l) = a .
 u(l) + b reaches 0. phi is nondecreasing and piecewise linear, with a kink wherever a component
-enters or leaves its interval. If phi stays negative, no action meets the row; u(infinity), which
-maximises a . u + b over the box, violates it least.
+enters or leaves its interval. If phi stays negative, no action meets the constraint; u(infinity),
+which maximises a . u + b over the input bounds, violates it least.
 
 A component whose proposal lies beyond its near bound stays there until l enters, and is measured
 from there: a proposal of 1e16 does not drown it. What rounding leaves of the miss at the result is
@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp.rows import ROUNDING, tolerance, tolerances
+from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance, tolerances
 
 _EXCESS = 1e3
-"""A row that holds with so many times its rounding to spare is not on the nearest action: the
-rounding of the way there was larger. Then, and where that makes it miss, a state of a batch is
+"""A constraint that holds with so many times its rounding to spare is not on the nearest action:
+the rounding of the way there was larger. Then, and where that makes it miss, a state of a batch is
 solved by itself."""
 _CORRECTIONS = 3
 """How often the rounding of a long way is taken back: each time it shrinks by a factor of 1e16."""
@@ -41,8 +41,8 @@ def project_floats(
     """Project the input u of one state.
 
     Returns:
-        The minimiser (m floats), its margin a . u + b, whether the row had to act, and whether it
-        can be met.
+        The minimiser (m floats), its margin a . u + b, whether the constraint had to act, and
+        whether it can be met.
     """
     if len(u) == 1:
         return _project_scalar(a[0], b, u[0], low[0], high[0])
@@ -76,9 +76,7 @@ def project_floats(
 def _project_scalar(
     a: float, b: float, v: float, low: float, high: float
 ) -> tuple[list[float], float, bool, bool]:
-    """A single input: the root of the row, if the box holds it, and the end of the box next to it
-    if not.
-    """
+    """Project a single input: to the root of the constraint, or the bound next to it."""
     u = low if v < low else high if v > high else v
     margin = a * u + b
     if margin >= 0.0:
@@ -100,7 +98,7 @@ def _follow_multiplier(
     high: Sequence[float],
     w: Sequence[float],
 ) -> tuple[list[float], list[float]]:
-    """The minimiser, and the way of each component along a / w, 0 for those that are not free."""
+    """Return the minimiser, and the way of each component along a / w, 0 for those not free."""
     size = max([abs(aj) for aj in a]) or 1.0
     a, b = [aj / size for aj in a], b / size  # so that products neither overflow nor vanish
     d = [aj / wj for aj, wj in zip(a, w, strict=True)]
@@ -147,11 +145,12 @@ def project_arrays(
     high: Sequence[Any],
     w: Sequence[Any],
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
-    """Project the inputs of a batch of B states. A flat row divides by zero: the caller silences
-    that warning.
+    """Project the inputs of a batch of B states.
+
+    A flat constraint divides by zero: the caller silences that warning.
 
     Args:
-        a: m entries of the row, each a float or an array (B,).
+        a: m entries of the constraint, each a float or an array (B,).
         b: the offset, a float or an array (B,).
         v: m arrays (B,) of proposed inputs.
         low: m lower bounds, each a float or an array (B,).
@@ -223,7 +222,7 @@ def _follow_multipliers(
     w: Sequence[Any],
     rows: np.ndarray,
 ) -> tuple[list[np.ndarray], np.ndarray]:
-    """The inputs, and which of the states in `rows` have components that can still move (R,).
+    """Return the inputs, and which states in `rows` have components that can still move (R,).
 
     Components are in front: shape (m, R), kinks in a third axis (m, R, 2m + 1).
     """

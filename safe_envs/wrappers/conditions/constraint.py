@@ -1,0 +1,79 @@
+"""The affine constraint on the input that a condition derives from a system and a barrier."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import sympy as sp
+
+from safe_envs.dynamics.codegen import Components
+from safe_envs.dynamics.lie import lie_derivative_g, tidied
+from safe_envs.dynamics.sde import ControlAffineSDE
+
+
+class Terms(Protocol):
+    """Numbers of a learned model in a constraint, whose expressions hold symbols for them."""
+
+    @property
+    def symbols(self) -> tuple[sp.Symbol, ...]:
+        """Symbols of the numbers."""
+        ...
+
+    def floats(self, x: Sequence[float]) -> Sequence[float]:
+        """Return the values at one state, given by components."""
+        ...
+
+    def arrays(self, x: Components) -> Components:
+        """Return the values at a batch of states, components of shape (B,) in and out."""
+        ...
+
+
+@dataclass(frozen=True)
+class AffineConstraint:
+    """The constraint a(x) u + b(x) >= 0 that a condition asks for.
+
+    Attributes:
+        coefficient: a, an expression for each input.
+        offset: b.
+        chain: b_0 = h, ..., b_(r-1); the condition keeps the intersection of {b_j >= 0}, not C
+            itself.
+        demand: of a reciprocal condition, which asks for a u + b >= demand where h > 0 and has no
+            meaning elsewhere. There a u + b is the rate of h, and all that is left is to make that
+            as large as the other constraints allow.
+        change: rate of the constraint while the input is held, an expression of states and inputs,
+            where a margin of first order is asked for.
+        uncertainty: where a and b are known up to an error only, the entries (i, j), i <= j, of the
+            symmetric Q(x) with which the condition asks for a u + b >= sqrt([1, u]' Q [1, u]).
+        terms: learned numbers in the expressions, whose symbols are no states.
+    """
+
+    coefficient: tuple[sp.Expr, ...]
+    offset: sp.Expr
+    chain: tuple[sp.Expr, ...]
+    demand: sp.Expr | None = None
+    change: sp.Expr | None = None
+    uncertainty: tuple[sp.Expr, ...] | None = None
+    terms: Terms | None = None
+
+    @classmethod
+    def after(
+        cls,
+        model: ControlAffineSDE,
+        chain: Sequence[sp.Expr],
+        offset: sp.Expr,
+        demand: sp.Expr | None = None,
+    ) -> AffineConstraint:
+        """Return the constraint L_g b_(r-1) u + offset >= 0, or >= demand, at the end of a chain.
+
+        Args:
+            model: system that the chain was derived for.
+            chain: b_0, ..., b_(r-1).
+            offset: part of b_r without the input.
+            demand: see the class.
+        """
+        a = lie_derivative_g(model, chain[-1])
+        return cls(
+            tuple(tidied(a[0, j]) for j in range(model.m)), tidied(offset), tuple(chain), demand
+        )

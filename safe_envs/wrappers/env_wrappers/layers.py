@@ -1,0 +1,150 @@
+"""What a filter and the env below it share, whether that is one env or a batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from safe_envs.envs.env import SafeEnv
+from safe_envs.envs.info import Info, filter_info
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.conditions import Condition, spec_of
+from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
+from safe_envs.wrappers.safety_filter import SafetyFilter
+
+
+class FilterLayer:
+    """The part of a filter's wrapper that does not depend on the number of envs."""
+
+    def attach(
+        self,
+        inner: Any,
+        condition: Condition | Sequence[Condition] | str,
+        knowledge: str,
+        objective: str,
+        priorities: Sequence[float] | None,
+    ) -> str:
+        """Build the filter over the layer of an env that shows its state.
+
+        Args:
+            inner: layer that shows the state and takes inputs in physical units.
+            condition: one for every barrier, one for each, or their text.
+            knowledge: "model" or "plant".
+            objective: "nearest" or "clf".
+            priorities: weights of the squared slacks.
+
+        Returns:
+            The text of the conditions.
+        """
+        problem: SafetyProblem = inner.problem
+        self.safety_filter = SafetyFilter.for_problem(
+            problem, condition, knowledge, objective, priorities
+        )
+        text = spec_of([each for _, each in self.safety_filter.pairs])
+        if inner.viewer is not None:
+            inner.viewer.caption = text
+        self._inner = inner
+        # Inputs that pass through an env's numbers are rounded, by float32 at worst.
+        self._tolerance = [1e-6 * (high - low) for low, high in problem.box]
+        return text
+
+    def changed_action(self, decided: Sequence[Any]) -> ConfigurationError:
+        """Return the error of a wrapper below that changed the action that was decided."""
+        return ConfigurationError(
+            f"a wrapper below the filter changed the safe action {decided} into"
+            f" {self._inner.executed}: {self}. Put wrappers that change actions around the filter;"
+            " several conditions go into one SafetyFilter"
+        )
+
+
+def third_party_spec(
+    env: object, ours: type[Any], view: dict[str, Any], knowledge: str
+) -> FilterSpec:
+    """Return how a filter sees a third-party env.
+
+    Args:
+        env: the env without wrappers.
+        ours: class of this project's envs, which need no view.
+        view: fields of `FilterSpec`.
+        knowledge: what the filter is to know.
+
+    Raises:
+        ConfigurationError: The env is this project's, or anything but the model is to be known.
+    """
+    if isinstance(env, ours):
+        raise ConfigurationError(
+            f"{', '.join(view)}: only for third-party envs; {env} has a model and barriers of its"
+            " own"
+        )
+    if knowledge != "model":
+        raise ConfigurationError(
+            f"knowledge = {knowledge!r}: of a third-party env nothing is known but the model; use"
+            " 'model'"
+        )
+    return FilterSpec.of(view)
+
+
+def state_layer(env: Any, kinds: tuple[type, ...], vector: bool) -> Any:
+    """Return the layer of an env from which a filter reads the state.
+
+    Args:
+        env: an env, possibly wrapped.
+        kinds: classes of layers that show the state.
+        vector: whether the filter is for a batch.
+
+    Raises:
+        ConfigurationError: There is none.
+    """
+    layer = env
+    while isinstance(layer, gym.Wrapper | gym.vector.VectorWrapper) and not isinstance(
+        layer, kinds
+    ):
+        layer = layer.env
+    if not isinstance(layer, kinds):
+        raise _unreadable(layer, vector)
+    return layer
+
+
+def _unreadable(env: Any, vector: bool) -> ConfigurationError:
+    if isinstance(env, gym.vector.VectorEnv) != vector:
+        batched = isinstance(env, gym.vector.VectorEnv)
+        kinds = (
+            ("SafetyFilterVectorWrapper", "a vector env")
+            if batched
+            else ("SafetyFilterWrapper", "a single env")
+        )
+        return ConfigurationError(f"{env} is {kinds[1]}; put {kinds[0]} over it")
+    if vector and any(isinstance(each.unwrapped, SafeEnv) for each in getattr(env, "envs", [])):
+        return ConfigurationError(
+            f"{env} holds envs of this project one by one; make them by gym.make_vec, which is many"
+            " times faster too"
+        )
+    return ConfigurationError(
+        f"{env} is not one of this project's envs, so that a filter cannot read its state; give"
+        " model, barriers, state_fn: see FilterSpec"
+    )
+
+
+def resting_action(problem: SafetyProblem) -> np.ndarray:
+    """Return the input within its bounds nearest to 0, reported before any action."""
+    return np.array([min(max(0.0, low), high) for low, high in problem.box])
+
+
+def rest_info(problem: SafetyProblem) -> Info:
+    """Return what a filter reports at reset."""
+    return filter_info(
+        nominal_action=resting_action(problem),
+        safe_action=resting_action(problem),
+        intervention=False,
+        filter_active=False,
+        feasible=True,
+        slack=0.0,
+        slacks=np.zeros(len(problem.barriers)),
+        active_barrier=-1,
+        episode_interventions=0,
+        episode_infeasible=0,
+    )

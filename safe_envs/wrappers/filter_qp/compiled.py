@@ -1,0 +1,160 @@
+"""The constraints of a QP as functions of a state, or of a batch of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.codegen import Components, Flavour, compile_function, constants, finite
+from safe_envs.errors import ConfigurationError
+from safe_envs.wrappers.filter_qp.decision import UndefinedConstraintError
+from safe_envs.wrappers.filter_qp.qp import FilterQP
+from safe_envs.wrappers.qp import dispatch
+from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance, tolerances
+
+
+class CompiledQP:
+    """A QP compiled for states given component by component, as floats or as arrays of a batch.
+
+    The formulas are the same for both flavours; only the choice between two values and the solver
+    differ.
+    """
+
+    def __init__(self, qp: FilterQP, flavour: Flavour) -> None:
+        self._qp = qp
+        self._flavour: Flavour = flavour
+        self._m = qp.model.m
+        self._count = len(qp.constraints)
+        self._reciprocal = [i for i, c in enumerate(qp.constraints) if c.demand is not None]
+        self._sampled = [i for i, c in enumerate(qp.constraints) if c.change is not None]
+        self._uncertain = [i for i, c in enumerate(qp.constraints) if c.uncertainty is not None]
+        arrays = flavour == "arrays"
+        self._terms = [term.arrays if arrays else term.floats for term in qp.terms]
+        self._symbols = (
+            *qp.model.states,
+            *(s for term in qp.terms for s in term.symbols),
+        )
+        self._low: Sequence[Any] = constants(qp.low) if arrays else qp.low
+        self._high: Sequence[Any] = constants(qp.high) if arrays else qp.high
+        self._weights = qp.weights
+        self._choose: Any = np.where if arrays else _choose
+        self._larger: Any = np.maximum if arrays else max
+        self._tolerance: Any = tolerances if arrays else tolerance
+        self._project: Any = dispatch.project_arrays if arrays else dispatch.project_floats
+        if qp.clf is not None:
+            qp.clf.require_known(qp.model)
+            weights = (qp.clf.input_weight, qp.clf.slack_weight)
+            input_weight, self._slack_weight = [float(qp.model.numeric(w)) for w in weights]
+            if not (0 < input_weight < math.inf and 0 < self._slack_weight < math.inf):
+                raise ConfigurationError(
+                    f"the goal weighs inputs by {input_weight} and slack by {self._slack_weight};"
+                    " give positive numbers"
+                )
+            self._weights = [input_weight] * self._m
+
+    def _with_terms(self, x: Sequence[Any]) -> Sequence[Any]:
+        """Return the state, followed by the learned terms there."""
+        return (
+            (*x, *[value for term in self._terms for value in term(tuple(x))]) if self._terms else x
+        )
+
+    def _require_finite(self, values: Sequence[Any], what: str = "the constraint") -> None:
+        total: Any = sum(values)
+        if self._flavour == "floats":
+            if not math.isfinite(total):
+                raise UndefinedConstraintError(0, what)
+        elif not finite(np.atleast_1d(total)):
+            bad = np.flatnonzero(~np.isfinite(total))
+            if bad.size:
+                raise UndefinedConstraintError(int(bad[0]), what)
+
+    def _split(
+        self, values: Components
+    ) -> tuple[list[Any], list[Any], Sequence[Any], Sequence[Any], dict[int, Components]]:
+        """Take values apart.
+
+        Returns:
+            a and b of each constraint, the goal's offset and coefficients, h of reciprocal
+            conditions less its rounding, and Q of uncertain constraints.
+        """
+        width, count, entries = self._m + 1, self._count, (self._m + 1) * (self._m + 2) // 2
+        rows = [values[i * width : (i + 1) * width] for i in range(count)]
+        forms_at = len(values) - entries * len(self._uncertain)
+        goal_end = forms_at - len(self._reciprocal)
+        forms = {
+            i: values[forms_at + k * entries : forms_at + (k + 1) * entries]
+            for k, i in enumerate(self._uncertain)
+        }
+        goal, h = values[count * width : goal_end], values[goal_end:forms_at]
+        return [row[:-1] for row in rows], [row[-1] for row in rows], goal, h, forms
+
+    def _demand(self, i: int, x: Sequence[Any], inside: Any) -> Any:
+        """Return what a reciprocal condition demands; floats have no 1/h outside its domain."""
+        return 0.0 if inside is False else self._demands[i](*x)[0]
+
+    def _loss(self, i: int, x: Sequence[Any], action: Sequence[Any], inside: Any) -> Any:
+        """Return the rate at which a constraint falls under an action, else 0."""
+        if inside is False:
+            return 0.0
+        loss = self._larger(-self._changes[i](*x, *action)[0], 0.0)
+        return loss if inside is None else self._choose(inside, loss, 0.0)
+
+    @cached_property
+    def _values(self) -> Any:
+        """Values that `_split` takes apart again."""
+        p = self._qp
+        expressions = [e for c in p.constraints for e in (*c.coefficient, c.offset)]
+        if p.clf is not None:
+            growth, along = p.clf.growth(p.model)
+            expressions += [growth, *along]
+        expressions += [_beyond_rounding(p.constraints[i].chain[0]) for i in self._reciprocal]
+        return self._compiled(
+            [
+                *expressions,
+                *(e for i in self._uncertain for e in p.constraints[i].uncertainty or ()),
+            ]
+        )
+
+    @cached_property
+    def _demands(self) -> dict[int, Any]:
+        return {i: self._compiled([self._qp.constraints[i].demand]) for i in self._reciprocal}
+
+    @cached_property
+    def _changes(self) -> dict[int, Any]:
+        return {
+            i: self._compiled([self._qp.constraints[i].change], self._qp.model.inputs)
+            for i in self._sampled
+        }
+
+    def _compiled(self, expressions: Sequence[Any], more: Sequence[sp.Symbol] = ()) -> Any:
+        model = self._qp.model
+        return compile_function(
+            (*self._symbols, *more), [model.numeric(e) for e in expressions], self._flavour
+        )
+
+
+def _beyond_rounding(h: sp.Expr) -> sp.Expr:
+    """Return h less its own rounding.
+
+    Where that is not positive, a state and a batch may find h on either side of 0.
+    """
+    return h - sp.Float(ROUNDING, 17) * _size(h)
+
+
+def _size(expression: sp.Expr) -> sp.Expr:
+    """Return the sum of the sizes of an expression's terms."""
+    parts: Any = expression.args
+    if expression.is_Add or expression.is_Mul:
+        return expression.func(*map(_size, parts))
+    if isinstance(expression, sp.Max | sp.Min):
+        return sp.Max(*map(_size, parts))
+    return sp.Abs(expression)
+
+
+def _choose(condition: bool, chosen: Any, other: Any) -> Any:
+    return chosen if condition else other

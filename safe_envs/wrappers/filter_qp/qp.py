@@ -1,0 +1,130 @@
+"""The quadratic program of a filter, as data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.clf import CLF
+from safe_envs.wrappers.conditions.constraint import AffineConstraint, Terms
+
+
+@dataclass(frozen=True)
+class FilterQP:
+    """Minimise over the input bounds, subject to constraints; see `SafetyFilter`.
+
+    Attributes:
+        model: system whose symbols the constraints hold.
+        constraints: k constraints.
+        low: m lower input bounds.
+        high: m upper input bounds.
+        weights: m weights of the inputs.
+        priorities: k weights of the squared slacks.
+        dt: control period in s, 0 where no constraint needs it.
+        clf: goal of the joint QP, if there is one.
+    """
+
+    model: ControlAffineSDE
+    constraints: tuple[AffineConstraint, ...]
+    low: list[float]
+    high: list[float]
+    weights: list[float]
+    priorities: list[float]
+    dt: float
+    clf: CLF | None
+
+    @classmethod
+    def checked(
+        cls,
+        model: ControlAffineSDE,
+        constraints: tuple[AffineConstraint, ...],
+        box: Sequence[tuple[float, float]],
+        *,
+        weights: Sequence[float] | None,
+        priorities: Sequence[float] | None,
+        dt: float | None,
+        clf: CLF | None,
+    ) -> FilterQP:
+        """Return the QP of arguments as users give them; None stands for weights of one.
+
+        Args:
+            model: system whose symbols the constraints hold.
+            constraints: k constraints.
+            box: (low, high) of each of the m inputs.
+            weights: m weights of the inputs.
+            priorities: k weights of the squared slacks.
+            dt: control period in s.
+            clf: goal of the joint QP.
+
+        Raises:
+            ConfigurationError: The input bounds, a weight or a priority is not allowed, or dt is
+                missing.
+        """
+        return cls(
+            model,
+            constraints,
+            *_bounds(model, box),
+            weights=_positive("weights", weights, model.m),
+            priorities=_positive("priorities", priorities, len(constraints)),
+            dt=_period(constraints, dt),
+            clf=clf,
+        )
+
+    @property
+    def plain(self) -> bool:
+        """Whether the constraints at the proposed input are all there is.
+
+        Then there is no demand of a reciprocal condition, no sampling margin of first order, no
+        goal, and uncertainty only for one input.
+        """
+        return self.clf is None and all(
+            c.demand is None and c.change is None and (c.uncertainty is None or self.model.m == 1)
+            for c in self.constraints
+        )
+
+    @property
+    def terms(self) -> list[Terms]:
+        """Learned terms of the constraints, each once."""
+        return list(
+            {id(c.terms): c.terms for c in self.constraints if c.terms is not None}.values()
+        )
+
+
+def _bounds(
+    model: ControlAffineSDE, box: Sequence[tuple[float, float]]
+) -> tuple[list[float], list[float]]:
+    if len(box) != model.m:
+        raise ConfigurationError(
+            f"the box has {len(box)} intervals; the model has {model.m} inputs"
+        )
+    low, high = [float(pair[0]) for pair in box], [float(pair[1]) for pair in box]
+    for symbol, lo, hi in zip(model.inputs, low, high, strict=True):
+        if not (math.isfinite(lo) and math.isfinite(hi) and lo < hi):
+            raise ConfigurationError(
+                f"box of {symbol} is [{lo}, {hi}]; it needs finite bounds, the lower one below the"
+                " upper"
+            )
+    return low, high
+
+
+def _positive(name: str, given: Sequence[float] | None, count: int) -> list[float]:
+    values = [1.0] * count if given is None else [float(v) for v in given]
+    if len(values) != count or not all(math.isfinite(v) and v > 0 for v in values):
+        raise ConfigurationError(f"{name} = {values}; give {count} positive numbers")
+    return values
+
+
+def _period(constraints: Sequence[AffineConstraint], dt: float | None) -> float:
+    if dt is None:
+        if any(constraint.change is not None for constraint in constraints):
+            raise ConfigurationError(
+                "a sampling margin of first order needs the control period: SafetyFilter(...,"
+                " dt=...)"
+            )
+        return 0.0
+    if not 0 < dt < math.inf:
+        raise ConfigurationError(f"dt = {dt} s; a control period is positive and finite")
+    return float(dt)

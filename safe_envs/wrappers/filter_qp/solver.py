@@ -1,0 +1,291 @@
+"""Solves the QP of a filter for a state or a batch."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from safe_envs.dynamics.codegen import Components
+from safe_envs.wrappers.filter_qp.compiled import CompiledQP
+from safe_envs.wrappers.filter_qp.decision import FilterDecision
+from safe_envs.wrappers.qp import one_constraint, second_order_batch, second_order_constraint
+from safe_envs.wrappers.qp.majorant import majorant
+
+_FAR = 1e4
+"""How many times further than the input bounds reach is far away."""
+
+
+class FilterQPSolver(CompiledQP):
+    """Solves a QP for states given component by component, as floats or as arrays of a batch."""
+
+    def solve_single(self, x: Sequence[Any], u: Sequence[Any]) -> FilterDecision:
+        """Solve a plain QP of one constraint; raises as `solve`."""
+        values = self._values(*self._with_terms(x))
+        if self._uncertain:
+            return self._solve_uncertain(values, u)
+        *a, b = values
+        p = self._qp
+        if self._flavour == "floats":
+            action, margin, active, feasible = one_constraint.project_floats(
+                a, b, u, p.low, p.high, p.weights
+            )
+            self._require_finite((margin,))
+            return FilterDecision(
+                action, (margin,), (active,), feasible, (0.0 if feasible else -margin,), 0, u
+            )
+        action, margin, active, feasible = one_constraint.project_arrays(
+            a, b, u, self._low, self._high, p.weights
+        )
+        self._require_finite((margin,))
+        met = np.count_nonzero(feasible) == len(feasible)
+        slack = np.zeros(len(margin)) if met else np.where(feasible, 0.0, -margin)
+        return FilterDecision(action, (margin,), (active,), feasible, (slack,), 0, u)
+
+    def _solve_uncertain(self, values: Components, u: Sequence[Any]) -> FilterDecision:
+        a, b, *form = values
+        p = self._qp
+        project = (
+            second_order_constraint.project_floats
+            if self._flavour == "floats"
+            else second_order_batch.project_arrays
+        )
+        action, margin, active, feasible = project(
+            (a,), (b,), (form,), u[0], p.low[0], p.high[0], p.priorities
+        )
+        self._require_finite((margin[0], *form))
+        return FilterDecision(
+            (action,),
+            tuple(margin),
+            tuple(active),
+            feasible,
+            (self._choose(feasible, 0.0, -margin[0]),),
+            0,
+            u,
+        )
+
+    def solve(self, x: Sequence[Any], u: Sequence[Any]) -> FilterDecision:
+        """Solve any QP.
+
+        Args:
+            x: n components of the state.
+            u: m components of the proposed input.
+
+        Raises:
+            UndefinedConstraintError: A constraint or the goal has no finite value.
+        """
+        x = self._with_terms(x)
+        a, b, goal, h, forms = self._split(self._values(*x))
+        target = u
+        if goal:
+            target = [0.0 * uj for uj in u]
+            u = self._best(goal, target)
+        inside = dict(zip(self._reciprocal, [value > 0.0 for value in h], strict=True))
+        self._require_finite([*b, *[aj for ai in a for aj in ai]])
+        asked = [
+            (
+                self._choose(inside[i], b[i] - self._demand(i, x, inside[i]), 0.0)
+                if i in inside
+                else b[i]
+            )
+            for i in range(self._count)
+        ]
+        held = [
+            [self._choose(inside[i], aj, 0.0) for aj in a[i]] if i in inside else a[i]
+            for i in range(self._count)
+        ]
+        aim = self._outwards(a, inside, target)
+        action, margin, active, feasible = self._minimise(held, asked, aim, goal, forms)
+        if self._sampled:
+            for i in self._sampled:
+                asked[i] = asked[i] - self._qp.dt * self._loss(i, x, action, inside.get(i))
+            action, margin, active, feasible = self._minimise(held, asked, aim, goal, forms)
+        for i, defined in inside.items():
+            margin[i] = self._choose(defined, margin[i], _dot(a[i], action) + b[i])
+            active[i] = self._choose(defined, active[i], True)
+            feasible = feasible & defined
+        # A demand or a loss without a value shows here, and so does what overflows on the way to
+        # the action.
+        self._require_finite([*action, *margin])
+        slack = [self._choose(feasible, 0.0, self._larger(-value, 0.0)) for value in margin]
+        return FilterDecision(
+            action, margin, active, feasible, slack, self._cause(a, asked, u, active, inside), u
+        )
+
+    def best(self, x: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
+        """Return the input that is best for the goal, without constraints; raises as `solve`.
+
+        Args:
+            x: n components of the state.
+            nothing: m components of the input 0.
+        """
+        return self._best(self._split(self._values(*self._with_terms(x)))[2], nothing)
+
+    def _best(self, goal: Sequence[Any], nothing: Sequence[Any]) -> Sequence[Any]:
+        self._require_finite(goal, "the goal")
+        return self._minimise((), (), nothing, goal)[0]
+
+    def _outwards(
+        self, a: Sequence[Any], inside: dict[int, Any], u: Sequence[Any]
+    ) -> Sequence[Any]:
+        """Return the proposed input, or one far away where h of a reciprocal condition rises most.
+
+        The latter is for states outside its domain. The allowed point nearest to an input so far
+        off is where h rises most among those that the other constraints allow: these are not to
+        suffer from a condition that is undefined.
+
+        The point of the input bounds and of the constraints nearest to one so far off is where h
+        rises most among those that the other constraints allow: these are not to suffer from a
+        condition that is undefined.
+        """
+        if all(
+            defined is True or (defined is not False and defined.all())
+            for defined in inside.values()
+        ):
+            return u
+        rise = [0.0] * self._m
+        for i, defined in inside.items():
+            rise = [
+                rj + self._choose(defined, 0.0, aj)
+                for rj, aj in zip(rise, self._over_largest(a[i]), strict=True)
+            ]
+        rise = self._over_largest(rise)
+        steepness = sum([rj * rj / wj for rj, wj in zip(rise, self._weights, strict=True)])
+        ends = list(zip(self._low, self._high, strict=True))
+        span = sum([abs(rj) * (hi - lo) for rj, (lo, hi) in zip(rise, ends, strict=True)])
+        far = _FAR * span / self._choose(steepness > 0.0, steepness, 1.0)
+        corner = [
+            self._choose(rj > 0.0, hi, self._choose(rj < 0.0, lo, uj))
+            for rj, (lo, hi), uj in zip(rise, ends, u, strict=True)
+        ]
+        return [c + far * rj / wj for c, rj, wj in zip(corner, rise, self._weights, strict=True)]
+
+    def _over_largest(self, entries: Sequence[Any]) -> list[Any]:
+        """Return entries over the largest of their sizes, whose inverse may overflow."""
+        size = functools.reduce(self._larger, [abs(entry) for entry in entries])
+        return [entry / self._choose(size > 0.0, size, 1.0) for entry in entries]
+
+    def _minimise(
+        self,
+        a: Sequence[Any],
+        b: Sequence[Any],
+        u: Sequence[Any],
+        goal: Sequence[Any],
+        forms: dict[int, Components] | None = None,
+    ) -> tuple[Any, Any, Any, Any]:
+        p = self._qp
+        if forms:
+            for form in forms.values():
+                self._require_finite(form)
+            if self._m == 1 and not goal:
+                q = [forms.get(i, (0.0, 0.0, 0.0)) for i in range(self._count)]
+                project = (
+                    second_order_batch.project_arrays
+                    if self._flavour == "arrays"
+                    else second_order_constraint.project_floats
+                )
+                action, margin, active, feasible = project(
+                    [ai[0] for ai in a], b, q, u[0], p.low[0], p.high[0], p.priorities
+                )
+                return [action], list(margin), list(active), feasible
+            a, b = self._on_the_safe_side(a, b, forms)
+        if not goal:
+            return self._project(a, b, u, self._low, self._high, self._weights, p.priorities)
+        # The goal's slack d = unit e, in a unit in which it weighs as much as an input: its square
+        # would overflow before d does. Twice the most that the input bounds can make d always meets
+        # the goal's constraint, also after rounding.
+        growth, along = goal[0], goal[1:]
+        most = growth + sum(
+            [
+                self._larger(bj * lo, bj * hi)
+                for bj, lo, hi in zip(along, self._low, self._high, strict=True)
+            ]
+        )
+        unit = math.sqrt(self._weights[0] / self._slack_weight)
+        rows = [*[(*ai, 0.0) for ai in a], (*[-bj for bj in along], unit)]
+        low, high = (
+            (*self._low, 0.0),
+            (*self._high, self._choose(most > 0.0, 2.0 * most / unit, 1.0)),
+        )
+        w = (*self._weights, self._weights[0])
+        priorities = [*p.priorities[: len(a)], 1.0]
+        action, margin, active, _ = self._project(
+            rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities
+        )
+        action, margin, active = action[: self._m], margin[: len(a)], active[: len(a)]
+        # The goal's constraint, which can always be met, has no say in that, nor has its rounding.
+        feasible: Any = True
+        for ai, bi, g in zip(a, b, margin, strict=True):
+            feasible = feasible & (g >= -self._tolerance(ai, bi, action))
+        return action, margin, active, feasible
+
+    def _on_the_safe_side(
+        self, a: Sequence[Any], b: Sequence[Any], forms: dict[int, Components]
+    ) -> tuple[list[Any], list[Any]]:
+        """Return affine constraints that are met only where the uncertain ones are."""
+        a, b = list(a), list(b)
+        for i, form in forms.items():
+            slopes, constant = self._planes[i] if i in self._planes else self._plane(form)
+            a[i] = [aj - cj for aj, cj in zip(a[i], slopes, strict=True)]
+            b[i] = b[i] - constant
+        return a, b
+
+    def _plane(self, form: Components) -> tuple[list[Any], Any]:
+        """Return the plane above the uncertainty of a constraint; see `majorant`."""
+        width = self._m + 1
+        place = {
+            pair: k
+            for k, pair in enumerate(itertools.combinations_with_replacement(range(width), 2))
+        }
+        q = [[form[place[min(j, k), max(j, k)]] for k in range(width)] for j in range(width)]
+        return majorant(q, self._qp.low, self._qp.high)
+
+    @cached_property
+    def _planes(self) -> dict[int, tuple[list[Any], Any]]:
+        """Planes that are the same at every state."""
+        forms = {i: self._qp.constraints[i].uncertainty or () for i in self._uncertain}
+        return {
+            i: self._plane(tuple(map(float, form)))
+            for i, form in forms.items()
+            if all(e.is_number for e in form)
+        }
+
+    def _cause(
+        self,
+        a: Sequence[Any],
+        b: Sequence[Any],
+        u: Sequence[Any],
+        active: Sequence[Any],
+        inside: dict[int, Any],
+    ) -> Any:
+        """Return the active constraint whose half-space is furthest from the proposed input.
+
+        A reciprocal one outside its domain is further than any.
+        """
+        cause, furthest = -1, -math.inf
+        for i, (ai, bi, acts) in enumerate(zip(a, b, active, strict=True)):
+            if acts is False or (acts is not True and not np.count_nonzero(acts)):
+                continue
+            size = functools.reduce(self._larger, [abs(aj) for aj in ai])
+            unit = self._choose(
+                size > 0.0, size, 1.0
+            )  # so that squares neither overflow nor vanish
+            square = sum(
+                [p * p / wj for p, wj in zip([aj / unit for aj in ai], self._weights, strict=True)]
+            )
+            distance = -(_dot(ai, u) + bi) / unit / self._choose(size > 0.0, square, 1.0) ** 0.5
+            if i in inside:
+                distance = self._choose(inside[i], distance, math.inf)
+            distance = self._choose(acts & (size > 0.0), distance, -math.inf)
+            cause = self._choose(distance > furthest, i, cause)
+            furthest = self._larger(furthest, distance)
+        return cause
+
+
+def _dot(a: Sequence[Any], u: Sequence[Any]) -> Any:
+    return sum([aj * uj for aj, uj in zip(a, u, strict=True)])
