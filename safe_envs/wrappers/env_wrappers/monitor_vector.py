@@ -102,16 +102,16 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`."""
         # Gymnasium's own vector envs take the mask out of the mapping that they are given.
-        restarted = np.array((options or {}).get("reset_mask", self._everywhere), dtype=bool)
+        restarted = np.array((options or {}).get("reset_mask", self.episodes.everywhere), dtype=bool)
         observation, info = self.env.reset(
             seed=seed, options=None if options is None else dict(options)
         )
-        self._forget(restarted)
+        self.episodes.restart(restarted)
         seen = self._seen(observation, restarted)
         if self.viewer is not None:
             self.viewer.restart(
                 np.stack(self._x, axis=-1),
-                self._steps * self.problem.dt,
+                self.episodes.steps * self.problem.dt,
                 np.flatnonzero(restarted).tolist(),
             )
         return observation, {**info, **with_masks(seen, restarted)}
@@ -123,15 +123,15 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         ended, episodes = terminated | truncated, self.episodes
         episodes.steps += 1
         if self._mode == AutoresetMode.SAME_STEP:
-            restarted, shown = ended, self._of_same_step(observation, ended, info)
+            shown = self._of_same_step(observation, ended, info)
+            episodes.begun = ended
         else:
-            restarted = self._ended
-            self._forget(restarted)
-            self._ended = ended.copy()
-            shown = self._seen(observation, self._everywhere)
+            due = episodes.due()
+            if due is not None:
+                episodes.restart(due)
+            episodes.ended = ended
+            shown = self._seen(observation, episodes.everywhere)
         if self.viewer is not None:
-            self._steps += ~restarted
-            times, begun = self._steps * self.problem.dt, np.flatnonzero(restarted).tolist()
             self.viewer.advance(
                 np.stack(self._x, axis=-1),
                 episodes.steps * self.problem.dt,
