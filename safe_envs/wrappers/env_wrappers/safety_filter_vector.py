@@ -111,16 +111,12 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
                 if not np.allclose(u, v, rtol=0.0, atol=tolerance):
                     raise self.changed_action(decision.action)
         added = self._decided(decision, active)
-        ended = terminated | truncated
-        if self._mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
-            info["final_info"].update(
-                with_masks({key: value.copy() for key, value in added.items()}, ended)
-            )
-            self._restart(added, ended)
-        elif self._mode == AutoresetMode.NEXT_STEP:
-            if np.count_nonzero(self._ended):
-                self._restart(added, self._ended)
-            self._ended = ended
+        begun = self._inner.episodes.begun
+        if np.count_nonzero(begun):
+            if self._mode == AutoresetMode.SAME_STEP:
+                last = {key: value.copy() for key, value in added.items()}
+                info["final_info"].update(with_masks(last, begun))
+            self._restart(added, begun)
         info.update(with_masks(added, info["_cost"]))
         return observation, reward, terminated, truncated, info
 
