@@ -17,9 +17,8 @@ from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import BayesianSCBF, Condition
-from safe_envs.wrappers.verification.guarantee import guarantee_of
+from safe_envs.wrappers.verification.guarantee import Guarantee, guarantee_of
 from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
-from safe_envs.wrappers.verification.results import Guarantee
 
 _SIZES = ("delta", "supremum", "shortfall", "bias")
 """What a bound over a posterior is made of."""

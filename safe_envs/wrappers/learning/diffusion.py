@@ -15,7 +15,8 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.checks import Purpose, random_stream
 from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.estimators import by_parts, rounding
+from safe_envs.wrappers.learning.drift_checks import rounding
+from safe_envs.wrappers.learning.estimators import by_parts
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.values import array_of
 

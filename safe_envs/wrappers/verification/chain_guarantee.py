@@ -125,16 +125,29 @@ class ChainGuarantee:
         return not any(stages.shortfalls) or not (noisy or any(map(math.isnan, stages.rates)))
 
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
-        """Return the largest bound whose hypotheses hold; see `Guarantee.at`."""
+        """Return the largest bound on P(safe up to the horizon) whose hypotheses hold.
+
+        Args:
+            starts: states, shape (B, n).
+            horizon: T in s.
+
+        Returns:
+            Values in [0, 1], shape (B,); 0 where there is no bound.
+        """
         b = self.formulas.chain(np.asarray(starts, dtype=np.float64))
         return np.zeros(len(b)) if self.note else self._candidates(b, horizon)[-1].values
 
     def contradiction(
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
     ) -> str:
-        """Say what states contradict; see `Guarantee.contradiction`.
+        """Say what states contradict in the numbers of the bound; "" if nothing.
 
-        The actions themselves tell how much of the slack is a sampling margin.
+        Args:
+            reached: states that were reached, starts among them, shape (B, n).
+            violated: states where the filter violated its conditions, shape (E, n).
+            actions: what it executed there, shape (E, m).
+            slack: by how much it reports to have violated them, shape (E,); the actions themselves
+                tell how much of it is a sampling margin.
         """
         if self.note:
             return ""

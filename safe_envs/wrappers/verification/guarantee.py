@@ -9,8 +9,14 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import BayesianSCBF, Condition, LearnedCondition
 from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.posterior_guarantee import posterior_guarantee
-from safe_envs.wrappers.verification.results import Guarantee
+from safe_envs.wrappers.verification.posterior_guarantee import (
+    PosteriorGuarantee,
+    posterior_guarantee,
+)
+
+Guarantee = ChainGuarantee | PosteriorGuarantee
+"""The largest bound that is estimated for a filter: `at` starts, `note` where there is none, `remark`
+where it is weak, and `contradiction` by states that were seen."""
 
 
 def guarantee_of(

@@ -30,7 +30,7 @@ from safe_envs.wrappers.verification.smoothness import Asked, roughness
 from safe_envs.wrappers.verification.step_bias import rate_bias
 
 if TYPE_CHECKING:
-    from safe_envs.wrappers.learning.posterior import Posterior
+    from safe_envs.wrappers.learning.models.posterior import Posterior
 
 _SAMPLES = 8192
 _STARTS = 64
@@ -71,7 +71,7 @@ class PosteriorGuarantee:
     note: None = None
 
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
-        """Return the estimate at starts; see `Guarantee.at`."""
+        """Return the estimate at starts; see `ChainGuarantee.at`."""
         h = _values(self._barrier, np.asarray(starts, dtype=np.float64))
         return (1.0 - self.delta) * bounds.stage_bound(
             h, self.supremum, horizon, shortfall=self.shortfall + self.bias
@@ -80,7 +80,7 @@ class PosteriorGuarantee:
     def contradiction(
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
     ) -> str:
-        """Say what states contradict in c and m; see `Guarantee.contradiction`."""
+        """Say what states contradict in c and m; see `ChainGuarantee.contradiction`."""
         h = _values(self._barrier, reached[in_workspace(reached, self._workspace)])
         if (h > self.supremum * (1.0 + RELATIVE)).any():
             return reaches("h", h.max(), self.supremum)

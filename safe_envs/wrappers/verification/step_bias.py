@@ -12,7 +12,7 @@ import sympy as sp
 from safe_envs.dynamics.codegen import compile_function, stacked
 
 if TYPE_CHECKING:
-    from safe_envs.wrappers.learning.posterior import Posterior
+    from safe_envs.wrappers.learning.models.posterior import Posterior
 
 _SLOPE, _CURVE = 1e-6, 1e-3
 """Parts of its range by which a state is moved for first and second derivatives."""

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from safe_envs.dynamics.codegen import compile_function, stacked
-from safe_envs.dynamics.integrators import Integrator
-from safe_envs.dynamics.sde import finite_number
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import Progress
 from safe_envs.wrappers.learning.checks import Purpose, random_stream, require_problem, require_room
+from safe_envs.wrappers.learning.data.steps import Step, period_of, plant_step
 from safe_envs.wrappers.learning.data.transitions import Transitions, numbers
 from safe_envs.wrappers.learning.models.signature import Signature
-
-Step = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]
-"""From states (B, n), physical inputs (B, m) held and a generator to the states (B, n) one dt
-later."""
 
 _AT_ONCE = 1 << 17
 """Transitions that are simulated together: few enough for the cache. The noise that a seed gives
@@ -30,68 +24,6 @@ depends on it."""
 _TRIES_AT_ONCE = 1024
 _TRIES_BEFORE_DESPAIR = 1 << 20
 _SMALLEST_SHARE = 1e-4
-
-
-def plant_step(problem: SafetyProblem, dt: float | None = None) -> Step:
-    """The step of a problem's plant.
-
-    Args:
-        problem: whose plant and number of substeps are taken.
-        dt: length of the step in s; None for the control period.
-
-    Raises:
-        ConfigurationError: dt is no positive number.
-    """
-    integrator = Integrator(problem.plant, _period(problem, dt), problem.substeps, "arrays")
-
-    def step(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        draws = rng.standard_normal((integrator.channels, len(x)))
-        return stacked(
-            integrator.step(
-                tuple(np.ascontiguousarray(x.T)), tuple(np.ascontiguousarray(u.T)), draws
-            ),
-            len(x),
-        )
-
-    return step
-
-
-def env_step(
-    env: gym.Env[Any, Any],
-    set_state: Callable[[gym.Env[Any, Any], np.ndarray], object],
-    get_state: Callable[[gym.Env[Any, Any]], Any],
-    to_action: Callable[[np.ndarray], Any] | None = None,
-) -> Step:
-    """The step of any scalar env whose state can be set. It runs in a Python loop: such an env
-    knows only one state at a time.
-
-    The env is reset, with a seed drawn from the generator, whenever the step is given another
-    generator than before: the env's own randomness is then as reproducible as the generator. One
-    step of the env has to last the dt that is told to `collect`.
-
-    Args:
-        env: to be stepped.
-        set_state: puts the env into a state (n,); also after an episode has ended, of which the
-            step takes no notice.
-        get_state: reads the state (n,) off the env.
-        to_action: from a physical input (m,) to an action of the env; None if they are the same.
-    """
-    known: np.random.Generator | None = None
-
-    def step(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        nonlocal known
-        if rng is not known:
-            env.reset(seed=int(rng.integers(2**31)))
-            known = rng
-        successors = []
-        for state, held in zip(x, u, strict=True):
-            set_state(env, state.copy())
-            env.step(held.copy() if to_action is None else to_action(held.copy()))
-            # A copy: the env may change the very array in the next step.
-            successors.append(np.array(get_state(env), dtype=float))
-        return np.array(successors)
-
-    return step
 
 
 def draw_states(problem: SafetyProblem, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -175,7 +107,7 @@ def collect(
         require_whole(name, value, 1)
     tried, period = (
         _allowed(problem, problem.exploration.inputs if inputs is None else inputs),
-        _period(problem, dt),
+        period_of(problem, dt),
     )
     n, rows = len(problem.states), points * len(tried)
     require_room(
@@ -242,7 +174,7 @@ def collect_paths(
     """
     require_problem(problem)
     require_whole("steps", steps, 1)
-    held, period = _allowed(problem, inputs), _period(problem, dt)
+    held, period = _allowed(problem, inputs), period_of(problem, dt)
     begin = numbers("states", states)
     if begin.shape != (len(held), len(problem.states)) or not np.isfinite(begin).all():
         raise InvalidInputError(
@@ -261,13 +193,6 @@ def collect_paths(
     for k in range(steps):
         paths[:, k + 1] = _stepped(step, paths[:, k], held, noise)
     return paths
-
-
-def _period(problem: SafetyProblem, dt: float | None) -> float:
-    period = problem.dt if dt is None else finite_number("dt", dt)
-    if not period > 0:
-        raise ConfigurationError(f"dt = {period} s; give a positive length of a step")
-    return period
 
 
 def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:

@@ -10,127 +10,21 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import sympy as sp
-from scipy.stats import chi2
 
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.features import Features
+from safe_envs.wrappers.learning.models.noise import Diffusion, require_noise
+from safe_envs.wrappers.learning.models.pruning import insignificant, mixed_by_steps, solved
 from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.models.values import (
     LARGEST,
-    LearnedFileError,
     array_of,
     require_finite,
 )
-from safe_envs.wrappers.learning.regression import Gaussian, sigma_map, sigma_samples
-
-_SIGNIFICANT = 0.999
-_POINTS = 256
-_SLOPE = 1e-6
-"""Part of its range by which a state is moved to see how f and g change."""
-
-_ROUNDING = 1e-9
-"""Of the entries of a matrix of correlations."""
-
-_ROUNDED = 1e-3
-"""Part of its mean within which a regressed variance is rounded off towards 0, so that it stays
-positive and smooth."""
-
-
-@dataclass(frozen=True, eq=False)
-class Diffusion:
-    """What is known of the noise: a level for each state, or a variance that varies, and
-    correlations.
-
-    Attributes:
-        squares: S of each state, the sum of xi^2/dt over the residual increments xi, (n,); 0 for a
-            state without noise.
-        count: N, degrees of freedom of each S.
-        correlation: of the noise of the states, (n, n).
-        alpha: shape of the prior of sigma.
-        beta: its scale, in the units of sigma.
-        features: on which the variances per s were regressed; None for constant noise.
-        variance: weights of these variances; None for constant noise.
-    """
-
-    squares: np.ndarray
-    count: float
-    correlation: np.ndarray
-    alpha: float = 1.0
-    beta: float = 1.0
-    features: Features | None = None
-    variance: Gaussian | None = None
-
-    @property
-    def sigma(self) -> np.ndarray:
-        """The most probable constant levels, (n,). A state without any scatter has none, where the
-        prior would say beta/N."""
-        levels = sigma_map(
-            self.squares, np.full(len(self.squares), self.count), self.alpha, self.beta
-        )
-        return np.where(self.squares > 0, levels, 0.0)
-
-    def sigma_intervals(self, delta: float) -> np.ndarray:
-        """Intervals that hold all sigma_i of constant, independent noise but for a probability
-        delta, shape (n, 2).
-
-        They are those of S/sigma^2 ~ chi^2_N: a prior of sigma, whose scale is a guess, would move
-        them off the truth.
-
-        Raises:
-            ConfigurationError: the noise varies with the state, or is correlated.
-        """
-        if self.features is not None or not np.array_equal(
-            self.correlation, np.eye(len(self.squares))
-        ):
-            raise ConfigurationError(
-                "intervals of sigma are known for constant noise of independent states only; ask"
-                " for confidence instead"
-            )
-        tail = 0.5 * delta / len(self.squares)
-        levels = np.array([tail, 1.0 - tail])
-        return np.sqrt(self.squares[:, None] / chi2.isf(levels, self.count))
-
-    def variances(self, x: np.ndarray) -> np.ndarray:
-        """Estimated variances per s at states (B, n), without the prior of sigma, shape (B, n)."""
-        constant = self.squares / self.count
-        if self.features is None or self.variance is None:
-            return np.broadcast_to(constant, x.shape)
-        p, rounding = self.features.matrix(x) @ self.variance.mean.T, _ROUNDED * constant
-        return 0.5 * (p + np.sqrt(p**2 + 4.0 * rounding**2))
-
-    def matrix(self, rng: np.random.Generator | None = None) -> sp.ImmutableMatrix:
-        """sigma(x), (n, n): the most probable one, or one drawn from the posterior."""
-        if self.features is None or self.variance is None:
-            levels = [sp.Float(s, 17) if s else sp.Integer(0) for s in self._levels(rng).tolist()]
-        else:
-            weights = self.variance.mean if rng is None else self.variance.sample(rng)
-            levels = [
-                self._level(p, r)
-                for p, r in zip(
-                    map(self.features.combined, weights), self.squares / self.count, strict=True
-                )
-            ]
-        return sp.ImmutableMatrix(sp.diag(*levels) * _root(self.correlation))
-
-    def _levels(self, rng: np.random.Generator | None) -> np.ndarray:
-        if rng is None:
-            return self.sigma
-        return np.array(
-            [
-                sigma_samples(s, self.count, self.alpha, self.beta, 1, rng)[0] if s > 0 else 0.0
-                for s in self.squares
-            ]
-        )
-
-    def _level(self, p: sp.Expr, constant: float) -> sp.Expr:
-        if not constant:
-            return sp.Integer(0)
-        rounding = sp.Float(2.0 * _ROUNDED * constant, 17)
-        return sp.sqrt((p + sp.sqrt(p**2 + rounding**2)) / 2)
+from safe_envs.wrappers.learning.regression import Gaussian
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,50 +70,13 @@ class Posterior(LearnedModel):
 
     @cached_property
     def pruned(self) -> np.ndarray:
-        """Whether g_ij is taken for 0, (n, m): it does not differ from 0, or only as the length of
-        the steps makes it.
+        """Whether g_ij is taken for 0, shape (n, m); see `safe_envs.wrappers.learning.models.pruning`.
 
         Such entries would have tiny values, and with them give a relative degree to barriers that
         the input does not reach.
         """
-        return self._insignificant() | self._leaked()
-
-    def _insignificant(self) -> np.ndarray:
-        """Whether w' Cov^-1 w of the weights of g_ij is below the .999 quantile of chi^2_M."""
-        count = self.features.count
-        small = np.empty((len(self.mean), len(self.inputs)), dtype=bool)
-        for j in range(len(self.inputs)):
-            block = slice((j + 1) * count, (j + 2) * count)
-            weights = self.mean[:, block, None]
-            size = (weights * _solved(self.covariance[:, block, block], weights)).sum(axis=(1, 2))
-            small[:, j] = size <= chi2.ppf(_SIGNIFICANT, count)
-        return small
-
-    def _leaked(self) -> np.ndarray:
-        """Whether g_ij is no larger than twice dt/2 (Df g_j + Dg_j f)_i, by which a step of dt
-        mixes it with the others.
-
-        A plant that is integrated finer than dt shows that much: to a position the input comes
-        within a step.
-        """
-        n, parts, _, count = self._blocks
-        low, high = np.array(self.features.region).T
-        x = np.random.default_rng(0).uniform(low, high, (_POINTS, n))
-        reach = np.diag(_SLOPE * (high - low))
-        slopes = np.stack(
-            [
-                (self.features.matrix(x + h) - self.features.matrix(x - h)) / (2.0 * h.sum())
-                for h in reach
-            ],
-            axis=-1,
-        )
-        weights = self.mean.reshape(n, parts, count)
-        values = np.einsum("bk,ipk->bip", self.features.matrix(x), weights)
-        jacobians = np.einsum("bkj,ipk->bipj", slopes, weights, optimize=True)
-        mixed = jacobians[:, :, 0] @ values[:, :, 1:] + np.einsum(
-            "bipj,bj->bip", jacobians[:, :, 1:], values[:, :, 0]
-        )
-        return (values[:, :, 1:] ** 2).mean(axis=0) <= self.dt**2 * (mixed**2).mean(axis=0)
+        zero = insignificant(self.mean, self.covariance, len(self.inputs))
+        return zero | mixed_by_steps(self.features, self.mean, self.dt)
 
     @cached_property
     def weights(self) -> Gaussian:
@@ -229,7 +86,7 @@ class Posterior(LearnedModel):
         for i, row in enumerate(self.pruned):
             zero = np.flatnonzero(np.repeat([False, *row], self.features.count))
             if zero.size:
-                gain = _solved(covariance[i][np.ix_(zero, zero)], covariance[i][zero]).T
+                gain = solved(covariance[i][np.ix_(zero, zero)], covariance[i][zero]).T
                 mean[i] -= gain @ mean[i][zero]
                 covariance[i] -= gain @ covariance[i][zero]
                 mean[i][zero], covariance[i][zero], covariance[i][:, zero] = 0.0, 0.0, 0.0
@@ -382,7 +239,7 @@ class Posterior(LearnedModel):
                 numbers("variance_covariance", n, varying.count, varying.count),
             ),
         )
-        _require_noise(noise)
+        require_noise(noise)
         weights = numbers("mean", n, count), numbers("covariance", n, count, count)
         scale, dt = numbers("input_scale", m), require_finite(details["dt"])
         if not (0 < dt <= LARGEST and (scale > 0).all()):
@@ -406,35 +263,6 @@ class Posterior(LearnedModel):
         return {name: (truth[name], estimate[name]) for name in truth}
 
 
-def _solved(covariance: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """The solution of a system with a covariance of weights; what is learned has a regular one."""
-    try:
-        return np.linalg.solve(covariance, right)
-    except np.linalg.LinAlgError as error:
-        raise LearnedFileError(
-            "the covariance of the weights is singular: the file was altered. Learn again"
-        ) from error
-
-
-def _require_noise(noise: Diffusion) -> None:
-    """Raise ValueError where noise has a variance, a correlation or a prior that there is not."""
-    correlation = noise.correlation
-    fits = (
-        (noise.squares >= 0).all()
-        and 0 < noise.count <= LARGEST
-        and max(noise.alpha, noise.beta) <= LARGEST
-    )
-    fits = fits and min(noise.alpha, noise.beta) >= 0
-    if not (
-        fits
-        and np.allclose(correlation, correlation.T, atol=_ROUNDING)
-        and (abs(correlation) <= 1.0 + _ROUNDING).all()
-    ):
-        raise ValueError(
-            "the noise has a negative variance, a correlation above 1, or no degrees of freedom"
-        )
-
-
 def _entries(system: ControlAffineSDE, x: np.ndarray) -> dict[str, np.ndarray]:
     """Values of f, g and the upper half of sigma sigma' at states (B, n), by name."""
     covariance = system.diffusion * system.diffusion.T
@@ -454,12 +282,3 @@ def _entries(system: ControlAffineSDE, x: np.ndarray) -> dict[str, np.ndarray]:
         system.states, [system.numeric(e) for e in named.values()], "arrays"
     )
     return dict(zip(named, stacked(compiled(*np.ascontiguousarray(x.T)), len(x)).T, strict=True))
-
-
-def _root(correlation: np.ndarray) -> sp.Matrix:
-    """The symmetric square root of a correlation matrix, which may be singular."""
-    values, vectors = np.linalg.eigh(correlation)
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return sp.Matrix(
-        [[sp.Float(v, 17) if v else sp.Integer(0) for v in row] for row in root.tolist()]
-    )
