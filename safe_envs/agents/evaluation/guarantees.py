@@ -100,7 +100,7 @@ class GuaranteeAverager:
             sizes = {} if found is None else {name: getattr(found, name) for name in _SIZES}
             row |= {
                 "estimated_bound": None,
-                "bound_note": "it rests on something learned: see its bound over the posterior",
+                "bound_note": "the condition is learned: see its bound over the posterior",
             }
             row |= {"posterior_bound": {"probability": bound, "note": note, **sizes}}
         else:

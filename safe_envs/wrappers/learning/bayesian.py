@@ -1,4 +1,4 @@
-"""Bayesian identification of a control-affine system of which nothing is known, from one-step data."""
+"""Bayesian identification of an unknown control-affine system from one-step data."""
 
 from __future__ import annotations
 
@@ -48,8 +48,8 @@ def identify(
     """Learn f, g and sigma of a problem's plant.
 
     (x' - x)/dt = f(x) + g(x) u + noise of the covariance sigma sigma'/dt is regressed on features
-    of the state, and on these times each input. The noise is told by repetitions, or in a log by
-    what the fit leaves.
+    of the state, and on these times each input. The noise follows from repetitions, or in a log
+    from what the fit leaves.
 
     Args:
         problem: its exploration says where and under which inputs data are collected.
@@ -67,7 +67,7 @@ def identify(
         data: to learn from, instead of collecting any.
         seed: of all randomness.
         step: how the system is stepped; None for the plant.
-        progress: is told which part is done.
+        progress: called with the part that is done.
 
     Returns:
         What was learned. Warns (`IdentifiabilityWarning`) of what the data do not tell.
@@ -77,9 +77,8 @@ def identify(
         ConfigurationError: an argument is not allowed, or the data are too few to tell the noise.
 
     Source: thesis Sec. 6.2 and 6.3.1; 10 starts x 100 steps and the priors 10 I (cubic) and 1e4 I
-        (ACC) were taken for what the
-    print leaves open. The print identifies f under u = 0 and g under u = .1; here both come from
-    inputs of both signs.
+        (ACC) were taken for what the thesis leaves open. It identifies f under u = 0 and g under
+        u = .1; here both come from inputs of both signs.
     """
     began = time.perf_counter()
     require_problem(problem)
@@ -105,7 +104,7 @@ def identify(
     errors = _held_out(data, features, scale, varying, believed)
     found = fit(rows, design, varying, believed)
     names = [u.name for u in problem.plant.inputs]
-    told = (
+    warned = (
         *weaknesses(
             features,
             names,
@@ -121,7 +120,7 @@ def identify(
         *misfits(features, found.misfit, found.variation),
         *region_warnings(problem, data),
     )
-    for text in told:
+    for text in warned:
         warnings.warn(text, IdentifiabilityWarning, stacklevel=2)
     settings = {
         **({"starts": starts, "steps": steps} if collected else {"points": data.points}),
@@ -138,7 +137,7 @@ def identify(
     if progress is not None:
         progress(1.0)
     record = Record(
-        data.count, data.observed, time.perf_counter() - began, data.seed, errors, settings, told
+        data.count, data.observed, time.perf_counter() - began, data.seed, errors, settings, warned
     )
     learned, dt = found.learned, float(data.dt.mean())
     weights = learned.mean, learned.covariance
@@ -169,7 +168,7 @@ def _require_prior(prior: float, alpha: float, beta: float) -> None:
 
 
 def _degree(problem: SafetyProblem, rows: int) -> int:
-    """The highest degree that the number of weights allows."""
+    """Return the highest degree that the number of weights allows."""
     lowest = Features.of(problem, 1)
     coordinates = lowest.count - 1
     parts = 1 + len(problem.inputs)
@@ -186,17 +185,17 @@ def _held_out(
 ) -> dict[str, float]:
     """Root-mean-square errors of the rates at start states that were left out, for each state.
 
-    In its units per s, beside what the noise of the data makes of it; and in standard deviations of
-    the prediction, which is 1 where the posterior is right. Empty where the data are too few to
+    They are in its units per s, with the part that the noise of the data explains; and in standard
+    deviations of the prediction, which are 1 where the posterior is right. Empty where the data are too few to
     leave any out.
     """
     if len(np.unique(data.x, axis=0)) < _FEWEST_HELD_OUT:
         return {}
-    kept, held = (
+    trained, held = (
         Rows.of(part)
         for part in data.split(_HELD_OUT, random_stream(data.seed or 0, Purpose.HELD_OUT))
     )
-    found = fit(kept, kept.design(features, scale), varying, prior)
+    found = fit(trained, trained.design(features, scale), varying, prior)
     design = held.design(features, scale)
     error = held.rate - design @ found.learned.mean.T
     noise = found.diffusion.variances(held.x) / (held.dt * held.count)[:, None]

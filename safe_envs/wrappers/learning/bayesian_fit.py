@@ -98,12 +98,12 @@ def fit(rows: Rows, design: np.ndarray, features: Features | None, prior: Prior)
         error = rows.rate - design @ learned.mean.T
         excess = (error**2 / variance).sum(axis=0) / left
         beyond = excess > fisher.ppf(_SURE, left, count)
-        missed = np.where(beyond, np.maximum((error**2 - variance).mean(axis=0), 0.0), 0.0)
+        unexplained = np.where(beyond, np.maximum((error**2 - variance).mean(axis=0), 0.0), 0.0)
         learned = posterior(
             design, rows.rate, variance * np.where(beyond, excess, 1.0), prior.weights
         )
-        learned.covariance[:, 0, 0] += missed
-        misfit = np.sqrt(missed / (size + _SMALLEST))
+        learned.covariance[:, 0, 0] += unexplained
+        misfit = np.sqrt(unexplained / (size + _SMALLEST))
     return Fit(
         learned,
         noise,
@@ -113,9 +113,9 @@ def fit(rows: Rows, design: np.ndarray, features: Features | None, prior: Prior)
 
 
 def _residuals(rows: Rows, design: np.ndarray) -> tuple[np.ndarray, float]:
-    """What is noise in the R transitions, (R, n), and its degrees of freedom N.
+    """Return the noise in the R transitions, (R, n), and its degrees of freedom N.
 
-    The scatter within the rows where these repeat, and else what a first fit leaves.
+    It is the scatter within the rows where these repeat, and else what a first fit leaves.
     """
     if rows.repeated:
         return rows.deviation, float(len(rows.group) - len(rows.count))
@@ -159,8 +159,14 @@ def _diffusion(
 def _regressed(
     phi: np.ndarray, targets: np.ndarray, count: np.ndarray, prior: np.ndarray
 ) -> Gaussian:
-    """Weights of variances per s, from mean squares (G, n) whose own noise is told by what the fit
-    leaves."""
+    """Return the weights of variances per s; their own noise follows from what the fit leaves.
+
+    Args:
+        phi: features, shape (G, M).
+        targets: mean squares, shape (G, n).
+        count: degrees of freedom of each row, shape (G,).
+        prior: variance of each weight, shape (n,).
+    """
     weight = np.sqrt(count)[:, None]
     solution, _, rank, _ = np.linalg.lstsq(phi * weight, targets * weight, rcond=None)
     left = ((targets - phi @ solution) ** 2 * count[:, None]).sum(axis=0) / max(len(phi) - rank, 1)
@@ -168,8 +174,10 @@ def _regressed(
 
 
 def _variation(rows: Rows, residual: np.ndarray, noise: Diffusion) -> np.ndarray:
-    """Part by which the variance of each state varies, as a quadratic of the state, (n,); 0 where
-    that may be chance."""
+    """Return the part by which the variance of each state varies as a quadratic of the state, (n,).
+
+    It is 0 where that may be chance.
+    """
     centred = rows.x - rows.x.mean(axis=0)
     scaled = centred / np.maximum(abs(centred).max(axis=0), np.finfo(float).tiny)
     terms = np.column_stack((np.ones(len(scaled)), scaled, scaled**2))
@@ -185,8 +193,10 @@ def _variation(rows: Rows, residual: np.ndarray, noise: Diffusion) -> np.ndarray
 
 
 def _correlation(white: np.ndarray) -> np.ndarray:
-    """Correlations of residuals (R, n) of variance 1; the unit matrix where none is significant,
-    and 0 for a state without noise."""
+    """Return the correlations (n, n) of residuals (R, n) of variance 1.
+
+    They are the unit matrix where none is significant, and 0 for a state without noise.
+    """
     n = white.shape[1]
     sizes = np.sqrt((white**2).sum(axis=0))
     sizes[sizes == 0] = 1.0

@@ -19,7 +19,7 @@ _SURE = 5.0
 
 
 _MATERIAL = 0.05
-"""Part of a state's steps, or of all states, from which something is told."""
+"""Part of a state's steps, or of all states, from which there is a warning."""
 
 
 _ROUNDING = 64 * np.finfo(float).eps
@@ -27,23 +27,31 @@ _ROUNDING = 64 * np.finfo(float).eps
 
 
 def rounding(data: Transitions, rate: np.ndarray) -> np.ndarray:
-    """The largest residual of each state that may be a rounding error, shape (n,); arguments as for
-    `drift_score`."""
+    """Return the largest residual of each state that may be a rounding error, shape (n,).
+
+    Args:
+        data: transitions.
+        rate: f(x) + g(x) u at each point, shape (P, n).
+    """
     return _ROUNDING * (np.abs(data.x) + np.abs(rate) * data.dt[:, None]).max(axis=0)
 
 
 def slack(data: Transitions, rate: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """The largest residual of each state that another way of integrating may make, shape (n,);
-    arguments as for `drift_warnings`."""
+    """Return the largest residual of each state that another integration may make, shape (n,).
+
+    Args:
+        data: transitions.
+        rate: f(x) + g(x) u at each point, shape (P, n).
+        mean: its mean over the steps, shape (P, n).
+    """
     return _MATERIAL * (np.abs(mean - rate) * data.dt[:, None]).max(axis=0)
 
 
 def drift_score(data: Transitions, rate: np.ndarray, allowed: np.ndarray | float = 0.0) -> float:
-    """How far the mean steps are from a drift's, in standard errors: root mean square over points
-    and states; 1 if it is right.
+    """Return how far the mean steps are from a drift's, in standard errors; 1 if it is right.
 
-    Steps without repetitions say nothing about it and score 1, and so do residuals within the
-    rounding.
+    It is the root mean square over points and states. Steps without repetitions tell nothing and
+    score 1, and so do residuals within the rounding.
 
     Args:
         data: transitions under any inputs.
@@ -71,7 +79,7 @@ def drift_score(data: Transitions, rate: np.ndarray, allowed: np.ndarray | float
 def drift_warnings(
     data: Transitions, rate: np.ndarray, mean: np.ndarray, names: Sequence[str]
 ) -> tuple[str, ...]:
-    """What a user has to know where a drift does not fit the data.
+    """Return warnings where a drift does not fit the data.
 
     Args:
         data: transitions under any inputs.
@@ -92,8 +100,7 @@ def drift_warnings(
 
 
 def _factor_warnings(data: Transitions, mean: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
-    """The same where the score sees nothing: of a log without repetitions, by regression of the
-    steps on those of the drift."""
+    """Return warnings for a log without repetitions, by regression on the steps of the drift."""
     moved = mean * data.dt[:, None]
     product = (data.successors.mean(axis=1) - data.x - moved) * moved
     size, total, spread = (
@@ -117,8 +124,12 @@ def _factor_warnings(data: Transitions, mean: np.ndarray, names: Sequence[str]) 
 
 
 def region_warnings(problem: SafetyProblem, data: Transitions) -> tuple[str, ...]:
-    """Which states of the data are to a material part outside the region in which a problem is
-    explored."""
+    """Return warnings where much of the data is outside the region that is explored.
+
+    Args:
+        problem: whose region is taken.
+        data: transitions.
+    """
     found = []
     for variable, (low, high), column in zip(
         problem.states, problem.exploration.region, data.x.T, strict=True

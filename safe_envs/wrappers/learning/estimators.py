@@ -1,5 +1,4 @@
-"""Estimates of what the noise adds to the generator of a function, from one-step transitions; the
-drift is known."""
+"""Estimates of what noise adds to the generator of a function, from one-step data; drift known."""
 
 from __future__ import annotations
 
@@ -52,17 +51,24 @@ class Estimate:
 
 
 def rates(model: ControlAffineSDE, data: Transitions) -> np.ndarray:
-    """f(x) + g(x) u of a model at each point under its input, in units of the states per s, shape
-    (P, n)."""
+    """Return f(x) + g(x) u of a model at each point.
+
+    Args:
+        model: that is known.
+        data: transitions under any inputs.
+
+    Returns:
+        Rates in units of the states per s, shape (P, n).
+    """
     return _rate_of(model, data)(data.x)
 
 
 def mean_rates(model: ControlAffineSDE, data: Transitions, rate: np.ndarray) -> np.ndarray:
-    """Mean of f + g u of a model over each step, as the data were integrated, shape (P, n).
+    """Return the mean of f + g u of a model over each step, as the data were integrated.
 
     An Euler step takes the rate at its beginning, an exact one differs from that by an order of dt,
-    and one of several Euler steps is between them. Which it was is one number, told by least
-    squares over all data; for noise it must not be taken.
+    and one of several Euler steps is between them. Which it was is one number, found by least
+    squares over all data; noise must not be taken for it.
 
     Args:
         model: that is known.
@@ -85,7 +91,7 @@ def mean_rates(model: ControlAffineSDE, data: Transitions, rate: np.ndarray) -> 
 
 
 def _rate_of(model: ControlAffineSDE, data: Transitions) -> Callable[[np.ndarray], np.ndarray]:
-    """The function f + g u of a model, of states (P, n) under the inputs of the points."""
+    """Return the function f + g u of a model, of states (P, n) under the inputs of the points."""
     rate = model.numeric(model.drift + model.input_matrix * sp.Matrix(model.inputs))
     compiled, u = (
         compile_function((*model.states, *model.inputs), tuple(rate), "arrays"),
@@ -95,7 +101,7 @@ def _rate_of(model: ControlAffineSDE, data: Transitions) -> Callable[[np.ndarray
 
 
 def by_parts(data: Transitions) -> Iterator[tuple[slice, list[np.ndarray]]]:
-    """A few points at a time, with the n components (points, K) of their successors."""
+    """Yield a few points at a time, with the n components (points, K) of their successors."""
     points = max(1, _AT_ONCE // data.repetitions)
     for begin in range(0, data.points, points):
         part = slice(begin, begin + points)
@@ -109,8 +115,7 @@ def by_parts(data: Transitions) -> Iterator[tuple[slice, list[np.ndarray]]]:
 
 
 def in_bulk(network: Network, inputs: Sequence[np.ndarray]) -> np.ndarray:
-    """The first output of a tanh network at very many states, in single precision, which is much
-    faster.
+    """Return the first output of a tanh network at very many states, in fast single precision.
 
     Args:
         network: with tanh for its activation.

@@ -62,11 +62,11 @@ def train(
     sizes: np.ndarray | None = None,
     progress: Progress | None = None,
 ) -> Trained:
-    """Fit a network: 70 % of the rows train it, 15 % choose the epoch, 15 % measure it. One thread,
-    no global generator.
+    """Fit a network: 70 % of the rows train it, 15 % choose the epoch, 15 % measure it.
 
-    A target that is the same in all rows, up to rounding, is answered by this constant: of a
-    barrier to which the noise adds nothing, a network would learn its own error.
+    One thread and no global generator are used. A target that is the same in all rows, up to
+    rounding, is answered by this constant: of a barrier to which the noise adds nothing, a network
+    would learn its own error.
 
     Args:
         inputs: (N, p).
@@ -80,7 +80,7 @@ def train(
             same network.
         sizes: (q,), against which the spread of each target is judged small (see
             `_standardisation`); its largest entry by default.
-        progress: told after each epoch.
+        progress: called after each epoch.
 
     Raises:
         InvalidInputError: the arrays have other shapes, fewer than ten rows, or entries that are
@@ -128,7 +128,7 @@ def train(
 
 
 def hidden_widths(hidden: Any) -> tuple[int, ...]:
-    """The widths of hidden layers as Python's numbers.
+    """Return the widths of hidden layers as Python's numbers.
 
     Raises:
         ConfigurationError: they are no whole numbers from 1.
@@ -176,7 +176,7 @@ def _check_data(inputs: np.ndarray, targets: np.ndarray) -> None:
 def _standardisation(
     columns: np.ndarray, sizes: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and scale of each column (N, k).
+    """Return mean and scale of each column (N, k).
 
     A column that should be constant, such as Delta_2 of a Dubins vehicle, still varies by the
     rounding and truncation of its labels, up to about 1e-5 of its size. Divided by its own
@@ -191,8 +191,7 @@ def _standardisation(
 
 @contextmanager
 def _single_thread() -> Iterator[None]:
-    """Let torch use one thread: on small matrices more are slower, and the order of sums would hang
-    on their number."""
+    """Let torch use one thread: more are slower on small matrices, and change the order of sums."""
     import torch
 
     threads = torch.get_num_threads()
@@ -215,8 +214,7 @@ def _fit(
     seed: int,
     progress: Progress | None,
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], int, float]:
-    """Train on standardised data; return (weights, bias) of each layer, the epochs that were run,
-    and the validation loss."""
+    """Train on standardised data; return weights and biases, the epochs and the validation loss."""
     import torch
 
     generator = torch.Generator().manual_seed(seed)
@@ -251,8 +249,7 @@ def _fit(
 
 
 def _first_parameters(shapes: Sequence[tuple[int, ...]], generator: Any) -> Any:
-    """Weights and biases of all layers in one tensor, each uniform within 1/sqrt(inputs of the
-    layer)."""
+    """Draw all weights and biases into one tensor, uniform within 1/sqrt(inputs of the layer)."""
     import torch
 
     bounds = [weights[1] ** -0.5 for weights in shapes[::2] for _ in range(2)]
@@ -266,7 +263,7 @@ def _first_parameters(shapes: Sequence[tuple[int, ...]], generator: Any) -> Any:
 
 
 def _unpacked(flat: Any, shapes: Sequence[tuple[int, ...]]) -> list[Any]:
-    """Weights and bias of each layer in turn, as views of the tensor that holds them all."""
+    """Yield weights and bias of each layer in turn, as views of the tensor that holds them all."""
     return [
         part.view(shape)
         for part, shape in zip(flat.split([math.prod(s) for s in shapes]), shapes, strict=True)
@@ -274,7 +271,7 @@ def _unpacked(flat: Any, shapes: Sequence[tuple[int, ...]]) -> list[Any]:
 
 
 def _forward(parameters: Sequence[Any], x: Any, activation: Activation) -> Any:
-    """Outputs of the layers for a batch, as tensors."""
+    """Return the outputs of the layers for a batch, as tensors."""
     import torch
 
     for k in range(0, len(parameters), 2):

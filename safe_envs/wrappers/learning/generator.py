@@ -1,5 +1,4 @@
-"""The generator of a barrier under unknown noise, learned from one-step transitions: DDSCBF of the
-thesis, and a shorter way."""
+"""Learning the generator of a barrier under unknown noise: DDSCBF, or by the covariance."""
 
 from __future__ import annotations
 
@@ -67,8 +66,7 @@ def learn_generator(
     step: Step | None = None,
     progress: Progress | None = None,
 ) -> GeneratorModel:
-    """Learn what the noise adds to the generators of a problem's barriers, where the model's f and
-    g are right.
+    """Learn what noise adds to the generators of a problem's barriers, where f and g are known.
 
     The way "network" is the thesis': M_1 is fitted to estimates of 1/2 tr(sigma sigma' h_xx). For r
     >= 2 it goes on with A b_(j-1) of b_(j-1) = L_f^(j-1) h + M_(j-1), so that a network is
@@ -86,7 +84,7 @@ def learn_generator(
             ignored then.
         seed: of all randomness.
         step: how the system is stepped; None for the plant's.
-        progress: is told which part is done.
+        progress: called with the part that is done.
 
     Raises:
         ConfigurationError: an argument is not allowed, or the data are of another system.
@@ -100,7 +98,7 @@ def learn_generator(
     require_estimator(estimator)
     if way not in (None, *get_args(Way)):
         raise ConfigurationError(f"way = {shown(way)}; allowed: {', '.join(get_args(Way))}")
-    begin, told = time.perf_counter(), progress or (lambda _: None)
+    begin, tell = time.perf_counter(), progress or (lambda _: None)
     degrees = [relative_degree(problem.model, b.expression) for b in problem.barriers]
     if data is None:
         at_rest = [min(max(0.0, low), high) for low, high in problem.box]
@@ -111,7 +109,7 @@ def learn_generator(
             [at_rest],
             seed=seed,
             step=step,
-            progress=lambda part: told(0.5 * part),
+            progress=lambda part: tell(0.5 * part),
         )
     require_kind("data", data, Transitions, "collect, Transitions.from_log or Transitions.load")
     data.require(problem)
@@ -137,13 +135,13 @@ def learn_generator(
             for _ in range(degree):
                 how = {
                     "seed": seed,
-                    "progress": lambda part, k=done: told(0.5 + 0.5 * (k + part) / every),
+                    "progress": lambda part, k=done: tell(0.5 + 0.5 * (k + part) / every),
                 }
                 found, new = _next_order(problem, barrier, found, data, taken, estimator, **how)
                 errors |= new
                 done += 1
             generators.append(found)
-    told(1.0)
+    tell(1.0)
     record = Record(
         data.count,
         data.observed,
@@ -168,8 +166,7 @@ def _next_order(
     estimator: Estimator,
     **how: Any,
 ) -> tuple[LearnedGenerator, dict[str, float]]:
-    """Add M_j to M_1..M_(j-1); and its median error at held-out points, labels included, and the
-    labels' standard error."""
+    """Add M_j to M_1..M_(j-1); return held-out errors and standard errors of labels too."""
     model, below, n = problem.model, known.degree, problem.plant.n
     base = model.numeric(derivatives(model, barrier.expression, below, lie_derivative_f)[-1])
     read_base = compile_function(model.states, (base,), "arrays")

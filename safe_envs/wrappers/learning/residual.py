@@ -1,5 +1,4 @@
-"""What the model gets wrong in the derivatives of a barrier, learned from short paths of the plant
-under held inputs.
+"""Learning what a model gets wrong in the derivatives of a barrier, from short paths of the plant.
 
 A network says something everywhere, but it has seen states of the explored region only. Outside it
 extrapolates, and the errors at held-out states, all of which are from that region, mean nothing
@@ -71,7 +70,7 @@ def learn_residual(
         seed: of all randomness.
         step: the plant, if it is not the problem's; a step of it has to last `label_dt` and to be
             free of noise.
-        progress: told how far the work is.
+        progress: called with the part that is done.
 
     Raises:
         ConfigurationError: an argument is out of its range, the plant is noisy, or the inputs
@@ -121,7 +120,7 @@ def learn_residual(
     record = Record(
         transitions, transitions * label_dt, time.perf_counter() - began, seed, errors, settings
     )
-    # The step of somebody else may be that of any plant.
+    # A given step may be that of any plant.
     signature = Signature.of(problem) if step is None else replace(Signature.of(problem), plant=())
     return ResidualModel(signature, record, tuple(parts))
 
@@ -153,8 +152,8 @@ def residual_labels(
             before derivative r.
 
     Source: thesis Eq. (3.17), (3.23), (3.24), for any number of inputs. Eq. (3.28) prints the
-        central second difference, half of
-    which lies under another input: it gives half of the input's gain for every step.
+        central second difference, half of which lies under another input: it gives half of the
+        input's gain for every step.
     """
     tried = np.array(problem.exploration.inputs, dtype=float)
     split = _split_by_input(problem, tried)
@@ -194,8 +193,7 @@ def _require_label_dt(label_dt: float, dt: float) -> None:
 
 
 def _split_by_input(problem: SafetyProblem, tried: np.ndarray) -> np.ndarray:
-    """The matrix (1 + m, J) that takes values c + a u at J inputs to (c, a) by least squares;
-    raises as `residual_labels`."""
+    """Return the matrix (1 + m, J) from values c + a u at J inputs to (c, a) by least squares."""
     # Centred and scaled, for inputs may be large and far from 0.
     center = tried.mean(axis=0)
     scale = np.abs(tried - center).max(axis=0)
@@ -214,8 +212,10 @@ def _split_by_input(problem: SafetyProblem, tried: np.ndarray) -> np.ndarray:
 
 
 def _differences(h: np.ndarray, degree: int, dt: float) -> np.ndarray:
-    """Derivatives 1..degree at the beginning of paths with samples (..., S + 1) dt apart, shape
-    (..., degree)."""
+    """Return derivatives 1..degree at the beginning of paths with samples (..., S + 1) dt apart.
+
+    The shape is (..., degree).
+    """
     # Exact rationals, about 1 as sympy has it: weights that miss the sum 0 by a rounding would add
     # that times h/dt^j.
     table = sp.finite_diff_weights(degree, list(range(1, h.shape[-1] + 1)))
@@ -238,12 +238,12 @@ def _require_agreement(rates: np.ndarray, name: str) -> None:
 
 
 def _share(progress: Progress | None, part: int, parts: int) -> Progress | None:
-    """Progress of one of some equal parts of the work."""
+    """Return the progress of one of some equal parts of the work."""
     return None if progress is None else lambda done: progress((part + done) / parts)
 
 
 def _summary(name: str, outputs: Sequence[str], part: LearnedResidual) -> dict[str, float]:
-    """Held-out errors by name: root mean square and 95 % quantile of each residual."""
+    """Return held-out errors by name: root mean square and 95 % quantile of each residual."""
     # The quantile describes these errors; that of fresh ones, `eps`, exists for 19 held-out states
     # or more only.
     rms, q95 = (

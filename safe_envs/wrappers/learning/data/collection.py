@@ -27,8 +27,7 @@ _SMALLEST_SHARE = 1e-4
 
 
 def draw_states(problem: SafetyProblem, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw states uniformly from where a problem is explored: its region, where every barrier is
-    positive.
+    """Draw states uniformly from the region that is explored, where every barrier is positive.
 
     Args:
         problem: whose region and barriers are taken.
@@ -73,12 +72,11 @@ def collect(
     dt: float | None = None,
     progress: Progress | None = None,
 ) -> Transitions:
-    """Collect one-step data where a problem is explored: at every state each of some inputs, some
-    times.
+    """Collect one-step data where a problem is explored, under each of some inputs.
 
     With several steps, trajectories are followed. Each goes on with the first successor under one
-    of the inputs, chosen at random, and starts anew from a fresh state where it leaves the region
-    or a barrier is not positive.
+    of the inputs, chosen at random, and restarts from a fresh state where it leaves the region or a
+    barrier is not positive.
 
     Args:
         problem: of what system; its exploration says where and under which inputs.
@@ -89,7 +87,7 @@ def collect(
         seed: of all randomness.
         step: how the system is stepped; None for `plant_step(problem, dt)`.
         dt: length of a step in s; None for the control period.
-        progress: is told which part is done.
+        progress: called with the part that is done.
 
     Returns:
         Data of P = steps * points * J rows: the states at the beginning of all trajectories, then
@@ -118,7 +116,7 @@ def collect(
     )
     # Two generators: the states that are drawn do not depend on how often a step is repeated.
     drawing, noise = random_stream(seed, Purpose.DATA).spawn(2)
-    # The step of somebody else may be that of any plant.
+    # A given step may be that of any plant.
     signature = Signature.of(problem) if step is None else replace(Signature.of(problem), plant=())
     step = plant_step(problem, period) if step is None else step
     x, successors = np.empty((steps, rows, n)), np.empty((steps, rows, repetitions, n))
@@ -196,7 +194,7 @@ def collect_paths(
 
 
 def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
-    """Inputs as an array (J, m), once each is known to be in the box."""
+    """Return inputs as an array (J, m); raise ConfigurationError where one is out of bounds."""
     names = ", ".join(i.symbol.name for i in problem.inputs)
     tried = numbers("inputs", inputs)
     if tried.ndim != 2 or tried.shape[-1] != len(problem.inputs) or not len(tried):
@@ -215,7 +213,7 @@ def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
 
 
 def _explored(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
-    """Whether states (B, n) are in the region and every barrier is positive there, shape (B,)."""
+    """Return whether states (B, n) are in the region with positive barriers, shape (B,)."""
     low, high = np.array(problem.exploration.region).T
     barriers = compile_function(
         problem.plant.states,
@@ -230,8 +228,7 @@ def _explored(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
 def _followed(
     problem: SafetyProblem, successors: np.ndarray, points: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """The next states (points, n) of trajectories, from their successors (points * J, n) under each
-    input."""
+    """Return the next states (points, n) of trajectories, from their successors (points * J, n)."""
     reached = successors.reshape(points, -1, successors.shape[-1])
     states = reached[np.arange(points), rng.integers(reached.shape[1], size=points)]
     left = ~_explored(problem, states)
@@ -259,7 +256,7 @@ def _repeat(
 
 
 def _stepped(step: Step, x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """What a step returns, once it is known to be states."""
+    """Return what a step gives; raise an error where these are no states."""
     with np.errstate(all="ignore"):
         successors = np.asarray(step(x, u, rng), dtype=float)
     if successors.shape != x.shape:

@@ -20,7 +20,7 @@ later."""
 
 
 def plant_step(problem: SafetyProblem, dt: float | None = None) -> Step:
-    """The step of a problem's plant.
+    """Make the step of a problem's plant.
 
     Args:
         problem: whose plant and number of substeps are taken.
@@ -49,12 +49,11 @@ def env_step(
     get_state: Callable[[gym.Env[Any, Any]], Any],
     to_action: Callable[[np.ndarray], Any] | None = None,
 ) -> Step:
-    """The step of any scalar env whose state can be set. It runs in a Python loop: such an env
-    knows only one state at a time.
+    """Make the step of any scalar env whose state can be set, in a Python loop over the states.
 
     The env is reset, with a seed drawn from the generator, whenever the step is given another
     generator than before: the env's own randomness is then as reproducible as the generator. One
-    step of the env has to last the dt that is told to `collect`.
+    step of the env has to last the dt that `collect` is given.
 
     Args:
         env: to be stepped.

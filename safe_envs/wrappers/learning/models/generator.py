@@ -32,11 +32,10 @@ ACTIVATION = "tanh"
 
 @dataclass(frozen=True, eq=False)
 class LearnedGenerator:
-    """What noise adds to the derivatives of one barrier of relative degree r: A^j h = L_f^j h +
-    M_j(x) (+ the input's part).
+    """The terms M_j that noise adds to the derivatives of a barrier: A^j h = L_f^j h + M_j + ....
 
-    Implements `safe_envs.wrappers.conditions.base.Terms`: the row of a condition takes M_r and, for
-    r >= 2, the slopes of M_(r-1), for
+    Implements `safe_envs.wrappers.conditions.base.Terms`: a constraint takes M_r and, for r >= 2,
+    the slopes of M_(r-1), for
 
         A^r h(x, u) = L_f^r h + M_r + (L_g L_f^(r-1) h + grad M_(r-1) . g) u.
 
@@ -71,15 +70,14 @@ class LearnedGenerator:
 
     @cached_property
     def _chart(self) -> tuple[Callable[..., Components], Callable[..., Components]]:
-        """The coordinates, and their derivatives by every state, coordinate by coordinate; over
-        floats, and over arrays."""
+        """The coordinates, then their derivatives by every state; over floats, and over arrays."""
         read = (*self.coordinates, *(sp.diff(c, s) for c in self.coordinates for s in self.states))
         return compile_function(self.states, read, "floats"), compile_function(
             self.states, read, "arrays"
         )
 
     def floats(self, x: Sequence[float]) -> list[float]:
-        """Values of the symbols at one state, given by components."""
+        """Return the values of the symbols at one state, given by components."""
         read, p = self._chart[0](*x), len(self.coordinates)
         value = self.networks[-1].floats(read[:p])
         return (
@@ -90,12 +88,20 @@ class LearnedGenerator:
         )
 
     def arrays(self, x: Components) -> Components:
-        """Values of the symbols at a batch of states, components (B,) in and out."""
+        """Return the values of the symbols at a batch of states, components (B,) in and out."""
         value = self.networks[-1].arrays(self.coordinates_at(x))
         return value if self.degree == 1 else (*value, *self.slopes(self.degree - 1, x))
 
     def slopes(self, order: int, x: Components) -> Components:
-        """dM_j/dx_1..dx_n for an order j from 1, components (B,) in and out."""
+        """Return dM_j/dx_1..dx_n.
+
+        Args:
+            order: j, from 1.
+            x: states, n components (B,).
+
+        Returns:
+            n components (B,).
+        """
         read, p = self._chart[1](*x), len(self.coordinates)
         return tuple(
             self._by_states(
@@ -105,12 +111,11 @@ class LearnedGenerator:
         )
 
     def coordinates_at(self, x: Components) -> list[np.ndarray]:
-        """The coordinates at a batch of states, components (B,) in and out."""
+        """Return the coordinates at a batch of states, components (B,) in and out."""
         return [filled(c, x[0].shape) for c in self._chart[1](*x)[: len(self.coordinates)]]
 
     def _by_states(self, slopes: Sequence[Any], chart: Components) -> list[Any]:
-        """The chain rule: slopes by the coordinates, and those of the coordinates, to slopes by the
-        states."""
+        """Return slopes by the states, by the chain rule, of those by the coordinates."""
         n = len(self.states)
         return [sum(slope * chart[k * n + i] for k, slope in enumerate(slopes)) for i in range(n)]
 
@@ -136,7 +141,7 @@ class GeneratorModel(LearnedModel):
     diffusion: LearnedDiffusion | None = None
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The numbers, by name."""
+        """Return the numbers, by name."""
         if self.diffusion is not None:
             return self.diffusion.to_arrays()
         networks = [
@@ -151,7 +156,7 @@ class GeneratorModel(LearnedModel):
         }
 
     def details(self) -> dict[str, Any]:
-        """What else `restored` needs, JSON-able."""
+        """Return what else `restored` needs, JSON-able."""
         if self.diffusion is not None:
             return {"way": "direct", "entries": self.diffusion.details()}
         coordinates = [str(c) for c in self.generators[0].coordinates]
@@ -169,7 +174,7 @@ class GeneratorModel(LearnedModel):
         details: Mapping[str, Any],
         arrays: Mapping[str, np.ndarray],
     ) -> Self:
-        """Make the model again for a problem whose signature fits.
+        """Make the model again; see `LearnedModel.restored`.
 
         Raises:
             LearnedFileError: the networks are functions of other coordinates.
@@ -200,7 +205,7 @@ class GeneratorModel(LearnedModel):
 
     @classmethod
     def check(cls, signature: Signature, problem: SafetyProblem) -> None:
-        """Raise LearnedFileError where a model with a signature is of no use for a problem.
+        """Raise LearnedFileError where it is of no use for a problem; see `LearnedModel.check`.
 
         f and g of the model must be the same, and the barriers where their own generators were
         learned. What the model says about the noise does not matter: nothing of that was used.
@@ -217,8 +222,7 @@ class GeneratorModel(LearnedModel):
     def compare(
         self, problem: SafetyProblem, x: np.ndarray
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """(truth, estimate) at states (B, n), by name: M_r of each barrier, or the covariance's
-        entries from the diagonal on.
+        """Return truth and estimate of M_r or of the covariance; see `LearnedModel.compare`.
 
         Raises:
             ConfigurationError: plant and model differ in f or g, and r >= 2: then M_r is no
@@ -248,7 +252,7 @@ class GeneratorModel(LearnedModel):
 
 
 def _noise_part(problem: SafetyProblem, barrier: Barrier, degree: int) -> Any:
-    """A^r h - L_f^r h of the plant, in symbols."""
+    """Return A^r h - L_f^r h of the plant, in symbols."""
     plant, model = problem.plant, problem.model
     fields = [
         [system.numeric(part) for part in (system.drift, system.input_matrix)]

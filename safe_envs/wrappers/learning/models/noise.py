@@ -1,4 +1,4 @@
-"""The noise of an identified system: levels or varying variances, and correlations."""
+"""The noise of an identified system: constant levels or varying variances, and correlations."""
 
 from __future__ import annotations
 
@@ -25,8 +25,7 @@ positive and smooth."""
 
 @dataclass(frozen=True, eq=False)
 class Diffusion:
-    """What is known of the noise: a level for each state, or a variance that varies, and
-    correlations.
+    """The noise: a level for each state, or a variance that varies, and correlations.
 
     Attributes:
         squares: S of each state, the sum of xi^2/dt over the residual increments xi, (n,); 0 for a
@@ -49,19 +48,17 @@ class Diffusion:
 
     @property
     def sigma(self) -> np.ndarray:
-        """The most probable constant levels, (n,). A state without any scatter has none, where the
-        prior would say beta/N."""
+        """The most probable constant levels, (n,); 0 for a state without any scatter."""
         levels = sigma_map(
             self.squares, np.full(len(self.squares), self.count), self.alpha, self.beta
         )
         return np.where(self.squares > 0, levels, 0.0)
 
     def sigma_intervals(self, delta: float) -> np.ndarray:
-        """Intervals that hold all sigma_i of constant, independent noise but for a probability
-        delta, shape (n, 2).
+        """Return intervals of all sigma_i of constant, independent noise, shape (n, 2).
 
-        They are those of S/sigma^2 ~ chi^2_N: a prior of sigma, whose scale is a guess, would move
-        them off the truth.
+        All of them hold but for a probability delta. They are those of S/sigma^2 ~ chi^2_N: a prior
+        of sigma, whose scale is a guess, would move them off the truth.
 
         Raises:
             ConfigurationError: the noise varies with the state, or is correlated.
@@ -136,7 +133,7 @@ def require_noise(noise: Diffusion) -> None:
 
 
 def _root(correlation: np.ndarray) -> sp.Matrix:
-    """The symmetric square root of a correlation matrix, which may be singular."""
+    """Return the symmetric square root of a correlation matrix, which may be singular."""
     values, vectors = np.linalg.eigh(correlation)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     return sp.Matrix(

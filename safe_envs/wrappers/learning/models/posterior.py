@@ -1,5 +1,4 @@
-"""What Bayesian identification knows of a control-affine system: distributions of its drift, input
-matrix and noise."""
+"""The posterior of a control-affine system: distributions of drift, input matrix and noise."""
 
 from __future__ import annotations
 
@@ -29,7 +28,7 @@ from safe_envs.wrappers.learning.regression import Gaussian
 
 @dataclass(frozen=True, eq=False)
 class Posterior(LearnedModel):
-    """What Bayesian identification knows of f, g and sigma.
+    """The distributions of f, g and sigma of an identified system.
 
     f_i = Phi w_i0 and g_ij = s_j Phi w_ij, with the features Phi and Gaussian weights (w_i0, ..,
     w_im), drawn independently from state to state. Where the noise of the states is correlated, the
@@ -51,8 +50,7 @@ class Posterior(LearnedModel):
             constant, (n,), likewise.
 
     Source: thesis Sec. 6.2, with f and g in one regression on both inputs instead of the pairs of
-        Eq. (6.5): the same posterior,
-    with the right variances.
+        Eq. (6.5): the same posterior, with the right variances.
     """
 
     method: ClassVar[str] = "bayesian"
@@ -70,7 +68,7 @@ class Posterior(LearnedModel):
 
     @cached_property
     def pruned(self) -> np.ndarray:
-        """Whether g_ij is taken for 0, shape (n, m); see `safe_envs.wrappers.learning.models.pruning`.
+        """Which g_ij are taken for 0, (n, m); see `safe_envs.wrappers.learning.models.pruning`.
 
         Such entries would have tiny values, and with them give a relative degree to barriers that
         the input does not reach.
@@ -80,8 +78,7 @@ class Posterior(LearnedModel):
 
     @cached_property
     def weights(self) -> Gaussian:
-        """The weights of `system`: their distribution, given that those of the pruned entries are
-        0."""
+        """The weights of `system`: their distribution where those of the pruned entries are 0."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
         for i, row in enumerate(self.pruned):
             zero = np.flatnonzero(np.repeat([False, *row], self.features.count))
@@ -103,7 +100,7 @@ class Posterior(LearnedModel):
         return self._system(self.mean, self.diffusion.matrix())
 
     def sample(self, rng: np.random.Generator) -> ControlAffineSDE:
-        """A system drawn from the posterior. What is pruned stays 0."""
+        """Draw a system from the posterior; what is pruned stays 0."""
         return self._system(self.weights.sample(rng), self.diffusion.matrix(rng))
 
     def _system(self, weights: np.ndarray, diffusion: sp.ImmutableMatrix) -> ControlAffineSDE:
@@ -118,8 +115,10 @@ class Posterior(LearnedModel):
         return ControlAffineSDE(self.features.states, self.inputs, drift, rows, diffusion)
 
     def drift_variance(self, x: np.ndarray) -> np.ndarray:
-        """Covariances of (f_i, g_i1, .., g_im) at states (B, n), shape (B, n, 1 + m, 1 + m); also
-        of what is pruned."""
+        """Return the covariances of (f_i, g_i1, .., g_im) at states, pruned entries included.
+
+        The states are (B, n), the covariances (B, n, 1 + m, 1 + m).
+        """
         phi = self.features.matrix(x)
         return np.einsum(
             "bipqk,bk->bipq", (phi @ self._stretched).reshape(len(x), *self._blocks), phi
@@ -132,8 +131,7 @@ class Posterior(LearnedModel):
 
     @cached_property
     def _split_covariance(self) -> np.ndarray:
-        """The covariance of the weights with the scales of the inputs in it, axes (n, 1 + m, 1 + m,
-        M, M)."""
+        """The covariance of the weights in physical inputs, axes (n, 1 + m, 1 + m, M, M)."""
         n, parts, _, count = self._blocks
         scale = np.array([1.0, *self.input_scale])
         split = self.covariance.reshape(n, parts, count, parts, count).transpose(0, 1, 3, 2, 4)
@@ -141,15 +139,14 @@ class Posterior(LearnedModel):
 
     @cached_property
     def _stretched(self) -> np.ndarray:
-        """The same as one matrix (M, n (1 + m)^2 M), so that a batch costs one product of matrices."""
+        """The same as one matrix (M, n (1 + m)^2 M): a batch costs one product of matrices."""
         return np.ascontiguousarray(
             np.moveaxis(self._split_covariance, 3, 0).reshape(self.features.count, -1)
         )
 
     @property
     def variance_expressions(self) -> tuple[sp.ImmutableMatrix, ...]:
-        """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m) of expressions,
-        multiplied out."""
+        """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m), multiplied out."""
         first, second = np.triu_indices(self.features.count)
         phi = self.features.expressions
         products = [
@@ -257,14 +254,13 @@ class Posterior(LearnedModel):
     def compare(
         self, problem: SafetyProblem, x: np.ndarray
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """See `LearnedModel.compare`: f_i and g_ij in the units of the states per s, and the
-        entries of sigma sigma'."""
+        """Return f_i, g_ij and the entries of sigma sigma'; see `LearnedModel.compare`."""
         truth, estimate = _entries(problem.plant, x), _entries(self.system, x)
         return {name: (truth[name], estimate[name]) for name in truth}
 
 
 def _entries(system: ControlAffineSDE, x: np.ndarray) -> dict[str, np.ndarray]:
-    """Values of f, g and the upper half of sigma sigma' at states (B, n), by name."""
+    """Return f, g and the upper half of sigma sigma' at states (B, n), by name."""
     covariance = system.diffusion * system.diffusion.T
     named = {f"f[{s}]": system.drift[i] for i, s in enumerate(system.states)}
     named |= {

@@ -31,8 +31,9 @@ _HELD_OUT = 0.15
 
 @dataclass(eq=False)
 class LearnedResidual:
-    """Residuals of one barrier: h^(j) = L_f^j h + Delta_j, j <= r, and Sigma u more in the last, f
-    and g those of the model.
+    """Residuals of one barrier: h^(j) = L_f^j h + Delta_j, j <= r, with Sigma u added in the last.
+
+    f and g are those of the model.
 
     Attributes:
         states: n symbols.
@@ -73,20 +74,19 @@ class LearnedResidual:
         self._arrays = compile_function(self.states, self.coordinates, "arrays")
 
     def floats(self, x: Sequence[float]) -> Sequence[float]:
-        """The r + m residuals at one state."""
+        """Return the r + m residuals at one state."""
         return self.network.floats(self._floats(*x))
 
     def arrays(self, x: Components) -> Components:
-        """The residuals at a batch of states, n components (B,) in and r + m components (B,) out."""
+        """Return the residuals at states: n components (B,) in, r + m components (B,) out."""
         return self.network.arrays(tuple(stacked(self._arrays(*x), len(x[0])).T))
 
     def eps(self, level: float) -> np.ndarray:
-        """The errors (r + m,) that a fresh state exceeds with a probability of at most 1 - level,
-        each residual by itself.
+        """Return errors (r + m,) that a fresh state exceeds with probability at most 1 - level.
 
-        The error of rank ceil(level (n + 1)) among the n at held-out states. It holds for states
-        that are drawn as those were, on average over what is learned; outside the explored region
-        it means nothing, for the network extrapolates there.
+        They are those of rank ceil(level (n + 1)) among the n at held-out states, for each residual
+        by itself. That holds for states that are drawn as those were, on average over what is
+        learned; outside the explored region it means nothing, for the network extrapolates there.
 
         Raises:
             ConfigurationError: the level is not in [0, 1], or higher than this many held-out states
@@ -144,7 +144,7 @@ class ResidualModel(LearnedModel):
         details: Mapping[str, Any],
         arrays: Mapping[str, np.ndarray],
     ) -> Self:
-        """Make the model again.
+        """Make the model again; see `LearnedModel.restored`.
 
         Raises:
             ConfigurationError: the problem is explored in other coordinates now, or the numbers do
@@ -179,14 +179,13 @@ class ResidualModel(LearnedModel):
 
     @classmethod
     def check(cls, signature: Signature, problem: SafetyProblem) -> None:
-        """Raise LearnedFileError unless system, barriers and model are those that were learned."""
+        """Raise LearnedFileError unless system, barriers and model are the same."""
         signature.require(problem, "barriers", "model")
 
     def compare(
         self, problem: SafetyProblem, x: np.ndarray
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """(truth, estimate) of each residual at states (B, n), by name, values (B,); the truth
-        symbolic, of plant less model."""
+        """Return truth (plant less model) and estimate of each; see `LearnedModel.compare`."""
         states, found = np.ascontiguousarray(x.T), {}
         for barrier, part in zip(problem.barriers, self.parts, strict=True):
             systems = (problem.plant, problem.model)
@@ -205,8 +204,15 @@ class ResidualModel(LearnedModel):
 def lie_derivatives(
     system: ControlAffineSDE, h: sp.Expr, degree: int
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """From states (N, n) to h, L_f h, ..., L_f^r h and the m entries of L_g L_f^(r-1) h, side by
-    side (N, 1 + r + m)."""
+    """Return a function of states (N, n) that gives Lie derivatives, side by side (N, 1 + r + m).
+
+    They are h, L_f h, ..., L_f^r h and the m entries of L_g L_f^(r-1) h.
+
+    Args:
+        system: with f and g.
+        h: expression of the states.
+        degree: r.
+    """
     along = derivatives(system, h, degree, lie_derivative_f)
     expressions = [
         system.numeric(e) for e in (*along, *lie_derivative_g(system, along[degree - 1]))
@@ -216,7 +222,7 @@ def lie_derivatives(
 
 
 def _remedy(level: float, heldout: int) -> str:
-    """How to get errors of a level that some held-out states are too few for."""
+    """Say how to get errors of a level for which there are too few held-out states."""
     highest = f"give a level up to {math.floor(1000 * heldout / (heldout + 1)) / 1000}"
     if level == 1:
         return f"{highest}: no number of states tells the largest error"
