@@ -49,15 +49,41 @@ class Trained:
     heldout: np.ndarray
 
 
+@dataclass(frozen=True)
+class AdamSettings:
+    """Layers of a network, and how Adam trains it.
+
+    Attributes:
+        hidden: width of each hidden layer.
+        activation: after each of them.
+        epochs: at most; training stops when the validation loss has not fallen for 60 of them.
+        batch: rows in a step.
+        rate: of Adam.
+
+    Raises:
+        ConfigurationError: a setting is out of its range.
+    """
+
+    hidden: Sequence[int] = (100, 30)
+    activation: Activation = "relu"
+    epochs: int = 500
+    batch: int = 256
+    rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "batch"):
+            require_whole(name, getattr(self, name), 1)
+        object.__setattr__(self, "hidden", _widths(self.hidden))
+        require_activation(self.activation)
+        if not 0 < self.rate < 1:
+            raise ConfigurationError(f"rate = {shown(self.rate)}; give a number between 0 and 1")
+
+
 def train(
     inputs: np.ndarray,
     targets: np.ndarray,
+    settings: AdamSettings | None = None,
     *,
-    hidden: Sequence[int] = (100, 30),
-    activation: Activation = "relu",
-    epochs: int = 500,
-    batch: int = 256,
-    rate: float = 1e-3,
     seed: int = 0,
     sizes: np.ndarray | None = None,
     progress: Progress | None = None,
@@ -71,11 +97,7 @@ def train(
     Args:
         inputs: (N, p).
         targets: (N, q).
-        hidden: width of each hidden layer.
-        activation: after each of them.
-        epochs: at most; training stops when the validation loss has not fallen for 60 of them.
-        batch: rows in a step.
-        rate: of Adam.
+        settings: of the training; by default those of `AdamSettings`.
         seed: of the split, the first weights and the order of the rows; the same seed gives the
             same network.
         sizes: (q,), against which the spread of each target is judged small (see
@@ -85,49 +107,37 @@ def train(
     Raises:
         InvalidInputError: the arrays have other shapes, fewer than ten rows, or entries that are
             not finite or above 1e100.
-        ConfigurationError: a setting is out of its range, or the network would have more than ten
+        ConfigurationError: the seed is out of its range, or the network would have more than ten
             million parameters.
 
     Source: thesis Sec. 3.4.2, whose loss lacks the square and whose update has the wrong sign.
     """
     _check_data(inputs, targets)
-    for name, value in (("epochs", epochs), ("batch", batch)):
-        require_whole(name, value, 1)
-    widths = (inputs.shape[1], *hidden_widths(hidden), targets.shape[1])
+    how = settings or AdamSettings()
+    widths = (inputs.shape[1], *how.hidden, targets.shape[1])
     _require_size(widths)
     rows = random_stream(seed, Purpose.TRAINING).permutation(len(inputs))
-    require_activation(activation)
-    if not 0 < rate < 1:
-        raise ConfigurationError(f"rate = {shown(rate)}; give a number between 0 and 1")
     fitted, validated = int(_TRAINED * len(rows)), int(_VALIDATED * len(rows))
     parts = np.split(rows, [fitted, fitted + validated])
     ends = (*_standardisation(inputs), *_standardisation(targets, sizes))
     x, y = (inputs - ends[0]) / ends[1], (targets - ends[2]) / ends[3]
     constant = np.ptp(targets, axis=0) <= _ROUNDING * np.abs(targets).max(axis=0)
     with _single_thread():
-        layers, run, loss = _fit(
-            x,
-            y,
-            parts,
-            widths,
-            activation,
-            0 if constant.all() else epochs,
-            batch,
-            rate,
-            int(seed),
-            progress,
-        )
+        allowed = 0 if constant.all() else how.epochs
+        layers, run, loss = _fit(x, y, parts, how, allowed, int(seed), progress)
     # In the last layer, whose output the mean is added to.
     for numbers in layers[-1]:
         numbers[constant] = 0.0
-    network = Network(tuple(w for w, _ in layers), tuple(b for _, b in layers), activation, *ends)
+    network = Network(
+        tuple(w for w, _ in layers), tuple(b for _, b in layers), how.activation, *ends
+    )
     predicted = np.stack(network.arrays(tuple(inputs[parts[2]].T)), axis=1)
     return Trained(
         network, run, 0.0 if constant.all() else loss, np.abs(predicted - targets[parts[2]])
     )
 
 
-def hidden_widths(hidden: Any) -> tuple[int, ...]:
+def _widths(hidden: Any) -> tuple[int, ...]:
     """Return the widths of hidden layers as Python's numbers.
 
     Raises:
@@ -206,11 +216,8 @@ def _fit(
     x: np.ndarray,
     y: np.ndarray,
     parts: Sequence[np.ndarray],
-    widths: Sequence[int],
-    activation: Activation,
+    how: AdamSettings,
     epochs: int,
-    batch: int,
-    rate: float,
     seed: int,
     progress: Progress | None,
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], int, float]:
@@ -221,22 +228,23 @@ def _fit(
     (x_fit, x_val), (y_fit, y_val) = (
         [torch.tensor(a[part], dtype=torch.float32) for part in parts[:2]] for a in (x, y)
     )
+    widths = (x.shape[1], *how.hidden, y.shape[1])
     shapes = [shape for into, out in pairwise(widths) for shape in ((out, into), (out,))]
     # All parameters in one tensor: Adam's cost is in the number of its calls, not in the size of
     # what it updates.
     flat = _first_parameters(shapes, generator).requires_grad_()
-    optimizer = torch.optim.Adam([flat], lr=rate)
+    optimizer = torch.optim.Adam([flat], lr=how.rate)
     loss_of = torch.nn.functional.mse_loss
     best, least, since, epoch = flat.detach().clone(), float("inf"), 0, 0
     for epoch in range(1, epochs + 1):
-        for rows in torch.randperm(len(x_fit), generator=generator).split(batch):
+        for rows in torch.randperm(len(x_fit), generator=generator).split(how.batch):
             optimizer.zero_grad()
             loss_of(
-                _forward(_unpacked(flat, shapes), x_fit[rows], activation), y_fit[rows]
+                _forward(_unpacked(flat, shapes), x_fit[rows], how.activation), y_fit[rows]
             ).backward()
             optimizer.step()
         with torch.no_grad():
-            loss = loss_of(_forward(_unpacked(flat, shapes), x_val, activation), y_val).item()
+            loss = loss_of(_forward(_unpacked(flat, shapes), x_val, how.activation), y_val).item()
         since += 1
         if loss < least:
             best, least, since = flat.detach().clone(), loss, 0

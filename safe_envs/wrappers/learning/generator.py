@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -33,7 +33,7 @@ from safe_envs.wrappers.learning.estimators import (
     rates,
     require_estimator,
 )
-from safe_envs.wrappers.learning.fit import train
+from safe_envs.wrappers.learning.fit import AdamSettings, train
 from safe_envs.wrappers.learning.models.generator import (
     ACTIVATION,
     GeneratorModel,
@@ -45,13 +45,7 @@ from safe_envs.wrappers.learning.models.signature import Signature
 Way = Literal["network", "direct"]
 """How a generator is learned: see `learn_generator`."""
 
-_TRAINING: dict[str, Any] = {
-    "hidden": [100, 30],
-    "activation": ACTIVATION,
-    "rate": 1e-3,
-    "batch": 32,
-    "epochs": 500,
-}
+_TRAINING = AdamSettings((100, 30), ACTIVATION, batch=32)
 
 
 def learn_generator(
@@ -126,7 +120,8 @@ def learn_generator(
         diffusion, errors = LearnedDiffusion.learn(problem, data, mean, slack(data, rate, mean))
         warnings += () if diffusion.entries else ("the data show no noise, and none was learned",)
     else:
-        settings |= {"estimator": estimator, "training_seed": seed, **_TRAINING}
+        settings |= {"estimator": estimator, "training_seed": seed, **asdict(_TRAINING)}
+        settings["hidden"] = list(_TRAINING.hidden)
         done, every = 0, sum(degrees)
         # The printed estimator has the bias that it was printed with.
         taken = rate if estimator == "printed" else mean
@@ -193,7 +188,7 @@ def _next_order(
             slope * f for slope, f in zip(known.slopes(below, x), read(*x)[n:], strict=True)
         )
     trained = train(
-        stacked(known.coordinates_at(x), data.points), labels[:, None], **how, **_TRAINING
+        stacked(known.coordinates_at(x), data.points), labels[:, None], _TRAINING, **how
     )
     label = order_label(below + 1, barrier)
     errors = {label: float(np.median(trained.heldout))}

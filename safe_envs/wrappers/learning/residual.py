@@ -27,7 +27,7 @@ from safe_envs.wrappers.learning.checks import (
 )
 from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
 from safe_envs.wrappers.learning.data.steps import Step
-from safe_envs.wrappers.learning.fit import LEAST_ROWS, hidden_widths, train
+from safe_envs.wrappers.learning.fit import LEAST_ROWS, AdamSettings, train
 from safe_envs.wrappers.learning.models.residual import (
     LearnedResidual,
     ResidualModel,
@@ -82,7 +82,7 @@ def learn_residual(
     began = time.perf_counter()
     require_problem(problem)
     require_whole("states", states, LEAST_ROWS)
-    widths = hidden_widths(hidden)
+    how = AdamSettings(hidden, epochs=epochs)
     _require_label_dt(label_dt, problem.dt)
     if step is None and problem.plant.noisy:
         raise ConfigurationError(
@@ -101,8 +101,7 @@ def learn_residual(
         trained = train(
             inputs,
             targets,
-            hidden=widths,
-            epochs=epochs,
+            how,
             seed=seed,
             sizes=sizes,
             progress=_share(progress, i, len(labels)),
@@ -116,7 +115,12 @@ def learn_residual(
         errors |= _summary(
             barrier.name, residual_names(degree, [u.symbol.name for u in problem.inputs]), parts[-1]
         )
-    settings = {"states": states, "label_dt": label_dt, "hidden": list(widths), "epochs": epochs}
+    settings = {
+        "states": states,
+        "label_dt": label_dt,
+        "hidden": list(how.hidden),
+        "epochs": epochs,
+    }
     record = Record(
         transitions, transitions * label_dt, time.perf_counter() - began, seed, errors, settings
     )
