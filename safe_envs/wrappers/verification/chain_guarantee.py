@@ -24,7 +24,7 @@ from safe_envs.wrappers.verification.candidates import (
     surely_safe,
 )
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.observed import above_shortfall, above_suprema, described
+from safe_envs.wrappers.verification.observed import above_shortfall, above_suprema
 from safe_envs.wrappers.verification.results import Bound, Status
 from safe_envs.wrappers.verification.safe_set import sample
 from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
@@ -237,6 +237,6 @@ def _outside(formulas: Formulas, b: np.ndarray) -> str:
         return "no start lies in all C_j at once"
     j = int(b.max(axis=0).argmin())
     stage = j - next(s.start for s in formulas.stages if s.start <= j < s.stop)
-    return f"the start is outside C_{stage}: {described(formulas, j)} = {b[:, j].max():.4g}" + (
+    return f"the start is outside C_{stage}: {formulas.names[j]} = {b[:, j].max():.4g}" + (
         " at most" if len(b) > 1 else ""
     )

@@ -65,6 +65,16 @@ class Formulas:
         """Whether all relative degrees are 1, so that the invariant set is C itself."""
         return self.stages[-1].stop == len(self.stages)
 
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of all chain functions: h, b_1, ...; with that of the barrier if there are several."""
+        several = len(self.stages) > 1
+        return [
+            barrier.name if j == 0 else f"b_{j}" + f" of {barrier.name}" * several
+            for barrier, stage in zip(self.problem.barriers, self.stages, strict=True)
+            for j in range(stage.stop - stage.start)
+        ]
+
     @property
     def barriers(self) -> list[int]:
         """Indices of the barriers themselves among the chain functions."""
@@ -84,9 +94,11 @@ class Formulas:
     @property
     def expressions(self) -> list[Any]:
         """All functions of the state that a verification evaluates."""
-        return [*self._chain_expressions(), *self._constraint_expressions()]
+        return [*self.chain_expressions, *self._constraint_expressions()]
 
-    def _chain_expressions(self) -> list[Any]:
+    @property
+    def chain_expressions(self) -> list[Any]:
+        """b_0..b_(r-1) of each barrier, one after the other."""
         return [e for c in self._constraints for e in c.chain]
 
     def _constraint_expressions(self) -> list[Any]:
@@ -95,7 +107,7 @@ class Formulas:
     @cached_property
     def chain(self) -> Callable[[np.ndarray], np.ndarray]:
         """States (B, n) to b_0..b_(r-1) of each barrier, one after the other, (B, sum of the r)."""
-        return self._compiled(self._chain_expressions())
+        return self._compiled(self.chain_expressions)
 
     @cached_property
     def _constraints_compiled(self) -> Any:
@@ -115,9 +127,8 @@ class Formulas:
     @cached_property
     def variation_rates(self) -> Callable[[np.ndarray], np.ndarray]:
         """States (B, n) to |sigma' grad h|^2 of each barrier, the variance of h per s, (B, k)."""
-        return self._compiled(
-            [quadratic_variation_rate(self.system, c.chain[0]) for c in self._constraints]
-        )
+        barriers = [c.chain[0] for c in self._constraints]
+        return self._compiled([quadratic_variation_rate(self.system, h) for h in barriers])
 
     @cached_property
     def region(self) -> Region:
@@ -134,10 +145,7 @@ class Formulas:
 
     @cached_property
     def _edges(self) -> np.ndarray:
-        """Width of the strip of each b_j at the edge that does not count.
-
-        A reciprocal condition has no value there; the others have no such strip.
-        """
+        """Width of the strip of each b_j where a reciprocal condition has no value; else 0."""
         reciprocal = [c.demand is not None for c in self._constraints for _ in c.chain]
         return np.where(reciprocal, _EDGE * self._sizes[0], 0.0)
 
@@ -157,11 +165,8 @@ class Formulas:
 
     @property
     def joint(self) -> bool:
-        """Whether the joint shortfall is exact: for one condition, independent ones or one input.
-
-        Where several conditions share an input that cannot meet their sampling margins, these
-        decide how the filter distributes the violation, and they depend on the nominal action.
-        """
+        """Whether the joint shortfall is exact: for one condition, independent ones or one input."""
+        # Sampling margins decide how the filter distributes a violation, by the nominal action.
         sampled = any(c.change is not None for c in self._constraints)
         return self.independent or (self.problem.plant.m == 1 and not sampled)
 
@@ -252,11 +257,9 @@ class Formulas:
         )
 
     def _common(self, x: np.ndarray, reach: float) -> np.ndarray:
-        """Return minus the best common margin of several conditions on one input, shape (B,).
-
-        The smallest of the margins is concave and piecewise linear in the input: it is largest
-        where two of them cross, or at a bound of the input.
-        """
+        """Return minus the best common margin of several conditions on one input, shape (B,)."""
+        # The smallest margin is concave and piecewise linear in the input: it is largest where two
+        # of them cross, or at a bound of the input.
         a, b = self.constraints_at(x)
         a = a[:, :, 0]
         low, high = (end[0] for end in self._ends(reach))

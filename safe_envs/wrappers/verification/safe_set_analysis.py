@@ -194,10 +194,7 @@ class SafeSetAnalysis:
 
     def infinite(self, j: int) -> str:
         """Say that the supremum of the j-th chain function is infinite, or seems so."""
-        i = next(i for i, stage in enumerate(self.formulas.stages) if stage.start <= j < stage.stop)
-        name, stage = self.formulas.problem.barriers[i].name, j - self.formulas.stages[i].start
-        what = f"sup {name}" if stage == 0 else f"sup b_{stage} of {name}"
-        return f"{what} {self.how_infinite(j)}"
+        return f"sup {self.formulas.names[j]} {self.how_infinite(j)}"
 
     def how_infinite(self, j: int) -> str:
         """Say how sure it is that the supremum of the j-th chain function is infinite."""

@@ -9,6 +9,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.errors import shortened
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.search import Box, Score, largest
 
@@ -76,23 +77,13 @@ def asked_of(formulas: Formulas) -> list[Asked]:
 
     They are the chains, which without noise need no derivative; the constraints need values.
     """
-    found = []
-    numeric = formulas.system.numeric
-    for barrier, row in zip(
-        formulas.problem.barriers, formulas.safety_filter.constraints, strict=True
-    ):
-        for j, function in enumerate(row.chain):
-            found.append(
-                Asked(
-                    barrier.name if j == 0 else f"b_{j} of {barrier.name}",
-                    numeric(function),
-                    not formulas.noisy,
-                )
-            )
-        found += [
-            Asked(f"the condition on {barrier.name}", numeric(entry), True)
-            for entry in (*row.coefficient, row.offset)
-        ]
+    numeric, found = formulas.system.numeric, []
+    constraints, barriers = formulas.safety_filter.constraints, formulas.problem.barriers
+    for barrier, stage, row in zip(barriers, formulas.stages, constraints, strict=True):
+        chain = zip(formulas.names[stage], row.chain, strict=True)
+        found += [Asked(name, numeric(function), not formulas.noisy) for name, function in chain]
+        entries = (*row.coefficient, row.offset)
+        found += [Asked(f"the condition on {barrier.name}", numeric(e), True) for e in entries]
     return found
 
 
@@ -132,7 +123,7 @@ def roughness(
                     if edge.pole
                     else "is not twice differentiable, which Ito's formula asks for,"
                 )
-                return f"{name} {what} near {at}, by {_short(edge.part)}"
+                return f"{name} {what} near {at}, by {shortened(edge.part, _LONGEST)}"
     return ""
 
 
@@ -159,8 +150,3 @@ def _reaches_zero(
     sizes = sizes[np.isfinite(sizes)]
     least, state = largest(score, points, region, rng)
     return state if sizes.size and -least <= _TOUCHED * float(np.median(sizes)) else None
-
-
-def _short(part: sp.Expr) -> str:
-    text = str(part)
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
