@@ -20,7 +20,6 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
 from safe_envs.wrappers.verification.guarantee import guarantee_of
 from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
-from safe_envs.wrappers.verification.results import Guarantee
 
 _SIZES = ("delta", "supremum", "shortfall", "bias")
 """What a bound over a posterior is made of."""
@@ -100,7 +99,7 @@ class GuaranteeAverager:
             sizes = {} if found is None else {name: getattr(found, name) for name in _SIZES}
             row |= {
                 "estimated_bound": None,
-                "bound_note": "it rests on something learned: see its bound over the posterior",
+                "bound_note": "the condition is learned: see its bound over the posterior",
             }
             row |= {"posterior_bound": {"probability": bound, "note": note, **sizes}}
         else:

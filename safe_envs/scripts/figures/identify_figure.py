@@ -19,7 +19,8 @@ from matplotlib.ticker import MaxNLocator
 from safe_envs.atomic_io import write_atomically
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, add_legend
 from safe_envs.scripts.reports.identify_report import Function, Identification, percent
-from safe_envs.wrappers.learning.posterior import Diffusion, Posterior
+from safe_envs.wrappers.learning.models.noise import Diffusion
+from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.learning.regression import sigma_samples
 
 _TRUTH = "#D55E00"

@@ -29,13 +29,9 @@ def _kinked(formulas: Formulas) -> str:
 
     The noise adds a local time there that the generator does not contain.
     """
-    for barrier, row in zip(
-        formulas.problem.barriers, formulas.safety_filter.constraints, strict=True
-    ):
-        for j, function in enumerate(row.chain):
-            if has_kinks(function):
-                what = barrier.name if j == 0 else f"b_{j} of {barrier.name}"
-                return f"{what} is not twice differentiable, which Ito's formula asks for"
+    for name, function in zip(formulas.names, formulas.chain_expressions, strict=True):
+        if has_kinks(function):
+            return f"{name} is not twice differentiable, which Ito's formula asks for"
     return ""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -47,8 +47,8 @@ class Formulas:
         self.problem, self.conditions, self.knowledge = problem, tuple(conditions), knowledge
         if any(c.is_learned for c in self.conditions):
             raise ConfigurationError(
-                "what a condition promises is known for a known system only; this one rests on"
-                " something learned"
+                "the condition is learned; for bayesian-scbf:simultaneous=P a bound is estimated"
+                " over the posterior"
             )
         self.safety_filter = SafetyFilter.for_problem(problem, self.conditions, knowledge)
         self.system = self.safety_filter.model
@@ -62,8 +62,18 @@ class Formulas:
 
     @property
     def first_order(self) -> bool:
-        """Whether all relative degrees are 1, so that the intersection of the C_j is C itself."""
+        """Whether all relative degrees are 1, so that the invariant set is C itself."""
         return self.stages[-1].stop == len(self.stages)
+
+    @cached_property
+    def names(self) -> list[str]:
+        """Names of all chain functions: h, b_1, ...; with that of the barrier if there are several."""
+        several = len(self.stages) > 1
+        return [
+            barrier.name if j == 0 else f"b_{j}" + f" of {barrier.name}" * several
+            for barrier, stage in zip(self.problem.barriers, self.stages, strict=True)
+            for j in range(stage.stop - stage.start)
+        ]
 
     @property
     def barriers(self) -> list[int]:
@@ -83,17 +93,20 @@ class Formulas:
     @property
     def expressions(self) -> list[Any]:
         """All functions of the state that a verification evaluates."""
-        return [*self._chain_expressions(), *self._constraint_expressions()]
+        return [*self.chain_expressions, *self._constraint_expressions()]
 
-    def _chain_expressions(self) -> list[Any]:
+    @property
+    def chain_expressions(self) -> list[Any]:
+        """b_0..b_(r-1) of each barrier, one after the other."""
         return [e for c in self._constraints for e in c.chain]
 
     def _constraint_expressions(self) -> list[Any]:
         return [e for c in self._constraints for e in (*c.coefficient, c.offset - (c.demand or 0))]
 
     @cached_property
-    def _chain(self) -> Any:
-        return self._compiled(self._chain_expressions())
+    def chain(self) -> Callable[[np.ndarray], np.ndarray]:
+        """States (B, n) to b_0..b_(r-1) of each barrier, one after the other, (B, sum of the r)."""
+        return self._compiled(self.chain_expressions)
 
     @cached_property
     def _constraints_compiled(self) -> Any:
@@ -110,27 +123,11 @@ class Formulas:
 
         return values
 
-    def chain(self, x: np.ndarray) -> np.ndarray:
-        """Return b_0..b_(r-1) of every barrier, one barrier after the other, (B, sum of the r)."""
-        return self._chain(x)
-
     @cached_property
-    def _variation_rates(self) -> Any:
-        return self._compiled(
-            [quadratic_variation_rate(self.system, c.chain[0]) for c in self._constraints]
-        )
-
-    def quadratic_variation_rate(self, x: np.ndarray, i: int) -> np.ndarray:
-        """Return |sigma' grad h|^2 of a barrier, the variance of h per s.
-
-        Args:
-            x: states, shape (B, n).
-            i: index of the barrier.
-
-        Returns:
-            Values, shape (B,).
-        """
-        return self._variation_rates(x)[:, i]
+    def variation_rates(self) -> Callable[[np.ndarray], np.ndarray]:
+        """States (B, n) to |sigma' grad h|^2 of each barrier, the variance of h per s, (B, k)."""
+        barriers = [c.chain[0] for c in self._constraints]
+        return self._compiled([quadratic_variation_rate(self.system, h) for h in barriers])
 
     @cached_property
     def region(self) -> Region:
@@ -147,10 +144,7 @@ class Formulas:
 
     @cached_property
     def _edges(self) -> np.ndarray:
-        """Width of the strip of each b_j at the edge that does not count.
-
-        A reciprocal condition has no value there; the others have no such strip.
-        """
+        """Width of the strip of each b_j where a reciprocal condition has no value; else 0."""
         reciprocal = [c.demand is not None for c in self._constraints for _ in c.chain]
         return np.where(reciprocal, _EDGE * self._sizes[0], 0.0)
 
@@ -159,7 +153,7 @@ class Formulas:
         return (self.chain(x) - self._edges)[:, self.barriers].min(axis=1)
 
     def invariant_level(self, x: np.ndarray) -> np.ndarray:
-        """Return a level (B,) that is nonnegative in the invariant set, the intersection of the C_j."""
+        """Return a level (B,) that is nonnegative in the invariant set."""
         return (self.chain(x) - self._edges).min(axis=1)
 
     @property
@@ -170,11 +164,8 @@ class Formulas:
 
     @property
     def joint(self) -> bool:
-        """Whether the joint shortfall is exact: for one condition, independent ones or one input.
-
-        Where several conditions share an input that cannot meet their sampling margins, these
-        decide how the filter distributes the violation, and they depend on the nominal action.
-        """
+        """Whether the joint shortfall is exact: for one condition, independent ones or one input."""
+        # Sampling margins decide how the filter distributes a violation, by the nominal action.
         sampled = any(c.change is not None for c in self._constraints)
         return self.independent or (self.problem.plant.m == 1 and not sampled)
 
@@ -265,11 +256,9 @@ class Formulas:
         )
 
     def _common(self, x: np.ndarray, reach: float) -> np.ndarray:
-        """Return minus the best common margin of several conditions on one input, shape (B,).
-
-        The smallest of the margins is concave and piecewise linear in the input: it is largest
-        where two of them cross, or at a bound of the input.
-        """
+        """Return minus the best common margin of several conditions on one input, shape (B,)."""
+        # The smallest margin is concave and piecewise linear in the input: it is largest where two
+        # of them cross, or at a bound of the input.
         a, b = self.constraints_at(x)
         a = a[:, :, 0]
         low, high = (end[0] for end in self._ends(reach))

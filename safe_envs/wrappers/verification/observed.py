@@ -25,7 +25,7 @@ def above_suprema(formulas: Formulas, suprema: Sequence[float], x: np.ndarray) -
         return ""  # No supremum matters there.
     b = formulas.chain(x[_inside(formulas, x)])
     for j in np.flatnonzero((b > np.array(suprema) * (1.0 + RELATIVE)).any(axis=0)).tolist():
-        return reaches(described(formulas, j), float(b[:, j].max()), suprema[j])
+        return reaches(formulas.names[j], float(b[:, j].max()), suprema[j])
     return ""
 
 
@@ -77,12 +77,3 @@ def violated_by(most: float, shortfall: float) -> str:
 def _inside(formulas: Formulas, x: np.ndarray) -> np.ndarray:
     """Return which states are in the invariant set and in the workspace, shape (B,)."""
     return np.all(formulas.chain(x) > 0.0, axis=1) & in_workspace(x, workspace_of(formulas.problem))
-
-
-def described(formulas: Formulas, j: int) -> str:
-    """Name the j-th of all chain functions."""
-    i = next(i for i, stage in enumerate(formulas.stages) if stage.start <= j < stage.stop)
-    name, stage = formulas.problem.barriers[i].name, j - formulas.stages[i].start
-    return (
-        name if stage == 0 else f"b_{stage}" + (f" of {name}" if len(formulas.stages) > 1 else "")
-    )

@@ -1,6 +1,4 @@
-"""Where functions are not smooth, by what they are made of: poles, and roots whose radicand reaches
-0.
-"""
+"""Where functions are not smooth, by their parts: poles, and roots whose radicand reaches 0."""
 
 from __future__ import annotations
 
@@ -11,6 +9,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.errors import shortened
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.search import Box, Score, largest
 
@@ -18,7 +17,7 @@ _TOUCHED = 1e-6
 """Part of its typical size at which a function counts as one that reaches 0."""
 
 _LONGEST = 60
-"""Number of characters of a part that are told."""
+"""Number of characters of a part that a message shows."""
 
 
 class Edge(NamedTuple):
@@ -36,7 +35,7 @@ class Edge(NamedTuple):
 
 
 def edges(expression: Any) -> Iterator[Edge]:
-    """The parts of an expression that are smooth in the inside of their domains only, each once."""
+    """Yield the parts of an expression that are smooth only inside their domains, each once."""
     part: Any
     for part in dict.fromkeys(sp.preorder_traversal(expression)):
         arguments: tuple[Any, ...] = part.args
@@ -74,26 +73,17 @@ class Asked(NamedTuple):
 
 
 def asked_of(formulas: Formulas) -> list[Asked]:
-    """What the bounds of conditions ask to be smooth: the chains, which without noise need no
-    derivative; the rows need values.
+    """Return the functions that the bounds require to be smooth.
+
+    They are the chains, which without noise need no derivative; the constraints need values.
     """
-    found = []
-    numeric = formulas.system.numeric
-    for barrier, row in zip(
-        formulas.problem.barriers, formulas.safety_filter.constraints, strict=True
-    ):
-        for j, function in enumerate(row.chain):
-            found.append(
-                Asked(
-                    barrier.name if j == 0 else f"b_{j} of {barrier.name}",
-                    numeric(function),
-                    not formulas.noisy,
-                )
-            )
-        found += [
-            Asked(f"the condition on {barrier.name}", numeric(entry), True)
-            for entry in (*row.coefficient, row.offset)
-        ]
+    numeric, found = formulas.system.numeric, []
+    constraints, barriers = formulas.safety_filter.constraints, formulas.problem.barriers
+    for barrier, stage, row in zip(barriers, formulas.stages, constraints, strict=True):
+        chain = zip(formulas.names[stage], row.chain, strict=True)
+        found += [Asked(name, numeric(function), not formulas.noisy) for name, function in chain]
+        entries = (*row.coefficient, row.offset)
+        found += [Asked(f"the condition on {barrier.name}", numeric(e), True) for e in entries]
     return found
 
 
@@ -105,10 +95,10 @@ def roughness(
     region: Box,
     rng: np.random.Generator,
 ) -> str:
-    """Which function is not smooth somewhere in a set, and where; "" if none was found.
+    """Say which function is not smooth somewhere in a set, and where; "" if none was found.
 
     Ito's formula asks for two continuous derivatives, and without noise paths may not pass a pole.
-    What is a function with a kink by its name is found by `safe_envs.dynamics.lie.has_kinks`.
+    A function with a kink by its name is found by `safe_envs.dynamics.lie.has_kinks`.
 
     Args:
         asked: what has to be smooth.
@@ -133,7 +123,7 @@ def roughness(
                     if edge.pole
                     else "is not twice differentiable, which Ito's formula asks for,"
                 )
-                return f"{name} {what} near {at}, by {_short(edge.part)}"
+                return f"{name} {what} near {at}, by {shortened(edge.part, _LONGEST)}"
     return ""
 
 
@@ -145,7 +135,7 @@ def _reaches_zero(
     region: Box,
     rng: np.random.Generator,
 ) -> np.ndarray | None:
-    """A state (n,) of the set where a function is 0 to rounding, as far as a search finds one."""
+    """Return a state (n,) of the set where a function is 0 to rounding; None if none is found."""
     compiled = compile_function(tuple(states), [base], "arrays")
 
     def size(x: np.ndarray) -> np.ndarray:
@@ -160,8 +150,3 @@ def _reaches_zero(
     sizes = sizes[np.isfinite(sizes)]
     least, state = largest(score, points, region, rng)
     return state if sizes.size and -least <= _TOUCHED * float(np.median(sizes)) else None
-
-
-def _short(part: sp.Expr) -> str:
-    text = str(part)
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
