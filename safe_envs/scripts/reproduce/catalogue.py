@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from safe_envs.scripts.reproduce.chapter_3 import dubins_learning, quadrotor
+from safe_envs.scripts.reproduce.chapter_3 import dubins_disk, dubins_obstacle, quadrotor
 from safe_envs.scripts.reproduce.chapter_4 import cruise, dubins_noise, martingale
 from safe_envs.scripts.reproduce.chapter_5 import cubic, cubic_paths, pendulum
 from safe_envs.scripts.reproduce.chapter_6 import bayesian_cruise, bayesian_cubic
 from safe_envs.scripts.reproduce.framework.artefact import Artefact
 
 ARTEFACTS: tuple[Artefact, ...] = (
-    *dubins_learning.ARTEFACTS,
+    *dubins_disk.ARTEFACTS,
+    *dubins_obstacle.ARTEFACTS,
     *quadrotor.ARTEFACTS,
     *martingale.ARTEFACTS,
     *cruise.ARTEFACTS,

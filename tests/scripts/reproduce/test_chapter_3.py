@@ -74,7 +74,7 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
     assert [n.printed for n in outcome.numbers] == [3, None, None, None]
     assert all(
         [n.printed for n in other.numbers] == [3, None, None, None]
-        for other in outcome.elsewhere.values()
+        for other in outcome.alternative_settings.values()
     )
     assert {c["p"] for c in outcome.data["curves"]} == {0.5, 1.0, 5.0}
     # Sec. 3.5.1, moving case, with Fig. 3.2; p_1 = p_2 = 1 are of thesis-notes.
@@ -148,9 +148,9 @@ def test_what_is_told_of_the_learning_is_so(outcomes):
     ]
     assert load_problem(quadrotor.QUADROTOR).exploration.inputs == ((3.0,), (9.0,))
     for name in ("figure-3.1", "figure-3.2a", "figure-3.2b"):
-        assert any("3 inputs; " in line for line in ARTEFACTS[name].corrections)
+        assert any("3 inputs; " in line for line in ARTEFACTS[name].errata)
     assert all(
-        any("0.001 s" in line for line in artefact.corrections) for artefact in ARTEFACTS.values()
+        any("0.001 s" in line for line in artefact.errata) for artefact in ARTEFACTS.values()
     )
 
 
@@ -184,8 +184,8 @@ def test_names_of_numbers_are_unique_and_printed_forms_have_one_of_ours(name, ou
     outcome = outcomes[name]
     names = [number.name for number in outcome.numbers]
     assert len(set(names)) == len(names)
-    assert {number.name for number in outcome.as_printed} <= set(names)
-    for other in outcome.elsewhere.values():
+    assert {number.name for number in outcome.printed_formula} <= set(names)
+    for other in outcome.alternative_settings.values():
         assert [number.name for number in other.numbers] == names
         assert [claim.sentence for claim in other.claims] == [
             claim.sentence for claim in outcome.claims if claim.printed
@@ -247,7 +247,7 @@ def test_exact_derivatives_leave_the_disk_from_the_printed_start_too():
 
 
 def test_other_settings_of_the_disk_are_tried_with_every_learning(outcomes):
-    others = outcomes["figure-3.1"].elsewhere
+    others = outcomes["figure-3.1"].alternative_settings
     assert [
         ("start (0.0, 0.1, 0.0)" in name, "pi" in name, "margin" in name) for name in others
     ] == [
@@ -267,7 +267,7 @@ def test_the_disk_knows_the_exact_filter_and_the_direction_of_the_error(outcomes
     assert not held(outcome.claims, "All trajectories")
     assert "outside C_2 for every gain" in outcome.notes[0]
     assert "inside C_2 for every gain" in outcome.notes[1]
-    printed, corrected = ours(outcome.as_printed), ours(outcome.numbers)
+    printed, corrected = ours(outcome.printed_formula), ours(outcome.numbers)
     # Half of the gain makes the filter turn twice as much.
     assert printed["smallest h, p = 0.5"] > corrected["smallest h, p = 0.5"]
 
@@ -290,12 +290,12 @@ def test_the_way_past_the_obstacle_is_longer_at_the_same_speed(outcomes):
 
 def test_the_nominal_and_the_printed_derivatives_collide_and_the_true_ones_do_not(outcomes):
     outcome = outcomes["figure-3.2b"]
-    found, printed = ours(outcome.numbers), ours(outcome.as_printed)
+    found, printed = ours(outcome.numbers), ours(outcome.printed_formula)
     assert (
         found["smallest h, true"] > 0 > max(found["smallest h, nominal"], found["smallest h, none"])
     )
     assert printed["smallest h, true"] < 0
-    (at_rest,) = outcome.elsewhere.values()
+    (at_rest,) = outcome.alternative_settings.values()
     assert (
         ours(at_rest.numbers)["smallest h, nominal"]
         == printed["smallest h, nominal"]
@@ -307,7 +307,7 @@ def test_the_nominal_and_the_printed_derivatives_collide_and_the_true_ones_do_no
 
 def test_the_printed_formula_of_the_quadrotor_diverges_and_the_corrected_one_does_not(outcomes):
     outcome = outcomes["figure-3.3"]
-    found, printed = ours(outcome.numbers), ours(outcome.as_printed)
+    found, printed = ours(outcome.numbers), ours(outcome.printed_formula)
     assert found["smallest h, true"] > 0 > found["smallest h, nominal"]
     assert printed["smallest h, true"] < -10
     assert printed["time in the workspace, true"] < 3.0

@@ -62,10 +62,10 @@ def test_the_printed_differences_give_the_print_if_all_are_safe_in_every_learnin
         found = Outcome(
             outcome.numbers,
             outcome.claims,
-            as_printed=dubins_disk.disk_numbers(runs_of_the_disk(*counts)),
+            printed_formula=dubins_disk.disk_numbers(runs_of_the_disk(*counts)),
         )
         judged = verdict.judge(dubins_disk.FIGURE, found, Sample())
-        assert (judged.wrong_formula, judged.gives_print) == (True, same)
+        assert (judged.wrong_formula, judged.matches_thesis) == (True, same)
 
 
 @pytest.mark.parametrize(

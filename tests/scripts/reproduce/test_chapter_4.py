@@ -157,8 +157,8 @@ def test_goes_through_json_and_is_judged(artefact: Artefact) -> None:
     assert judge(artefact, again, Sample()) == judge(artefact, outcome, Sample())
     names = [number.name for number in outcome.numbers]
     assert len(set(names)) == len(names)
-    assert {number.name for number in outcome.as_printed} <= set(names)
-    for other in outcome.elsewhere.values():
+    assert {number.name for number in outcome.printed_formula} <= set(names)
+    for other in outcome.alternative_settings.values():
         assert [claim.sentence for claim in other.claims if claim.printed] == [
             claim.sentence for claim in outcome.claims if claim.printed
         ]
@@ -252,7 +252,7 @@ def test_printed_table_is_out_of_reach_of_the_default() -> None:
     )
     assert ours("table-4.1")["SCBF, unbounded"].ours == 100.0
     assert judge(ARTEFACTS["table-4.1"], outcome_of("table-4.1"), Sample()).verdict in (
-        Verdict.ELSEWHERE,
+        Verdict.ALTERNATIVE,
         Verdict.NOT,
     )
 
@@ -261,12 +261,13 @@ def test_the_fitted_setting_is_told_as_such() -> None:
     """Where it is named, and in a note."""
     outcome = outcome_of("table-4.1")
     assert any(
-        "fitted by us, 4 printed numbers by 5 quantities" in name for name in outcome.elsewhere
+        "fitted by us, 4 printed numbers by 5 quantities" in name
+        for name in outcome.alternative_settings
     )
     assert any("fitted 4 numbers by 5 quantities, tau = 5.8 s" in note for note in outcome.notes)
     assert any(
         "fitted to Table 4.1, not to this figure" in name
-        for name in outcome_of("figure-4.1").elsewhere
+        for name in outcome_of("figure-4.1").alternative_settings
     )
 
 
@@ -274,7 +275,7 @@ def test_effort_over_time_depends_on_what_the_print_leaves_open() -> None:
     """SRCBF's is the lower one most of the time, and the higher one with the settings that were
     fitted to the table."""
     outcome = outcome_of("figure-4.1")
-    by_print, fitted = outcome.elsewhere.values()
+    by_print, fitted = outcome.alternative_settings.values()
     assert [found.claims[0].holds for found in (outcome, by_print, fitted)] == [False, False, True]
 
 
@@ -291,9 +292,9 @@ def test_printed_zeroing_form() -> None:
     missing = 3 * (generator(problem.model, h) + 2 * h - h)
     assert (corrected.offset - printed.offset - missing).expand().simplify() == 0
     assert printed.coefficient[0].equals(corrected.coefficient[0])
-    as_printed = {number.name: number for number in outcome_of("figure-4.2").as_printed}
+    printed_formula = {number.name: number for number in outcome_of("figure-4.2").printed_formula}
     for name in dubins_runs.ALPHAS:
-        assert as_printed[f"{name}, sigma = 0"].ours == 0.0
+        assert printed_formula[f"{name}, sigma = 0"].ours == 0.0
         assert ours("figure-4.2")[f"{name}, sigma = 0"].ours > 50.0
 
 
@@ -301,7 +302,8 @@ def test_starts_without_condition_are_the_main_setting() -> None:
     """Nothing of the numbers is from starts with A h > 0, from which no path without noise leaves."""
     assert ours("figure-4.2")["SCBF, sigma = 0"].ours < 90.0
     assert any(
-        name.startswith("starts with A h > 0") for name in outcome_of("figure-4.2").elsewhere
+        name.startswith("starts with A h > 0")
+        for name in outcome_of("figure-4.2").alternative_settings
     )
     assert {"SCBF, sigma = 0.25", "SCBF, sigma = 0.3"} <= ours("figure-4.2").keys()
 

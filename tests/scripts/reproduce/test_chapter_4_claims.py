@@ -260,7 +260,7 @@ def test_product_is_contradicted_where_the_rate_is_below_it() -> None:
 def test_what_holds_elsewhere_is_named() -> None:
     """Both kinds of settings, or that there is none."""
     worse, better = ({0.0: runs_of(*counts)} for counts in ((100, 150, 150), (150, 100, 100)))
-    found = dubins_runs.elsewhere_of({"all starts": worse}, better, dubins_noise.claim_on_noises)
+    found = dubins_runs.alternatives_of({"all starts": worse}, better, dubins_noise.claim_on_noises)
     assert list(found) == [
         *(f"{dubins_runs.AS_PRINTED}, T = {t} s" for t in (5, 3, 10)),
         "all starts, T = 3 s",

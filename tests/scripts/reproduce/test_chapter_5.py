@@ -107,7 +107,7 @@ def test_names_fit_and_there_is_something_to_judge(outcomes, name):
     artefact, outcome = ARTEFACTS[name], outcomes[name]
     names = [number.name for number in outcome.numbers]
     assert len(set(names)) == len(names)
-    assert {number.name for number in outcome.as_printed} <= set(names)
+    assert {number.name for number in outcome.printed_formula} <= set(names)
     assert any(claim.printed for claim in outcome.claims) or any(
         number.printed is not None for number in outcome.numbers
     )
@@ -117,8 +117,8 @@ def test_names_fit_and_there_is_something_to_judge(outcomes, name):
 @EACH
 def test_other_settings_have_all_that_is_printed(outcomes, name):
     outcome = outcomes[name]
-    assert set(outcome.elsewhere) == set(OTHERS.get(name, ()))
-    for other in outcome.elsewhere.values():
+    assert set(outcome.alternative_settings) == set(OTHERS.get(name, ()))
+    for other in outcome.alternative_settings.values():
         assert [(n.name, n.printed) for n in other.numbers] == [
             (n.name, n.printed) for n in outcome.numbers
         ]
@@ -316,5 +316,5 @@ def test_the_box_is_too_small_in_the_stated_setting(outcomes):
     assert not outcome.claims[0].holds
     assert outcome.numbers[0].ours < 100.0
     judged = judge(ARTEFACTS["figure-5.3b"], outcome, FULL)
-    assert judged.verdict == Verdict.ELSEWHERE
+    assert judged.verdict == Verdict.ALTERNATIVE
     assert any("abs(u) <= 1000 1/s" in reason for reason in judged.reasons)

@@ -168,10 +168,10 @@ def test_an_outcome_is_json_is_drawn_and_judged(name, tmp_path, pictures):
     assert judge(ARTEFACTS[name], found, Sample()).verdict in Verdict
     names = [n.name for n in found.numbers]
     assert len(set(names)) == len(names)
-    for n in [*found.numbers, *found.as_printed]:
+    for n in [*found.numbers, *found.printed_formula]:
         assert (n.low is None) == (n.high is None)
         assert n.low is None or n.high is None or n.low <= n.ours <= n.high
-    assert {n.name for n in found.as_printed} <= set(names)
+    assert {n.name for n in found.printed_formula} <= set(names)
 
 
 @pytest.mark.parametrize("name", ["figure-6.1", "figure-6.2", "figure-6.3"])
@@ -197,7 +197,7 @@ def test_the_error_of_the_drift_is_the_law_for_states_over_the_disk():
 def test_errors_fall_and_the_printed_variance_is_overconfident(name):
     found = outcome(name)
     assert found.numbers[0].ours > found.numbers[2].ours  # K = 10 and 100
-    (printed,) = found.as_printed
+    (printed,) = found.printed_formula
     assert printed.ours > 5 * number(found.numbers, printed.name).ours
     assert judge(ARTEFACTS[name], found, Sample()).wrong_formula
 
@@ -211,7 +211,9 @@ def test_levels_gather_at_the_true_ones_and_the_printed_likelihood_ten_times_bel
         assert level.low is not None
         assert level.high is not None
         assert level.high - level.low < 0.2 * true
-        assert number(found.as_printed, f"sigma_{i}").ours == pytest.approx(true * 0.1, rel=0.2)
+        assert number(found.printed_formula, f"sigma_{i}").ours == pytest.approx(
+            true * 0.1, rel=0.2
+        )
     assert sum(found.data["counts 1"]) == identifications.DRAWS
 
 
@@ -230,7 +232,8 @@ def test_the_bounds_of_the_table_and_what_known_noise_makes_of_it():
     found = outcome("table-6.2")
     for place, h in (("(-.1, .7)", 50), ("(-.1, .8)", 35)):
         bound, repaired = (
-            number(numbers, f"Analytical {place}") for numbers in (found.as_printed, found.numbers)
+            number(numbers, f"Analytical {place}")
+            for numbers in (found.printed_formula, found.numbers)
         )
         assert bound.ours == pytest.approx(h)
         assert bound.printed == h
@@ -238,7 +241,7 @@ def test_the_bounds_of_the_table_and_what_known_noise_makes_of_it():
         assert repaired.printed is None
         scbf = number(found.numbers, f"SCBF {place}").ours
         assert scbf == pytest.approx(number(found.numbers, f"DDSCBF {place}").ours, abs=5)
-        assert scbf > number(found.as_printed, f"SCBF {place}").ours
+        assert scbf > number(found.printed_formula, f"SCBF {place}").ours
 
 
 def test_the_printed_generator_of_the_disk_lacks_what_was_found():
@@ -272,7 +275,7 @@ def test_the_printed_second_generator_of_the_car_is_not_safe():
 def test_a_quick_table_of_the_car_has_all_rows_and_says_that_it_is_short():
     found = outcome("table-6.3")
     assert [n.name for n in found.numbers] == ["SCBF", "DDSCBF", "Bayesian SCBF"]
-    assert {n.name for n in found.as_printed} == {"SCBF", "DDSCBF"}
+    assert {n.name for n in found.printed_formula} == {"SCBF", "DDSCBF"}
     assert any("2 s, too short" in line for line in ARTEFACTS["table-6.3"].setting(QUICK))
     assert not any("too short" in line for line in ARTEFACTS["table-6.3"].setting(Sample()))
 

@@ -142,7 +142,7 @@ def compute_table(sample: Sample) -> Outcome:
     notes = [_gaussian_note(), _odd_note(), _fitted_note(found[_fitted(sample)])]
     return replace(
         outcome_of(cells(TAKEN, episodes, sample.seed, step)),
-        elsewhere={name: outcome_of(safe) for name, safe in found.items()},
+        alternative_settings={name: outcome_of(safe) for name, safe in found.items()},
         notes=[*notes, *([] if sample.quick else _sweep(episodes, sample.seed, step))],
     )
 
@@ -218,8 +218,8 @@ ARTEFACTS: tuple[Artefact, ...] = (
         ),
         compute=compute_table,
         setting=lambda sample: describe(sample.size(EPISODES), _step(sample)),
-        chosen=(*CHOSEN, "bounded control: |u| <= .3 M g"),
-        corrections=CORRECTIONS,
+        assumptions=(*CHOSEN, "bounded control: |u| <= .3 M g"),
+        errata=CORRECTIONS,
         argument=(
             f"with tau = {TAKEN.tau} s A h >= 0 makes P(unsafe) at most {TAKEN.most_unsafe():.1g},"
             f" so that {PRINTED['SCBF, unbounded']:g} % for the unbounded SCBF is out of reach"

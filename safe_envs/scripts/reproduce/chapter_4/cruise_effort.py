@@ -123,7 +123,7 @@ def compute_figure(sample: Sample) -> Outcome:
     }
     return replace(
         outcome_of(runs, forces),
-        elsewhere={
+        alternative_settings={
             name: _by_the_print(outcome_of(*simulated(setting, episodes, sample.seed)))
             for name, setting in others.items()
         },
@@ -383,11 +383,11 @@ FIGURE = Artefact(
     title="Effort of SRCBF and SCBF in adaptive cruise control",
     compute=compute_figure,
     setting=lambda sample: describe(sample.size(EPISODES), STEP),
-    chosen=(
+    assumptions=(
         *CHOSEN,
         "the force has no bound: of which control its curves are, the print does not say",
     ),
-    corrections=CORRECTIONS,
+    errata=CORRECTIONS,
     draw=draw_figure,
     size=(7.0, 3.8),
 )

@@ -24,9 +24,9 @@ from safe_envs.scripts.reproduce.chapter_4.dubins_runs import (
     STEP,
     Runs,
     ahead_of,
+    alternatives_of,
     bands_of,
     counts,
-    elsewhere_of,
     holds_note,
     scbf_of,
     simulate,
@@ -65,12 +65,12 @@ def compute_noises(sample: Sample) -> Outcome:
     }
     beyond = {level: simulate(SCBF_ONLY, level, "uniform", episodes, seed) for level in BEYOND}
     named = {STARTS[start]: _at(runs[start], NOISES) for start in STARTS}
-    elsewhere = elsewhere_of(named, printed, claim_on_noises)
+    elsewhere = alternatives_of(named, printed, claim_on_noises)
     return Outcome(
         numbers=[*_rates(main, NOISES), *_rates(beyond, BEYOND), *_differences(main)],
         claims=[claim_on_noises(named[STARTS["uniform"]], HORIZON)],
-        elsewhere=elsewhere,
-        as_printed=[
+        alternative_settings=elsewhere,
+        printed_formula=[
             number for number in _rates(printed, NOISES) if not number.name.startswith("SCBF")
         ],
         data={
@@ -213,8 +213,8 @@ ARTEFACTS: tuple[Artefact, ...] = (
             *SETTING,
             f"random starts at each noise level, an episode from each: {sample.size(EPISODES)}",
         ),
-        chosen=CHOSEN,
-        corrections=CORRECTIONS,
+        assumptions=CHOSEN,
+        errata=CORRECTIONS,
         draw=draw_noises,
         size=(7.0, 4.2),
     ),

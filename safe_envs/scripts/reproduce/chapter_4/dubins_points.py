@@ -23,9 +23,9 @@ from safe_envs.scripts.reproduce.chapter_4.dubins_runs import (
     STARTS,
     Runs,
     ahead_of,
+    alternatives_of,
     bands_of,
     dubins_problem,
-    elsewhere_of,
     holds_note,
     random_starts,
     scbf_of,
@@ -66,7 +66,7 @@ def compute_points(sample: Sample) -> Outcome:
         found | scbf_of(of_start)
         for found, of_start in zip(from_each("uniform", PRINTED_FORM), main, strict=True)
     ]
-    elsewhere = elsewhere_of(runs, printed, claim_on_points)
+    elsewhere = alternatives_of(runs, printed, claim_on_points)
     together, step = pooled(main), step_of(HORIZON)
     return Outcome(
         numbers=[
@@ -79,8 +79,8 @@ def compute_points(sample: Sample) -> Outcome:
             ),
         ],
         claims=[claim_on_points(main, HORIZON)],
-        elsewhere=elsewhere,
-        as_printed=[
+        alternative_settings=elsewhere,
+        printed_formula=[
             run.rate(f"{name}, all ten starts", step)
             for name, run in pooled(printed).items()
             if name in ALPHAS
@@ -206,8 +206,8 @@ FIGURE_POINTS = Artefact(
             f" {sample.size(EPISODES_OF_POINT)}"
         ),
     ),
-    chosen=CHOSEN,
-    corrections=CORRECTIONS,
+    assumptions=CHOSEN,
+    errata=CORRECTIONS,
     draw=draw_points,
     size=(7.0, 4.0),
 )

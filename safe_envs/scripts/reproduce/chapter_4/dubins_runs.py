@@ -160,7 +160,7 @@ def scbf_of(runs: Runs) -> dict[str, Exits]:
     return {"SCBF": runs["SCBF"]}
 
 
-def elsewhere_of(
+def alternatives_of(
     named: Mapping[str, Any], printed: Any, claim: Callable[[Any, float], Claim]
 ) -> dict[str, Outcome]:
     """The claim by the printed SZCBF, for the other horizons, and from the other starts.

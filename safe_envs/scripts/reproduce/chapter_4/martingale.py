@@ -393,8 +393,8 @@ ARTEFACTS: tuple[Artefact, ...] = (
         title="What RCBF and SRCBF ask for at the edge, and P >= h/c where it is attained",
         compute=compute,
         setting=setting,
-        chosen=CHOSEN,
-        corrections=(
+        assumptions=CHOSEN,
+        errata=(
             (
                 "Prop. 4.2.8 needs c = sup h to be finite: on the half-line of the example h is"
                 " unbounded, and h/c promises nothing"

@@ -84,12 +84,12 @@ def _table(sample: Sample) -> Outcome:
     return Outcome(
         numbers=numbers(near, _FILTERS),
         claims=claims(near),
-        elsewhere={
+        alternative_settings={
             f"a single start {FIXED} with h = .25": Outcome(
                 numbers(single, _FILTERS), claims(single)
             )
         },
-        as_printed=numbers(literal, {"DDSCBF": "ddscbf"}),
+        printed_formula=numbers(literal, {"DDSCBF": "ddscbf"}),
         data={
             f"k = {k:g}": {name: near[k][text].curve for name, text in _FILTERS.items()}
             for k in LEVELS
@@ -230,13 +230,13 @@ ARTEFACTS: tuple[Artefact, ...] = (
         setting=partial(
             learning_setting, where="C within [-1, 1]^2", noise=f"sigma = {LEVELS[0]:g} x_2"
         ),
-        chosen=(
+        assumptions=(
             (
                 "the region [-1, 1]^2; tanh, Adam 1e-3, batches of 32, standardised inputs and"
                 " targets; 70 % of the states train"
             ),
         ),
-        corrections=(*FIT_ERRATA, STATES),
+        errata=(*FIT_ERRATA, STATES),
         draw=draw_learning,
         size=(7.5, 3.8),
     ),
@@ -245,11 +245,11 @@ ARTEFACTS: tuple[Artefact, ...] = (
         title="Safety rates of SCBF, DDSCBF and CBF, cubic system",
         compute=_table,
         setting=_table_setting,
-        chosen=(
+        assumptions=(
             "starts, horizon, task and box: see the setting",
             f"CBF with alpha(h) = {ALPHA:g} h 1/s, and with alpha = 0 beside it",
         ),
-        corrections=(
+        errata=(
             (
                 "Eq. (5.17), (5.18): the estimator without its bias and with far less noise, see"
                 " Figure 5.2"

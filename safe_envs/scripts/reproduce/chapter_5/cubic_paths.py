@@ -102,7 +102,7 @@ def _picture(key: str, name: str, sample: Sample) -> Outcome:
     return Outcome(
         numbers=[path.runs.number(_rate_name(name))],
         claims=[_CLAIMS[key](found)],
-        elsewhere=(
+        alternative_settings=(
             {f"abs(u) <= {WIDE[1]:g} 1/s in place of 10 1/s": _unbounded(name, sample)}
             if key == "b"
             else {}
@@ -258,12 +258,12 @@ ARTEFACTS: tuple[Artefact, ...] = tuple(
         title=f"Trajectories of the cubic system: {name}",
         compute=partial(_picture, key, name),
         setting=_setting,
-        chosen=(
+        assumptions=(
             "start, horizon, task and box: see the setting",
             f"CBF with alpha(h) = {ALPHA:g} h 1/s",
             "which start is drawn bold: see the notes",
         ),
-        corrections=(STATES,),
+        errata=(STATES,),
         draw=draw_paths,
         size=(7.0, 5.2),
     )

@@ -175,7 +175,7 @@ def learning_outcome(
             learnable(repaired.each, repaired.truth),
             near(repaired.each, repaired.truth),
         ],
-        as_printed=[printed.number, root_mean_square(_LABELS, missed["printed"])],
+        printed_formula=[printed.number, root_mean_square(_LABELS, missed["printed"])],
         data={
             "state": f"${sp.latex(problem.plant.states[state])}${unit}",
             "grid": grid.tolist(),

@@ -104,8 +104,8 @@ def _table(sample: Sample) -> Outcome:
     return Outcome(
         numbers=main.numbers,
         claims=main.claims,
-        elsewhere={A.told(sample): other},
-        as_printed=[literal.number("DDSCBF", PRINTED["DDSCBF"])],
+        alternative_settings={A.told(sample): other},
+        printed_formula=[literal.number("DDSCBF", PRINTED["DDSCBF"])],
         data={each.name: {text: run.curve for text, run in found[each].items()} for each in (B, A)},
         notes=[
             in_other_setting(other),
@@ -285,13 +285,13 @@ ARTEFACTS: tuple[Artefact, ...] = (
         title="Learned noise part of the generator, pendulum",
         compute=partial(learning_outcome, ENV, NOISE, 0, "-sqrt(3) (.1 theta)^2", printed_term),
         setting=partial(learning_setting, where="C", noise=f"sigma = {NOISE:g} theta"),
-        chosen=(
+        assumptions=(
             (
                 "tanh, Adam 1e-3, batches of 32, standardised inputs and targets; 70 % of the"
                 " states train"
             ),
         ),
-        corrections=(*FIT_ERRATA, "Eq. (5.19): the trace is malformed, its value is right"),
+        errata=(*FIT_ERRATA, "Eq. (5.19): the trace is malformed, its value is right"),
         draw=draw_learning,
         size=(7.5, 3.8),
     ),
@@ -300,7 +300,7 @@ ARTEFACTS: tuple[Artefact, ...] = (
         title="Safety rates of SCBF, DDSCBF and CBF, pendulum",
         compute=_table,
         setting=_table_setting,
-        chosen=(
+        assumptions=(
             "mass 1 kg, torque within 5 N m",
             (
                 "start, horizon and the rate of the CBF: both A and B were computed before B was"
@@ -308,7 +308,7 @@ ARTEFACTS: tuple[Artefact, ...] = (
             ),
             "CBF with alpha = 0 beside the others",
         ),
-        corrections=(
+        errata=(
             (
                 "Eq. (5.17), (5.18): the estimator without its bias and with far less noise, see"
                 " Figure 5.1"

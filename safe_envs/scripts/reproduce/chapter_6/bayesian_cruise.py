@@ -232,10 +232,13 @@ def _rates(sample: Sample) -> Outcome:
     return Outcome(
         numbers=table(found),
         claims=[similar({"": found})],
-        elsewhere={
+        alternative_settings={
             name: Outcome(table(each), [similar({"": each})]) for name, each in fewer.items()
         },
-        as_printed=[Number.rate("SCBF", printed.safe, printed.episodes), rate("DDSCBF", recursion)],
+        printed_formula=[
+            Number.rate("SCBF", printed.safe, printed.episodes),
+            rate("DDSCBF", recursion),
+        ],
         notes=[
             (
                 f"One identification differs from the next: the rates of {len(found.rates)} have"
@@ -311,7 +314,7 @@ ARTEFACTS: tuple[Artefact, ...] = (
         title="Identified drift of the car at random states",
         compute=_drift_picture,
         setting=_drift_setting,
-        chosen=(
+        assumptions=(
             "steps of a trajectory 100",
             "K = 100",
             "inputs of both signs",
@@ -321,7 +324,7 @@ ARTEFACTS: tuple[Artefact, ...] = (
             ),
             "v_f = 20 m/s",
         ),
-        corrections=FIT_ERRATA,
+        errata=FIT_ERRATA,
         draw=_draw_drift,
         size=(7.0, 3.4),
     ),
@@ -330,8 +333,8 @@ ARTEFACTS: tuple[Artefact, ...] = (
         title="Posterior of the noise levels of the car",
         compute=_noise_picture,
         setting=lambda sample: noise_setting(sample, "sigma_1 = sigma_2 = .5"),
-        chosen=("input 0 N while the residuals are collected",),
-        corrections=SIGMA_ERRATA,
+        assumptions=("input 0 N while the residuals are collected",),
+        errata=SIGMA_ERRATA,
         draw=draw_levels,
         size=(7.0, 3.2),
     ),
@@ -340,13 +343,13 @@ ARTEFACTS: tuple[Artefact, ...] = (
         title="Safety of the car with known, partly known and identified dynamics",
         compute=_rates,
         setting=_rates_setting,
-        chosen=(
+        assumptions=(
             "horizon 30 s, but for a quick sample",
             "v_f = 20 m/s",
             "goal V = (v - 22)^2 with rate 1 /s, weights 2/M^2 of u^2 and 2 of the squared slack",
             f"identification from {STARTS} x {STEPS} states under +-4000 N, K = {REPETITIONS[-1]}",
         ),
-        corrections=(
+        errata=(
             "b_1 of Sec. 6.3.2 lacks 10 sigma_2^2 (z - D)^3",
             (
                 "b_2 of Sec. 6.3.2 has another coefficient of u, and lacks and adds terms of the"

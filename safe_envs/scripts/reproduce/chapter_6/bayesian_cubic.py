@@ -55,7 +55,7 @@ FEEBLE = ((0.0,), (0.1,))
 
 PRINTED_RATES = {"SCBF": (91, 55), "DDSCBF": (88, 45), "Bayesian SCBF": (90, 43)}
 _PRINTED_BOUND = (50, 35)
-"""h/c, which does not hold: for as_printed."""
+"""h/c, which does not hold: for printed_formula."""
 
 _ANALYTICAL = "Analytical"
 PLACES = {"(-.1, .7)": "thesis-1", "(-.1, .8)": "thesis-2"}
@@ -258,12 +258,12 @@ def _rates(sample: Sample) -> Outcome:
                 _long(sample), {place.name: (place.late, place.bound) for place in places}
             ),
         ],
-        elsewhere=(
+        alternative_settings=(
             {f"K = {REPETITIONS[0]} in the identification": Outcome(few, [similar(rough)])}
             if few
             else {}
         ),
-        as_printed=[
+        printed_formula=[
             number for place in places for number in place.as_printed(sample, dull.get(place.name))
         ],
         notes=[
@@ -330,8 +330,8 @@ ARTEFACTS: tuple[Artefact, ...] = (
         title="Posterior of the noise levels of the cubic system",
         compute=_noise_picture,
         setting=lambda sample: noise_setting(sample, "sigma_1 = sigma_2 = .2"),
-        chosen=("input 0 while the residuals are collected",),
-        corrections=SIGMA_ERRATA,
+        assumptions=("input 0 while the residuals are collected",),
+        errata=SIGMA_ERRATA,
         draw=draw_levels,
         size=(7.0, 3.2),
     ),
@@ -341,8 +341,8 @@ ARTEFACTS: tuple[Artefact, ...] = (
         title="Safety in the disk with known, partly known and identified dynamics",
         compute=_rates,
         setting=_setting,
-        chosen=("horizon 1 s", "abs(u) <= 10", f"K = {REPETITIONS[-1]} in the identification"),
-        corrections=(
+        assumptions=("horizon 1 s", "abs(u) <= 10", f"K = {REPETITIONS[-1]} in the identification"),
+        errata=(
             "A h of Sec. 6.3.1 has 2 x1 x2, not x1 x2, and sigma_1^2 + sigma_2^2",
             "Sec. 6.3.1: u = .1 does not identify g; inputs of both signs do",
             (

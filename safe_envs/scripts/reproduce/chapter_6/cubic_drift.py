@@ -187,7 +187,7 @@ def _drift_errors(sample: Sample) -> Outcome:
             *(falls(name, by) for name, by in squares.items()),
             *(falls_as_printed(name, by, _PRINTED_MSE[name]) for name, by in squares.items()),
         ],
-        as_printed=[Number.mean(doubt, many.overconfident, least=0.0)],
+        printed_formula=[Number.mean(doubt, many.overconfident, least=0.0)],
         notes=[
             (
                 "The errors of single identifications differ so much that the intervals span"
@@ -240,7 +240,7 @@ def _drift_picture(sample: Sample) -> Outcome:
     return Outcome(
         numbers=[*numbers, covered],
         claims=[falls("f_2 = x_1^3", {k: np.sqrt(s.squares[:, 1]) for k, s in found.items()})],
-        as_printed=[printed],
+        printed_formula=[printed],
         data={
             "x_1": x[:, 0].tolist(),
             "truth": true_drift(problem, x)[:, 1].tolist(),
@@ -283,8 +283,8 @@ FIGURE = Artefact(
     title="Estimate of f_2 from K repetitions of each step",
     compute=_drift_picture,
     setting=lambda sample: _setting(sample, SHOWN, _PICTURED),
-    chosen=("steps of a trajectory 100",),
-    corrections=FIT_ERRATA,
+    assumptions=("steps of a trajectory 100",),
+    errata=FIT_ERRATA,
     draw=_draw_drift,
     size=(7.0, 3.2),
 )
@@ -294,6 +294,6 @@ TABLE = Artefact(
     title="Errors of the identified drift",
     compute=_drift_errors,
     setting=lambda sample: _setting(sample, POINTS, _IDENTIFICATIONS),
-    chosen=("steps of a trajectory 100", "e^-2 in print is read as 1e-2, and so on"),
-    corrections=FIT_ERRATA,
+    assumptions=("steps of a trajectory 100", "e^-2 in print is read as 1e-2, and so on"),
+    errata=FIT_ERRATA,
 )

@@ -175,7 +175,11 @@ def noise_levels(
         ),
     ]
     return Outcome(
-        numbers=numbers, claims=[gathered(every, true)], as_printed=printed, data=shown, notes=notes
+        numbers=numbers,
+        claims=[gathered(every, true)],
+        printed_formula=printed,
+        data=shown,
+        notes=notes,
     )
 
 
@@ -235,7 +239,7 @@ def draw_levels(figure: Figure, outcome: Outcome) -> None:
 def _draw_likelihoods(axes: Axes, outcome: Outcome) -> None:
     """Medians by either likelihood on one axis, where their intervals are thinner than the points."""
     truth = outcome.data["truth"][0]
-    for row, numbers in enumerate((outcome.numbers, outcome.as_printed)):
+    for row, numbers in enumerate((outcome.numbers, outcome.printed_formula)):
         for i, number in enumerate(numbers):
             # One above the other, for they are nearly equal.
             axes.plot(
@@ -247,7 +251,7 @@ def _draw_likelihoods(axes: Axes, outcome: Outcome) -> None:
                 alpha=0.8,
             )
     axes.axvline(truth, color="black", linewidth=1.0, zorder=0)
-    low = outcome.as_printed[0].ours
+    low = outcome.printed_formula[0].ours
     ticks = [float(f"{t:.1g}") for t in (low, np.sqrt(low * truth), truth)]
     axes.set(
         xscale="log",

@@ -145,5 +145,5 @@ TIMES = Artefact(
     title="Time to learn the car",
     compute=_runtimes,
     setting=_setting,
-    chosen=("networks of 100 and 30 tanh units, 500 epochs",),
+    assumptions=("networks of 100 and 30 tanh units, 500 epochs",),
 )
