@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from safe_envs.registry import load_problem
 from safe_envs.scripts.reproduce.chapter_3 import (
     dubins_disk,
-    dubins_learning,
+    dubins_obstacle,
     learned_runs,
     quadrotor,
 )
@@ -18,11 +18,13 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import runs, thinned
 from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
 from safe_envs.scripts.reproduce.framework import store, verdict
 from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.wrappers import HOCBF
 
 pytestmark = pytest.mark.slow
 ARTEFACTS = {
-    artefact.name: artefact for artefact in (*dubins_learning.ARTEFACTS, *quadrotor.ARTEFACTS)
+    artefact.name: artefact
+    for artefact in (*dubins_disk.ARTEFACTS, *dubins_obstacle.ARTEFACTS, *quadrotor.ARTEFACTS)
 }
 QUICK = Sample(episodes=8, quick=True)
 
@@ -61,7 +63,7 @@ def test_the_module_has_the_figures_of_the_chapter():
     assert list(ARTEFACTS) == ["figure-3.1", "figure-3.2a", "figure-3.2b", "figure-3.3"]
 
 
-def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
+def test_settings_and_numbers_are_those_of_the_thesis(outcomes):
     # Sec. 3.5.1, static case, with Eq. (3.27), (3.28).
     world = dubins_disk.disk(Sample())
     assert (world.dt, world.horizon, world.steps) == (0.05, 50.0, 1000)
@@ -78,7 +80,7 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
     )
     assert {c["p"] for c in outcome.data["curves"]} == {0.5, 1.0, 5.0}
     # Sec. 3.5.1, moving case, with Fig. 3.2; p_1 = p_2 = 1 are of thesis-notes.
-    world = load_problem(dubins_learning.OBSTACLE, {"start": "thesis"})
+    world = load_problem(dubins_obstacle.OBSTACLE, {"start": "thesis"})
     assert [learned_runs.parameters(world.plant)[name] for name in ("v", "v_o")] == [0.8, 0.5]
     assert [learned_runs.parameters(world.model)[name] for name in ("v", "v_o")] == [0.5, 0.5]
     instants = outcomes["figure-3.2a"].data["instants"]
@@ -86,9 +88,9 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
     assert [instants[0][what] for what in ("vehicle", "obstacle")] == [[-2.0, -2.0], [-1.0, 0.0]]
     assert [instant["obstacle"][0] for instant in instants] == pytest.approx([-1.0, 1.0, 2.5])
     assert (
-        dubins_learning.OBSTACLE_RADIUS,
-        dubins_learning.SPEED,
-        dubins_learning.OBSTACLE_RATES,
+        dubins_obstacle.OBSTACLE_RADIUS,
+        dubins_obstacle.SPEED,
+        dubins_obstacle.OBSTACLE_RATES,
     ) == (0.5, 0.8, "1,1")
     # Sec. 3.5.2 with Fig. 3.3.
     world = quadrotor.hover(Sample())
@@ -99,7 +101,7 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
     assert (quadrotor.GAINS, quadrotor.HALF_WIDTH) == ((2.0, 8.0), 2.0)
     assert outcomes["figure-3.3"].data["true"]["z"][0] == 5.0
     # Sec. 3.5.1, 3.5.2: 500 epochs; the rest is of thesis-notes, and three learnings are ours.
-    assert learned_runs.settings(Sample()) == (2000, 500)
+    assert learned_runs.learning_sizes(Sample()) == (2000, 500)
     assert len(learned_runs.seeds(Sample())) == 3
 
 
@@ -133,14 +135,14 @@ def test_settings_are_those_of_the_sample():
 
 
 def test_what_is_told_of_the_learning_is_so(outcomes):
-    for env_id in (dubins_disk.DISK, dubins_learning.OBSTACLE, quadrotor.QUADROTOR):
+    for env_id in (dubins_disk.DISK, dubins_obstacle.OBSTACLE, quadrotor.QUADROTOR):
         models = learned_runs.residuals(env_id, QUICK)
         assert len(models) == 2
         told = {"states": 400, "label_dt": 1e-3, "hidden": [100, 30], "epochs": 80}
         assert [model.record.settings for model in models] == [told, told]
     coordinates = [
         list(map(str, load_problem(env_id).exploration.coordinates))
-        for env_id in (dubins_disk.DISK, dubins_learning.OBSTACLE)
+        for env_id in (dubins_disk.DISK, dubins_obstacle.OBSTACLE)
     ]
     assert coordinates == [
         ["x", "y", "cos(theta)", "sin(theta)"],
@@ -172,10 +174,10 @@ def test_an_outcome_is_drawn_and_judged(name, outcomes, tmp_path, pictures):
 def test_the_same_seed_gives_the_same_outcome(name, outcomes):
     """One of each module; figure-3.2a shows the runs of figure-3.2b, and rates as figure-3.3 does."""
     if name == "figure-3.2b":
-        dubins_learning.passages.cache_clear()
+        dubins_obstacle.passages.cache_clear()
     if name == "figure-3.3":
         # This one learns anew, too.
-        dubins_learning.residuals.cache_clear()
+        dubins_obstacle.residuals.cache_clear()
     assert compute(name).document() == outcomes[name].document()
 
 
@@ -283,7 +285,7 @@ def test_the_way_past_the_obstacle_is_longer_at_the_same_speed(outcomes):
     )
     assert (
         found["path, none"]
-        > math.dist((-2, -2), dubins_learning.GOAL) - dubins_learning.GOAL_RADIUS
+        > math.dist((-2, -2), dubins_obstacle.GOAL) - dubins_obstacle.GOAL_RADIUS
     )
     assert held(outcome.claims, "longer")
 
@@ -338,7 +340,7 @@ def test_the_printed_row_differs_from_the_derived_one_as_the_errata_say():
     barrier, model = problem.barriers[0], problem.model
     derived, printed = (
         condition.constraint(model, barrier)
-        for condition in (HOCBF(quadrotor.GAINS), quadrotor.PrintedHOCBF())
+        for condition in (HOCBF(quadrotor.GAINS), PrintedCondition(quadrotor.printed_hocbf))
     )
     at = {quadrotor.z: 6.5, quadrotor.zdot: 0.7, **model.parameters}
     assert float((derived.coefficient[0] + printed.coefficient[0]).subs(at)) == pytest.approx(
