@@ -260,7 +260,7 @@ def draw_passage(figure: Figure, outcome: Outcome) -> None:
         edge = {"fill": False, "edgecolor": color, "linewidth": 1.5}
         axes.add_patch(Circle(at, OBSTACLE_RADIUS, facecolor=UNSAFE, zorder=0, **shade))
         axes.add_patch(Circle(at, OBSTACLE_RADIUS, **edge))
-        axes.text(*at, label, ha="center", va="center", color=QUIET)
+        axes.text(at[0], at[1], label, ha="center", va="center", color=QUIET)
         star: dict[str, Any] = {"color": color, "markersize": 12, "zorder": 3}
         axes.plot(*instant["vehicle"], "*", label=f"learned, t = {label}", **star)
     axes.set(aspect="equal", xlabel="x (m)", ylabel="y (m)", xlim=(-2.4, 5.2), ylim=(-2.4, 2.2))

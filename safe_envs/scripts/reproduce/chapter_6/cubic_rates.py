@@ -87,7 +87,7 @@ class _Models:
         )
 
 
-def _generator_work(sample: Sample) -> dict[str, int]:
+def _generator_work(sample: Sample) -> dict[str, Any]:
     return {name: sample.work(_SETTINGS[f"generator_{name}"]) for name in ("points", "repetitions")}
 
 

@@ -28,7 +28,7 @@ _RECURSION, _BAYESIAN = _PRINTED_SECONDS
 _FAR_LESS = 10.0
 
 
-def generator_work(sample: Sample) -> dict[str, int]:
+def generator_work(sample: Sample) -> dict[str, Any]:
     """Return the amount of data of DDSCBF, as `learn_generator` takes it."""
     return {
         "points": sample.work(POINTS),

@@ -67,18 +67,19 @@ def noise_levels(section: str, unit: tuple[str, ...], sample: Sample) -> Outcome
     left = data.successors[:, 0] - data.x - rates(learned.system, data) * problem.dt
     squares, count = (left**2).sum(axis=0), len(left)
     rng = np.random.default_rng([sample.seed, 63])
+    alpha, beta = PRIOR_OF_SIGMA
     true = [parameter(problem, name) for name in ("sigma_1", "sigma_2")]
     numbers, printed, every, shown = [], [], [], {"truth": true}
     for i, (s, at) in enumerate(zip(squares.tolist(), unit, strict=True), start=1):
-        draws = sigma_samples(s / problem.dt, count, *PRIOR_OF_SIGMA, DRAWS, rng)
+        draws = sigma_samples(s / problem.dt, count, alpha, beta, DRAWS, rng)
         # The printed formula: no dt, and one factor less.
-        wrong = sigma_samples(s, count - 1, *PRIOR_OF_SIGMA, DRAWS, rng)
+        wrong = sigma_samples(s, count - 1, alpha, beta, DRAWS, rng)
         numbers.append(credible(f"sigma_{i}", draws, at))
         printed.append(credible(f"sigma_{i}", wrong, at))
         every.append(draws)
         counts, edges = np.histogram(draws, bins=_BINS)
         shown |= {f"counts {i}": counts.tolist(), f"edges {i}": edges.tolist()}
-    modes = sigma_map(squares / problem.dt, np.full(len(squares), count), *PRIOR_OF_SIGMA).tolist()
+    modes = sigma_map(squares / problem.dt, np.full(len(squares), count), alpha, beta).tolist()
     sharp = np.mean([draws.std() / draws.mean() for draws in every])
     notes = [
         (
