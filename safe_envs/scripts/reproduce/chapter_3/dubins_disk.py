@@ -1,4 +1,4 @@
-"""Figure 3.1: a Dubins vehicle of unknown speed in a disk, under learned derivatives of the HOCBF."""
+"""Figure 3.1: a Dubins vehicle of unknown speed in a disk, under a learned HOCBF."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ DISK, RATES = _SETTINGS["env"], _SETTINGS["rates"]
 PRINTED_START, VALID_START = _SETTINGS["start"], _SETTINGS["valid_start"]
 WIDE, NARROW = (-_SETTINGS["turn_rate"], _SETTINGS["turn_rate"]), (-math.pi, math.pi)  # rad/s
 _SAFE_RUNS = CHAPTER.printed("figure-3.1")["safe_runs"]
-_SHOWN = 400  # control instants in the picture
+_SHOWN = 400  # control instants in the figure
 SAFE_COUNT = f"safe trajectories of {len(RATES)}, in the worst learning"
 _NOMINAL = [f"hocbf:p={p},{p}" for p in RATES]
 _LEARNED = [f"learned-{text}" for text in _NOMINAL]
@@ -279,7 +279,7 @@ def binding(problem: SafetyProblem) -> str:
 
 
 def draw_disk(figure: Figure, outcome: Outcome) -> None:
-    """Draw panels for the start of the thesis, by our estimates and the printed ones, and a valid one."""
+    """Draw panels for the start of the thesis, by both estimates, and for a valid start."""
     colors = dict(zip(RATES, COLORS, strict=False))
     names = ("our estimates", "printed estimates", "our estimates")
     panels = figure.subplots(1, len(names), sharey=True)

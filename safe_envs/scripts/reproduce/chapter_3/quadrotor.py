@@ -1,4 +1,4 @@
-"""Figure 3.3: the altitude of a quadrotor of unknown mass, under learned derivatives of the HOCBF."""
+"""Figure 3.3: the altitude of a quadrotor of unknown mass, under a learned HOCBF."""
 
 from __future__ import annotations
 

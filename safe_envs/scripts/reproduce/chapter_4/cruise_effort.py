@@ -144,7 +144,7 @@ def _ends_note(runs: EffortRecords) -> str:
 
 
 def _bands(effort: np.ndarray) -> list[list[float]]:
-    """Return quantiles over the running episodes of the largest effort in each block, at least 1 N^2."""
+    """Return quantiles over running episodes of the largest effort in a block, at least 1 N^2."""
     blocks = effort[: len(effort) // _BLOCK * _BLOCK].reshape(-1, _BLOCK, effort.shape[1])
     largest = np.nan_to_num(blocks, nan=-1.0).max(axis=1)
     largest[largest < 0.0] = np.nan

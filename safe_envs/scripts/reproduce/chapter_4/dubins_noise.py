@@ -104,7 +104,7 @@ def _differences(runs: Mapping[float, ByFilter]) -> list[Number]:
 
 
 def claim_on_noises(runs: Mapping[float, ByFilter], horizon: float) -> Claim:
-    """Return the claim against all rates of the SZCBF, as the thesis names none, by paired intervals.
+    """Return the claim against all rates of the SZCBF by paired intervals: the thesis names none.
 
     Args:
         runs: of SCBF and the SZCBFs at each noise level.

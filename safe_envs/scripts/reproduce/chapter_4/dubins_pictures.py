@@ -58,7 +58,7 @@ def draw_noises(figure: Figure, outcome: Outcome) -> None:
 
 
 def draw_points(figure: Figure, outcome: Outcome) -> None:
-    """Draw safety from each start, filled at the short horizon and hollow at the long one, and the starts."""
+    """Draw the starts and the safety from each, hollow at the long horizon."""
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
     data = outcome.data
     index = np.arange(1, len(data["starts"]) + 1)

@@ -153,7 +153,7 @@ def _over_other_starts(runs: Sequence[ByFilter]) -> list[str]:
 
 
 def printed_and_union_bound(starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the product of Thm. 4.2.10 and the union bound for ever at each start, shape (starts,).
+    """Return the product of Thm. 4.2.10 and the union bound at each start, shape (starts,) each.
 
     Both are 0 where A h <= 0.
     """

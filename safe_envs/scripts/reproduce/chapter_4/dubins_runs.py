@@ -1,4 +1,4 @@
-"""Thesis Sec. 4.3.2, a Dubins vehicle with noise in a disk: episodes, and how two filters compare."""
+"""Thesis Sec. 4.3.2, a Dubins vehicle with noise in a disk: episodes and their comparison."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Thesis Sec. 4.3.1: numbers and claims about the effort in adaptive cruise control (Figure 4.1)."""
+"""Thesis Sec. 4.3.1: numbers and claims about the effort in cruise control (Figure 4.1)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class EffortRecord:
 
     @property
     def peaks(self) -> np.ndarray:
-        """Return the largest effort of each episode where the filter acts, or 0, shape (episodes,)."""
+        """Return the largest effort of each episode where the filter acts, or 0."""
         return np.nan_to_num(self.acting).max(axis=0)
 
 

@@ -1,4 +1,4 @@
-"""Thesis Sec. 4.2.2 and Prop. 4.2.8: reciprocal conditions under noise, and a bound that is attained."""
+"""Thesis Sec. 4.2.2, Prop. 4.2.8: reciprocal conditions under noise, and an attained bound."""
 
 from __future__ import annotations
 
@@ -37,8 +37,7 @@ from safe_envs.wrappers.verification.bounds import proposition_4_2_8
 LIMITS, STARTS, SCALE = (SETTINGS[name] for name in ("limits", "starts", "scale"))
 STEP, HORIZON, EPISODES = (SETTINGS[name] for name in ("step", "horizon", "episodes"))
 SHIFT = 0.5826
-"""A boundary that is watched at the steps only seems further away by so many standard deviations of a
-step."""
+"""Standard deviations of a step by which a boundary watched at the steps only seems further away."""
 
 
 def attaining_problem(start: float) -> SafetyProblem:

@@ -1,4 +1,4 @@
-"""Thesis Sec. 4.2.2: the inputs that reciprocal conditions allow towards the edge of the safe set."""
+"""Thesis Sec. 4.2.2: the inputs that reciprocal conditions allow towards the edge."""
 
 from __future__ import annotations
 

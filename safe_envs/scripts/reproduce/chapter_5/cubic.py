@@ -133,7 +133,7 @@ def _fall(found: Levels, name: str) -> float:
 
 
 def _falls(sample: Sample) -> str:
-    """Return how far the CBF falls between the levels, over class-K rates and horizons, in words."""
+    """Return how far the CBF falls between the levels, over rates and horizons, in words."""
     tried = _ALPHAS[:1] if sample.quick else _ALPHAS
     swept = [
         measured(ENV, {"noise": k}, [f"cbf:alpha={a}" for a in tried], [], sample) for k in LEVELS

@@ -88,7 +88,7 @@ def compute(sample: Sample) -> Outcome:
 
 
 def validated(doubt: Number) -> Claim:
-    """Return the claim that errors are those that the data leave open, as far as their mean tells."""
+    """Return the claim that the mean error is one that the data leave open."""
     return Claim(
         f"The identified f is validated at {FRESH} random states: its errors are no larger than its"
         " posterior leaves open.",

@@ -1,4 +1,4 @@
-"""Table 6.3: safety of the car behind another one with known, partly known and identified dynamics."""
+"""Table 6.3: safety of the car with known, partly known and identified dynamics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Table 6.1 and Figure 6.1: the drift of the cubic system, identified from K repetitions of a step."""
+"""Table 6.1 and Figure 6.1: the drift of the cubic system from K repetitions of each step."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def one_more(values: Sequence[float] | np.ndarray) -> tuple[float, float]:
 
 
 def predicted(name: str, values: Any, printed: float | None = None, unit: str = "") -> Number:
-    """Return the geometric mean of a positive quantity, with the 95 % prediction interval of one more.
+    """Return the geometric mean of a positive quantity, and the prediction interval of one more.
 
     Its logarithm is taken for normal. A printed number is of a single identification: it is one
     more.

@@ -1,4 +1,4 @@
-"""What the tables of chapter 6 share: rates with identifications, and under a printed constraint."""
+"""What the tables of chapter 6 share: rates with identifications or a printed constraint."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def rate_of_one_more(
 ) -> Number:
     """Return the mean rate, and the interval of the rate with one more identification.
 
-    A printed rate is with a single one. The distances from the mean to the ends of the interval over
-    episodes, which all identifications share, and those of the prediction interval over
+    A printed rate is with a single one. The distances from the mean to the ends of the interval
+    over episodes, which all identifications share, and those of the prediction interval over
     identifications are added as squares.
 
     Args:

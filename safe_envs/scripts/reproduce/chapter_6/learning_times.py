@@ -43,7 +43,7 @@ def generator_values(sample: Sample) -> dict[str, int]:
 
 @cache
 def recursion(sample: Sample) -> GeneratorModel:
-    """Return DDSCBF's networks of both orders, by the printed estimate, learned once for both tables."""
+    """Return DDSCBF's networks by the printed estimate, learned once for both tables."""
     how: dict[str, Any] = {"way": "network", "estimator": "printed", "seed": seeds(sample, 1)[0]}
     return learn_generator(load_problem(ENV), **generator_work(sample), **how)
 

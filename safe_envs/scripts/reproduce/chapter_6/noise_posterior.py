@@ -139,7 +139,7 @@ def draw_levels(figure: Figure, outcome: Outcome) -> None:
 
 
 def _draw_likelihoods(axes: Axes, outcome: Outcome) -> None:
-    """Draw medians by either likelihood on one axis: their intervals are thinner than the points."""
+    """Draw medians by either likelihood; their intervals are thinner than the points."""
     truth = outcome.data["truth"][0]
     for row, numbers in enumerate((outcome.numbers, outcome.printed_formula)):
         for i, number in enumerate(numbers):

@@ -1,4 +1,4 @@
-"""The measured rates of Table 6.2 against the worst case h/c, and at one horizon for both starts."""
+"""The measured rates of Table 6.2 against the worst case h/c, and at one horizon."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from safe_envs.scripts.reproduce.framework.verdict import disagreement
 
 
 def above_worst(horizon: float, each: Mapping[str, tuple[Sequence[Number], float]]) -> Claim:
-    """Return the claim that measured rates are above the worst case, by the ends of their intervals.
+    """Return the claim that measured rates are above the worst case, by their lower ends.
 
     Args:
         horizon: up to which they were measured, in s.

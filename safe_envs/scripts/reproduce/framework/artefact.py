@@ -1,4 +1,4 @@
-"""A table or figure of the thesis: printed numbers, how ours is computed and drawn, and its outcome."""
+"""A table or figure of the thesis: how it is computed and drawn, and its outcome."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ class Outcome:
     Attributes:
         numbers: of the artefact.
         claims: of its figure and of the text about it.
-        alternative_settings: the same numbers and claims with other settings, by a name that says which.
+        alternative_settings: the same with other settings, by a name that says which.
         printed_formula: the same numbers by the printed formula, where that is wrong.
         data: what the picture shows, lists by name.
         notes: what else a reader should know, computed where it holds numbers.
@@ -184,7 +184,7 @@ class Outcome:
 
 
 def _typed(kind: type, row: dict[str, Any]) -> Any:
-    """Return the number or claim of a JSON object whose entries have the types of its attributes."""
+    """Return the number or claim of a JSON object, whose entries are of its types."""
     hints = get_type_hints(kind)
     for name, value in row.items():
         # JSON does not tell 1.0 from 1.

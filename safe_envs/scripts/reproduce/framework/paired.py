@@ -61,7 +61,7 @@ class MeasuredFilter:
         return Number(name, self.rate, low, high, printed, trials, "%")
 
     def at_each_horizon(self, printed: float) -> list[Number]:
-        """Return the rate up to each instant of the curve, with a rate of the thesis in per cent."""
+        """Return the rate up to each instant, with a printed one in per cent."""
         return [
             Number.rate("", safe, self.row["episodes"], printed, PRINTED_EPISODES)
             for safe in self.row["curve"]["safe"]

@@ -1,9 +1,9 @@
-"""Settings, printed numbers, assumptions and errata of the thesis: the files `thesis/chapter_N.yaml`.
+"""Settings, printed numbers, assumptions and errata of the thesis: `thesis/chapter_N.yaml`.
 
 A file has `settings` (sections of named values) and `artefacts`. An artefact has a title, the lines
-of its setting, its assumptions and errata, the argument why it cannot be reproduced, if any, and its
-printed numbers. In these texts {name} stands for a value of the section that the artefact names, or
-for one that its module gives.
+of its setting, its assumptions and errata, the argument why it cannot be reproduced, if any, notes
+by name, and its printed numbers. In these texts {name} is a value of the section that the artefact
+names, or one that its module gives.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Outcome, Sample
 
 _TEXTS = ("setting", "assumptions", "errata")
-_FIELDS = {"settings", "title", *_TEXTS, "argument", "printed"}
+_FIELDS = {"settings", "title", *_TEXTS, "argument", "notes", "printed"}
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,17 @@ class Chapter:
     def printed(self, artefact: str) -> dict[str, Any]:
         """Return the printed numbers of an artefact by name: a number each, or a tuple of them."""
         return dict(self.artefacts[artefact]["printed"])
+
+    def note(self, artefact: str, name: str, **values: Any) -> str:
+        """Return a note of an artefact.
+
+        Args:
+            artefact: its name.
+            name: of the note.
+            values: that the note names besides those of the section.
+        """
+        text = self.artefacts[artefact]
+        return text["notes"][name].format(**{**self.settings[text["settings"]], **values})
 
     def artefact(
         self,
@@ -115,7 +126,8 @@ def _artefact(given: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str
         raise ValueError(f"no section {given['settings']!r} in settings")
     single = {key: _text(given.get(key, "")) for key in ("settings", "title", "argument")}
     lines = {key: tuple(_lines(given.get(key, []))) for key in _TEXTS}
-    return {**single, **lines, "printed": _values(given.get("printed", {}))}
+    notes = {key: _text(text) for key, text in given.get("notes", {}).items()}
+    return {**single, **lines, "notes": notes, "printed": _values(given.get("printed", {}))}
 
 
 def _lines(given: Any) -> list[str]:

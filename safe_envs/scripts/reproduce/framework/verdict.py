@@ -179,7 +179,7 @@ def _turned(orders: Sequence[tuple[Number, Number]]) -> list[tuple[Number, Numbe
 
 
 def _reached(found: Outcome, outcome: Outcome, failed: Sequence[str]) -> bool:
-    """Return whether another setting gives all that is printed, and what does not hold otherwise."""
+    """Return whether another setting gives all that is printed, and what fails otherwise."""
     claims = {claim.sentence: claim.holds for claim in found.claims if claim.printed}
     names = {number.name for number in found.numbers if number.printed is not None}
     return (
