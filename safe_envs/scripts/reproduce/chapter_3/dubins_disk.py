@@ -175,12 +175,9 @@ def _by_rate(values: Sequence[float]) -> str:
 
 
 def _by_printed_differences(shares: Sequence[float], found: Learnings) -> str:
-    return (
-        f"the differences of Eq. (3.28) give at most {max(shares):.2g} of the input's gain (median"
-        f" over states), so that the filter turns about {1 / max(shares):.2g} times as much as the"
-        f" condition asks for: without a margin, as in the thesis, {min(_counts(found))} of {len(RATES)}"
-        f" runs from {PRINTED_START} are safe in the worst learning"
-    )
+    counts = {"safe": min(_counts(found)), "runs": len(RATES)}
+    share = max(shares)
+    return CHAPTER.note("figure-3.1", "differences", share=share, excess=1 / share, **counts)
 
 
 def _pictures(
@@ -269,13 +266,8 @@ def binding(problem: SafetyProblem) -> str:
     """Return what exact derivatives and the control 0 do from the start of the thesis, in words."""
     rows = [chain_at(problem, p, PRINTED_START)[2] for p in RATES]
     times, depths = zip(*[crossing(problem, p, PRINTED_START) for p in RATES], strict=True)
-    return (
-        f"driving straight on breaks the exact condition at {PRINTED_START}, by b_2 ="
-        f" {_by_rate(rows)}; while it binds, in continuous time h = (h(0) + b_1(0) t) exp(-p t),"
-        f" which is negative from t = {_by_rate(times)} s on and falls to {_by_rate(depths)} if it"
-        " binds so long: only a coarse control period or a control that turns more than the"
-        " condition asks for keeps such a run safe"
-    )
+    each = {"violation": rows, "times": times, "depths": depths}
+    return CHAPTER.note("figure-3.1", "binding", **{k: _by_rate(v) for k, v in each.items()})
 
 
 def draw_disk(figure: Figure, outcome: Outcome) -> None:

@@ -182,10 +182,8 @@ def compute_clearance(sample: Sample) -> Outcome:
         ],
         data={kind: run.over_time(problem.dt, h=run.h) for kind, run in shown.items()},
         notes=[
-            (
-                "with the true speed but without the obstacle's velocity, by the printed formula,"
-                f" the smallest h is {blind.smallest:.3g} m^2; with it,"
-                f" {found['true'][0].smallest:.3g} m^2"
+            CHAPTER.note(
+                "figure-3.2b", "blind", blind=blind.smallest, true=found["true"][0].smallest
             ),
             (
                 f"of the printed claims hold {_held(found, problem)} here, and"

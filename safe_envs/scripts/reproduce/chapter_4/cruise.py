@@ -158,12 +158,9 @@ def _fitted_note(safe: Safe) -> str:
     before, after = (
         100 * float(safe[f"SCBF, {control}"].mean()) for control in ("unbounded", "bounded")
     )
-    return (
-        f"a search of ours fitted {len(PRINTED)} numbers by {QUANTITIES} quantities, {FITTED_GOAL},"
-        f" |u| <= {FITTED.limit:g} N: where they agree, that shows that the table can be reached,"
-        f" and not how it was. SCBF is {before:.1f} % safe there without and {after:.1f} % with a"
-        f" bound; the thesis has {PRINTED['SCBF, unbounded']:g} % and {PRINTED['SCBF, bounded']:g} %"
-    )
+    numbers = {"count": len(PRINTED), "quantities": QUANTITIES, "goal": FITTED_GOAL}
+    rates = {"before": before, "after": after, "printed": PRINTED}
+    return CHAPTER.note("table-4.1", "fitted", fitted=FITTED, **numbers, **rates)
 
 
 def headway_for(unsafe: float) -> float:
@@ -173,17 +170,20 @@ def headway_for(unsafe: float) -> float:
 
 def _gaussian_note() -> str:
     unsafe = 1 - PRINTED["SCBF, unbounded"] / 100
-    return (
-        "under any controller with A h >= 0, h >= h_0 - tau sigma_1 W_t, so that P(unsafe) <= 2"
-        f" Phi(-h_0/(tau sigma_1 sqrt(T))) = {ASSUMED.most_unsafe():.1g} for tau = {ASSUMED.tau} s,"
-        f" {FITTED.most_unsafe():.2f} for tau = {FITTED.tau} s; {100 * unsafe:.0f} % unsafe with"
-        f" unbounded SCBF needs tau >= {headway_for(unsafe):.2f} s"
+    return CHAPTER.note(
+        "table-4.1",
+        "gaussian",
+        most_unsafe=ASSUMED.most_unsafe(),
+        most_unsafe_fitted=FITTED.most_unsafe(),
+        tau_fitted=FITTED.tau,
+        unsafe=100 * unsafe,
+        needed=headway_for(unsafe),
     )
 
 
 def _odd_note() -> str:
     printed = PRINTED["SRCBF, bounded"]
-    return f"{printed:g} % of {EPISODES} runs is {printed * EPISODES / 100:g} runs"
+    return CHAPTER.note("table-4.1", "odd", printed=printed, runs=printed * EPISODES / 100)
 
 
 def _sweep(episodes: int, seed: int, step: float) -> list[str]:

@@ -123,24 +123,17 @@ def simulated(
 
 
 def _strict_note() -> str:
-    return (
-        "SRCBF asks for A h >= (tau sigma_1)^2/h - gamma h^3, so that it is the stricter one only"
-        f" below h = sqrt(tau sigma_1)/gamma^(1/4): {ASSUMED.stricter_below():.3g} m, and"
-        f" {FITTED.stricter_below():.3g} m with what we fitted to Table 4.1, {FITTED_GOAL}"
-    )
+    below = {"assumed": ASSUMED.stricter_below(), "fitted": FITTED.stricter_below()}
+    return CHAPTER.note("figure-4.1", "strict", goal=FITTED_GOAL, **below)
 
 
 def _ends_note(runs: EffortRecords) -> str:
-    kept = ", ".join(
+    running = ", ".join(
         f"{name} {np.isfinite(r.effort[-1]).sum()} of {r.effort.shape[1]}"
         for name, r in runs.items()
     )
     first, other = (float(np.median(runs[name].effort[0])) for name in ("SRCBF", "SCBF"))
-    return (
-        f"episodes that are safe and running at the end: {kept}; effort counts up to an episode's"
-        f" first violation, of either in a pair. At the start J of SRCBF is {first:.2g} N^2, that"
-        f" of SCBF {other:.2g}"
-    )
+    return CHAPTER.note("figure-4.1", "ends", running=running, first=first, other=other)
 
 
 def _bands(effort: np.ndarray) -> list[list[float]]:

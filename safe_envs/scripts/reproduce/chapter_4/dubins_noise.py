@@ -79,7 +79,12 @@ def compute_noises(sample: Sample) -> Outcome:
                 STARTS[s]: {n: _curve(runs[s][max(NOISES)][n]) for n in FILTERS} for s in STARTS
             },
         },
-        notes=[holds_note(alternatives), _beyond_note(), *_turns(runs), *_infeasible(main)],
+        notes=[
+            holds_note(alternatives),
+            CHAPTER.note("figure-4.2", "beyond"),
+            *_turns(runs),
+            _infeasible(main),
+        ],
     )
 
 
@@ -148,13 +153,6 @@ def _against(rival: str, gaps: Mapping[float, Number], perfect: int) -> str:
     )
 
 
-def _beyond_note() -> str:
-    return (
-        f"Sec. 4.3.2 tests the SCBF alone within [0, {max(BEYOND):g}] as well and shows nothing of"
-        " it; ours are in the table and in the picture, from the same random starts"
-    )
-
-
 def _turns(runs: Mapping[str, Mapping[float, ByFilter]]) -> list[str]:
     """Return from when on SCBF is the safer one, in words."""
     most = max(NOISES)
@@ -170,14 +168,12 @@ def _as_text(time: float | None) -> str:
     return f"not up to {max(HORIZONS):g} s" if time is None else f"from {time:.2f} s on"
 
 
-def _infeasible(runs: Mapping[float, ByFilter]) -> list[str]:
+def _infeasible(runs: Mapping[float, ByFilter]) -> str:
     shares = ", ".join(
         f"{name} {100 * run.infeasible:.2g} %" for name, run in runs[max(NOISES)].items()
     )
-    return [
-        f"steps in which no turn rate in its bounds meets the condition, sigma = {max(NOISES):g},"
-        f" {STARTS['uniform']}: {shares}"
-    ]
+    where = {"noise": max(NOISES), "where": STARTS["uniform"]}
+    return CHAPTER.note("figure-4.2", "infeasible", shares=shares, **where)
 
 
 def _curve(run: Violations) -> dict[str, list[float]]:

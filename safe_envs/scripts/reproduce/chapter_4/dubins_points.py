@@ -145,10 +145,7 @@ def _over_other_starts(runs: Sequence[ByFilter]) -> list[str]:
         gap = Number.mean(
             "", [ahead_of(rival, run, HORIZON).ours for run in runs], "points", -100.0, 100.0
         )
-        notes.append(
-            f"the thesis does not give its starts; over other random starts SCBF - {rival} is"
-            f" {with_interval(gap)} points on average"
-        )
+        notes.append(CHAPTER.note("figure-4.3", "others", rival=rival, gap=with_interval(gap)))
     return notes
 
 
@@ -187,12 +184,17 @@ def bound_note(
     last = [run.rate("", step_of(max(HORIZONS))) for run in runs]
     below = sum(is_below(last[i], 100 * product[i]) for i in inside)
     share = 100 * np.mean([run.infeasible for run in runs])
-    return (
-        f"{name}: A h > 0, as Thm. 4.2.10 presumes, holds at {len(inside)} of {len(runs)}. Its"
-        f" product b_0 b_1/(c_0 c_1) is at most {100 * product.max():.1f} % there, and contradicted"
-        f" at {below} by T = {max(HORIZONS):g} s; the union bound is at most"
-        f" {100 * union.max():.1f} %. Both presume the condition, which no turn rate meets in"
-        f" {share:.1f} % of the steps"
+    return CHAPTER.note(
+        "figure-4.3",
+        "bounds",
+        name=name,
+        inside=len(inside),
+        count=len(runs),
+        below=below,
+        longest=max(HORIZONS),
+        product=100 * product.max(),
+        union=100 * union.max(),
+        share=share,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,7 @@ def compute(sample: Sample) -> Outcome:
         [safe_up_to(s, t, step) for s in STARTS] for t, step in ((math.inf, 0.0), (HORIZON, STEP))
     ]
     curves = [each.row["curve"] for each in attained]
+    note = partial(CHAPTER.note, "example-4.2.2", horizon=HORIZON)
     calm_rate = measure(SCALAR, "rcbf", 1, 0, options=calm).rate
     return Outcome(
         numbers=[
@@ -135,14 +137,11 @@ def compute(sample: Sample) -> Outcome:
             "closed": [[safe_up_to(s, t, STEP) for t in curves[0]["time"][1:]] for s in STARTS],
         },
         notes=[
-            f"x_0 = {s:g}: h/c = {100 * b:.2f} %, closed form for ever {100 * e:.2f} %, for"
-            f" {HORIZON:g} s looked at every {STEP:g} s {100 * f:.2f} %, simulated"
-            f" {each.rate:.2f} %"
-            for s, b, e, f, each in zip(STARTS, bounds, *closed, attained, strict=True)
-        ]
-        + [
-            f"Prop. 4.2.2 guarantees 100 % with unbounded SRCBF; with an input that is held for"
-            f" {STEP:g} s it is {limited[-1][0].ours:.1f} %"
+            *(
+                note("attained", start=s, bound=100 * b, ever=100 * e, closed=100 * f, rate=r.rate)
+                for s, b, e, f, r in zip(STARTS, bounds, *closed, attained, strict=True)
+            ),
+            note("held", rate=limited[-1][0].ours),
         ],
     )
 

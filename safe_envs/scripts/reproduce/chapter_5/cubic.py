@@ -33,7 +33,7 @@ from safe_envs.wrappers.verification.guarantee import promise
 
 SETTINGS = CHAPTER.settings["cubic"]
 ENV, LEVELS, ALPHA, FIXED = (SETTINGS[name] for name in ("env", "levels", "alpha", "fixed_start"))
-PRINTED = CHAPTER.printed("table-5.2")
+PRINTED, note = CHAPTER.printed("table-5.2"), partial(CHAPTER.note, "table-5.2")
 CBF, WITHOUT = f"cbf:alpha={ALPHA}", f"cbf:alpha={NO_RATE}"
 _ALPHAS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 """Rates among which the printed fall of the CBF is looked for, in 1/s."""
@@ -80,11 +80,7 @@ def compute_table(sample: Sample) -> Outcome:
             *(explain_gap(near[k], CBF, f"at k = {k:g}") for k in LEVELS),
             _falls(sample),
             *compare_with_no_filter(near),
-            (
-                "from a single start the rate falls from the lower to the higher noise by"
-                f" {_fall(single, CBF):.1f} points with the CBF, by {_fall(single, 'scbf'):.1f}"
-                " with SCBF"
-            ),
+            note("single", cbf=_fall(single, CBF), scbf=_fall(single, "scbf")),
             *_no_bound(sample),
         ],
     )
@@ -142,11 +138,8 @@ def _falls(sample: Sample) -> str:
     largest = max(float((before - after).max()) for before, after in zip(*levels, strict=True))
     lowest = min(float(rates[-1]) for rates in levels[1])
     fell = PRINTED["CBF"][0] - PRINTED["CBF"][1]
-    return (
-        f"the printed rate of the CBF falls by {fell:.1f} points from the lower to the higher"
-        f" noise; here by {largest:.1f} at most, over alpha = {', '.join(f'{a:g}' for a in tried)}"
-        f" 1/s and every horizon up to 2 s, down to {lowest:.1f} % at least"
-    )
+    alphas = ", ".join(f"{a:g}" for a in tried)
+    return note("falls", fell=fell, largest=largest, rates=alphas, lowest=lowest)
 
 
 def compare_with_no_filter(found: Levels) -> list[str]:
@@ -157,10 +150,8 @@ def compare_with_no_filter(found: Levels) -> list[str]:
         side = (
             "below" if is_above(free, printed) else "above" if is_below(free, printed) else "within"
         )
-        said.append(
-            f"at k = {k:g} the printed {printed:g} % of the CBF is {side} [{free.low:.1f},"
-            f" {free.high:.1f}], the interval without any filter"
-        )
+        ends = {"low": free.low, "high": free.high}
+        said.append(note("side", k=k, printed=printed, side=side, **ends))
     return said
 
 
@@ -174,10 +165,7 @@ def _no_bound(sample: Sample) -> list[str]:
         "floats",
     )
     coefficient, offset = (value + 0.0 for value in read(-1.0, 0.0))  # no -0
-    notes = [
-        "Prop. 4.2.8 and 5.2.2 ask for A h >= 0 on all of C; at (-1, 0), where h = 2, the input"
-        f" has the factor {coefficient:g}, and without it A h = {offset:g}"
-    ]
+    notes = [note("no_bound", coefficient=coefficient, offset=offset)]
     if sample.quick:
         return notes
     found = verify(problem, (SCBF(),), samples=1024)

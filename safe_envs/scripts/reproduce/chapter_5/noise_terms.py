@@ -23,6 +23,7 @@ from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     models,
     repeated,
 )
+from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Outcome, Sample
 from safe_envs.scripts.reproduce.framework.paired import is_below
 from safe_envs.wrappers.learning.data.collection import draw_states
@@ -184,31 +185,18 @@ def _why_printed_fails(
 ) -> list[str]:
     """Return the printed estimator's error, its bias in closed form, and its noise, in words."""
     plant, h = problem.plant, problem.barriers[0].expression
-    bias = (
-        (plant.drift.T * gradient(plant, h).jacobian(plant.states) * plant.drift)[0, 0]
-        / 2
-        * problem.dt
-    )
+    bend = gradient(plant, h).jacobian(plant.states)
+    bias = (plant.drift.T * bend * plant.drift)[0, 0] / 2 * problem.dt
     read = compile_function(plant.states, (plant.numeric(bias), plant.numeric(h)), "arrays")
     predicted, level = read(*np.ascontiguousarray(first.x.T))
-    noise = next(
-        value
-        for name, value in first.learned["printed"].record.errors.items()
-        if "standard error" in name
-    )
+    errors = first.learned["printed"].record.errors
+    noise = next(value for name, value in errors.items() if "standard error" in name)
     signal, added = _rms(first.labels["martingale"]), _rms(level / (repetitions * problem.dt))
+    errors = {"missed": _rms(missed), "bias": _rms(predicted), "noise": noise}
+    shares = {f"{name}_share": error / signal for name, error in errors.items()}
     return [
-        (
-            f"Eq. (5.17), (5.18) miss by {_rms(missed):.2g} 1/s rms, {_rms(missed) / signal:.3g}"
-            f" times the term itself: the bias dt/2 f' h_xx f is {_rms(predicted):.2g} 1/s,"
-            f" {_rms(predicted) / signal:.3g} times the term, and the noise of {repetitions}"
-            f" transitions {noise:.2g} 1/s, {noise / signal:.2g} of it; the bias is proportional to"
-            " dt, the noise to 1/sqrt(dt)"
-        ),
-        (
-            f"the sum of Eq. (5.17) from j = 0 would add h/(n dt), {added:.2g} 1/s rms: not in"
-            " these numbers"
-        ),
+        CHAPTER.note("figure-5.1", "printed", repetitions=repetitions, **errors, **shares),
+        CHAPTER.note("figure-5.1", "first_term", added=added),
     ]
 
 

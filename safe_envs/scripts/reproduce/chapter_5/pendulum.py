@@ -178,12 +178,9 @@ def in_other_setting(other: Outcome) -> str:
 def _by_printed_estimator(learned: list[Identification], sample: Sample) -> str:
     printed = models(learned, "printed")
     options = ({**A.options(sample), **box} for box in ({}, {"box": _UNBOUNDED}))
-    boxed, free = (measured(ENV, each, [], printed, sample)["ddscbf"].rate for each in options)
-    return (
-        f"DDSCBF by the printed estimator in A: {boxed:.1f} % safe with a torque within 5 N m,"
-        f" {free:.1f} % with an unbounded one. The bias of that estimator, -dt f' P f, is never"
-        " positive: it asks for more control"
-    )
+    rates = (measured(ENV, each, [], printed, sample)["ddscbf"].rate for each in options)
+    bounded, free = rates
+    return CHAPTER.note("table-5.1", "estimator", bounded=bounded, free=free)
 
 
 def _sampled(sample: Sample) -> str:
@@ -229,10 +226,7 @@ def _bounds(first: Identification, scbf: MeasuredFilter, sample: Sample) -> list
         if slack > 0.0
         else "meets the condition"
     )
-    notes = [
-        "Prop. 5.2.2 asks for a positive margin on all of C: at the origin, where h is largest,"
-        f" with the median error of the network, {margin:.2g} 1/s, for it the best torque {met}"
-    ]
+    notes = [CHAPTER.note("table-5.1", "margin", margin=margin, met=met)]
     if sample.quick:
         return notes
     bound = promise(verify(problem, (SCBF(),)), starts_of(problem), problem.duration)[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,8 @@ def compute(sample: Sample) -> Outcome:
     sigma, time = parameter(problem, "sigma_1"), REPETITIONS[-1] * 2 * STARTS * STEPS * problem.dt
     law = float(np.sqrt(learned[0].features.count * sigma**2 / time))
     most = problem.box[0][1] / parameter(problem, "M")
+    needed = REPETITIONS[-1] * (law / (_NEAR * size[0])) ** 2
+    note = partial(CHAPTER.note, "figure-6.3")
     by_data = Number.mean(
         "rms error in standard deviations of the posterior", errors_in_deviations, least=0.0
     )
@@ -72,17 +75,9 @@ def compute(sample: Sample) -> Outcome:
         claims=[validated(by_data), *(near(f"f_{i + 1}", errors[:, i] / size[i]) for i in (0, 1))],
         data=shown,
         notes=[
-            "The thesis does not say how near the estimate is.",
-            (
-                f"By sqrt(M sigma^2/(K R dt)) these data leave at least {law:.2g} m/s^2 in f_1, of"
-                f" the size {size[0]:.2g}: {100 * _NEAR:g} % of it takes K ="
-                f" {REPETITIONS[-1] * (law / (_NEAR * size[0])) ** 2:.0f} with states drawn over"
-                " the whole region."
-            ),
-            (
-                f"The input moves the car by up to {most:.1f} m/s^2,"
-                f" {most / np.exp(np.log(errors[:, 0]).mean()):.0f} times the error of f_1."
-            ),
+            note("none"),
+            note("law", law=law, size=size[0], near=100 * _NEAR, needed=needed),
+            note("input", most=most, ratio=most / np.exp(np.log(errors[:, 0]).mean())),
         ],
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -80,6 +81,7 @@ def compute(sample: Sample) -> Outcome:
     found = bayesian(REPETITIONS[-1], _CONTROLLERS)
     # A quick sample does without what is only compared with the table.
     fewer = None if sample.quick else bayesian(REPETITIONS[0], _FEW_CONTROLLERS)
+    blind = measure(problem.configured(model={"sigma_1": 0.0, "sigma_2": 0.0}), "scbf", *size)
     by_recursion = measure(problem, "ddscbf", *size, [recursion(sample)])
     return Outcome(
         numbers=table(found),
@@ -95,32 +97,22 @@ def compute(sample: Sample) -> Outcome:
             printed_rate("SCBF", problem, printed_second_generator(problem), *size),
             by_recursion.number("DDSCBF"),
         ],
-        notes=[
-            (
-                f"One identification differs from the next: the rates of {len(found.rates)} have"
-                f" the standard deviation {100 * np.std(found.rates, ddof=1):.0f} points, and the"
-                f" mean {100 * np.mean(found.rates):.0f} %."
-            ),
-            (
-                f"DDSCBF differs from the SCBF by {ddscbf.describe()}; in the thesis by"
-                f" {PRINTED['DDSCBF'] - PRINTED['SCBF']:+g} points."
-            ),
-            _without_noise(problem, size, scbf.rate),
-            (
-                "The DDSCBF by the printed formula is one run of the recursion with the estimate of"
-                " Eq. (5.17)."
-            ),
-        ],
+        notes=_notes(found, ddscbf, blind.rate, scbf.rate),
     )
 
 
-def _without_noise(problem: SafetyProblem, size: tuple[int, int], rate: float) -> str:
-    """Return what the noise, which is all that DDSCBF learns, does to the rate, in words."""
-    blind = measure(problem.configured(model={"sigma_1": 0.0, "sigma_2": 0.0}), "scbf", *size).rate
-    return (
-        "The noise is all that DDSCBF learns; an SCBF that assumes none is safe in"
-        f" {blind:.1f} %, compared with {rate:.1f} %."
-    )
+def _notes(
+    bayesian: LearnedController, ddscbf: LearnedController, blind: float, known: float
+) -> list[str]:
+    note, rates = partial(CHAPTER.note, "table-6.3"), bayesian.rates
+    spread = {"deviation": 100 * np.std(rates, ddof=1), "mean": 100 * np.mean(rates)}
+    printed = PRINTED["DDSCBF"] - PRINTED["SCBF"]
+    return [
+        note("spread", count=len(rates), **spread),
+        note("ddscbf", difference=ddscbf.describe(), printed=printed),
+        note("noise", blind=blind, known=known),
+        note("recursion"),
+    ]
 
 
 def _values(sample: Sample) -> dict[str, Any]:

@@ -189,11 +189,7 @@ def compute_errors(sample: Sample) -> Outcome:
         ],
         printed_formula=[Number.mean(doubt, many.overconfident, least=0.0)],
         notes=[
-            (
-                "The errors of single identifications differ so much that the intervals span"
-                f" {min(widths):.0f} to {max(widths):.0f}-fold: a printed number of one"
-                " identification tells little."
-            ),
+            CHAPTER.note("table-6.1", "span", least=min(widths), largest=max(widths)),
             _compared_with_law(problem, x, chosen, found[REPETITIONS[0]]),
         ],
     )
@@ -211,13 +207,9 @@ def _compared_with_law(
     time = REPETITIONS[0] * STARTS * STEPS * problem.dt
     law = Features.of(problem, DEGREE).count * sigma**2 / time
     ratio = Number.mean("ratio", spread_out.squares.mean(axis=1) / law, least=0.0)
-    return (
-        f"From {STARTS * STEPS} states drawn over the disk the MSE at K = {REPETITIONS[0]} is"
-        f" {ratio.ours:.2f} [{ratio.low:.2f}, {ratio.high:.2f}] times M sigma^2/(K R dt) ="
-        f" {law:.2g} (mean of {len(chosen)} identifications); from as many on {STARTS}"
-        f" trajectories, which do not see all of the disk, {followed.squares.mean() / law:.1f}"
-        " times that."
-    )
+    counts = {"data": STARTS * STEPS, "count": len(chosen)}
+    share = followed.squares.mean() / law
+    return CHAPTER.note("table-6.1", "law", ratio=ratio, law=law, followed=share, **counts)
 
 
 def compute_picture(sample: Sample) -> Outcome:
@@ -250,7 +242,7 @@ def compute_picture(sample: Sample) -> Outcome:
             **{f"deviation {k}": s.first[1][:, 1].tolist() for k, s in found.items()},
         },
         notes=[
-            "The picture is of the first identification; the rms errors are geometric means over"
+            "The figure is of the first identification; the rms errors are geometric means over"
             " identifications."
         ],
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import sympy as sp
@@ -232,30 +233,22 @@ def compute(sample: Sample) -> Outcome:
 
 def _notes(columns: Sequence[_Column], dull: Mapping[str, Sequence[float]]) -> list[str]:
     first, second = columns
-    supremum, shortfall, horizon = first.supremum, first.shortfall, first.problem.horizon
+    note = partial(CHAPTER.note, "table-6.2")
+    found = {"shortfall": first.shortfall, "supremum": first.supremum}
+    differences = {
+        each.name: (each.ddscbf.describe(), each.printed["DDSCBF"] - each.printed["SCBF"])
+        for each in columns
+    }
     return [
-        (
-            "The hypothesis of h/c fails: no input keeps A h >= 0 near the centre: it is violated"
-            f" by up to {shortfall:.3f}. What holds is (h - {shortfall:.3f} T)/{supremum:g}: the row"
-            f" '{_ANALYTICAL}' of ours is this repaired bound, estimated with the m and c found, at"
-            f" T = {horizon:g} s. The thesis has no number for it; h/c is in that row by the printed"
-            " formula."
-        ),
-        *(
-            f"{each.name}: the repaired bound is withheld: {each.withheld}"
-            for each in columns
-            if each.withheld
-        ),
+        note("hypothesis", horizon=first.problem.horizon, **found),
+        *(note("withheld", name=c.name, withheld=c.withheld) for c in columns if c.withheld),
         at_one_horizon(first.scbf, second.scbf, PRINTED["SCBF"]),
         *(
-            f"{each.name}: with f and g known DDSCBF differs from the SCBF by"
-            f" {each.ddscbf.describe()}; in the thesis by"
-            f" {each.printed['DDSCBF'] - each.printed['SCBF']:+g} points."
-            for each in columns
+            note("ddscbf", name=name, difference=gap, printed=printed)
+            for name, (gap, printed) in differences.items()
         ),
         *(
-            f"{name}: identified under 0 and .1, with all weights kept, the rates are"
-            f" {100 * min(rates):.0f} to {100 * max(rates):.0f} %."
+            note("dull", name=name, low=100 * min(rates), high=100 * max(rates))
             for name, rates in dull.items()
             if rates
         ),

@@ -80,6 +80,11 @@ def compute(sample: Sample) -> Outcome:
     single, evaluations = _one_by_one(networks), POINTS * GENERATOR_REPETITIONS
     printed = _PRINTED_SECONDS[_RECURSION]
     slow = Number(_RECURSION, networks.record.seconds, printed=printed, unit="s")
+    each = {
+        "each": 1e6 * single,
+        "together": single * evaluations,
+        "printed": printed / evaluations * 1e3,
+    }
     quick = predicted(_BAYESIAN, seconds, _PRINTED_SECONDS[_BAYESIAN], "s")
     return Outcome(
         numbers=[
@@ -89,18 +94,8 @@ def compute(sample: Sample) -> Outcome:
         ],
         claims=sooner(slow.ours / quick.ours),
         notes=[
-            (
-                f"The printed N K = {evaluations:.0e} values of the first network take"
-                f" {1e6 * single:.0f} us each here one by one, {single * evaluations:.0f} s"
-                " together; the printed 5 hours are"
-                f" {printed / evaluations * 1e3:.0f} ms each. In batches they"
-                " take the time in the table."
-            ),
-            (
-                "Learning the covariance of the noise once, and differentiating symbols, takes"
-                f" {direct:.2g} s of the same data, against {slow.ours:.2g} s by the recursion; both"
-                " take the drift for known."
-            ),
+            CHAPTER.note("table-6.4", "one_by_one", evaluations=evaluations, **each),
+            CHAPTER.note("table-6.4", "direct", direct=direct, recursion=slow.ours),
         ],
     )
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
+from safe_envs.scripts.reproduce.chapter_6.identifications import CHAPTER
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
@@ -60,16 +62,10 @@ def at_one_horizon(first: MeasuredFilter, second: MeasuredFilter, printed: Seque
     both = [
         time for time, *pair in zip(times, *curves, strict=True) if not any(map(disagreement, pair))
     ]
+    note = partial(CHAPTER.note, "table-6.2", count=len(times), printed=printed)
     if both:
-        return (
-            f"The SCBF has both printed rates at the same horizon at {len(both)} of {len(times)}"
-            f" instants, first at T = {both[0]:.2f} s."
-        )
+        return note("both", both=len(both), first=both[0])
     k = min(range(len(times)), key=lambda k: abs(curves[0][k].ours - printed[0]))
-    return (
-        f"At none of {len(times)} instants up to T = {times[-1]:g} s has the SCBF both printed"
-        f" rates: from the first start it is nearest to {printed[0]:g} % at T = {times[k]:.2f} s,"
-        f" with {curves[0][k].ours:.1f} %, and has {curves[1][k].ours:.1f} % from the second one"
-        f" then, {printed[1]:g} % in the thesis. At longer horizons it has no more than"
-        f" {curves[0][-1].ours:.1f} % from the first start."
-    )
+    first, second = (curve[k].ours for curve in curves)
+    end = {"last": times[-1], "end": curves[0][-1].ours}
+    return note("none", time=times[k], first=first, second=second, **end)
