@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from safe_envs.registry import load_problem
 from safe_envs.scripts.reproduce.chapter_3 import (
+    disk_starts,
     dubins_disk,
     dubins_obstacle,
     learned_runs,
@@ -209,14 +210,14 @@ def test_curves_are_thinned(name, outcomes):
 @pytest.mark.parametrize(("p", "b_1"), [(0.5, -1.35), (1.0, -1.26), (5.0, -0.54)])
 def test_the_printed_start_of_the_disk_is_outside_the_kept_set(p, b_1):
     # By hand: h = .18, L_f h = -2 v x = -1.44, L_f^2 h = -2 v^2 = -1.28.
-    h, first, second = dubins_disk.chain_at(
+    h, first, second = disk_starts.chain_at(
         load_problem(dubins_disk.DISK), p, dubins_disk.PRINTED_START
     )
     assert h == pytest.approx(0.18)
     assert first == pytest.approx(b_1)
     assert second == pytest.approx(-1.28 - 1.44 * 2 * p + 0.18 * p * p)
     assert second < 0
-    assert dubins_disk.chain_at(load_problem(dubins_disk.DISK), p, dubins_disk.VALID_START)[
+    assert disk_starts.chain_at(load_problem(dubins_disk.DISK), p, dubins_disk.VALID_START)[
         1
     ] == pytest.approx(0.99 * p)
 
@@ -228,7 +229,7 @@ def test_with_a_fine_period_the_exact_filter_follows_the_closed_form(p):
         start=dubins_disk.PRINTED_START, dt=dt, horizon=2.6, box=(-1000.0, 1000.0)
     )
     (run,) = runs(world, [f"hocbf:p={p},{p}"], policy="zero", knowledge="plant")
-    time, depth = dubins_disk.crossing(world, p, dubins_disk.PRINTED_START)
+    time, depth = disk_starts.crossing(world, p, dubins_disk.PRINTED_START)
     assert dt * int(np.argmax(run.h < 0)) == pytest.approx(time, abs=2 * dt)
     assert run.smallest == pytest.approx(depth, rel=0.02)
 

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import sympy as sp
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
@@ -14,6 +13,14 @@ from matplotlib.patches import Circle
 from safe_envs import SafetyProblem
 from safe_envs.agents import load_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legend
+from safe_envs.scripts.reproduce.chapter_3.disk_starts import (
+    PRINTED_START,
+    RATES,
+    VALID_START,
+    binding,
+    by_rate,
+    outside,
+)
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     CHAPTER,
     Trajectory,
@@ -26,12 +33,10 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
 from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 from safe_envs.scripts.reproduce.framework.drawing import SHADED
-from safe_envs.wrappers import HOCBF
 from safe_envs.wrappers.learning.residual import ResidualModel
 
 _SETTINGS = CHAPTER.settings["disk"]
-DISK, RATES = _SETTINGS["env"], _SETTINGS["rates"]
-PRINTED_START, VALID_START = _SETTINGS["start"], _SETTINGS["valid_start"]
+DISK = _SETTINGS["env"]
 WIDE, NARROW = (-_SETTINGS["turn_rate"], _SETTINGS["turn_rate"]), (-math.pi, math.pi)  # rad/s
 _SAFE_RUNS = CHAPTER.printed("figure-3.1")["safe_runs"]
 _SHOWN = 400  # control instants in the figure
@@ -73,7 +78,7 @@ def compute_disk(sample: Sample) -> Outcome:
         notes=[
             *(outside(world, start) for start in at),
             *(
-                f"with exact derivatives from {start} the smallest h is {_by_rate(_smallest(each))}"
+                f"with exact derivatives from {start} the smallest h is {by_rate(_smallest(each))}"
                 for start, each in exact.items()
             ),
             binding(world),
@@ -136,7 +141,7 @@ def all_safe(found: Learnings) -> Claim:
         "All trajectories stay safe under the learned derivatives",
         min(worst(found)) > 0,
         f"safe in each learning: {', '.join(map(str, _counts(found)))} of {len(RATES)}; smallest h"
-        f" over all: {_by_rate(worst(found))}",
+        f" over all: {by_rate(worst(found))}",
     )
 
 
@@ -151,8 +156,8 @@ def theory_holds(found: Learnings, nominal: Sequence[Trajectory]) -> Claim:
         f"From {VALID_START}, a start that the theory covers, all stay safe under the learned"
         " derivatives, none under the nominal",
         min(worst(found)) > 0 > max(_smallest(nominal)),
-        f"smallest h over the learnings: {_by_rate(worst(found))}; nominal:"
-        f" {_by_rate(_smallest(nominal))}",
+        f"smallest h over the learnings: {by_rate(worst(found))}; nominal:"
+        f" {by_rate(_smallest(nominal))}",
         printed=False,
     )
 
@@ -168,10 +173,6 @@ def _smallest(each: Sequence[Trajectory]) -> list[float]:
 
 def _counts(found: Learnings) -> list[int]:
     return [sum(run.smallest > 0 for run in each) for each in found]
-
-
-def _by_rate(values: Sequence[float]) -> str:
-    return ", ".join(f"{value:.3g} (p = {p:g})" for p, value in zip(RATES, values, strict=True))
 
 
 def _by_printed_differences(shares: Sequence[float], found: Learnings) -> str:
@@ -208,66 +209,6 @@ def _pictures(
         "starts": [PRINTED_START, PRINTED_START, VALID_START],
         "radius": 1.0,
     }
-
-
-def chain_at(
-    problem: SafetyProblem, p: float, start: Sequence[float]
-) -> tuple[float, float, float]:
-    """Return h, b_1 and b_2 without the input at a state of the plant.
-
-    Args:
-        problem: of the disk.
-        p: the rates p_1 = p_2, in 1/s.
-        start: the state.
-    """
-    constraint = HOCBF((p, p)).constraint(problem.plant, problem.barriers[0])
-    values = dict(zip(problem.plant.states, map(sp.Float, start), strict=True))
-    h, b_1, b_2 = (
-        float(problem.plant.numeric(e).subs(values)) for e in (*constraint.chain, constraint.offset)
-    )
-    return h, b_1, b_2
-
-
-def outside(problem: SafetyProblem, start: Sequence[float]) -> str:
-    """Return whether a start is in C_2 for each gain, in words.
-
-    Args:
-        problem: of the disk.
-        start: a state.
-    """
-    values = [chain_at(problem, p, start)[1] for p in RATES]
-    where = (
-        "outside C_2 for every gain"
-        if max(values) < 0
-        else "inside C_2 for every gain"
-        if min(values) >= 0
-        else "inside C_2 for some gains"
-    )
-    return f"the start {tuple(start)} is {where}: b_1 = {_by_rate(values)}, for the true speed"
-
-
-def crossing(problem: SafetyProblem, p: float, start: Sequence[float]) -> tuple[float, float]:
-    """Return when h passes 0, in s, and its minimum while the exact condition binds.
-
-    Then b_1 = b_1(0) exp(-p t) and h = (h(0) + b_1(0) t) exp(-p t), with its minimum
-    at t = h(0)/-b_1(0) + 1/p.
-
-    Args:
-        problem: of the disk.
-        p: the rates p_1 = p_2, in 1/s.
-        start: a state.
-    """
-    h, b_1, _ = chain_at(problem, p, start)
-    time = -h / b_1
-    return time, b_1 / p * math.exp(-p * time - 1)
-
-
-def binding(problem: SafetyProblem) -> str:
-    """Return what exact derivatives and the control 0 do from the start of the thesis, in words."""
-    rows = [chain_at(problem, p, PRINTED_START)[2] for p in RATES]
-    times, depths = zip(*[crossing(problem, p, PRINTED_START) for p in RATES], strict=True)
-    each = {"violation": rows, "times": times, "depths": depths}
-    return CHAPTER.note("figure-3.1", "binding", **{k: _by_rate(v) for k, v in each.items()})
 
 
 def draw_disk(figure: Figure, outcome: Outcome) -> None:

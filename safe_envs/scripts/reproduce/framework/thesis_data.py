@@ -41,7 +41,7 @@ class Chapter:
         """Return the printed numbers of an artefact by name: a number each, or a tuple of them."""
         return dict(self.artefacts[artefact]["printed"])
 
-    def note(self, artefact: str, name: str, **values: Any) -> str:
+    def note(self, artefact: str, name: str, /, **values: Any) -> str:
         """Return a note of an artefact.
 
         Args:
