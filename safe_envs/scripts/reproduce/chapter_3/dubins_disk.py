@@ -68,13 +68,13 @@ def compute_disk(sample: Sample) -> Outcome:
         *(printed_residuals(load_problem(DISK), sample, seed) for seed in seeds(sample)),
         strict=True,
     )
-    by_print = trajectories(at[PRINTED_START], estimates, _NO_MARGIN)
+    by_formula = trajectories(at[PRINTED_START], estimates, _NO_MARGIN)
     return Outcome(
         numbers=disk_numbers(found[PRINTED_START], printed=_SAFE_RUNS),
         claims=[all_safe(found[PRINTED_START]), theory_holds(found[VALID_START], nominal)],
         alternative_settings=_alternatives(at, models, found[VALID_START]),
-        printed_formula=disk_numbers(by_print),
-        data=_pictures(found[PRINTED_START][0], by_print[0], found[VALID_START][0], nominal),
+        printed_formula=disk_numbers(by_formula),
+        data=_panels(found[PRINTED_START][0], by_formula[0], found[VALID_START][0], nominal),
         notes=[
             *(outside(world, start) for start in at),
             *(
@@ -82,7 +82,7 @@ def compute_disk(sample: Sample) -> Outcome:
                 for start, each in exact.items()
             ),
             binding(world),
-            _by_printed_differences(shares, by_print),
+            _by_printed_differences(shares, by_formula),
         ],
     )
 
@@ -181,16 +181,16 @@ def _by_printed_differences(shares: Sequence[float], found: Learnings) -> str:
     return CHAPTER.note("figure-3.1", "differences", share=share, excess=1 / share, **counts)
 
 
-def _pictures(
+def _panels(
     printed: Sequence[Trajectory],
-    by_print: Sequence[Trajectory],
+    by_formula: Sequence[Trajectory],
     valid: Sequence[Trajectory],
     nominal: Sequence[Trajectory],
 ) -> dict[str, Any]:
     """Return the curves of the three panels."""
     shown = (
         (0, "learned", printed),
-        (1, "learned", by_print),
+        (1, "learned", by_formula),
         (2, "learned", valid),
         (2, "nominal", nominal),
     )

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from safe_envs import ControlAffineSDE, SafetyProblem
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import derivatives, lie_derivative_f, lie_derivative_g
-from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import learning_sizes
 from safe_envs.scripts.reproduce.framework.artefact import Sample
 from safe_envs.wrappers.learning.base import Record

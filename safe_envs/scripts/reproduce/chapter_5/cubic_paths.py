@@ -21,7 +21,7 @@ from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Outc
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, safer
 
 HORIZON, WIDE = SETTINGS["horizon"], SETTINGS["wide"]
-SHOWN, STRIDE = 12, 2  # trajectories in a picture, and which of their instants
+SHOWN, STRIDE = 12, 2  # trajectories in a figure, and which of their instants
 
 _KINDS = {"a": ("none", 0.0), "b": (CBF, 0.0), "c": (CBF, LEVELS[0]), "d": ("ddscbf", LEVELS[0])}
 _WANTED = {"a": False, "b": True, "c": False, "d": True}
@@ -53,7 +53,7 @@ class PlaneTrajectories:
 
 @lru_cache(maxsize=2)
 def paths(sample: Sample) -> dict[str, PlaneTrajectories]:
-    """Return the trajectories of all four pictures."""
+    """Return the trajectories of all four figures."""
     model = repeated(ENV, LEVELS[0], sample)[0].learned["martingale"]
     found = {}
     for key, (name, noise) in _KINDS.items():
@@ -78,7 +78,7 @@ def paths(sample: Sample) -> dict[str, PlaneTrajectories]:
 
 
 def alike(found: Mapping[str, PlaneTrajectories]) -> np.ndarray:
-    """Return the episodes that end as in the text of the thesis in all pictures.
+    """Return the episodes that end as in the text of the thesis in all figures.
 
     The CLF alone is to be unsafe, or the CBF changes nothing.
     """
@@ -87,7 +87,14 @@ def alike(found: Mapping[str, PlaneTrajectories]) -> np.ndarray:
     )
 
 
-def _picture(key: str, name: str, sample: Sample) -> Outcome:
+def compute(key: str, name: str, sample: Sample) -> Outcome:
+    """Compute one of the figures.
+
+    Args:
+        key: its letter.
+        name: what it shows.
+        sample: how much is simulated.
+    """
     found = paths(sample)
     path, fitting = found[key], alike(found)
     shown, recorded = int(fitting[0]) if len(fitting) else 0, path.states.shape[1]
@@ -108,7 +115,7 @@ def _picture(key: str, name: str, sample: Sample) -> Outcome:
         },
         notes=[
             (
-                f"drawn bold in all four pictures is an episode chosen by how it ends: {of_these};"
+                f"drawn bold in all four figures is an episode chosen by how it ends: {of_these};"
                 f" it is the first of {'these' if len(fitting) else 'all'}, number {shown}"
             ),
             *([short_of_input(path.runs)] if key == "b" else []),
@@ -207,7 +214,7 @@ def draw_paths(figure: Figure, outcome: Outcome) -> None:
     for line in reversed(lines[1:]):
         axes.plot(*line.T, label="other starts", **thin)
         axes.plot(*line[0], "o", color=COLORS[4], markersize=2.5)
-    label = "the same start in all pictures"
+    label = "the same start in all figures"
     axes.plot(*lines[0].T, color=COLORS[0], linewidth=2.2, label=label)
     axes.plot(*lines[0][0], "o", color="black", markersize=4, zorder=3)
     axes.plot(0.0, 0.0, "+", color="black", markersize=9, markeredgewidth=1.5)
@@ -240,7 +247,7 @@ _PICTURES = (
 
 ARTEFACTS: tuple[Artefact, ...] = tuple(
     CHAPTER.artefact(
-        f"figure-5.3{key}", partial(_picture, key, name), _values, draw_paths, (7.0, 5.2)
+        f"figure-5.3{key}", partial(compute, key, name), _values, draw_paths, (7.0, 5.2)
     )
     for key, name in _PICTURES
 )

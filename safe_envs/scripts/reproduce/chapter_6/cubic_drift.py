@@ -14,12 +14,10 @@ from matplotlib.figure import Figure
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import load_problem
-from safe_envs.agents.evaluation.statistics import repeated_interval
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
     AT_REST,
     CHAPTER,
-    CONFIDENCE,
     DEGREE,
     REPETITIONS,
     STARTS,
@@ -34,6 +32,7 @@ from safe_envs.scripts.reproduce.chapter_6.identifications import (
     true_drift,
 )
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.paired import is_above
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.models.features import Features
@@ -118,16 +117,10 @@ def falls(name: str, squares: Mapping[int, np.ndarray]) -> Claim:
     """
     sure, evidence = [], []
     for a, b in pairwise(squares):
-        ratios = np.log(squares[a] / squares[b])
-        mean = float(ratios.mean())
-        low, high = repeated_interval(
-            ratios.tolist(), (mean, mean), CONFIDENCE, (-math.inf, math.inf)
-        )
-        sure.append(low > 0.0)
-        evidence.append(
-            f"{math.exp(mean):.2g}-fold [{math.exp(low):.2g}, {math.exp(high):.2g}] on average from"
-            f" K = {a} to {b}"
-        )
+        ratio = Number.mean("", np.log(squares[a] / squares[b]))
+        sure.append(is_above(ratio))
+        low, fold, high = np.exp([ratio.low or 0.0, ratio.ours, ratio.high or 0.0])
+        evidence.append(f"{fold:.2g}-fold [{low:.2g}, {high:.2g}] on average from K = {a} to {b}")
     return Claim(
         f"The error of {name} falls as the repetitions K grow.", all(sure), ", ".join(evidence)
     )
@@ -212,7 +205,7 @@ def _compared_with_law(
     return CHAPTER.note("table-6.1", "law", ratio=ratio, law=law, followed=share, **counts)
 
 
-def compute_picture(sample: Sample) -> Outcome:
+def compute_figure(sample: Sample) -> Outcome:
     """Compute Figure 6.1."""
     problem = load_problem(ENV)
     x = draw_states(problem, SHOWN, np.random.default_rng([sample.seed, 62]))
@@ -265,7 +258,7 @@ def _values(states: int, full: int, sample: Sample) -> dict[str, Any]:
 
 ARTEFACTS: tuple[Artefact, ...] = (
     CHAPTER.artefact(
-        "figure-6.1", compute_picture, partial(_values, SHOWN, _PICTURED), _draw_drift, (7.0, 3.2)
+        "figure-6.1", compute_figure, partial(_values, SHOWN, _PICTURED), _draw_drift, (7.0, 3.2)
     ),
     CHAPTER.artefact("table-6.1", compute_errors, partial(_values, POINTS, _IDENTIFICATIONS)),
 )

@@ -66,6 +66,5 @@ def at_one_horizon(first: MeasuredFilter, second: MeasuredFilter, printed: Seque
     if both:
         return note("both", both=len(both), first=both[0])
     k = min(range(len(times)), key=lambda k: abs(curves[0][k].ours - printed[0]))
-    first, second = (curve[k].ours for curve in curves)
-    end = {"last": times[-1], "end": curves[0][-1].ours}
-    return note("none", time=times[k], first=first, second=second, **end)
+    rates = {"first": curves[0][k].ours, "second": curves[1][k].ours, "end": curves[0][-1].ours}
+    return note("none", time=times[k], last=times[-1], **rates)

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from safe_envs import SafetyProblem, SafeVectorEnv
 from safe_envs.agents import Policy, make_policy
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.envs.info import Info
-from safe_envs.envs.vector_env import SafeVectorEnv
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.reproduce.framework.artefact import Number
 from safe_envs.wrappers import Condition, SafetyFilterVectorWrapper, parse_conditions
 

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs import SafetyProblem
+from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.comparison import SafetyBits, compare_all
-from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.errors import RelativeDegreeError
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
 from safe_envs.wrappers.learning import LearnedModel
 
