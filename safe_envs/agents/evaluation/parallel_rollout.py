@@ -28,18 +28,18 @@ def play_in_processes(
     """Simulate episodes 0..episodes-1 by `jobs` processes, which remain for the next call.
 
     Args:
-        setting: Of the evaluation, with filters that were read.
-        conditions: Of the filter; none for the unfiltered env.
-        episodes: How many.
-        seed: Whose children seed the episodes.
-        num_envs: How many to simulate side by side in each process, at most.
-        jobs: Number of processes.
-        bridge: Whether to monitor h between control instants.
-        progress: Receives the number of episodes that are done.
+        setting: of the evaluation, with filters that were read.
+        conditions: of the filter; none for the unfiltered env.
+        episodes: how many.
+        seed: whose children seed the episodes.
+        num_envs: how many to simulate side by side in each process, at most.
+        jobs: number of processes.
+        bridge: whether to monitor h between control instants.
+        progress: receives the number of episodes that are done.
 
     Raises:
-        ConfigurationError: Something cannot be sent to a process, mostly a custom policy.
-        WorkersLostError: A process was ended from outside.
+        ConfigurationError: something cannot be sent to a process, mostly a custom policy.
+        WorkersLostError: a process was ended from outside.
     """
     size = max(1, math.ceil(episodes / (jobs * _PARTS)))
     parts = [range(first, min(first + size, episodes)) for first in range(0, episodes, size)]

@@ -33,8 +33,8 @@ class TaskLostError(Exception):
     """A task ended outside of its function, as with its worker.
 
     Attributes:
-        reason: What the cluster reports.
-        jobs: Those of the task.
+        reason: what the cluster reports.
+        jobs: those of the task.
     """
 
     def __init__(self, reason: BaseException, jobs: Sequence[Job]) -> None:
@@ -47,12 +47,12 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
     """Yield the arguments of `joblib.Parallel` for a Dask scheduler.
 
     Args:
-        address: Of the scheduler.
-        tell: Receives a message when it has lost all its workers. If none come for minutes, joblib
+        address: of the scheduler.
+        tell: receives a message when it has lost all its workers. If none come for minutes, joblib
             raises ConfigurationError.
 
     Raises:
-        ConfigurationError: There is no scheduler, or it has no workers.
+        ConfigurationError: there is no scheduler, or it has no workers.
     """
     from distributed import Client
     from joblib._dask import DaskDistributedBackend
@@ -147,7 +147,7 @@ def ray_settings(address: str) -> Iterator[dict[str, Any]]:
     """Yield the arguments of `joblib.Parallel` for a Ray cluster.
 
     Raises:
-        ConfigurationError: It cannot be reached.
+        ConfigurationError: it cannot be reached.
     """
     import ray
     from ray.util.joblib.ray_backend import RayBackend

@@ -37,7 +37,7 @@ class _LossError(Exception):
     """A worker ended.
 
     Attributes:
-        jobs: Those that it may have been computing.
+        jobs: those that it may have been computing.
     """
 
     def __init__(self, reason: str, jobs: Sequence[Job]) -> None:
@@ -50,12 +50,12 @@ class Backend:
     """Where to compute.
 
     Attributes:
-        backend: One of `BACKENDS`.
-        address: Of a Dask scheduler (tcp://HOST:PORT) or of a Ray cluster (HOST:PORT).
-        jobs: Number of processes of this machine, for "local"; a cluster uses all its workers.
+        backend: one of `BACKENDS`.
+        address: of a Dask scheduler (tcp://HOST:PORT) or of a Ray cluster (HOST:PORT).
+        jobs: number of processes of this machine, for "local"; a cluster uses all its workers.
 
     Raises:
-        ConfigurationError: The backend is unknown, an address is missing or does not apply, or a
+        ConfigurationError: the backend is unknown, an address is missing or does not apply, or a
             package is not installed.
     """
 
@@ -98,15 +98,15 @@ def run(
     all was computed, some from the whole list are tried one by one in place of those.
 
     Args:
-        jobs: What to compute. The results do not depend on their order.
-        backend: Where.
-        keep: Receives each outcome as soon as it exists, in the order of completion.
-        tell: Receives what the user should know meanwhile, such as that a cluster has lost all its
+        jobs: what to compute. The results do not depend on their order.
+        backend: where.
+        keep: receives each outcome as soon as it exists, in the order of completion.
+        tell: receives what the user should know meanwhile, such as that a cluster has lost all its
             workers; called by any thread.
 
     Raises:
-        ConfigurationError: A cluster cannot be reached, or has no workers.
-        WorkersLostError: Workers end before they have computed anything.
+        ConfigurationError: a cluster cannot be reached, or has no workers.
+        WorkersLostError: workers end before they have computed anything.
     """
     missing = {job.key: job for job in jobs}
     any_computed = False
@@ -181,7 +181,7 @@ def _outcomes(
     """Yield outcomes in the order of completion.
 
     Raises:
-        _LossError: A worker ended.
+        _LossError: a worker ended.
     """
     from joblib import Parallel, delayed
 

@@ -59,7 +59,7 @@ def file_checksum(path: Path) -> str:
     """Return the SHA-256 of a file.
 
     Raises:
-        ConfigurationError: The file cannot be read.
+        ConfigurationError: the file cannot be read.
     """
     try:
         return hashlib.sha256(read_bytes(path)).hexdigest()

@@ -36,10 +36,10 @@ class Outcome:
     """The end of a job.
 
     Attributes:
-        key: Of the job.
-        result: What it returned; None if it failed.
-        error: Why it failed, or None.
-        seconds: How long it took, the only part that depends on the machine.
+        key: of the job.
+        result: what it returned; None if it failed.
+        error: why it failed, or None.
+        seconds: how long it took, the only part that depends on the machine.
     """
 
     key: str

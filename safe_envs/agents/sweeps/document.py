@@ -84,7 +84,7 @@ def document_in(path: Path) -> Any:
     """Return the content of a YAML file.
 
     Raises:
-        ConfigurationError: It cannot be read, is no YAML, or holds a name twice or a number in a
+        ConfigurationError: it cannot be read, is no YAML, or holds a name twice or a number in a
             misleading form.
     """
     try:
@@ -104,11 +104,11 @@ def value_of(text: str, name: str) -> Any:
     """Return the value of a text in YAML.
 
     Args:
-        text: In YAML.
-        name: Where it comes from, for the message.
+        text: in YAML.
+        name: where it comes from, for the message.
 
     Raises:
-        YAMLError: It is no YAML, or holds a name twice or a number in a misleading form.
+        YAMLError: it is no YAML, or holds a name twice or a number in a misleading form.
     """
     if len(text) > _MOST_BYTES:
         raise yaml.YAMLError(f"it has {len(text)} characters, more than {_MOST_BYTES}")

@@ -40,11 +40,11 @@ def sections(document: Any, what: str) -> tuple[Settings, dict[str, list[Any]], 
     """Return the sections `fixed`, `grid` and `cells` of a sweep, each checked by itself.
 
     Args:
-        document: Content of the file.
-        what: Name of the sweep in errors.
+        document: content of the file.
+        what: name of the sweep in errors.
 
     Raises:
-        ConfigurationError: A section or a setting is unknown, or a value is not of its setting's
+        ConfigurationError: a section or a setting is unknown, or a value is not of its setting's
             kind.
     """
     given = _mapping(document, what, _SECTIONS)
@@ -59,11 +59,11 @@ def complete(settings: Settings, what: str) -> Settings:
     """Return the settings of a cell in a fixed order, with the defaults of an evaluation.
 
     Args:
-        settings: As given; checked by `sections`.
-        what: Name of the sweep in errors.
+        settings: as given; checked by `sections`.
+        what: name of the sweep in errors.
 
     Raises:
-        ConfigurationError: The cell has no filter, or not just one of env and system.
+        ConfigurationError: the cell has no filter, or not just one of env and system.
     """
     if ("env" in settings) == ("system" in settings):
         raise ConfigurationError(

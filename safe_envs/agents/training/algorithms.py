@@ -46,16 +46,16 @@ def new_model(
     """Make an untrained algorithm, whose `get_env()` is `envs`, normalised if the settings say so.
 
     Args:
-        name: See `algorithm_class`.
-        envs: On which it learns.
-        problem: Of the envs.
-        settings: Hyperparameters of the algorithm, and `normalize`, `noise_type` and `noise_std`.
-        action: On which an off-policy algorithm learns with a filter in the loop; None without a
+        name: see `algorithm_class`.
+        envs: on which it learns.
+        problem: of the envs.
+        settings: hyperparameters of the algorithm, and `normalize`, `noise_type` and `noise_std`.
+        action: on which an off-policy algorithm learns with a filter in the loop; None without a
             filter, or on-policy.
-        seed: Of the algorithm.
+        seed: of the algorithm.
 
     Raises:
-        ConfigurationError: The algorithm does not take these settings, or its policy cannot be
+        ConfigurationError: the algorithm does not take these settings, or its policy cannot be
             saved as numbers.
     """
     # Stable-Baselines3 writes into what it is given.

@@ -28,11 +28,11 @@ class LeaderboardOptions:
     """What all rows of a leaderboard have in common.
 
     Attributes:
-        algo: Name of the algorithm.
-        seed: Of all randomness.
-        quick: Train for moments only.
-        episodes: Of each evaluation.
-        knowledge: Of the filters. With a wrong model they would have to be learned first, which is
+        algo: name of the algorithm.
+        seed: of all randomness.
+        quick: train for moments only.
+        episodes: of each evaluation.
+        knowledge: of the filters. With a wrong model they would have to be learned first, which is
             another comparison.
     """
 
@@ -49,13 +49,13 @@ def leaderboard_rows(
     """Return five rows for each env, computed unless a previous run has kept them.
 
     Args:
-        env_ids: Full ids.
-        options: Of the leaderboard.
-        out: Folder of the agents and of the results.
-        tell: Receives the part of the work that is done, from 0 to 1.
+        env_ids: full ids.
+        options: of the leaderboard.
+        out: folder of the agents and of the results.
+        tell: receives the part of the work that is done, from 0 to 1.
 
     Raises:
-        ConfigurationError: The folder has results of other options, or files that are damaged.
+        ConfigurationError: the folder has results of other options, or files that are damaged.
     """
     store = ResultStore(out / "results")
     store.require_same_options([_key(env_id) for env_id in ENV_IDS], asdict(options))

@@ -51,12 +51,12 @@ class TrainingSession:
     """One run of a training, from its beginning or from a checkpoint.
 
     Attributes:
-        seconds: Processor time that the learning took, in all runs of the training so far.
+        seconds: processor time that the learning took, in all runs of the training so far.
 
     Args:
-        training: What to do.
-        folder: Of the training.
-        resume: Go on after the last checkpoint.
+        training: what to do.
+        folder: of the training.
+        resume: go on after the last checkpoint.
     """
 
     def __init__(self, training: Training, folder: Path, resume: bool = False) -> None:

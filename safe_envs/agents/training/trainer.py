@@ -36,19 +36,19 @@ def train(
     `safe-envs evaluate`.
 
     Args:
-        training: What to do.
-        folder: A new one, or with `resume` that of an interrupted training. Nothing in it is run;
+        training: what to do.
+        folder: a new one, or with `resume` that of an interrupted training. Nothing in it is run;
             Stable-Baselines3's files are not read.
-        resume: Go on after the last checkpoint.
-        tensorboard: Folder of logs for tensorboard, in which this training gets one named after its
+        resume: go on after the last checkpoint.
+        tensorboard: folder of logs for tensorboard, in which this training gets one named after its
             own.
-        tell: Receives the part of the training that is done, from 0 to 1.
+        tell: receives the part of the training that is done, from 0 to 1.
 
     Returns:
         Processor time of the learning in seconds, over all its runs and without evaluations.
 
     Raises:
-        ConfigurationError: The folder holds something else, another training writes to it, or it
+        ConfigurationError: the folder holds something else, another training writes to it, or it
             cannot be written, as on a full disk; or the training is not the one that is resumed.
     """
     torch.set_num_threads(training.threads)
