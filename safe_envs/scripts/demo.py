@@ -72,7 +72,7 @@ def _train(policy: Path, steps: int) -> None:
             Training.of(ENV_ID, "ppo", n_timesteps=steps, eval_freq=steps),
             policy,
             resume=os.path.exists(policy),
-            tell=tell,
+            progress=tell,
         )
     say(console, f"Trained in {seconds:.0f} s of processor time and saved in {policy}\n")
 

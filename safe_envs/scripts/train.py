@@ -70,7 +70,7 @@ def train(
         str,
         typer.Option(
             metavar="executed|proposed|both",
-            help="On which action an off-policy algorithm learns behind a filter.",
+            help="On which action an off-policy algorithm learns with a filter in the loop.",
         ),
     ] = "executed",
     intervention_penalty: Annotated[
@@ -140,7 +140,7 @@ def train(
     finished = resume and os.path.exists(out / DESCRIPTION)
     with progress_bar("Training") as tell:
         try:
-            train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)
+            train_agent(training, out, resume=resume, tensorboard=tensorboard, progress=tell)
         except KeyboardInterrupt:
             advice = "The same command with --resume goes on after the last checkpoint in"
             print(f"Stopped. {advice} {out}.", file=sys.stderr)

@@ -88,7 +88,7 @@ def run(
     jobs: Iterable[Job],
     backend: Backend,
     keep: Callable[[Outcome], None],
-    tell: Callable[[str], None] = lambda _: None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Compute jobs, each once.
 
@@ -101,7 +101,7 @@ def run(
         jobs: what to compute. The results do not depend on their order.
         backend: where.
         keep: receives each outcome as soon as it exists, in the order of completion.
-        tell: receives what the user should know meanwhile, such as that a cluster has lost all its
+        report: receives what the user should know meanwhile, such as that a cluster has lost all its
             workers; called by any thread.
 
     Raises:
@@ -113,7 +113,7 @@ def run(
 
     def take(some: Sequence[Job]) -> None:
         nonlocal any_computed
-        with closing(_outcomes(some, backend, tell)) as outcomes:
+        with closing(_outcomes(some, backend, report)) as outcomes:
             for outcome in outcomes:
                 keep(outcome)
                 del missing[outcome.key]
@@ -135,8 +135,8 @@ def run(
             for job in under_way or _spread(list(missing.values())):
                 error = loss if was_alone else _alone(job, take)
                 if error is not None:
-                    told = f"the process that computed it ended: {error}"
-                    keep(Outcome(job.key, None, told, 0.0))
+                    message = f"the process that computed it ended: {error}"
+                    keep(Outcome(job.key, None, message, 0.0))
                     del missing[job.key]
                 if any_computed and (error is not None or not under_way):
                     break
@@ -176,7 +176,7 @@ def _spread(jobs: Sequence[Job]) -> Sequence[Job]:
 
 
 def _outcomes(
-    jobs: Sequence[Job], backend: Backend, tell: Callable[[str], None]
+    jobs: Sequence[Job], backend: Backend, report: Callable[[str], None]
 ) -> Generator[Outcome, None, None]:
     """Yield outcomes in the order of completion.
 
@@ -192,7 +192,7 @@ def _outcomes(
             begun.append(job)
             yield delayed(outcome_of)(job)
 
-    with _settings(backend, len(jobs), tell) as settings:
+    with _settings(backend, len(jobs), report) as settings:
         # One job is one task, so that each outcome is kept as soon as it exists.
         parallel = Parallel(return_as="generator_unordered", batch_size=1, **settings)  # pyright: ignore[reportArgumentType]
         with (
@@ -206,18 +206,18 @@ def _outcomes(
             except SafeEnvsError:
                 raise
             except TaskLostError as error:
-                raise _LossError(_told(error.reason), error.jobs) from error
+                raise _LossError(_reason(error.reason), error.jobs) from error
             except Exception as error:  # those of jobs are in their outcomes
-                raise _LossError(_told(error), begun) from error
+                raise _LossError(_reason(error), begun) from error
 
 
-def _told(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")
 
 
 @contextmanager
 def _settings(
-    backend: Backend, count: int, tell: Callable[[str], None]
+    backend: Backend, count: int, report: Callable[[str], None]
 ) -> Iterator[dict[str, Any]]:
     """Yield the arguments of joblib for a backend, connected as long as the context lasts."""
     if backend.backend == "local":
@@ -225,7 +225,7 @@ def _settings(
         jobs = 1 if backend.jobs == 1 else max(2, min(backend.jobs, count))
         yield {"backend": local_processes(_IDLE), "n_jobs": jobs}
     elif backend.backend == "dask":
-        with dask_settings(str(backend.address), tell) as settings:
+        with dask_settings(str(backend.address), report) as settings:
             yield settings
     else:
         with ray_settings(str(backend.address)) as settings:

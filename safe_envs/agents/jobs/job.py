@@ -58,10 +58,10 @@ def outcome_of(job: Job) -> Outcome:
         # Jobs run side by side already.
         with _ONE_AT_A_TIME, threadpool_limits(1):
             result = job.compute()
-    except SafeEnvsError as told:
-        error = str(told)
-    except Exception as told:
-        error = f"{type(told).__name__}: {told}{_where(told)}"
+    except SafeEnvsError as raised:
+        error = str(raised)
+    except Exception as raised:
+        error = f"{type(raised).__name__}: {raised}{_where(raised)}"
     return Outcome(job.key, result, error, time.perf_counter() - began)
 
 

@@ -164,9 +164,9 @@ def reading(path: Path, advice: str = "remove it, and it is computed again") -> 
     except SafeEnvsError:
         raise
     except Exception as error:
-        told = f"{type(error).__name__}: {shortened(error, _SHOWN)}"
+        reason = f"{type(error).__name__}: {shortened(error, _SHOWN)}"
         raise ConfigurationError(
-            f"{path} cannot be read ({told}); it is damaged or altered: {advice}"
+            f"{path} cannot be read ({reason}); it is damaged or altered: {advice}"
         ) from error
 
 

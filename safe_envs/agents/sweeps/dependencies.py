@@ -62,7 +62,7 @@ def with_imported(path: Path) -> list[Path]:
 
 
 def _imports(file: Path, root: Path) -> Iterable[tuple[Path, Sequence[str]]]:
-    """Yield the imports of a file: the folder in which each begins, and the names down from there."""
+    """Yield the imports of a file: the folder in which each begins, and the names below it."""
     if file.suffix != ".py":
         return
     try:

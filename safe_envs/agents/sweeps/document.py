@@ -24,7 +24,7 @@ _DATE = "tag:yaml.org,2002:timestamp"
 
 
 class _Loader(yaml.SafeLoader):
-    """Loads YAML's data without aliases and tags: nested aliases stand for more than memory holds."""
+    """A loader without aliases and tags: nested aliases stand for more than memory holds."""
 
     # No setting takes a date, and some texts look like one.
     yaml_implicit_resolvers: ClassVar[Any] = {
@@ -70,7 +70,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def construct_number(self, node: Any) -> int | float:
-        """Construct a decimal number; refuse 010, which YAML reads as 8, 1:30, read as 90, and 1_000."""
+        """Construct a decimal number; refuse 010 (8 in YAML), 1:30 (90) and 1_000."""
         if not _PLAIN.fullmatch(node.value):
             raise ConstructorError(None, None, f"{node.value} is no plain number", node.start_mark)
         return whole_or_real(node.value)

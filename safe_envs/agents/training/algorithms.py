@@ -111,7 +111,7 @@ def _require_known(name: str, settings: Mapping[str, Any]) -> None:
 
 
 def _normalized(envs: VecEnv, normalize: Any, gamma: float) -> VecEnv:
-    """Return the envs, in a VecNormalize if the Zoo's `normalize` (bool, mapping or text) says so."""
+    """Return the envs, in a VecNormalize if the Zoo's `normalize` asks for it."""
     if isinstance(normalize, str):
         normalize = ast.literal_eval(normalize)
     if normalize is False or normalize is None:
@@ -144,7 +144,7 @@ def _replay(problem: SafetyProblem, action: str, settings: dict[str, Any]) -> di
     given = [key for key in _OF_THE_BUFFER if key in settings]
     if given:
         raise ConfigurationError(
-            f"{', '.join(given)}: behind a filter the replay buffer is that of --action; leave"
+            f"{', '.join(given)}: with a filter in the loop the replay buffer is that of --action; leave"
             " it out"
         )
     return replay_options(

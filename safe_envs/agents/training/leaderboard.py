@@ -44,7 +44,10 @@ class LeaderboardOptions:
 
 
 def leaderboard_rows(
-    env_ids: Sequence[str], options: LeaderboardOptions, out: Path, tell: Callable[[float], None]
+    env_ids: Sequence[str],
+    options: LeaderboardOptions,
+    out: Path,
+    progress: Callable[[float], None],
 ) -> list[Row]:
     """Return five rows for each env, computed unless a previous run has kept them.
 
@@ -52,7 +55,7 @@ def leaderboard_rows(
         env_ids: full ids.
         options: of the leaderboard.
         out: folder of the agents and of the results.
-        tell: receives the part of the work that is done, from 0 to 1.
+        progress: receives the part of the work that is done, from 0 to 1.
 
     Raises:
         ConfigurationError: the folder has results of other options, or files that are damaged.
@@ -63,11 +66,13 @@ def leaderboard_rows(
     for k, env_id in enumerate(env_ids):
         rows = _kept(store, env_id, options)
         if rows is None:
-            of_env = _rows_of_env(env_id, options, out, lambda part, k=k: tell((k + part) / count))
+            of_env = _rows_of_env(
+                env_id, options, out, lambda part, k=k: progress((k + part) / count)
+            )
             rows = list(of_env)
             store.keep(_key(env_id), _configuration(env_id, options), {"rows": rows})
         found += rows
-        tell((k + 1) / count)
+        progress((k + 1) / count)
     return found
 
 
@@ -95,14 +100,14 @@ def _kept(store: ResultStore, env_id: str, options: LeaderboardOptions) -> list[
 
 
 def _rows_of_env(
-    env_id: str, options: LeaderboardOptions, out: Path, tell: Callable[[float], None]
+    env_id: str, options: LeaderboardOptions, out: Path, progress: Callable[[float], None]
 ) -> Iterator[Row]:
-    """Yield the rows of the nominal controller, of an agent, and of one with the filter in the loop."""
+    """Yield the rows of the nominal controller, and of agents without and with the filter."""
     default, algo = load_problem(env_id).filter, options.algo
     yield from _evaluated(env_id, "nominal", "nominal", [BARE, default], options)
     for i, (name, kind, in_loop, filters) in enumerate(
         (
-            (algo, "bare", None, [BARE, default]),
+            (algo, "unfiltered", None, [BARE, default]),
             (f"{algo}, filter in the loop", "filtered", default, [default]),
         )
     ):
@@ -119,7 +124,7 @@ def _rows_of_env(
             training,
             folder,
             resume=(folder / "config.json").exists(),
-            tell=lambda part, i=i: tell((i + part) / 2),
+            progress=lambda part, i=i: progress((i + part) / 2),
         )
         yield from _evaluated(env_id, name, str(folder), filters, options, seconds)
 

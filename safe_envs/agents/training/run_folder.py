@@ -1,4 +1,4 @@
-"""The folder of a training, apart from its checkpoints: what it holds, and whether it may be used."""
+"""The folder of a training, apart from its checkpoints."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def train(
     *,
     resume: bool = False,
     tensorboard: Path | None = None,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> float:
     """Train an agent, and leave in a folder the agent and the record of its training.
 
@@ -42,7 +42,7 @@ def train(
         resume: go on after the last checkpoint.
         tensorboard: folder of logs for tensorboard, in which this training gets one named after its
             own.
-        tell: receives the part of the training that is done, from 0 to 1.
+        progress: receives the part of the training that is done, from 0 to 1.
 
     Returns:
         Processor time of the learning in seconds, over all its runs and without evaluations.
@@ -76,5 +76,5 @@ def train(
             prepare(folder, training)
         session.log(tensorboard)
         with blas_threads.limited(training.threads):
-            session.run(tell or (lambda _: None))
+            session.run(progress or (lambda _: None))
     return session.seconds

@@ -59,7 +59,7 @@ def finished(request, tmp_path_factory):
     """A short training of each kind."""
     folder = tmp_path_factory.mktemp(request.param) / "run"
     told = []
-    train(training(request.param), folder, tell=told.append)
+    train(training(request.param), folder, progress=told.append)
     assert told == sorted(told)
     assert told[-1] == 1.0
     return request.param, folder
@@ -139,7 +139,7 @@ def test_a_training_that_was_interrupted_goes_on_as_if_it_had_not_been(finished,
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(training(algorithm), interrupted, tell=stop)
+        train(training(algorithm), interrupted, progress=stop)
     assert evaluations(interrupted)[-1]["timesteps"] < LENGTHS[algorithm][0]
     with pytest.raises(ConfigurationError, match="not finished"):
         evaluate(DUBINS, str(interrupted), ["none"], episodes=1)
