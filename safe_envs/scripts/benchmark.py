@@ -20,7 +20,7 @@ import safe_envs
 from safe_envs import Barrier, ControlAffineSDE
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.options.console import require_result, say, stdout, write_result
 from safe_envs.scripts.reports.tables import make_table
 from safe_envs.wrappers import (
@@ -212,7 +212,7 @@ def _learn() -> tuple[dict[str, LearnedModel], Figures]:
     """
     learned, seconds = {}, {}
     for name, (env_id, method, settings) in _LEARNED.items():
-        problem = load_problem(env_id)
+        problem = make_problem(env_id)
         began = time.perf_counter()
         learned[name] = learner_of(method)(problem, **settings)
         seconds[f"{name}, learned in s"] = time.perf_counter() - began
@@ -228,7 +228,7 @@ def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
     }
     cases, rng = {}, np.random.default_rng(0)
     for name, (env_id, method, _) in _LEARNED.items():
-        problem = load_problem(env_id)
+        problem = make_problem(env_id)
         safety_filter = SafetyFilter.for_problem(
             problem, conditions[method](learned[name], problem)
         )

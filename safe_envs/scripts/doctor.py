@@ -249,10 +249,11 @@ def envs() -> Iterator[Check]:
 
 
 def _step(env_id: str) -> tuple[bool, str]:
-    from safe_envs.registry import make_env
+    from safe_envs.envs.env import SafeEnv
+    from safe_envs.registry import make_problem
     from safe_envs.wrappers import SafetyFilterWrapper
 
-    bare = make_env(env_id)
+    bare = SafeEnv(make_problem(env_id))
     env = SafetyFilterWrapper(bare, bare.problem.filter)
     env.reset(seed=0)
     inside = True

@@ -7,9 +7,9 @@ from typing import Any
 
 from rich.markup import escape
 
-from safe_envs import ENV_IDS, SafeEnv, SafetyProblem
+from safe_envs import ENV_IDS, SafetyProblem
 from safe_envs.dynamics.lie import relative_degree
-from safe_envs.registry import make_env
+from safe_envs.registry import env_class, make_problem
 from safe_envs.scripts.options.console import require_result, stdout, write_result
 from safe_envs.scripts.reports.tables import make_table
 
@@ -29,9 +29,8 @@ def list_envs(json_file: Path | None = None) -> None:
     table = make_table("pl", "id, and what is to be kept safe", *_COLUMNS)
     table.columns[0].max_width = 50
     rows = [
-        {"env_id": env_id, "about": _about(env), **_defaults(env.problem)}
+        {"env_id": env_id, "about": _about(env_id), **_defaults(make_problem(env_id))}
         for env_id in ENV_IDS
-        for env in (make_env(env_id),)
     ]
     for row in rows:
         table.add_row(
@@ -42,8 +41,8 @@ def list_envs(json_file: Path | None = None) -> None:
     write_result(json_file, lambda: {"envs": rows})
 
 
-def _about(env: SafeEnv) -> str:
-    return (type(env).__doc__ or "").strip().partition("\n")[0]
+def _about(env_id: str) -> str:
+    return (env_class(env_id).__doc__ or "").strip().partition("\n")[0]
 
 
 def _defaults(problem: SafetyProblem) -> dict[str, Any]:

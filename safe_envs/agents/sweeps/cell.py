@@ -15,8 +15,9 @@ from safe_envs.agents.jobs.fingerprint import (
     package_versions,
     source_checksum,
 )
-from safe_envs.agents.sweeps.settings import ENV_OPTIONS, EVALUATION_DEFAULTS, PARAMETERS
+from safe_envs.agents.sweeps.settings import ENV_OPTIONS, EVALUATION_DEFAULTS
 from safe_envs.errors import ConfigurationError
+from safe_envs.problem.options import PARAMETER_GROUPS
 from safe_envs.registry import which_env
 
 
@@ -62,7 +63,7 @@ class Cell:
         options = {name: self.settings[name] for name in ENV_OPTIONS if name in self.settings}
         for name, value in self.settings.items():
             group, dot, parameter = name.partition(".")
-            if dot and group in PARAMETERS:
+            if dot and group in PARAMETER_GROUPS:
                 options.setdefault(group, {})[parameter] = value
         return options
 

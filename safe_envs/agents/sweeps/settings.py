@@ -10,12 +10,10 @@ from typing import Any
 from safe_envs.agents.evaluation.evaluate import BARE
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import real
+from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS
 from safe_envs.registry import full_id
 
-PARAMETERS = ("plant", "model", "barrier")
-"""Groups of parameters, each of which a setting names as plant.NAME."""
-
-ENV_OPTIONS = ("system", "noise", "dt", "substeps", "horizon", "box", "start")
+ENV_OPTIONS = ("system", *(name for name in OPTION_NAMES if name not in PARAMETER_GROUPS))
 """Settings that are arguments of `gym.make`."""
 
 EVALUATION_DEFAULTS: dict[str, Any] = {
@@ -31,7 +29,7 @@ EVALUATION_DEFAULTS: dict[str, Any] = {
 _SECTIONS = ("fixed", "grid", "cells")
 _NAMES = ("env", "filter", *ENV_OPTIONS, *EVALUATION_DEFAULTS)
 _WORDS = ("env", "system", "filter", "policy", "knowledge", "objective")
-_GROUPS = tuple(f"{group}.NAME" for group in PARAMETERS)
+_GROUPS = tuple(f"{group}.NAME" for group in PARAMETER_GROUPS)
 
 Settings = dict[str, Any]
 
@@ -91,7 +89,7 @@ def text_of(value: Any) -> str:
 
 
 def _rank(name: str) -> int:
-    return _NAMES.index(name) if name in _NAMES else PARAMETERS.index(name.partition(".")[0])
+    return _NAMES.index(name) if name in _NAMES else PARAMETER_GROUPS.index(name.partition(".")[0])
 
 
 def _mapping(given: Any, what: str, allowed: Sequence[str] | None) -> dict[str, Any]:
@@ -140,14 +138,14 @@ def _listed(given: Any, what: str) -> list[Settings]:
 
 def _is_known(name: str) -> bool:
     group, dot, parameter = name.partition(".")
-    return name in _NAMES or (group in PARAMETERS and bool(dot and parameter))
+    return name in _NAMES or (group in PARAMETER_GROUPS and bool(dot and parameter))
 
 
 def _require_known(name: str, what: str) -> None:
     if not _is_known(name):
         hint = (
             f"; give its parameters as {name}.NAME"
-            if name in PARAMETERS
+            if name in PARAMETER_GROUPS
             else f"; {nearest(name, (*_NAMES, *_GROUPS))}"
         )
         raise ConfigurationError(f"{what} has the setting {shown(name)}{hint}")

@@ -12,7 +12,7 @@ from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.jobs.store import ResultStore, reading
 from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.trainer import train
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.systems import ENV_IDS
 
 _QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 50}
@@ -103,7 +103,7 @@ def _rows_of_env(
     env_id: str, options: LeaderboardOptions, out: Path, progress: Callable[[float], None]
 ) -> Iterator[Row]:
     """Yield the rows of the nominal controller, and of agents without and with the filter."""
-    default, algo = load_problem(env_id).filter, options.algo
+    default, algo = make_problem(env_id).filter, options.algo
     yield from _evaluated(env_id, "nominal", "nominal", [BARE, default], options)
     for i, (name, kind, in_loop, filters) in enumerate(
         (

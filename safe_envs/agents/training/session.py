@@ -41,7 +41,7 @@ from safe_envs.agents.training.run_folder import (
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.atomic_io import write_json
 from safe_envs.errors import ConfigurationError, SafeEnvsError
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 
 _OF_EVALUATIONS = 2**32 - 1
 """Key of their seeds, which no number of steps is."""
@@ -62,7 +62,7 @@ class TrainingSession:
     def __init__(self, training: Training, folder: Path, resume: bool = False) -> None:
         self.seconds = 0.0
         self._training, self._folder = training, folder
-        self._problem = load_problem(training.env_id, training.options)
+        self._problem = make_problem(training.env_id, **training.options)
         self._figures = SafetyFigures()
         envs = VecMonitor(
             make_sb3_env(

@@ -362,6 +362,7 @@ def test_envs_without_one_box():
         with pytest.raises(ConfigurationError, match="not one of this project's envs"):
             replay_options(source)
     with pytest.raises(
-        ConfigurationError, match=r"different input bounds \[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]"
+        ConfigurationError,
+        match=r"different input bounds \[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]",
     ):
         replay_options(DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))]))

@@ -21,7 +21,7 @@ from safe_envs.agents.training.hyperparameters import ALGORITHMS, scheduled, who
 from safe_envs.agents.training.session import TrainingSession
 from safe_envs.agents.training.trainer import train
 from safe_envs.agents.training.vec_env import make_sb3_env
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 
 pytestmark = pytest.mark.slow
 
@@ -287,7 +287,7 @@ def test_a_rollout_is_cut_into_whole_batches():
 
 
 def test_the_filter_in_the_loop_knows_what_it_is_to_know(tmp_path):
-    problem = load_problem("safe_envs/QuadrotorAltitude-v0")
+    problem = make_problem("safe_envs/QuadrotorAltitude-v0")
     for knowledge, system in (("model", problem.model), ("plant", problem.plant)):
         session = TrainingSession(
             Training.of("QuadrotorAltitude-v0", "ppo", filter="hocbf", knowledge=knowledge),
