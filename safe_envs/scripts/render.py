@@ -18,7 +18,7 @@ from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:
-    from safe_envs.agents.policies.registry import Policy
+    from safe_envs.agents.policies.base import Policy
     from safe_envs.problem.problem import SafetyProblem
     from safe_envs.wrappers import Condition
 

@@ -20,7 +20,7 @@ from safe_envs.agents.evaluation.statistics import (
 )
 from safe_envs.agents.evaluation.visited_states import Seen, Watch
 from safe_envs.agents.jobs import blas_threads
-from safe_envs.agents.policies.registry import Policy
+from safe_envs.agents.policies.base import Policy
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.info import Info
 from safe_envs.envs.vector_env import SafeVectorEnv

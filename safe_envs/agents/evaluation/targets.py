@@ -10,7 +10,8 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.agents.evaluation.rollout import Env
-from safe_envs.agents.policies.registry import POLICIES, Policy, make_policy, policy_files
+from safe_envs.agents.policies.base import Policy
+from safe_envs.agents.policies.registry import POLICIES, make_policy, policy_files
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.envs.simulation import center_and_half_width
 from safe_envs.envs.vector_env import SafeVectorEnv

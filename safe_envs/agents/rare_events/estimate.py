@@ -21,7 +21,7 @@ from safe_envs.agents.evaluation.statistics import (
     rate_interval,
     require_confidence,
 )
-from safe_envs.agents.policies.registry import Policy
+from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.rare_events.importance_sampling import Drifting, optimal_tilt
 from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Repetitions, Splitting
 from safe_envs.dynamics.integrators import Integrator

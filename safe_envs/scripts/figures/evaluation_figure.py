@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from safe_envs.agents.evaluation.evaluate import BARE, Evaluation
-from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS
+from safe_envs.agents.policies.base import DESCRIPTION, TENSORS
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.errors import ConfigurationError, nearest, shown

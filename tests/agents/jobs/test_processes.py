@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from safe_envs.agents import evaluate
-from safe_envs.agents.policies.registry import Policy
+from safe_envs.agents.policies.base import Policy
 from safe_envs.errors import ConfigurationError, WorkersLostError
 
 pytestmark = pytest.mark.slow

@@ -9,7 +9,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.rollout import play
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
-from safe_envs.agents.policies.registry import Policy
+from safe_envs.agents.policies.base import Policy
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.reproduce.framework.artefact import Number
