@@ -12,6 +12,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from safe_envs import ENV_IDS
+from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.atomic_io import write_json
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError, shown
@@ -23,7 +24,6 @@ from safe_envs.scripts.options.console import (
     stdout,
     write_result,
 )
-from safe_envs.scripts.reports.rates import percent_in
 
 _RESULTS = "results.json"
 _QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 50}
@@ -178,7 +178,7 @@ def _evaluated(
         knowledge=_KNOWLEDGE,
         bounds=False,
     )
-    figures = [{name: row[name] for name in ("filter", *_FIGURES)} for row in found.rows]
+    figures = [{name: getattr(row, name) for name in ("filter", *_FIGURES)} for row in found.rows]
     return [{"env_id": env_id, "policy": name, **row, "trained_in": seconds} for row in figures]
 
 
@@ -245,10 +245,10 @@ def _table(rows: Sequence[Row]) -> Table:
 
 def _markdown(rows: Sequence[Row]) -> list[str]:
     """A row for each env: how safe each policy was, and its return."""
-    from safe_envs.agents.evaluation.evaluate import BARE
+    from safe_envs.agents.evaluation.spec import UNFILTERED
 
     policies = [
-        row["policy"] if row["filter"] == BARE or k == 4 else f"{row['policy']} + filter"
+        row["policy"] if row["filter"] == UNFILTERED or k == 4 else f"{row['policy']} + filter"
         for k, row in enumerate(rows[:5])
     ]
     table = [["env", "filter", *policies, "processor time"], ["---"] * 8]

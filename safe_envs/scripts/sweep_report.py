@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
+from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.scripts.options import text_options
 from safe_envs.scripts.options.console import Json, stdout, write_result
-from safe_envs.scripts.reports.rates import percent, percent_in
 
 _PICTURE = "report.png"
 _SHOWN = 10
@@ -105,7 +105,7 @@ def _print(index: dict[str, Any], rows: list[Row], worst: int) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from safe_envs.agents.evaluation.evaluate import BARE
+    from safe_envs.agents.evaluation.spec import UNFILTERED
 
     console, names = stdout(), index["swept"]
     failed = [row for row in rows if row["error"] is not None]
@@ -128,7 +128,7 @@ def _print(index: dict[str, Any], rows: list[Row], worst: int) -> None:
         table.add_column(title, no_wrap=True, justify="left" if title in names else "right")
     for row in _worst(rows, worst):
         rates = [
-            "-" if row["filter"] == BARE else percent(row[name])
+            "-" if row["filter"] == UNFILTERED else percent(row[name])
             for name in ("intervention_rate", "infeasible_rate")
         ]
         cells = [

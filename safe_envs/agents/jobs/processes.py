@@ -14,8 +14,9 @@ from typing import Any
 import cloudpickle
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
-from safe_envs.agents.evaluation.rollout import Played, Progress, play
-from safe_envs.agents.evaluation.spec import EvaluationSpec
+from safe_envs.agents.evaluation.episode_batch import PlayedBatch
+from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+from safe_envs.agents.evaluation.rollout import Progress, play
 from safe_envs.errors import ConfigurationError, WorkersLostError
 from safe_envs.wrappers import Condition
 
@@ -59,7 +60,7 @@ def local_processes(idle: int = 300) -> Any:
 
 
 def play_in_processes(
-    setting: EvaluationSpec,
+    setting: ResolvedEvaluation,
     conditions: Sequence[Condition],
     episodes: int,
     seed: int,
@@ -67,7 +68,7 @@ def play_in_processes(
     jobs: int,
     bridge: bool,
     progress: Progress | None,
-) -> Iterator[Played]:
+) -> Iterator[PlayedBatch]:
     """Simulate episodes 0..episodes-1 by `jobs` processes, which stay for the next call.
 
     Args:
@@ -103,7 +104,7 @@ def play_in_processes(
         ) from error
 
 
-def _sent(setting: EvaluationSpec, conditions: Sequence[Condition], jobs: int) -> bytes:
+def _sent(setting: ResolvedEvaluation, conditions: Sequence[Condition], jobs: int) -> bytes:
     try:
         return cloudpickle.dumps((setting, conditions))
     except (
@@ -115,14 +116,14 @@ def _sent(setting: EvaluationSpec, conditions: Sequence[Condition], jobs: int) -
         ) from error
 
 
-def _played(sent: bytes, part: range, seed: int, num_envs: int, bridge: bool) -> list[Played]:
+def _played(sent: bytes, part: range, seed: int, num_envs: int, bridge: bool) -> list[PlayedBatch]:
     setting, conditions = cloudpickle.loads(sent)
     env = setting.env(conditions, min(num_envs, len(part)))
     try:
         return list(
             play(
                 env,
-                setting.actor,
+                setting.policy,
                 part,
                 seed,
                 bridge=BrownianBridge(setting.problem) if bridge else None,

@@ -6,9 +6,10 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 
-from safe_envs.agents.policies.base import Policy, checked_observation
+from safe_envs.agents.policies.base import Policy, Spaces, checked_observation
 from safe_envs.errors import ConfigurationError, InvalidInputError, SafeEnvsError, shortened
 from safe_envs.problem.problem import SafetyProblem
 
@@ -19,12 +20,13 @@ class FunctionPolicy(Policy):
     Args:
         function: maps observations (B, k) to actions (B, m) in [-1, 1]; with one input (B,) will
             do too. The action of a row may depend on that row only.
-        problem: whose numbers of observations and inputs are taken.
+        width: k.
+        inputs: m.
     """
 
-    def __init__(self, function: Callable[[np.ndarray], Any], problem: SafetyProblem) -> None:
+    def __init__(self, function: Callable[[np.ndarray], Any], width: int, inputs: int) -> None:
         self._function = function
-        self._width, self._m = len(problem.features), len(problem.inputs)
+        self._width, self._m = width, inputs
         self.name = policy_name(function)
 
     def predict(
@@ -66,21 +68,23 @@ class FunctionPolicy(Policy):
         return actions.reshape(*given.shape[:-1], self._m), state
 
 
-def as_policy(given: Any, problem: SafetyProblem) -> Any:
+def as_policy(given: Any, problem: SafetyProblem, spaces: Spaces | None = None) -> Any:
     """Return an object with `predict` for a policy from outside this project.
 
     Args:
         given: an object with `predict`; a class that takes the problem and makes one; or a
             function of a batch of observations, see `FunctionPolicy`.
         problem: which the policy is to act in.
+        spaces: of observations and actions; by default those of the problem's env.
 
     Raises:
         ConfigurationError: It is none of these, or the class cannot be called with the problem.
     """
-    made = given
+    made: Any = given
     if inspect.isclass(given):
+        make: Any = given
         try:
-            made = given(problem)
+            made = make(problem)
         except SafeEnvsError:
             raise
         except Exception as error:
@@ -92,7 +96,9 @@ def as_policy(given: Any, problem: SafetyProblem) -> Any:
     if callable(getattr(made, "predict", None)):
         return made
     if callable(made):
-        return FunctionPolicy(made, problem)
+        if spaces is None:
+            return FunctionPolicy(made, len(problem.features), len(problem.inputs))
+        return FunctionPolicy(made, *map(gym.spaces.flatdim, spaces))
     raise ConfigurationError(
         f"a {type(made).__name__} is no policy; give an object with predict(observation, state,"
         " episode_start, deterministic), a class that takes the SafetyProblem, or a function of a"

@@ -44,8 +44,8 @@ def make_policy(
             the policy in it; or the path of a .zip of Stable-Baselines3.
         problem: which the policy is to act in.
         trust: load a .zip too, which runs code that it contains.
-        spaces: of observations and actions, which a .zip is to fit; by default those of the
-            problem's env.
+        spaces: of observations and actions, which a policy that was trained or is a function is to
+            fit; by default those of the problem's env.
 
     Returns:
         A `Policy`, or another object with its `predict`.
@@ -57,9 +57,9 @@ def make_policy(
     if name in _NAMED:
         return _NAMED[name](problem)
     if name in plugin_names(POLICY_PLUGINS):
-        return as_policy(load_plugin(POLICY_PLUGINS, name), problem)
+        return as_policy(load_plugin(POLICY_PLUGINS, name), problem, spaces)
     if _is_place(name):
-        return as_policy(load_object(name), problem)
+        return as_policy(load_object(name), problem, spaces)
     files = policy_files(name)
     if len(files) > 1:
         from safe_envs.agents.policies.network import load_policy

@@ -149,7 +149,7 @@ def _evaluated(cell: Cell) -> tuple[dict[str, Any], dict[str, Any]]:
         objective=settings["objective"],
         bounds=settings["bounds"],
     )
-    return answer.rows[0], answer.config
+    return answer.rows[0].as_dict(), answer.config
 
 
 def _require_alike(cell: Cell) -> None:

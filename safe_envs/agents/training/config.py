@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.training.algorithms import ACTIONS, OFF_POLICY, whole_batches
 from safe_envs.agents.training.hyperparameters import hyperparameters
 from safe_envs.errors import ConfigurationError, nearest, require_whole
@@ -158,7 +158,7 @@ class Training:
         return cls(
             env_id=known,
             algorithm=algorithm,
-            filter=None if filter == BARE else filter,
+            filter=None if filter == UNFILTERED else filter,
             options={k: v for k, v in (options or {}).items() if v is not None},
             knowledge=knowledge,
             n_timesteps=steps,

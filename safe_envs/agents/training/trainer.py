@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.evaluate import BARE, evaluate, package_versions
+from safe_envs.agents.evaluation.evaluate import UNFILTERED, evaluate, package_versions
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.training.algorithms import OFF_POLICY, SHOWN, new_model
 from safe_envs.agents.training.checkpoints import (
@@ -323,14 +323,14 @@ class _Session:
         found = evaluate(
             training.env_id,
             str(checkpoint),
-            [training.filter or BARE],
+            [training.filter or UNFILTERED],
             options=training.options,
             episodes=training.eval_episodes,
             seed=seed,
             knowledge=training.knowledge,
             bounds=False,
         )
-        row = {k: v for k, v in found.rows[0].items() if k not in ("curve", "policy")}
+        row = {k: v for k, v in found.rows[0].as_dict().items() if k not in ("curve", "policy")}
         best = max((e["return_mean"] for e in self._evaluations), default=-np.inf)
         self._evaluations.append(
             {
