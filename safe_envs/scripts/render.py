@@ -18,7 +18,7 @@ from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, w
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:
-    from safe_envs.agents.policies.registry import Policy
+    from safe_envs.agents.policies.base import Policy
     from safe_envs.problem.problem import SafetyProblem
     from safe_envs.wrappers import Condition
 
@@ -143,10 +143,10 @@ def split_filters(text: str) -> list[str]:
     Raises:
         ConfigurationError: one has no text.
     """
-    from safe_envs.agents.evaluation.evaluate import BARE
+    from safe_envs.agents.evaluation.spec import UNFILTERED
     from safe_envs.wrappers import CONDITIONS, LEARNED
 
-    names = "|".join(sorted((BARE, *CONDITIONS, *LEARNED), key=len, reverse=True))
+    names = "|".join(sorted((UNFILTERED, *CONDITIONS, *LEARNED), key=len, reverse=True))
     found = [part.strip() for part in re.split(rf",(?=\s*(?:{names})\s*(?:[:+,]|$))", text)]
     if not all(found):
         raise ConfigurationError(
@@ -252,8 +252,8 @@ def make_runs(
         ConfigurationError: a filter or the policy is unknown or does not fit the problem.
         RelativeDegreeError: a filter does not suit a barrier.
     """
-    from safe_envs.agents.evaluation.evaluate import BARE
     from safe_envs.agents.evaluation.identification import Learning
+    from safe_envs.agents.evaluation.spec import UNFILTERED
     from safe_envs.agents.policies.registry import make_policy
     from safe_envs.errors import nearest, require_whole
     from safe_envs.wrappers import CONDITIONS, LEARNED, require_readable
@@ -263,7 +263,7 @@ def make_runs(
         raise ConfigurationError(
             f"knowledge = {shown(knowledge)}; {nearest(knowledge, ('model', 'plant'))}"
         )
-    known = (BARE, *CONDITIONS, *LEARNED)
+    known = (UNFILTERED, *CONDITIONS, *LEARNED)
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.
         for word in re.split("[:+]", name)[0].split(","):
@@ -271,7 +271,7 @@ def make_runs(
                 raise ConfigurationError(
                     f"unknown filter {shown(word.strip())}; {nearest(word.strip(), known)}"
                 )
-        if name != BARE:
+        if name != UNFILTERED:
             require_readable(name, problem)
     actors = [make_policy(policy, problem, trust) for _ in names]
     learning = Learning(problem, names, learned, 1, seed)
@@ -280,7 +280,7 @@ def make_runs(
     return [
         Run(
             name,
-            () if name == BARE else learning.conditions(name, 0),
+            () if name == UNFILTERED else learning.conditions(name, 0),
             problem,
             actor,
             seed,

@@ -108,7 +108,7 @@ def train(
     cost and smallest h, and violations, interventions and infeasible steps in the training so far.
     The folder is what `safe-envs evaluate --policy DIR` reads.
     """
-    from safe_envs.agents.policies.registry import DESCRIPTION
+    from safe_envs.agents.policies.base import DESCRIPTION
     from safe_envs.agents.training.config import Training
 
     text_options.require_outputs(

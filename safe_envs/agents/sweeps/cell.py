@@ -84,7 +84,7 @@ class Cell:
             options=self.options,
             **arguments,
         )
-        return {"row": found.rows[0], "config": found.config}
+        return {"row": found.rows[0].as_dict(), "config": found.config}
 
     def _require_same_code(self) -> None:
         here = versions()

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.registry import policy_files
+from safe_envs.agents.policies.registry import absolute_policy, policy_files
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 
 _FILE = re.compile("(?<=file=)[^:+]+")
@@ -22,8 +22,7 @@ def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
         **settings,
         "filter": _FILE.sub(lambda match: os.path.realpath(match.group()), settings["filter"]),
     }
-    if policy_files(settings["policy"]) and os.path.exists(settings["policy"]):
-        found["policy"] = os.path.realpath(settings["policy"])
+    found["policy"] = absolute_policy(settings["policy"])
     if "system" in settings:
         file, _, name = settings["system"].rpartition(":")
         found["system"] = f"{os.path.realpath(file)}:{name}"

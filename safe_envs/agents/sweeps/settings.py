@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import real
 from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS
@@ -69,7 +69,7 @@ def complete(settings: Settings, what: str) -> Settings:
         )
     if "filter" not in settings:
         raise ConfigurationError(
-            f"{what}: a cell has no filter; name one, or {BARE} for the unfiltered env"
+            f"{what}: a cell has no filter; name one, or {UNFILTERED} for the unfiltered env"
         )
     given = {**EVALUATION_DEFAULTS, **settings}
     return {

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.policies.registry import make_policy
 from safe_envs.agents.sweeps.cell import Cell, versions
@@ -177,7 +177,7 @@ def _check_cell(cell: Cell, derive: bool) -> None:
                 f"{name} = {shown(settings[name])}; {nearest(settings[name], allowed)}"
             )
     problem = make_problem(cell.env_id, **cell.options)
-    if settings["filter"] != BARE:
+    if settings["filter"] != UNFILTERED:
         require_readable(settings["filter"], problem)
         needs_learning = any(
             part.split(":")[0] in LEARNED for part in settings["filter"].split("+")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.training.hyperparameters import (
     ACTIONS,
     OFF_POLICY,
@@ -145,7 +145,7 @@ class Training:
             # The whole training, where Stable-Baselines3 would allocate a million rows.
             rows = steps * (2 if attributes.get("action") == "both" else 1)
             found.setdefault("buffer_size", min(_MOST_ROWS, rows))
-        if attributes.get("filter") == BARE:
+        if attributes.get("filter") == UNFILTERED:
             attributes["filter"] = None
         options = attributes.pop("options", None) or {}
         return cls(

@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE, evaluate
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.jobs.store import ResultStore, reading
 from safe_envs.agents.training.config import Training
@@ -104,10 +105,10 @@ def _rows_of_env(
 ) -> Iterator[Row]:
     """Yield the rows of the nominal controller, and of agents without and with the filter."""
     default, algo = make_problem(env_id).filter, options.algo
-    yield from _evaluated(env_id, "nominal", "nominal", [BARE, default], options)
+    yield from _evaluated(env_id, "nominal", "nominal", [UNFILTERED, default], options)
     for i, (name, kind, in_loop, filters) in enumerate(
         (
-            (algo, "unfiltered", None, [BARE, default]),
+            (algo, "unfiltered", None, [UNFILTERED, default]),
             (f"{algo}, filter in the loop", "filtered", default, [default]),
         )
     ):
@@ -147,5 +148,5 @@ def _evaluated(
         bounds=False,
     )
     for row in found.rows:
-        statistics = {name: row[name] for name in ("filter", *_STATISTICS)}
+        statistics = {name: getattr(row, name) for name in ("filter", *_STATISTICS)}
         yield {"env_id": env_id, "policy": name, **statistics, "trained_in": seconds}

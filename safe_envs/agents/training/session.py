@@ -18,7 +18,8 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecMonitor
 
-from safe_envs.agents.evaluation.evaluate import BARE, evaluate
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.training.algorithms import MOST_SHOWN, new_model
 from safe_envs.agents.training.callbacks import ProgressLog, SafetyFigures
 from safe_envs.agents.training.checkpoints import (
@@ -177,14 +178,14 @@ class TrainingSession:
         found = evaluate(
             training.env_id,
             str(checkpoint),
-            [training.filter or BARE],
+            [training.filter or UNFILTERED],
             options=training.options,
             episodes=training.eval_episodes,
             seed=seed,
             knowledge=training.knowledge,
             bounds=False,
         )
-        row = {k: v for k, v in found.rows[0].items() if k not in ("curve", "policy")}
+        row = {k: v for k, v in found.rows[0].as_dict().items() if k not in ("curve", "policy")}
         best = max((e["return_mean"] for e in self._evaluations), default=-np.inf)
         self._evaluations.append(
             {

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.training.lazy_info import LazyInfo
 from safe_envs.agents.training.native_vec_env import NativeVecEnv
 from safe_envs.envs.info import Info
@@ -72,7 +72,7 @@ def make_sb3_env(
         autoreset_mode=AutoresetMode.SAME_STEP.value,
         **given,
     )
-    if filter is not None and filter != BARE:
+    if filter is not None and filter != UNFILTERED:
         env = SafetyFilterVectorWrapper(env, filter, knowledge, objective)
     result = SafeVecEnv(env, intervention_penalty)
     if seed is not None:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.rate_text import percent, rate_of
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.rates import percent, rate_of
 from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def print_cells(console: Console, index: dict[str, Any], rows: Sequence[Row], wo
     )
     table = make_table("l" * len(names) + "r", *names, *_TITLES, tight=False)
     for row in _worst(rows, worst):
-        filtered = row["filter"] != BARE
+        filtered = row["filter"] != UNFILTERED
         rates = [
             row[name] if filtered else None for name in ("intervention_rate", "infeasible_rate")
         ]

@@ -19,8 +19,9 @@ import pytest
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from safe_envs.agents.policies.base import DESCRIPTION, TENSORS
 from safe_envs.agents.policies.network import _checksum, load_policy
-from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS, make_policy
+from safe_envs.agents.policies.registry import make_policy
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from tests.agents.policies.test_network import small

@@ -4,6 +4,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -20,7 +21,11 @@ pytestmark = pytest.mark.slow
 def test_a_file_that_changed_or_went_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     file = tmp_path / "model.npz"
     file.write_bytes(b"1")
-    monkeypatch.setattr(cell, "evaluate", lambda *_, **__: Evaluated([{"safe": 1}], {}))
+    monkeypatch.setattr(
+        cell,
+        "evaluate",
+        lambda *_, **__: Evaluated([SimpleNamespace(as_dict=lambda: {"safe": 1})], {}),
+    )
     (one,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
     one = replace(one, files={str(file): fingerprint.file_checksum(file)})
     assert outcome_of(one).result["row"] == {"safe": 1}
@@ -33,7 +38,7 @@ def test_a_file_that_changed_or_went_is_an_error(tmp_path: Path, monkeypatch: py
 class Evaluated(NamedTuple):
     """As much of an evaluation as a cell takes."""
 
-    rows: list[dict[str, Any]]
+    rows: list[Any]
     config: dict[str, Any]
 
 

@@ -106,7 +106,7 @@ def test_its_figures_are_those_of_the_evaluation(finished):
             bounds=False,
             options=SMALL["options"],
         ).rows
-        assert {key: found[key] for key in ("safe", "return_mean", "violations")} == {
+        assert {key: getattr(found, key) for key in ("safe", "return_mean", "violations")} == {
             key: row[key] for key in ("safe", "return_mean", "violations")
         }
 
@@ -168,7 +168,7 @@ def test_normalised_observations_are_part_of_the_policy(tmp_path):
     rows = evaluations(tmp_path / "run")
     given = {"episodes": 8, "seed": rows[-1]["seed"], "bounds": False, "options": SMALL["options"]}
     (found,) = evaluate(DUBINS, str(tmp_path / "run"), ["scbf"], **given).rows
-    assert found["return_mean"] == rows[-1]["return_mean"]
+    assert found.return_mean == rows[-1]["return_mean"]
     assert (tmp_path / "run" / "normalization.pkl").exists()
     assert (tmp_path / "run" / "best" / "normalization.pkl").exists()
     assert "normalization" in (tmp_path / "run" / "policy.json").read_text()
@@ -365,7 +365,7 @@ def test_the_figures_are_those_of_the_evaluation_on_the_same_episodes():
         figures._on_step()
     assert dones.all()
     assert 0 < figures.figures()["rate"] < 1
-    assert figures.figures()["rate"] == row["safety_rate"]
+    assert figures.figures()["rate"] == row.safety_rate
 
 
 def test_the_files_have_the_form_that_the_zoo_reads():

@@ -1,11 +1,11 @@
 """The claims and notes of chapter 5 follow from what they are given, and can say no."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from safe_envs.agents.evaluation.comparison import SafetyBits
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.scripts.reproduce.chapter_5 import (
     cubic,
@@ -23,13 +23,11 @@ def made(*safe, episodes=1000):
     """Runs in which the first so many episodes are safe, a number for each identification; or which
     ones, where an array is given."""
     flags = [np.arange(episodes) < each if isinstance(each, int) else each for each in safe]
-    kept = [SafetyBits() for _ in flags]
-    for each, values in zip(kept, flags, strict=True):
-        each.add(values)
     safe, trials = int(np.sum(flags)), len(flags) * episodes
     low, high = rate_interval(round(safe / len(flags)), episodes)
     counts = {"safe": safe, "episodes": trials, "violations": trials - safe}
-    return Runs({**counts, "safety_rate": safe / trials, "ci_low": low, "ci_high": high}, kept)
+    rate = {"safety_rate": safe / trials, "ci_low": low, "ci_high": high}
+    return Runs(SimpleNamespace(**counts, **rate), flags)
 
 
 def test_a_root_mean_square_has_the_interval_of_its_mean_square():

@@ -257,8 +257,7 @@ def test_a_row_by_hand_gives_the_same_episodes_as_the_condition():
     row = bayesian_cubic.printed_generator(problem) + x_1 * x_2
     by_hand = printed_totals(problem, row, 60, 0)
     assert (
-        by_hand.safe
-        == evaluate(problem, filters=["scbf"], episodes=60, bounds=False).rows[0]["safe"]
+        by_hand.safe == evaluate(problem, filters=["scbf"], episodes=60, bounds=False).rows[0].safe
     )
 
 
@@ -266,7 +265,7 @@ def test_the_printed_second_generator_of_the_car_is_not_safe():
     problem = replace(make_problem(bayesian_cruise.ENV), horizon=24.0)
     printed = printed_totals(problem, bayesian_cruise.printed_second_generator(problem), 20, 0)
     assert printed.safe < 6
-    assert known(problem, 20, 0).rows[0]["safe"] > 12
+    assert known(problem, 20, 0).rows[0].safe > 12
 
 
 def test_a_quick_table_of_the_car_has_all_rows_and_says_that_it_is_short():
@@ -293,7 +292,7 @@ def test_a_controller_is_compared_on_the_episodes_of_the_reference():
     found = Learned.run(problem, "bayesian-scbf", [learned, learned], reference)
     assert found.rates[0] == found.rates[1]
     assert found.difference[0] == pytest.approx(
-        100 * (found.rates[0] - reference.rows[0]["safety_rate"])
+        100 * (found.rates[0] - reference.rows[0].safety_rate)
     )
     assert found.difference[1] <= found.difference[0] <= found.difference[2]
     assert "average over 2 identifications" in found.told
@@ -311,5 +310,5 @@ def test_an_identification_without_any_input_is_counted_as_the_bare_env(monkeypa
     monkeypatch.setattr("safe_envs.scripts.reproduce.chapter_6.learned_controllers.evaluate", blind)
     blinds: Any = [None, None]
     found = Learned.run(problem, "bayesian-scbf", blinds, reference)
-    bare = evaluate(problem, filters=["none"], episodes=20, bounds=False).rows[0]["safety_rate"]
+    bare = evaluate(problem, filters=["none"], episodes=20, bounds=False).rows[0].safety_rate
     assert found.rates == [bare, bare]

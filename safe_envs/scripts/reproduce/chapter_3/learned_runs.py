@@ -13,6 +13,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.repeats import pooled
+from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.registry import make_problem
@@ -140,7 +141,7 @@ def runs(
         bounds=False,
         learned=learned,
         record=True,
-    ).recorders
+    ).trajectories
     return [cut(found[name].states[:, 0], found[name].barrier[:, 0]) for name in filters]
 
 
@@ -157,18 +158,18 @@ def rates_around(
     too."""
     world, size = problem.configured(start="spread"), sample.size(EPISODES)
 
-    def row(name: str, **rest: Any) -> dict[str, Any]:
+    def row(name: str, **rest: Any) -> EvaluationRow:
         return evaluate(
             world, "nominal", [name], episodes=size, seed=sample.seed, bounds=False, **rest
         ).rows[0]
 
     nominal, true = row(f"hocbf:p={gains}"), row(f"hocbf:p={gains}", knowledge="plant")
     learned = pooled([row(f"learned-hocbf:p={gains}", learned=(model,)) for model in models], 0.95)
-    rate, low, high = (100 * learned[key] for key in ("safety_rate", "ci_low", "ci_high"))
+    rate, low, high = (100 * v for v in (learned.safety_rate, learned.ci_low, learned.ci_high))
     return [
         Number("safe around the start, learned", rate, low, high, unit="%"),
-        Number.rate("safe around the start, nominal", nominal["safe"], nominal["episodes"]),
-        Number.rate("safe around the start, true", true["safe"], true["episodes"]),
+        Number.rate("safe around the start, nominal", nominal.safe, nominal.episodes),
+        Number.rate("safe around the start, true", true.safe, true.episodes),
     ]
 
 

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from safe_envs.agents.evaluation.rollout import Recorder, run_episodes
+from safe_envs.agents.evaluation.rollout import run_episodes
+from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.policies.registry import make_policy
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -89,9 +90,9 @@ class PrintedHOCBF(Condition):
 def printed_run(problem: SafetyProblem, knowledge: str) -> Run:
     """The trajectory under the printed formula, with the mass of the model or of the plant."""
     env = SafetyFilterVectorWrapper(SafeVectorEnv(problem, 1), PrintedHOCBF(), knowledge)
-    recorder = Recorder(problem.steps, problem.plant.n, 1)
-    run_episodes(env, make_policy("nominal", problem), 1, 0, recorder=recorder)
-    return cut(recorder.states[:, 0], recorder.barrier[:, 0])
+    recorded = Trajectories(problem.steps, problem.plant.n, 1)
+    run_episodes(env, make_policy("nominal", problem), 1, 0, trajectories=recorded)
+    return cut(recorded.states[:, 0], recorded.barrier[:, 0])
 
 
 def compute(sample: Sample) -> Outcome:

@@ -152,11 +152,11 @@ def compute(sample: Sample) -> Outcome:
     ]
     numbers = [
         *(
-            Number.rate(f"SCBF where h/c is attained, x_0 = {s:g}", r["safe"], episodes)
+            Number.rate(f"SCBF where h/c is attained, x_0 = {s:g}", r.safe, episodes)
             for s, r in zip(STARTS, attained, strict=True)
         ),
         *(number for pair in limited for number in pair),
-        Number(f"RCBF without noise, |u| <= {LIMITS[0]:g}", 100 * calm["safety_rate"], unit="%"),
+        Number(f"RCBF without noise, |u| <= {LIMITS[0]:g}", 100 * calm.safety_rate, unit="%"),
     ]
     rates = numbers[: len(STARTS)]
     bounds = [float(proposition_4_2_8(1.0 - s**2, 1.0)) for s in STARTS]
@@ -175,12 +175,12 @@ def compute(sample: Sample) -> Outcome:
             "h": DISTANCES.tolist(),
             "asked": {name: values.tolist() for name, values in asked.items()},
             "curves": [
-                {key: r["curve"][key] for key in ("time", "rate", "ci_low", "ci_high")}
+                {key: getattr(r.curve, key) for key in ("time", "rate", "ci_low", "ci_high")}
                 | {"bound": b, "start": s}
                 for s, r, b in zip(STARTS, attained, bounds, strict=True)
             ],
             "closed": [
-                [safe_up_to(s, t, STEP) for t in attained[0]["curve"]["time"][1:]] for s in STARTS
+                [safe_up_to(s, t, STEP) for t in attained[0].curve.time[1:]] for s in STARTS
             ],
         },
         notes=[
@@ -201,8 +201,8 @@ def _attained(start: float, episodes: int, seed: int) -> dict[str, Any]:
 
 def _together(row: Mapping[str, Any]) -> Number:
     """A rate with an interval that holds it at all of `STARTS` with 95 %."""
-    low, high = rate_interval(row["safe"], row["episodes"], 1.0 - 0.05 / len(STARTS))
-    return Number("", 100 * row["safe"] / row["episodes"], 100 * low, 100 * high, unit="%")
+    low, high = rate_interval(row.safe, row.episodes, 1.0 - 0.05 / len(STARTS))
+    return Number("", 100 * row.safe / row.episodes, 100 * low, 100 * high, unit="%")
 
 
 def _limited(limit: float, episodes: int, seed: int) -> list[Number]:
@@ -224,7 +224,7 @@ def _limited(limit: float, episodes: int, seed: int) -> list[Number]:
     ).rows
     where = "unbounded" if limit == UNBOUNDED else f"|u| <= {limit:g}"
     return [
-        Number.rate(f"{name}, {where}", row["safe"], episodes)
+        Number.rate(f"{name}, {where}", row.safe, episodes)
         for name, row in zip(("SRCBF", "SCBF"), rows, strict=True)
     ]
 

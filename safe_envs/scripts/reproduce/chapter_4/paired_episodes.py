@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from safe_envs.agents.evaluation.rollout import play
+from safe_envs.agents.evaluation.rollout import run_episodes
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
-from safe_envs.agents.policies.registry import Policy
+from safe_envs.agents.policies.base import Policy
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.reproduce.framework.artefact import Number
@@ -54,13 +54,9 @@ def exits(
     """
     conditions = parse_conditions(condition, problem) if isinstance(condition, str) else condition
     env = SafetyFilterVectorWrapper(SafeVectorEnv(problem, min(episodes, _WAVE)), conditions)
-    instants, counted, infeasible = [], 0, 0
-    for played in play(env, policy, range(episodes), seed):
-        wave, count = played.wave, played.count
-        instants.append(wave.first_violation(problem.steps + 1)[:count])
-        counted += int(wave.counted[:count].sum())
-        infeasible += int(wave.infeasible[:count].sum())
-    return Exits(np.concatenate(instants), infeasible / max(counted, 1))
+    found = run_episodes(env, policy, episodes, seed).results
+    instants = np.where(found.safe, problem.steps + 1, found.first_violation)
+    return Exits(instants, int(found.infeasible.sum()) / max(int(found.counted.sum()), 1))
 
 
 def difference(name: str, first: np.ndarray, second: np.ndarray) -> Number:

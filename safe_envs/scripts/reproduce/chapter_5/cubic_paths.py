@@ -75,11 +75,11 @@ def paths(sample: Sample) -> dict[str, Path]:
             learned=learned,
             **how,
         )
-        recorder = run.recorders[name]
+        recorded = run.trajectories[name]
         found[key] = Path(
-            Runs(run.rows[0], run.flags[name]),
-            recorder.states,
-            recorder.barrier[:, : recorder.states.shape[1]],
+            Runs(run.rows[0], [each.safe for each in run.episodes[name]]),
+            recorded.states,
+            recorded.barrier[:, : recorded.states.shape[1]],
         )
     return found
 
@@ -135,7 +135,7 @@ def short_of_input(runs: Runs) -> str:
     """How often the box is too small for the CBF."""
     return (
         "no input within 10 1/s meets the condition of the CBF at"
-        f" {runs.row['infeasible_rate']:.2%} of the steps up to a first violation"
+        f" {runs.row.infeasible_rate:.2%} of the steps up to a first violation"
     )
 
 
@@ -161,8 +161,8 @@ def kept(runs: Runs) -> Claim:
     row = runs.row
     return Claim(
         "the CBF guarantees safe trajectories without noise",
-        row["violations"] == 0,
-        f"{row['safe']} of {row['episodes']} are safe",
+        row.violations == 0,
+        f"{row.safe} of {row.episodes} are safe",
     )
 
 

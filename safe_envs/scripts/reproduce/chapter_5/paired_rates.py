@@ -7,9 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from safe_envs.agents.evaluation.comparison import SafetyBits, compare_all
+import numpy as np
+
+from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.repeats import pooled
+from safe_envs.agents.evaluation.rows import EpisodeSummary
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Sample
 from safe_envs.wrappers.learning.generator import GeneratorModel
 
@@ -28,25 +31,25 @@ class Runs:
         flags: which episodes were safe, with each identification.
     """
 
-    row: dict[str, Any]
-    flags: Sequence[SafetyBits]
+    row: EpisodeSummary
+    flags: Sequence[np.ndarray]
 
     @property
     def rate(self) -> float:
         """In %."""
-        return 100 * self.row["safety_rate"]
+        return 100 * self.row.safety_rate
 
     @property
     def curve(self) -> dict[str, list[float]]:
         """Rate in % over time in s."""
         return {
-            "time": self.row["curve"]["time"],
-            "rate": [100 * rate for rate in self.row["curve"]["rate"]],
+            "time": self.row.curve.time,
+            "rate": [100 * rate for rate in self.row.curve.rate],
         }
 
     def number(self, name: str, printed: float | None = None) -> Number:
         """The rate, beside a printed one of 1000 runs."""
-        low, high = (100 * self.row[key] for key in ("ci_low", "ci_high"))
+        low, high = (100 * v for v in (self.row.ci_low, self.row.ci_high))
         return Number(
             name, self.rate, low, high, printed, None if printed is None else EPISODES, "%"
         )
@@ -87,7 +90,7 @@ def measured(
     return {
         name: Runs(
             pooled([run.rows[0] for run in each], 0.95),
-            [flags for run in each for flags in run.flags[name]],
+            [found.safe for run in each for found in run.episodes[name]],
         )
         for name, each in found.items()
     }
@@ -96,7 +99,7 @@ def measured(
 def difference(first: Runs, second: Runs) -> Difference:
     """The first rate less the second one, on the same episodes."""
     (found,) = compare_all({"second": second.flags, "first": first.flags}, 0.95)
-    return Difference(*(100 * found[key] for key in ("difference", "ci_low", "ci_high")))
+    return Difference(*(100 * v for v in (found.difference, found.ci_low, found.ci_high)))
 
 
 def safer(sentence: str, first: Runs, second: Runs, *, printed: bool) -> Claim:

@@ -142,7 +142,7 @@ def outcome_of(setting: Setting, runs: dict[str, Runs], quiet: Runs) -> Outcome:
         ),
         runs[WITHOUT].number("CBF with alpha = 0"),
     ]
-    low, high = (100 * ddscbf.row[key] for key in ("ci_low", "ci_high"))
+    low, high = (100 * end for end in (ddscbf.row.ci_low, ddscbf.row.ci_high))
     above = (
         f"DDSCBF is safe in more than {THRESHOLD:g} % of the episodes, as counted, whatever its"
         " interval"
@@ -150,8 +150,8 @@ def outcome_of(setting: Setting, runs: dict[str, Runs], quiet: Runs) -> Outcome:
     claims = [
         Claim(
             "every trajectory is unsafe with the CBF",
-            cbf.row["safe"] == 0,
-            f"{cbf.row['safe']} of {cbf.row['episodes']} are safe",
+            cbf.row.safe == 0,
+            f"{cbf.row.safe} of {cbf.row.episodes} are safe",
         ),
         safer(
             "the noise makes trajectories unsafe with the CBF that are safe without it",
@@ -196,7 +196,7 @@ def _sampled(sample: Sample) -> str:
     said = []
     for where, noise in (("without noise", 0.0), ("with it", NOISE)):
         found = measured(ENV, {**A.options(sample), "noise": noise}, [A.cbf, ahead], [], sample)
-        bare, least = found[A.cbf], found[A.cbf].row["min_h_median"]
+        bare, least = found[A.cbf], found[A.cbf].row.min_h_median
         said.append(
             f"{where} {bare.rate:.1f} % (median of the least h {least:.1g}), with a margin for it"
             f" {found[ahead].rate:.1f} %"
@@ -213,17 +213,12 @@ def _horizons(setting: Setting, sample: Sample) -> str:
     for name, text in (("SCBF", "scbf"), ("CBF", setting.cbf)):
         row = found[text].row
         numbers = [
-            Number.rate("", safe, row["episodes"], PRINTED[name], EPISODES)
-            for safe in row["curve"]["safe"]
+            Number.rate("", safe, row.episodes, PRINTED[name], EPISODES) for safe in row.curve.safe
         ]
         agreeing.append(
-            {
-                t
-                for t, n in zip(row["curve"]["time"], numbers, strict=True)
-                if disagreement(n) is None
-            }
+            {t for t, n in zip(row.curve.time, numbers, strict=True) if disagreement(n) is None}
         )
-    both, tried = sorted(agreeing[0] & agreeing[1]), len(found["scbf"].row["curve"]["time"])
+    both, tried = sorted(agreeing[0] & agreeing[1]), len(found["scbf"].row.curve.time)
     said = f"{len(both)} of {tried} horizons up to {setting.longest:g} s" + (
         f", from {both[0]:.3g} to {both[-1]:.3g} s" if both else ""
     )
@@ -253,7 +248,7 @@ def _bounds(first: Lesson, scbf: Runs, sample: Sample) -> list[str]:
     if sample.quick:
         return notes
     bound = promise(verify(problem, (SCBF(),)), starts_of(problem), problem.duration)[0]
-    bound = bound.without(by_rate(bound.value, scbf.row["ci_high"]))
+    bound = bound.without(by_rate(bound.value, scbf.row.ci_high))
     value = f"none, {bound.reason}" if bound.value is None else f"{100 * bound.value:.1f} %"
     return [
         *notes,

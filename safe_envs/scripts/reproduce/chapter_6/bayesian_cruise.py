@@ -246,7 +246,7 @@ def _rates(sample: Sample) -> Outcome:
                 f"DDSCBF differs from the SCBF by {ddscbf.told}; in print by"
                 f" {PRINTED['DDSCBF'] - PRINTED['SCBF']:+g} points."
             ),
-            _without_noise(problem, episodes, sample.seed, scbf.rows[0]["safety_rate"]),
+            _without_noise(problem, episodes, sample.seed, scbf.rows[0].safety_rate),
             (
                 "The DDSCBF by the printed formula is one run of the recursion with the estimate of"
                 " Eq. (5.17)."
@@ -257,9 +257,11 @@ def _rates(sample: Sample) -> Outcome:
 
 def _without_noise(problem: SafetyProblem, episodes: int, seed: int, rate_with: float) -> str:
     """What the noise, which is all that DDSCBF learns, does to the rate."""
-    blind = known(problem.configured(model={"sigma_1": 0.0, "sigma_2": 0.0}), episodes, seed).rows[
-        0
-    ]["safety_rate"]
+    blind = (
+        known(problem.configured(model={"sigma_1": 0.0, "sigma_2": 0.0}), episodes, seed)
+        .rows[0]
+        .safety_rate
+    )
     beside = f"{100 * blind:.1f} %, beside {100 * rate_with:.1f} %"
     return (
         f"The noise is all that DDSCBF learns; an SCBF that believes in none is safe in {beside}."

@@ -191,7 +191,7 @@ class _Place:
     @property
     def withheld(self) -> str:
         """What the rate of the SCBF says against that; empty if nothing."""
-        return by_rate(self.repaired, self.scbf.rows[0]["ci_high"])
+        return by_rate(self.repaired, self.scbf.rows[0].ci_high)
 
     def numbers(self, bayesian: Learned) -> list[Number]:
         """The column of the table, with identifications of one kind."""
@@ -230,7 +230,7 @@ class _Place:
             evaluate(replace(self.problem, model=model.mean_system), filters=["scbf"], **how)
             for model in models
         ]
-        return Learned([e.rows[0]["safety_rate"] for e in found], how["episodes"], (0.0, 0.0, 0.0))
+        return Learned([e.rows[0].safety_rate for e in found], how["episodes"], (0.0, 0.0, 0.0))
 
 
 def _rates(sample: Sample) -> Outcome:

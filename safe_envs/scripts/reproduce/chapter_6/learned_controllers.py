@@ -11,8 +11,10 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.agents.evaluation.comparison import pair_counts
 from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate
-from safe_envs.agents.evaluation.rollout import EpisodeStatistics, run_episodes
+from safe_envs.agents.evaluation.rollout import run_episodes
+from safe_envs.agents.evaluation.rows import EpisodeSummary
 from safe_envs.agents.evaluation.statistics import (
     paired_difference_interval,
     rate_interval,
@@ -66,10 +68,11 @@ class PrintedRow(Condition):
         return cls()
 
 
-def printed_totals(problem: SafetyProblem, row: Any, episodes: int, seed: int) -> EpisodeStatistics:
+def printed_totals(problem: SafetyProblem, row: Any, episodes: int, seed: int) -> EpisodeSummary:
     """Run the episodes of an evaluation under a printed row."""
     env = SafetyFilterVectorWrapper(SafeVectorEnv(problem, min(episodes, 1024)), (PrintedRow(row),))
-    return run_episodes(env, make_policy("nominal", problem, False), episodes, seed)
+    policy = make_policy("nominal", problem, False)
+    return run_episodes(env, policy, episodes, seed).summary(CONFIDENCE)
 
 
 def known(problem: SafetyProblem, episodes: int, seed: int) -> Evaluation:
@@ -81,8 +84,8 @@ def rate(name: str, found: Evaluation, printed: float | None = None) -> Number:
     """The rate of an evaluation of one filter."""
     return Number.rate(
         name,
-        found.rows[0]["safe"],
-        found.rows[0]["episodes"],
+        found.rows[0].safe,
+        found.rows[0].episodes,
         printed,
         PRINTED_EPISODES if printed is not None else None,
     )
@@ -119,7 +122,8 @@ class Learned:
             "bounds": False,
         }
         found = [_under(problem, text, model, how) for model in models]
-        tables = [next(iter(e.flags.values()))[0].table(reference.flags["scbf"][0]) for e in found]
+        known = reference.episodes["scbf"][0].safe
+        tables = [pair_counts(next(iter(e.episodes.values()))[0].safe, known) for e in found]
         mean = np.mean(tables, axis=0).tolist()
         differences = [(first - second) / how["episodes"] for _, first, second, _ in tables]
         ends = repeated_interval(
@@ -127,7 +131,7 @@ class Learned:
         )
         middle = float(np.mean(differences))
         return cls(
-            [e.rows[0]["safety_rate"] for e in found],
+            [e.rows[0].safety_rate for e in found],
             how["episodes"],
             (100 * middle, 100 * ends[0], 100 * ends[1]),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from safe_envs.agents.evaluation.rollout import Row
+from safe_envs.agents.evaluation.rows import EpisodeSummary
 from safe_envs.scripts.reproduce.chapter_6.learned_controllers import PRINTED_EPISODES
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
@@ -48,7 +48,9 @@ def worst_for_ever(seconds: float, each: Mapping[str, tuple[Number, float]]) -> 
     )
 
 
-def at_one_horizon(first: Row, second: Row, printed: tuple[float, float]) -> str:
+def at_one_horizon(
+    first: EpisodeSummary, second: EpisodeSummary, printed: tuple[float, float]
+) -> str:
     """Whether the rates from two starts are the printed ones at the same horizon, in words.
 
     Args:
@@ -57,7 +59,7 @@ def at_one_horizon(first: Row, second: Row, printed: tuple[float, float]) -> str
         printed: of both, in per cent.
     """
     times, curves = (
-        first["curve"]["time"],
+        first.curve.time,
         [_rates(row, at) for row, at in zip((first, second), printed, strict=True)],
     )
     both = [
@@ -78,8 +80,7 @@ def at_one_horizon(first: Row, second: Row, printed: tuple[float, float]) -> str
     )
 
 
-def _rates(row: Row, printed: float) -> list[Number]:
+def _rates(row: EpisodeSummary, printed: float) -> list[Number]:
     return [
-        Number.rate("", safe, row["episodes"], printed, PRINTED_EPISODES)
-        for safe in row["curve"]["safe"]
+        Number.rate("", safe, row.episodes, printed, PRINTED_EPISODES) for safe in row.curve.safe
     ]

@@ -23,9 +23,9 @@ def test_exits_are_those_of_an_evaluation() -> None:
     problem = make_problem("safe_envs/StochasticDubins-v0", start="uniform", horizon=0.5)
     found = exits(problem, "scbf", ZeroController(problem), 1100, 3)
     row = evaluate(problem, "zero", ["scbf"], episodes=1100, seed=3, bounds=False).rows[0]
-    assert [found.safe(k).sum() for k in range(problem.steps + 1)] == row["curve"]["safe"]
-    assert found.infeasible == pytest.approx(row["infeasible_rate"])
-    assert found.rate("here", problem.steps).ours == pytest.approx(100 * row["safety_rate"])
+    assert [found.safe(k).sum() for k in range(problem.steps + 1)] == row.curve.safe
+    assert found.infeasible == pytest.approx(row.infeasible_rate)
+    assert found.rate("here", problem.steps).ours == pytest.approx(100 * row.safety_rate)
 
 
 def test_difference_is_of_pairs() -> None:
