@@ -4,12 +4,11 @@ project's own."""
 from __future__ import annotations
 
 import numbers
-import reprlib
 from typing import Any
 
 import numpy as np
 
-from safe_envs.errors import InvalidInputError
+from safe_envs.errors import InvalidInputError, shown
 
 
 def real_array(what: str, given: Any) -> np.ndarray:
@@ -37,14 +36,6 @@ def real_array(what: str, given: Any) -> np.ndarray:
         return array.astype(np.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise InvalidInputError(
-            f"the {what} is {_shown(given)}: {error}; give an array of real numbers, such as"
+            f"the {what} is {shown(given)}: {error}; give an array of real numbers, such as"
             " np.zeros(2)"
         ) from error
-
-
-def _shown(given: Any) -> str:
-    """The beginning of what was given; Python refuses to write integers of more than 4300 digits."""
-    try:
-        return reprlib.repr(given)
-    except ValueError:
-        return f"a {type(given).__name__}"

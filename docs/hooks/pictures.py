@@ -174,15 +174,15 @@ def _promise() -> Figure:
     figure = Figure(figsize=(7.5, 4.2))
     axes = figure.subplots()
     for row, color in zip(evaluation.rows, ("#D55E00", COLORS[0]), strict=True):
-        curve = row["curve"]
+        curve = row.curve
         axes.fill_between(
-            curve["time"], curve["ci_low"], curve["ci_high"], color=color, alpha=0.25, linewidth=0
+            curve.time, curve.ci_low, curve.ci_high, color=color, alpha=0.25, linewidth=0
         )
         axes.plot(
-            curve["time"],
-            curve["rate"],
+            curve.time,
+            curve.rate,
             color=color,
-            label=f"{row['filter']}: measured, {_EPISODES} episodes, with its 95 % band",
+            label=f"{row.filter}: measured, {_EPISODES} episodes, with its 95 % band",
         )
     times = np.linspace(0.0, problem.horizon, 41)
     at_times = zip(*[promise(verification, starts, t) for t in times.tolist()], strict=True)

@@ -18,14 +18,13 @@ import sympy as sp
 from sympy.printing.codeprinter import PrintMethodNotImplementedError
 
 from safe_envs.dynamics.printers import SUPPORTED, ArrayPrinter, FloatPrinter
-from safe_envs.errors import SystemDefinitionError
+from safe_envs.errors import SystemDefinitionError, shown
 
 Flavour = Literal["floats", "arrays"]
 Components = tuple[Any, ...]
 
 _LARGEST_EXPANDED_POWER = 8
 _LARGEST_FLOAT = sp.Rational(sys.float_info.max)
-_LONGEST_QUOTED = 120
 
 
 _settled: dict[int, np.ndarray] = {}
@@ -131,7 +130,7 @@ def _compile(
         )
     except PrintMethodNotImplementedError as error:
         raise SystemDefinitionError(
-            f"{_shortened(expressions)} has no numerical form: {str(error).splitlines()[0]}"
+            f"{shown(expressions)} has no numerical form: {str(error).splitlines()[0]}"
         ) from error
     if isinstance(printer, ArrayPrinter):
         function.__globals__.update(printer.constants)
@@ -181,12 +180,12 @@ def _require_computable(expression: Any, arguments: tuple[sp.Symbol, ...]) -> No
     unknown = expression.free_symbols - set(arguments)
     if unknown:
         raise SystemDefinitionError(
-            f"{_shortened(expression)} holds {', '.join(sorted(map(str, unknown)))}, which is none"
+            f"{shown(expression)} holds {', '.join(sorted(map(str, unknown)))}, which is none"
             f" of {', '.join(map(str, arguments))}"
         )
     if len(set(arguments)) < len(arguments):
         raise SystemDefinitionError(
-            f"a symbol stands for two arguments of {_shortened(expression)}:"
+            f"a symbol stands for two arguments of {shown(expression)}:"
             f" {', '.join(map(str, arguments))}"
         )
     strange = {f.func for f in expression.atoms(sp.Function) if not isinstance(f, SUPPORTED)}
@@ -197,28 +196,20 @@ def _require_computable(expression: Any, arguments: tuple[sp.Symbol, ...]) -> No
             else ""
         )
         raise SystemDefinitionError(
-            f"{_shortened(expression)} holds {', '.join(sorted(map(str, strange)))}, which has no"
+            f"{shown(expression)} holds {', '.join(sorted(map(str, strange)))}, which has no"
             f" numerical form here; write it with {', '.join(f.__name__ for f in SUPPORTED)}, Max"
             f" and Min{advice}"
         )
     if expression.has(sp.I, sp.zoo):
         raise SystemDefinitionError(
-            f"{_shortened(expression)} is not real everywhere, or has a division by 0; look at its"
+            f"{shown(expression)} is not real everywhere, or has a division by 0; look at its"
             " numbers"
         )
     if any(abs(number) > _LARGEST_FLOAT for number in expression.atoms(sp.Float, sp.Rational)):
         raise SystemDefinitionError(
-            f"{_shortened(expression)} holds a number beyond {float(_LARGEST_FLOAT):.2g}, the"
+            f"{shown(expression)} holds a number beyond {float(_LARGEST_FLOAT):.2g}, the"
             " largest of floats"
         )
-
-
-def _shortened(expression: Any) -> str:
-    try:
-        text = str(expression)
-    except ValueError:  # Python does not print whole numbers of thousands of digits.
-        return "an expression"
-    return text if len(text) <= _LONGEST_QUOTED else f"{text[:_LONGEST_QUOTED]}..."
 
 
 def in_plain_names(

@@ -7,7 +7,8 @@ import math
 
 import numpy as np
 
-from safe_envs.problem.problem import SafetyProblem, Variable
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import Variable
 from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.scenes.base import runs

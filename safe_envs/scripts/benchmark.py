@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import sympy as sp
-from rich import box
 from rich.table import Table
 
 import safe_envs
 from safe_envs import Barrier, ControlAffineSDE
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError
-from safe_envs.registry import load_problem
-from safe_envs.scripts.options.console import require_result, stdout, write_result
+from safe_envs.registry import make_problem
+from safe_envs.scripts.options.console import require_result, say, stdout, write_result
+from safe_envs.scripts.reports.tables import make_table
 from safe_envs.wrappers import (
     CBF,
     DDSCBF,
@@ -96,9 +96,9 @@ def benchmark(json_file: Path | None = None, compare: Path | None = None) -> Non
     earlier = {} if compare is None else read_figures(compare)
     figures = measure()
     console = stdout()
-    console.print(
+    say(
+        console,
         f"{_ID} with scbf, safe-envs {safe_envs.__version__}, on one of {os.cpu_count()} cores\n",
-        highlight=False,
     )
     console.print(table_of(figures, earlier))
     write_result(json_file, lambda: figures)
@@ -212,7 +212,7 @@ def _learn() -> tuple[dict[str, LearnedModel], Figures]:
     """
     learned, seconds = {}, {}
     for name, (env_id, method, settings) in _LEARNED.items():
-        problem = load_problem(env_id)
+        problem = make_problem(env_id)
         began = time.perf_counter()
         learned[name] = learner_of(method)(problem, **settings)
         seconds[f"{name}, learned in s"] = time.perf_counter() - began
@@ -228,7 +228,7 @@ def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
     }
     cases, rng = {}, np.random.default_rng(0)
     for name, (env_id, method, _) in _LEARNED.items():
-        problem = load_problem(env_id)
+        problem = make_problem(env_id)
         safety_filter = SafetyFilter.for_problem(
             problem, conditions[method](learned[name], problem)
         )
@@ -356,13 +356,12 @@ def read_figures(path: Path) -> Figures:
 
 def table_of(figures: Figures, earlier: Figures) -> Table:
     """The figures, and where there are earlier ones, those and the ratio to them."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    table.add_column(
+    first = (
         "microseconds for each state, seconds where they are named, or a ratio; vector envs of"
         f" {_NUM_ENVS}"
     )
-    for title in ("figure", *["earlier", "figure / earlier"] * bool(earlier)):
-        table.add_column(title, justify="right")
+    titles = ("figure", *["earlier", "figure / earlier"] * bool(earlier))
+    table = make_table("pr", first, *titles, tight=False)
     for name, value in figures.items():
         before = earlier.get(name)
         beside = ["-", "-"] if not before else [f"{before:.3g}", f"{value / before:.2f}"]

@@ -10,7 +10,13 @@ from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.trainer import train
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.figures.evaluation_figure import draw
-from safe_envs.scripts.options.console import progress_bar, require_result, stdout, write_result
+from safe_envs.scripts.options.console import (
+    progress_bar,
+    require_result,
+    say,
+    stdout,
+    write_result,
+)
 from safe_envs.scripts.reports.evaluation_report import print_evaluation
 
 ENV_ID = "safe_envs/StochasticDubins-v0"
@@ -53,28 +59,22 @@ def demo(
         documents.append(answer.document())
         picture = folder / f"{Path(actor).stem}.png"
         draw(answer, picture)
-        console.print(f"Picture: {picture}\n", highlight=False, markup=False)
+        say(console, f"Picture: {picture}\n")
     write_result(json_file, lambda: {"folder": str(folder), "evaluations": documents})
 
 
 def _train(policy: Path, steps: int) -> None:
     """Train the policy, or finish its training."""
     console = stdout()
-    console.print(
-        f"Training PPO on {ENV_ID}, {steps} steps without any filter ...", highlight=False
-    )
+    say(console, f"Training PPO on {ENV_ID}, {steps} steps without any filter ...")
     with progress_bar("Training PPO") as tell:
         seconds = train(
             Training.of(ENV_ID, "ppo", n_timesteps=steps, eval_freq=steps),
             policy,
             resume=os.path.exists(policy),
-            tell=tell,
+            progress=tell,
         )
-    console.print(
-        f"Trained in {seconds:.0f} s of processor time and saved in {policy}\n",
-        highlight=False,
-        markup=False,
-    )
+    say(console, f"Trained in {seconds:.0f} s of processor time and saved in {policy}\n")
 
 
 if __name__ == "__main__":

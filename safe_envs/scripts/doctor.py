@@ -16,13 +16,18 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
 from rich.text import Text
 
 from safe_envs import ENV_IDS, __version__
 from safe_envs.rendering.viewer import require_pygame
-from safe_envs.scripts.options.console import progress_bar, require_result, stdout, write_result
+from safe_envs.scripts.options.console import (
+    progress_bar,
+    require_result,
+    say,
+    stdout,
+    write_result,
+)
+from safe_envs.scripts.reports.tables import make_table
 
 _NEEDED = ""
 """In place of an extra: what is needed in any case."""
@@ -244,10 +249,11 @@ def envs() -> Iterator[Check]:
 
 
 def _step(env_id: str) -> tuple[bool, str]:
-    from safe_envs.registry import make_env
+    from safe_envs.envs.env import SafeEnv
+    from safe_envs.registry import make_problem
     from safe_envs.wrappers import SafetyFilterWrapper
 
-    bare = make_env(env_id)
+    bare = SafeEnv(make_problem(env_id))
     env = SafetyFilterWrapper(bare, bare.problem.filter)
     env.reset(seed=0)
     inside = True
@@ -319,12 +325,8 @@ def speeds() -> dict[str, float]:
 
 def _report(found: dict[str, list[Check]], speed: dict[str, float], healthy: bool) -> None:
     console = stdout()
-    console.print(
-        f"safe-envs {__version__} on {platform.platform()}\n", highlight=False, markup=False
-    )
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in ("", "", "found", "what to do"):
-        table.add_column(title)
+    say(console, f"safe-envs {__version__} on {platform.platform()}\n")
+    table = make_table("p", "", "", "found", "what to do", tight=False)
     for checks in found.values():
         for check in checks:
             mark = {True: "ok", False: "WRONG", None: "-"}[check.ok]
@@ -335,9 +337,7 @@ def _report(found: dict[str, list[Check]], speed: dict[str, float], healthy: boo
     for name, steps in speed.items():
         table.add_row("", f"speed: {name}", f"{steps:,.0f} steps/s", "")
     console.print(table)
-    console.print(
-        f"\n{'All is well.' if healthy else 'Something is wrong: see above.'}", highlight=False
-    )
+    say(console, f"\n{'All is well.' if healthy else 'Something is wrong: see above.'}")
 
 
 if __name__ == "__main__":

@@ -5,14 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from rich import box
 from rich.markup import escape
-from rich.table import Table
 
-from safe_envs import ENV_IDS, SafeEnv, SafetyProblem
+from safe_envs import ENV_IDS, SafetyProblem
 from safe_envs.dynamics.lie import relative_degree
-from safe_envs.registry import make_env
+from safe_envs.registry import env_class, make_problem
 from safe_envs.scripts.options.console import require_result, stdout, write_result
+from safe_envs.scripts.reports.tables import make_table
 
 _COLUMNS = ("states", "inputs", "degree", "filter", "noise", "dt", "horizon")
 
@@ -27,16 +26,11 @@ def list_envs(json_file: Path | None = None) -> None:
         ConfigurationError: the file cannot be written.
     """
     require_result(json_file)
-    table = Table(
-        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False, collapse_padding=True
-    )
-    table.add_column("id, and what is to be kept safe", max_width=50)
-    for name in _COLUMNS:
-        table.add_column(name, no_wrap=True)
+    table = make_table("pl", "id, and what is to be kept safe", *_COLUMNS)
+    table.columns[0].max_width = 50
     rows = [
-        {"env_id": env_id, "about": _about(env), **_defaults(env.problem)}
+        {"env_id": env_id, "about": _about(env_id), **_defaults(make_problem(env_id))}
         for env_id in ENV_IDS
-        for env in (make_env(env_id),)
     ]
     for row in rows:
         table.add_row(
@@ -47,8 +41,8 @@ def list_envs(json_file: Path | None = None) -> None:
     write_result(json_file, lambda: {"envs": rows})
 
 
-def _about(env: SafeEnv) -> str:
-    return (type(env).__doc__ or "").strip().partition("\n")[0]
+def _about(env_id: str) -> str:
+    return (env_class(env_id).__doc__ or "").strip().partition("\n")[0]
 
 
 def _defaults(problem: SafetyProblem) -> dict[str, Any]:

@@ -14,11 +14,11 @@ import typer
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.figures.film import require_film, steps_a_frame, write_film
 from safe_envs.scripts.options import text_options
-from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:
-    from safe_envs.agents.policies.registry import Policy
+    from safe_envs.agents.policies.base import Policy
     from safe_envs.problem.problem import SafetyProblem
     from safe_envs.wrappers import Condition
 
@@ -84,7 +84,7 @@ def render(
     The episode is that of an env which is reset with the seed. Filters that rest on something
     learned learn it first, unless --learned gives it.
     """
-    from safe_envs.registry import load_problem
+    from safe_envs.registry import make_problem
 
     if filter_name is not None and compare is not None:
         raise ConfigurationError(
@@ -104,7 +104,7 @@ def render(
         out=out,
         inputs=text_options.inputs_of(env.system, policy, names or (), learned or ()),
     )
-    problem = load_problem(env.full_id, env.arguments)
+    problem = make_problem(env.full_id, **env.arguments)
     with progress_bar("Drawing") as tell:
         runs = make_runs(
             problem,
@@ -123,13 +123,13 @@ def render(
         count = write_film(out, frames_of(runs, every, problem.steps, tell), every * problem.dt)
     console = stdout()
     for each in runs:
-        console.print(each.summary(), highlight=False)
+        say(console, each.summary())
     size = (
         "a still"
         if out.suffix.lower() == ".png"
         else f"{count} frames, {count * every * problem.dt:.2f} s"
     )
-    console.print(f"{out}: {size}", highlight=False)
+    say(console, f"{out}: {size}")
     write_result(
         json_file,
         lambda: {"film": str(out), "frames": count, "episodes": [each.document() for each in runs]},
@@ -143,10 +143,10 @@ def split_filters(text: str) -> list[str]:
     Raises:
         ConfigurationError: one has no text.
     """
-    from safe_envs.agents.evaluation.evaluate import BARE
+    from safe_envs.agents.evaluation.spec import UNFILTERED
     from safe_envs.wrappers import CONDITIONS, LEARNED
 
-    names = "|".join(sorted((BARE, *CONDITIONS, *LEARNED), key=len, reverse=True))
+    names = "|".join(sorted((UNFILTERED, *CONDITIONS, *LEARNED), key=len, reverse=True))
     found = [part.strip() for part in re.split(rf",(?=\s*(?:{names})\s*(?:[:+,]|$))", text)]
     if not all(found):
         raise ConfigurationError(
@@ -252,8 +252,8 @@ def make_runs(
         ConfigurationError: a filter or the policy is unknown or does not fit the problem.
         RelativeDegreeError: a filter does not suit a barrier.
     """
-    from safe_envs.agents.evaluation.evaluate import BARE
     from safe_envs.agents.evaluation.identification import Learning
+    from safe_envs.agents.evaluation.spec import UNFILTERED
     from safe_envs.agents.policies.registry import make_policy
     from safe_envs.errors import nearest, require_whole
     from safe_envs.wrappers import CONDITIONS, LEARNED, require_readable
@@ -263,7 +263,7 @@ def make_runs(
         raise ConfigurationError(
             f"knowledge = {shown(knowledge)}; {nearest(knowledge, ('model', 'plant'))}"
         )
-    known = (BARE, *CONDITIONS, *LEARNED)
+    known = (UNFILTERED, *CONDITIONS, *LEARNED)
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.
         for word in re.split("[:+]", name)[0].split(","):
@@ -271,7 +271,7 @@ def make_runs(
                 raise ConfigurationError(
                     f"unknown filter {shown(word.strip())}; {nearest(word.strip(), known)}"
                 )
-        if name != BARE:
+        if name != UNFILTERED:
             require_readable(name, problem)
     actors = [make_policy(policy, problem, trust) for _ in names]
     learning = Learning(problem, names, learned, 1, seed)
@@ -280,7 +280,7 @@ def make_runs(
     return [
         Run(
             name,
-            () if name == BARE else learning.conditions(name, 0),
+            () if name == UNFILTERED else learning.conditions(name, 0),
             problem,
             actor,
             seed,

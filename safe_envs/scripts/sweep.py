@@ -1,32 +1,16 @@
-"""`safe-envs sweep`: many evaluations from one file, on this machine or on a cluster; a stopped one
-goes on."""
+"""`safe-envs sweep`: many evaluations from one file, on this machine or on a cluster."""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import text_options
-from safe_envs.scripts.options.console import (
-    Json,
-    progress_bar,
-    require_result,
-    stdout,
-    write_result,
-)
-
-if TYPE_CHECKING:
-    from safe_envs.agents.jobs.executor import Backend
-    from safe_envs.agents.sweeps.cell import Outcome
-    from safe_envs.agents.sweeps.spec import Sweep
-    from safe_envs.agents.sweeps.store import Store
-
-_SHOWN = 10
+from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
+from safe_envs.scripts.options.job_progress import run_jobs
 
 
 def sweep(
@@ -77,6 +61,7 @@ def sweep(
     from safe_envs.agents.jobs.executor import Backend
     from safe_envs.agents.sweeps.spec import read_sweep
     from safe_envs.agents.sweeps.store import Store
+    from safe_envs.scripts.reports.sweep_cells import failures_text, sweep_document
 
     require_result(json)
     if jobs is not None and backend != "local":
@@ -88,91 +73,24 @@ def sweep(
     found = read_sweep(spec, trust)
     store = Store(out, found)
     before = len(found.cells) - len(store.missing)
-    failures = _compute(store, place, out)
+    missing = store.missing
+    failures = run_jobs(missing, place, out, f"{len(missing)} cells to do", store.keep)
+    # Another run may have computed one of them meanwhile.
+    left = {cell.key for cell in store.missing}
+    failures = [outcome for outcome in failures if outcome.key in left]
     done = len(found.cells) - len(store.missing)
     kept = f", of which {before} were there before" if before else ""
-    stdout().print(
-        f"{done} of {len(found.cells)} cells are in {out}{kept}.",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
+    say(stdout(), f"{done} of {len(found.cells)} cells are in {out}{kept}.")
     if store.hidden:
         hidden = (
             f"{store.hidden} cells of another grid or version are in {out} too, where no report"
             " reads them now"
         )
-        stdout().print(
-            f"Note: {hidden}; give each sweep a folder of its own.",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
+        say(stdout(), f"Note: {hidden}; give each sweep a folder of its own.")
     counts = {"cells": len(found.cells), "done": done, "before": before}
-    write_result(json, lambda: _document(found, failures, counts))
+    write_result(json, lambda: {**counts, **sweep_document(found, failures)})
     if failures:
-        raise ConfigurationError(_told(found, failures))
-
-
-def _document(found: Sweep, failures: Sequence[Outcome], counts: dict[str, int]) -> dict[str, Any]:
-    from safe_envs.agents.sweeps.cell import versions
-
-    errors = {outcome.key: outcome.error for outcome in failures}
-    failed = [
-        {"key": cell.key, "settings": cell.settings, "error": errors[cell.key]}
-        for cell in found.cells
-        if cell.key in errors
-    ]
-    return {**counts, "failed": failed, "swept": found.swept, "versions": versions()}
-
-
-def _compute(store: Store, place: Backend, out: Path) -> list[Outcome]:
-    """Compute what is missing; return the outcomes that failed, and that no other run has computed
-    meanwhile."""
-    from safe_envs.agents.jobs.executor import run
-
-    missing, failures, done = store.missing, [], 0
-    with progress_bar(f"{len(missing)} cells to do") as bar:
-        tell = bar or (lambda _: None)
-
-        def keep(outcome: Outcome) -> None:
-            nonlocal done
-            store.keep(outcome)
-            done += 1
-            failures.extend([outcome] * (outcome.error is not None))
-            tell(done / len(missing))
-
-        try:
-            run(missing, place, keep, lambda text: print(text, file=sys.stderr, flush=True))
-        except KeyboardInterrupt:
-            print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
-            raise
-    left = {cell.key for cell in store.missing}
-    return [outcome for outcome in failures if outcome.key in left]
-
-
-def _told(found: Sweep, failures: Sequence[Outcome]) -> str:
-    """What failed and why, in the order of the file."""
-    from safe_envs.agents.sweeps.spec import describe
-
-    errors = {outcome.key: outcome.error for outcome in failures}
-    lines = [
-        f"{describe(cell, found.swept) or 'the only cell'}: {errors[cell.key]}"
-        for cell in found.cells
-        if cell.key in errors
-    ]
-    more = (
-        [f"and {len(lines) - _SHOWN} more, which `safe-envs sweep-report` lists"]
-        if len(lines) > _SHOWN
-        else []
-    )
-    return "\n  ".join(
-        [
-            f"{len(lines)} of {len(found.cells)} cells failed; the same command tries them again:",
-            *lines[:_SHOWN],
-            *more,
-        ]
-    )
+        raise ConfigurationError(failures_text(found, failures))
 
 
 if __name__ == "__main__":

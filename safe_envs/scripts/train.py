@@ -6,18 +6,16 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
 
-from safe_envs.errors import ConfigurationError, shortened
-from safe_envs.number_text import real
+from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import completion, text_options
-from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
+from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
-from safe_envs.scripts.reports.rates import percent_in
+from safe_envs.scripts.options.hyperparameter_options import read_hyperparameters
+from safe_envs.scripts.reports.training_report import print_evaluations
 
 
 @with_env
@@ -72,7 +70,7 @@ def train(
         str,
         typer.Option(
             metavar="executed|proposed|both",
-            help="On which action an off-policy algorithm learns behind a filter.",
+            help="On which action an off-policy algorithm learns with a filter in the loop.",
         ),
     ] = "executed",
     intervention_penalty: Annotated[
@@ -110,16 +108,15 @@ def train(
     cost and smallest h, and violations, interventions and infeasible steps in the training so far.
     The folder is what `safe-envs evaluate --policy DIR` reads.
     """
-    from safe_envs.agents.policies.registry import DESCRIPTION
+    from safe_envs.agents.policies.base import DESCRIPTION
     from safe_envs.agents.training.config import Training
-    from safe_envs.agents.training.trainer import train as train_agent
 
     text_options.require_outputs(
         json_file, None, inputs=text_options.inputs_of(env.system, filters=filters or ())
     )
-    if len(filters or []) > 1:
+    if filters and len(filters) > 1:
         raise ConfigurationError(
-            f"--filter was given {len(filters or [])} times; a training has one filter in the loop"
+            f"--filter was given {len(filters)} times; a training has one filter in the loop"
         )
     training = Training.of(
         env.full_id,
@@ -129,7 +126,7 @@ def train(
         knowledge=knowledge,
         n_timesteps=n_timesteps,
         num_envs=num_envs,
-        settings=_settings(settings or []),
+        settings=read_hyperparameters(settings or []),
         seed=seed,
         action=action,
         intervention_penalty=intervention_penalty,
@@ -137,94 +134,27 @@ def train(
         eval_episodes=eval_episodes,
         threads=threads,
     )
+    from safe_envs.agents.training.trainer import train as train_agent
+
     # The policy itself is written at the very end.
     finished = resume and os.path.exists(out / DESCRIPTION)
     with progress_bar("Training") as tell:
         try:
-            train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)
+            train_agent(training, out, resume=resume, tensorboard=tensorboard, progress=tell)
         except KeyboardInterrupt:
-            print(
-                "Stopped. The same command with --resume goes on after the last checkpoint in"
-                f" {out}.",
-                file=sys.stderr,
-            )
+            advice = "The same command with --resume goes on after the last checkpoint in"
+            print(f"Stopped. {advice} {out}.", file=sys.stderr)
             raise
     if finished:
-        stdout().print(
-            f"The training in {out} was finished already: nothing was left to do.",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
+        say(stdout(), f"The training in {out} was finished already: nothing was left to do.")
     rows = json.loads((out / "evaluations.json").read_text())
-    _report(training.filter or "none", rows)
+    filter_name = training.filter or "none"
+    print_evaluations(stdout(), filter_name, rows)
     known = [f"--knowledge={knowledge}"] if knowledge != "model" else []
-    command = env.evaluate_command(
-        "--policy", str(out), "--filter", training.filter or "none", *known
-    )
-    stdout().print(f"\nTo evaluate the policy: {command}", highlight=False, markup=False)
-    write_result(
-        json_file,
-        lambda: {
-            "folder": str(out),
-            "config": json.loads((out / "config.json").read_text()),
-            "evaluations": rows,
-        },
-    )
-
-
-def _settings(texts: list[str]) -> dict[str, Any]:
-    """NAME=VALUE entries, the values read as YAML."""
-    import yaml
-
-    from safe_envs.agents.sweeps.document import value_of
-
-    found = {}
-    for text in texts:
-        name, equals, value = text.partition("=")
-        if not equals or not name:
-            raise ConfigurationError(
-                f"--set {shortened(text)}: give NAME=VALUE, such as learning_rate=0.001"
-            )
-        if not value.isascii():
-            raise ConfigurationError(
-                f"--set {shortened(text)} has characters beyond ASCII; write numbers with the"
-                " digits 0 to 9"
-            )
-        try:
-            found[name] = _number(value_of(value, "--set"))
-        except yaml.YAMLError as error:
-            problem = shortened(getattr(error, "problem", error))
-            raise ConfigurationError(
-                f"--set {shortened(text)} is no YAML that a setting may have: {problem}"
-            ) from error
-    return found
-
-
-def _number(value: Any) -> Any:
-    """What YAML takes for a text although it is a number, such as 3e-4."""
-    try:
-        return real(value) if isinstance(value, str) else value
-    except ValueError:
-        return value
-
-
-def _report(filter_name: str, rows: list[dict[str, Any]]) -> None:
-    """Print how safe and how good the agent was in each evaluation."""
-    console = stdout()
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in ("steps", "safe [95 % interval]", "return", "violations in training"):
-        table.add_column(title, justify="right")
-    for row in rows:
-        rate = percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
-        table.add_row(
-            f"{row['timesteps']:,}",
-            rate,
-            f"{row['return_mean']:.4g}",
-            f"{row['training']['violations']:.0f}",
-        )
-    console.print(f"Evaluations with the filter {filter_name}:", highlight=False, markup=False)
-    console.print(table)
+    command = env.evaluate_command("--policy", str(out), "--filter", filter_name, *known)
+    say(stdout(), f"\nTo evaluate the policy: {command}")
+    config = json.loads((out / "config.json").read_text())
+    write_result(json_file, lambda: {"folder": str(out), "config": config, "evaluations": rows})
 
 
 if __name__ == "__main__":

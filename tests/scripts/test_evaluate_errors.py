@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.usefixtures("coarse_bounds")
@@ -71,8 +71,8 @@ USER_ERRORS = (
     ([DUBINS, "--confidence", "95"], ["confidence = 95.0", "such as 0.95"]),
     ([DUBINS, "--confidence", "nan"], ["confidence = nan"]),
     ([DUBINS, "--filter", "hocbf:p=1,2+scbf"], ["has 2 conditions"]),
-    ([DUBINS, "--filter", "hocbf+none"], ["'hocbf+none'", "'none' is the bare env"]),
-    ([DUBINS, "--filter", "none+hocbf:p=1,2"], ["'none' is the bare env"]),
+    ([DUBINS, "--filter", "hocbf+none"], ["'hocbf+none'", "'none' is the unfiltered env"]),
+    ([DUBINS, "--filter", "none+hocbf:p=1,2"], ["'none' is the unfiltered env"]),
     ([DUBINS, "--refine", "--episodes", "0"], ["episodes = 0"]),
     (
         ["Scalar-v0", "--refine", "--dt", "5e-324", "--horizon", "5e-324"],
@@ -135,7 +135,7 @@ def ppo(tmp_path):
     from safe_envs.agents.policies.network import save_policy
 
     model = PPO("MlpPolicy", gym.make(DUBINS), policy_kwargs={"net_arch": [8]}, device="cpu")
-    save_policy(model, tmp_path / "ppo", load_problem(DUBINS))
+    save_policy(model, tmp_path / "ppo", make_problem(DUBINS))
     model.save(tmp_path / "ppo" / "model.zip")
 
 

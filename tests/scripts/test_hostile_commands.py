@@ -3,7 +3,6 @@ traceback."""
 
 from __future__ import annotations
 
-import json
 import os
 
 import pytest
@@ -66,7 +65,7 @@ LONG = "x" * 100_000
         (("sweep-report", "."), "holds no sweep"),
         (("benchmark", "--compare", "pipe"), "it is a pipe or a device"),
         (("benchmark", "--compare", "deep.json"), "is no JSON"),
-        (("leaderboard", "Scalar-v0", "--out", "."), "is not what `safe-envs leaderboard` writes"),
+        (("leaderboard", "Scalar-v0", "--out", "."), "results/Scalar-v0.json cannot be read"),
     ],
     ids=lambda given: " ".join(map(str, given))[:40] if isinstance(given, tuple) else "",
 )
@@ -77,9 +76,8 @@ def test_what_no_command_can_take_ends_with_status_2_and_a_short_message(
         os.mkfifo(tmp_path / name)
     (tmp_path / "loop").symlink_to("loop")
     (tmp_path / "deep.json").write_text("[" * 100_000)
-    (tmp_path / "results.json").write_text(
-        json.dumps({"settings": {}, "rows": [{"env_id": "safe_envs/Scalar-v0"}]})
-    )
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "Scalar-v0.json").write_text('{"rows": [{"env_id": "Scalar-v0"}]}')
     status, out, err = safe_envs_command(*arguments)
     assert (status, out) == (2, "")
     assert message in " ".join(err.replace("│", " ").split())

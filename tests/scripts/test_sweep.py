@@ -26,11 +26,11 @@ grid:
 """
 
 SYSTEM = """
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 
 def problem(first=0, second=0):
     1 / (2 - first - second)
-    return load_problem("Scalar-v0", {"horizon": 0.2})
+    return make_problem("Scalar-v0", horizon=0.2)
 """
 
 
@@ -91,7 +91,7 @@ grid: {barrier.first: [0, 1], barrier.second: [0, 1], seed: [0, 1]}
         document = strictly(tmp_path / "done.json")
         assert (document["cells"], document["done"], len(document["failed"])) == (8, 6, 2)
         assert document["failed"][1]["settings"]["seed"] == 1
-    (tmp_path / "done" / "cells" / f"{read(tmp_path / 'done')['key'][0]}.parquet").unlink()
+    (tmp_path / "done" / "cells" / f"{read(tmp_path / 'done')['key'][0]}.json").unlink()
     # No cell that is there has this one.
     index = json.loads((tmp_path / "done" / "sweep.json").read_text())
     (tmp_path / "done" / "sweep.json").write_text(
@@ -172,7 +172,7 @@ def test_a_stop_keeps_what_is_done_and_leaves_no_process(
     try:
         cells = tmp_path / "out" / "cells"
         while process.poll() is None and not (
-            cells.exists() and len(list(cells.glob("[!.]*.parquet"))) >= 3
+            cells.exists() and len(list(cells.glob("[!.]*.json"))) >= 3
         ):
             time.sleep(0.05)
         # As a terminal and a job manager send it: to all of them.

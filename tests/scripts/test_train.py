@@ -112,7 +112,7 @@ def test_what_it_cannot_take_ends_with_status_2_and_leaves_nothing(
 @pytest.mark.slow
 def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command, monkeypatch):
     monkeypatch.setattr(
-        "safe_envs.scripts.leaderboard._QUICK",
+        "safe_envs.agents.training.leaderboard._QUICK",
         {"n_timesteps": 256, "num_envs": 4, "eval_freq": 256, "eval_episodes": 4},
     )
     arguments = (
@@ -127,7 +127,7 @@ def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command
     )
     status, out, err = safe_envs_command(*arguments)
     assert (status, err) == (0, "")
-    rows = strictly("board/results.json")["rows"]
+    rows = strictly("board/results/Scalar-v0.json")["rows"]
     assert [(row["policy"], row["filter"]) for row in rows] == [
         ("nominal", "none"),
         ("nominal", "scbf"),
@@ -145,7 +145,7 @@ def test_the_leaderboard_compares_agents_and_is_not_done_twice(safe_envs_command
         " loop | processor time |"
     )
     assert row.startswith("| Scalar | scbf | ")
-    assert strictly("board/results.json")["rows"] == rows
+    assert strictly("board/results/Scalar-v0.json")["rows"] == rows
     status, _, err = safe_envs_command(*arguments, "--seed", 1)
     assert status == 2
     assert "give another --out" in err

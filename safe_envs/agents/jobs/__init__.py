@@ -1,1 +1,1 @@
-"""Processes and clusters that compute independent jobs."""
+"""The one runner of independent jobs, and the one store of their results."""

@@ -1,5 +1,4 @@
-"""A limit on the threads of BLAS, which gain nothing on small networks and wait for each other on a
-busy machine."""
+"""A limit on the threads of BLAS, which slow down small networks on a busy machine."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ _BRING_A_BLAS = ("numpy", "scipy.linalg", "torch")
 
 
 def limited(threads: int = 1) -> AbstractContextManager[Any]:
-    """Limit the threads of every BLAS that is loaded by now."""
+    """Limit the number of threads of every BLAS that is loaded by now."""
     return _controller(tuple(name in sys.modules for name in _BRING_A_BLAS)).limit(
         limits=threads, user_api="blas"
     )
@@ -22,6 +21,5 @@ def limited(threads: int = 1) -> AbstractContextManager[Any]:
 
 @lru_cache
 def _controller(loaded: tuple[bool, ...]) -> ThreadpoolController:
-    """Find the libraries of this process, which takes longer than many a simulation, once for each
-    set of them."""
+    """Find the libraries of this process once per set, since that outlasts many simulations."""
     return ThreadpoolController()

@@ -1,5 +1,4 @@
-"""joblib's own backends for Dask and Ray, with the loss of a worker told to joblib in place of
-waited for without end."""
+"""joblib's backends for Dask and Ray, which report the loss of a worker to joblib."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from safe_envs.agents.sweeps.cell import Cell
+from safe_envs.agents.jobs.job import Job
 from safe_envs.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -24,36 +23,36 @@ _LOOK = 5.0
 """Seconds between two looks at whether a scheduler still has workers."""
 
 _MOST_LOOKS = 60
-"""After how many looks in a row without workers it is given up."""
+"""Looks in a row without workers after which to give up."""
 
 _RETRIES = 2
-"""How often Ray starts a cell again whose worker has ended; Dask's own setting says it for Dask."""
+"""How often Ray starts a job again whose worker ended; Dask has a setting of its own for this."""
 
 
 class TaskLostError(Exception):
     """A task ended outside of its function, as with its worker.
 
     Attributes:
-        reason: what the cluster says.
-        cells: of the task.
+        reason: what the cluster reports.
+        jobs: those of the task.
     """
 
-    def __init__(self, reason: BaseException, cells: Sequence[Cell]) -> None:
+    def __init__(self, reason: BaseException, jobs: Sequence[Job]) -> None:
         super().__init__(str(reason))
-        self.reason, self.cells = reason, cells
+        self.reason, self.jobs = reason, jobs
 
 
 @contextmanager
-def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[str, Any]]:
-    """The arguments of `joblib.Parallel` for a Dask scheduler.
+def dask_settings(address: str, report: Callable[[str], None]) -> Iterator[dict[str, Any]]:
+    """Yield the arguments of `joblib.Parallel` for a Dask scheduler.
 
     Args:
         address: of the scheduler.
-        tell: told when it has no workers any more. Without any for minutes, joblib raises
-            ConfigurationError.
+        report: receives a message when it has lost all its workers. If none come for minutes, joblib
+            raises ConfigurationError.
 
     Raises:
-        ConfigurationError: there is none, or it has no workers.
+        ConfigurationError: there is no scheduler, or it has no workers.
     """
     from distributed import Client
     from joblib._dask import DaskDistributedBackend
@@ -76,12 +75,11 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
                 )
             return future
 
-        def _end(self, done: Any, cells: Sequence[Cell]) -> None:
+        def _end(self, done: Any, jobs: Sequence[Job]) -> None:
             callback, error = self._waiting.pop(done), done.exception()
             if error is not None:
-                # Of a task that ended with an error outside of its function, joblib would never
-                # hear.
-                callback(TaskLostError(error, cells))
+                # joblib would never hear of a task that ended outside of its function.
+                callback(TaskLostError(error, jobs))
 
         def give_up(self, error: Exception) -> None:
             for callback in list(self._waiting.values())[:1]:
@@ -104,7 +102,7 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
             ) from error
         backend, ended = Dask(client), threading.Event()
         watch = threading.Thread(
-            target=_watch, args=(client, address, tell, backend.give_up, ended), daemon=True
+            target=_watch, args=(client, address, report, backend.give_up, ended), daemon=True
         )
         watch.start()
         try:
@@ -117,41 +115,36 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
 def _watch(
     client: Client,
     address: str,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
     give_up: Callable[[Exception], None],
     ended: threading.Event,
 ) -> None:
-    """Look from time to time whether a scheduler has workers; say once that it has none, and give
-    up when none come."""
+    """Report once that a scheduler has no workers, and give up when none come."""
     looks = 0
     while not ended.wait(_LOOK):
         try:
             looks = 0 if client.nthreads() else looks + 1
-        except Exception:  # That the scheduler itself ends is told with the tasks.
+        except Exception:  # the end of the scheduler itself is reported with the tasks
             continue
         if ended.is_set():
             return
         if looks == 1:
-            tell(
+            report(
                 f"The Dask scheduler at {address} has no workers any more; waiting for some. Start"
                 f" them by: dask worker {address}"
             )
         if looks == _MOST_LOOKS:
             minutes = _LOOK * _MOST_LOOKS / 60
-            told = (
+            message = (
                 f"the Dask scheduler at {address} has had no workers for {minutes:g} minutes; start"
                 f" some by: dask worker {address}"
             )
-            give_up(
-                ConfigurationError(
-                    f"{told}, and start the sweep again: it goes on after what was computed"
-                )
-            )
+            give_up(ConfigurationError(f"{message}, and start again: what was computed is kept"))
 
 
 @contextmanager
 def ray_settings(address: str) -> Iterator[dict[str, Any]]:
-    """The arguments of `joblib.Parallel` for a Ray cluster.
+    """Yield the arguments of `joblib.Parallel` for a Ray cluster.
 
     Raises:
         ConfigurationError: it cannot be reached.
@@ -178,8 +171,10 @@ def ray_settings(address: str) -> Iterator[dict[str, Any]]:
 
 
 def _require_listener(address: str) -> None:
-    """Raise OSError unless something listens at HOST:PORT, ValueError for another form; the
-    clusters' own clients try for long."""
+    """Raise OSError unless something listens at HOST:PORT, and ValueError for another form.
+
+    The clients of the clusters would try for minutes.
+    """
     host, _, port = address.rpartition(":")
     if not (host and port.isdecimal() and "/" not in host):
         raise ValueError("this is not of the form HOST:PORT")

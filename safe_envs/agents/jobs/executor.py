@@ -1,5 +1,4 @@
-"""Where the cells of a sweep are computed: by joblib in processes of this machine, on a Dask
-scheduler or on a Ray cluster."""
+"""The runner of independent jobs: in processes of this machine, on a Dask or a Ray cluster."""
 
 from __future__ import annotations
 
@@ -11,8 +10,8 @@ from importlib.util import find_spec
 from typing import Any, cast
 
 from safe_envs.agents.jobs.clusters import TaskLostError, dask_settings, ray_settings
+from safe_envs.agents.jobs.job import Job, Outcome, outcome_of
 from safe_envs.agents.jobs.processes import local_processes
-from safe_envs.agents.sweeps.cell import Cell, Outcome, compute
 from safe_envs.errors import (
     ConfigurationError,
     SafeEnvsError,
@@ -24,11 +23,11 @@ from safe_envs.errors import (
 BACKENDS = ("local", "dask", "ray")
 
 _MOST_LOSSES = 3
-"""How often processes of this machine may end before cells are computed one by one; clusters have a
-number of their own."""
+"""How often processes of this machine may end before jobs are computed one by one; clusters retry
+by themselves."""
 
 _MOST_TRIED = 5
-"""How many cells are tried, one by one, before it is said that none can be computed."""
+"""How many jobs are tried, one by one, before none is taken to be computable."""
 
 _IDLE = 30
 """Seconds after which a process of this machine ends that has nothing to do."""
@@ -38,12 +37,12 @@ class _LossError(Exception):
     """A worker ended.
 
     Attributes:
-        cells: those that may have been under way with it.
+        jobs: those that it may have been computing.
     """
 
-    def __init__(self, reason: str, cells: Sequence[Cell]) -> None:
+    def __init__(self, reason: str, jobs: Sequence[Job]) -> None:
         super().__init__(reason)
-        self.cells = cells
+        self.jobs = jobs
 
 
 @dataclass(frozen=True)
@@ -53,10 +52,10 @@ class Backend:
     Attributes:
         backend: one of `BACKENDS`.
         address: of a Dask scheduler (tcp://HOST:PORT) or of a Ray cluster (HOST:PORT).
-        jobs: processes of this machine, for "local"; a cluster's workers are all used.
+        jobs: number of processes of this machine, for "local"; a cluster uses all its workers.
 
     Raises:
-        ConfigurationError: the backend is unknown, an address is missing or out of place, or a
+        ConfigurationError: the backend is unknown, an address is missing or does not apply, or a
             package is not installed.
     """
 
@@ -86,79 +85,71 @@ class Backend:
 
 
 def run(
-    cells: Iterable[Cell],
-    place: Backend,
+    jobs: Iterable[Job],
+    backend: Backend,
     keep: Callable[[Outcome], None],
-    tell: Callable[[str], None] = lambda _: None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Compute cells, each once.
+    """Compute jobs, each once.
 
-    When a worker ends, what was under way is computed again. After several such losses those that
-    were under way are computed one by one, up to the first that ends its worker by itself (as for
-    want of memory), which counts as failed; then the others go on side by side. As long as nothing
-    was computed at all, some cells from the whole of the list are tried one by one in place of
-    those.
+    When a worker ends, the jobs that were under way are computed again. After several such losses
+    those jobs are computed one by one, up to the first that ends its worker by itself (as for want
+    of memory), which counts as failed; then the others continue in parallel. As long as no job at
+    all was computed, some from the whole list are tried one by one in place of those.
 
     Args:
-        cells: what to compute. What comes out does not depend on their order.
-        place: where.
-        keep: told each outcome as soon as it is there, in the order of completion.
-        tell: told what the user should know while the others wait, such as that a cluster has no
-            workers any more; by any thread.
+        jobs: what to compute. The results do not depend on their order.
+        backend: where.
+        keep: receives each outcome as soon as it exists, in the order of completion.
+        report: receives what the user should know meanwhile, such as that a cluster has lost all its
+            workers; called by any thread.
 
     Raises:
         ConfigurationError: a cluster cannot be reached, or has no workers.
         WorkersLostError: workers end before they have computed anything.
     """
-    missing = {cell.key: cell for cell in cells}
+    missing = {job.key: job for job in jobs}
     any_computed = False
 
-    def take(some: Sequence[Cell]) -> None:
+    def take(some: Sequence[Job]) -> None:
         nonlocal any_computed
-        with closing(_outcomes(some, place, tell)) as outcomes:
+        with closing(_outcomes(some, backend, report)) as outcomes:
             for outcome in outcomes:
                 keep(outcome)
                 del missing[outcome.key]
                 any_computed = True
 
-    # Every pass through this loop makes them fewer: each cell that is tried alone is computed, or
-    # counts as failed.
+    # Each pass through this loop makes them fewer: a job that is tried alone is computed, or counts
+    # as failed.
     while missing:
         try:
             _persistently(
                 lambda: take(list(missing.values())),
-                _MOST_LOSSES if place.backend == "local" else 1,
+                _MOST_LOSSES if backend.backend == "local" else 1,
             )
         except _LossError as loss:
-            under_way = [cell for cell in loss.cells if cell.key in missing] if any_computed else []
-            # One that was by itself need not be tried again; Dask names one of several.
-            was_alone = len(under_way) == 1 and place.backend != "dask"
+            under_way = [job for job in loss.jobs if job.key in missing] if any_computed else []
+            # A job that was alone need not be tried again; Dask names one of several.
+            was_alone = len(under_way) == 1 and backend.backend != "dask"
             error: _LossError | None = loss
-            for cell in under_way or _spread(list(missing.values())):
-                error = loss if was_alone else _alone(cell, take)
+            for job in under_way or _spread(list(missing.values())):
+                error = loss if was_alone else _alone(job, take)
                 if error is not None:
-                    keep(
-                        Outcome(
-                            cell.key,
-                            None,
-                            None,
-                            f"the process that computed it ended: {error}",
-                            0.0,
-                        )
-                    )
-                    del missing[cell.key]
+                    message = f"the process that computed it ended: {error}"
+                    keep(Outcome(job.key, None, message, 0.0))
+                    del missing[job.key]
                 if any_computed and (error is not None or not under_way):
                     break
             if missing and not any_computed:
                 raise WorkersLostError(
-                    f"no cell could be computed, since the processes for it end; the last: {error}."
+                    f"nothing could be computed, since the processes for it end; the last: {error}."
                     " Look for the reason, such as too little memory or another installation on"
                     " the workers, and start again"
                 ) from error
 
 
 def _persistently(take: Callable[[], None], times: int) -> None:
-    """Do it again as long as a worker ends on the way; raise _LossError at the last loss."""
+    """Repeat a call as long as a worker ends during it; raise _LossError at the last loss."""
     for attempt in range(1, times + 1):
         try:
             return take()
@@ -168,72 +159,74 @@ def _persistently(take: Callable[[], None], times: int) -> None:
     return None
 
 
-def _alone(cell: Cell, take: Callable[[Sequence[Cell]], None]) -> _LossError | None:
-    """Compute a cell with no other beside it; how its worker ended, if it did."""
+def _alone(job: Job, take: Callable[[Sequence[Job]], None]) -> _LossError | None:
+    """Compute a job while no other is computed; return how its worker ended, if it did."""
     try:
-        take([cell])
+        take([job])
     except _LossError as error:
         return error
     return None
 
 
-def _spread(cells: Sequence[Cell]) -> Sequence[Cell]:
-    """Some cells from the whole of a list, its ends first."""
-    last = len(cells) - 1
+def _spread(jobs: Sequence[Job]) -> Sequence[Job]:
+    """Return some jobs from the whole of a list, its ends first."""
+    last = len(jobs) - 1
     places = [0, last, *(last * k // (_MOST_TRIED - 1) for k in range(1, _MOST_TRIED - 1))]
-    return [cells[k] for k in dict.fromkeys(places)]
+    return [jobs[k] for k in dict.fromkeys(places)]
 
 
 def _outcomes(
-    cells: Sequence[Cell], place: Backend, tell: Callable[[str], None]
+    jobs: Sequence[Job], backend: Backend, report: Callable[[str], None]
 ) -> Generator[Outcome, None, None]:
-    """Outcomes as they come.
+    """Yield outcomes in the order of completion.
 
     Raises:
         _LossError: a worker ended.
     """
     from joblib import Parallel, delayed
 
-    begun: list[Cell] = []
+    begun: list[Job] = []
 
     def tasks() -> Iterator[Any]:
-        for cell in cells:
-            begun.append(cell)
-            yield delayed(compute)(cell)
+        for job in jobs:
+            begun.append(job)
+            yield delayed(outcome_of)(job)
 
-    with _settings(place, len(cells), tell) as settings:
-        # One cell is one task, so that each is kept as soon as it is done.
+    with _settings(backend, len(jobs), report) as settings:
+        # One job is one task, so that each outcome is kept as soon as it exists.
         parallel = Parallel(return_as="generator_unordered", batch_size=1, **settings)  # pyright: ignore[reportArgumentType]
         with (
             closing(cast("Generator[Outcome, None, None]", parallel(tasks()))) as outcomes,
             warnings.catch_warnings(),
         ):
-            # joblib warns of what is not waited for, which is meant when this is closed early.
+            # joblib warns of tasks that nobody waits for, which closing this early intends.
             warnings.simplefilter("ignore", UserWarning)
             try:
                 yield from outcomes
             except SafeEnvsError:
                 raise
             except TaskLostError as error:
-                raise _LossError(_told(error.reason), error.cells) from error
-            except Exception as error:  # Those of cells are in their outcomes.
-                raise _LossError(_told(error), begun) from error
+                raise _LossError(_reason(error.reason), error.jobs) from error
+            except Exception as error:  # those of jobs are in their outcomes
+                raise _LossError(_reason(error), begun) from error
 
 
-def _told(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")
 
 
 @contextmanager
-def _settings(place: Backend, count: int, tell: Callable[[str], None]) -> Iterator[dict[str, Any]]:
-    """The arguments of joblib for a place, connected as long as the context lasts."""
-    if place.backend == "local":
-        # A single cell of several jobs is to have a process of its own too.
-        jobs = 1 if place.jobs == 1 else max(2, min(place.jobs, count))
+def _settings(
+    backend: Backend, count: int, report: Callable[[str], None]
+) -> Iterator[dict[str, Any]]:
+    """Yield the arguments of joblib for a backend, connected as long as the context lasts."""
+    if backend.backend == "local":
+        # A single job, too, has a process of its own where several are allowed.
+        jobs = 1 if backend.jobs == 1 else max(2, min(backend.jobs, count))
         yield {"backend": local_processes(_IDLE), "n_jobs": jobs}
-    elif place.backend == "dask":
-        with dask_settings(str(place.address), tell) as settings:
+    elif backend.backend == "dask":
+        with dask_settings(str(backend.address), report) as settings:
             yield settings
     else:
-        with ray_settings(str(place.address)) as settings:
+        with ray_settings(str(backend.address)) as settings:
             yield settings

@@ -17,8 +17,8 @@ from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from safe_envs.agents.policies.base import DESCRIPTION, TENSORS, saved_policy_files
 from safe_envs.agents.policies.fixed_batch import BlockPolicy
-from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS, policy_files
 from safe_envs.agents.policies.sb3 import require_spaces
 from safe_envs.atomic_io import write_atomically
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
@@ -239,7 +239,7 @@ def load_policy(folder: str | Path, problem: SafetyProblem) -> NetworkPolicy:
         ConfigurationError: there is no such policy, it is damaged, altered or of an unknown format,
             or belongs to another problem.
     """
-    files = policy_files(str(folder))
+    files = saved_policy_files(Path(folder))
     if len(files) < 2:
         raise ConfigurationError(
             f"{shortened(folder)} is no folder; name one with {TENSORS} and {DESCRIPTION}, as"

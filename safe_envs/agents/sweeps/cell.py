@@ -1,47 +1,34 @@
-"""A cell of a sweep: one evaluation of one policy under one filter, what identifies it, and its
-result wherever it is computed."""
+"""A cell of a sweep: one evaluation of one policy under one filter, and what identifies it."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-import threading
-import time
-import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import evaluate, package_versions
-from safe_envs.bounded_reading import read_bytes
-from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents.jobs.fingerprint import (
+    file_checksum,
+    json_checksum,
+    package_versions,
+    source_checksum,
+)
+from safe_envs.agents.sweeps.settings import ENV_OPTIONS, EVALUATION_DEFAULTS
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.options import PARAMETER_GROUPS
 from safe_envs.registry import which_env
-
-PARAMETERS = ("plant", "model", "barrier")
-"""Groups of parameters, which a setting names as plant.NAME."""
-
-ENV_OPTIONS = ("system", "noise", "dt", "substeps", "horizon", "box", "start")
-"""Settings that are arguments of `gym.make`."""
-
-_FRAMES = 3
-"""How many lines of code an unexpected error is told with."""
-
-_ONE_AT_A_TIME = threading.Lock()
-"""A Dask worker may have several threads, but neither SymPy nor the limits of threadpoolctl are
-made for that."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One evaluation of a sweep.
+    """One evaluation of a sweep; a `safe_envs.agents.jobs.job.Job`.
 
     Attributes:
-        settings: value of every setting that is not the env's own, by name; paths are absolute.
+        settings: value of every setting that is not the env's default, by name; paths are absolute.
         files: SHA-256 of each file that it reads, by path.
-        versions: those by which it is to be computed; see `versions`.
+        versions: versions by which it is to be computed; see `versions`.
         trust: load a policy's .zip, which runs code that it contains.
     """
 
@@ -51,15 +38,19 @@ class Cell:
     trust: bool = False
 
     @property
+    def configuration(self) -> dict[str, Any]:
+        """Everything that the result depends on."""
+        parts = {"settings": self.settings, "files": self.files, "versions": self.versions}
+        return {name: dict(part) for name, part in parts.items()}
+
+    @property
     def key(self) -> str:
-        """Identifies the cell by all that its result hangs on: 32 hexadecimal digits."""
-        parts = [dict(self.settings), dict(self.files), dict(self.versions)]
-        return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:32]
+        """Checksum of the configuration, 32 hexadecimal digits."""
+        return json_checksum(list(self.configuration.values()))[:32]
 
     @property
     def env_id(self) -> str:
-        """Id of the env that it simulates; for a system of one's own, the id behind which such
-        systems are.
+        """Id of the env that it simulates, or under which custom systems are registered.
 
         Raises:
             ConfigurationError: there is no such id, or neither or both of env and system are given.
@@ -70,134 +61,51 @@ class Cell:
     def options(self) -> dict[str, Any]:
         """The arguments of `gym.make`."""
         options = {name: self.settings[name] for name in ENV_OPTIONS if name in self.settings}
-        for group in PARAMETERS:
-            of_group = {
-                name.partition(".")[2]: value
-                for name, value in self.settings.items()
-                if name.startswith(f"{group}.")
-            }
-            if of_group:
-                options[group] = of_group
+        for name, value in self.settings.items():
+            group, dot, parameter = name.partition(".")
+            if dot and group in PARAMETER_GROUPS:
+                options.setdefault(group, {})[parameter] = value
         return options
 
+    def compute(self) -> dict[str, Any]:
+        """Return the "row" and the "config" of the evaluation, in any process of this project.
 
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a cell.
-
-    Attributes:
-        key: of the cell.
-        row: of the evaluation; None if it failed.
-        config: of the evaluation; None if it failed.
-        error: why it failed, if it did.
-        seconds: how long it took, the only part that depends on where it was computed.
-    """
-
-    key: str
-    row: dict[str, Any] | None
-    config: dict[str, Any] | None
-    error: str | None
-    seconds: float
-
-
-def compute(cell: Cell) -> Outcome:
-    """Compute a cell, in any process that has this project in the same versions. What goes wrong is
-    in the outcome."""
-    from threadpoolctl import threadpool_limits
-
-    began = time.perf_counter()
-    try:
-        # Cells run side by side already.
-        with _ONE_AT_A_TIME, threadpool_limits(1):
-            row, config = _evaluated(cell)
-    except SafeEnvsError as error:
-        return Outcome(cell.key, None, None, str(error), time.perf_counter() - began)
-    except Exception as error:
-        return Outcome(
-            cell.key,
-            None,
-            None,
-            f"{type(error).__name__}: {error}{_where(error)}",
-            time.perf_counter() - began,
+        Raises:
+            ConfigurationError: this process has other versions or other files than the one that
+                wrote the cell.
+            SafeEnvsError: the evaluation fails.
+        """
+        self._require_same_code()
+        arguments = {name: self.settings[name] for name in EVALUATION_DEFAULTS}
+        found = evaluate(
+            self.env_id,
+            filters=[self.settings["filter"]],
+            trust=self.trust,
+            options=self.options,
+            **arguments,
         )
-    return Outcome(cell.key, row, config, None, time.perf_counter() - began)
+        return {"row": found.rows[0].as_dict(), "config": found.config}
 
-
-def _where(error: Exception) -> str:
-    """The last lines of code that led to an error, with as much of their files' paths as is the
-    same on all machines."""
-    frames = traceback.extract_tb(error.__traceback__)[-_FRAMES:]
-    places = [
-        f"{'/'.join(Path(frame.filename).parts[-2:])}:{frame.lineno} in {frame.name}"
-        for frame in frames
-    ]
-    return f" (at {', from '.join(reversed(places))})"
-
-
-def _evaluated(cell: Cell) -> tuple[dict[str, Any], dict[str, Any]]:
-    _require_alike(cell)
-    settings = cell.settings
-    answer = evaluate(
-        cell.env_id,
-        settings["policy"],
-        [settings["filter"]],
-        trust=cell.trust,
-        options=cell.options,
-        episodes=settings["episodes"],
-        seed=settings["seed"],
-        knowledge=settings["knowledge"],
-        objective=settings["objective"],
-        bounds=settings["bounds"],
-    )
-    return answer.rows[0], answer.config
-
-
-def _require_alike(cell: Cell) -> None:
-    """Check that this process has the versions and the files of the one that wrote the cell.
-
-    Raises:
-        ConfigurationError: it has not.
-    """
-    here = versions()
-    differing = [
-        f"{name} {here.get(name, 'missing')} in place of {value}"
-        for name, value in cell.versions.items()
-        if here.get(name) != value
-    ]
-    if differing:
-        raise ConfigurationError(
-            f"the worker has {', '.join(differing)}; install the same versions on all machines"
-        )
-    for path, digest in cell.files.items():
-        if checksum(Path(path)) != digest:
+    def _require_same_code(self) -> None:
+        here = versions()
+        differing = [
+            f"{name} {here.get(name, 'missing')} in place of {value}"
+            for name, value in self.versions.items()
+            if here.get(name) != value
+        ]
+        if differing:
             raise ConfigurationError(
-                f"the worker finds another content in {path}; put all files of a sweep on a disk"
-                " that workers share"
+                f"the worker has {', '.join(differing)}; install the same versions on all machines"
             )
-
-
-def checksum(path: Path) -> str:
-    """SHA-256 of a file.
-
-    Raises:
-        ConfigurationError: it cannot be read.
-    """
-    try:
-        return hashlib.sha256(read_bytes(path)).hexdigest()
-    except OSError as error:
-        raise ConfigurationError(
-            f"{shortened(path)} cannot be read ({error.strerror}); check the path, and that it is"
-            " on a disk that all workers of the sweep share"
-        ) from error
+        for path, digest in self.files.items():
+            if file_checksum(Path(path)) != digest:
+                raise ConfigurationError(
+                    f"the worker finds another content in {path}; put all files of a sweep on a"
+                    " disk that workers share"
+                )
 
 
 @cache
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages on which results depend, and a checksum of this
-    project's own code."""
-    digest = hashlib.sha256()
-    root = Path(str(files("safe_envs")))
-    for path in sorted(root.rglob("*.py")):
-        if not path.is_relative_to(root / "scripts"):
-            digest.update(f"{path.relative_to(root)}\0".encode() + path.read_bytes())
-    return {**package_versions(), "source": digest.hexdigest()[:16]}
+    """Return the versions on which cells depend, with a checksum of this project's own code."""
+    return {**package_versions(), "source": source_checksum(scripts=False)[:16]}

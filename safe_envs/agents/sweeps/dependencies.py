@@ -1,4 +1,4 @@
-"""The files that a cell of a sweep reads, by whose content it is known."""
+"""The files that a cell of a sweep reads, whose content is part of its key."""
 
 from __future__ import annotations
 
@@ -10,20 +10,19 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.registry import policy_files
+from safe_envs.agents.policies.registry import absolute_policy, policy_files
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 
 _FILE = re.compile("(?<=file=)[^:+]+")
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a cell with paths that mean the same in every process."""
+    """Return the settings of a cell with paths that mean the same in every process."""
     found = {
         **settings,
         "filter": _FILE.sub(lambda match: os.path.realpath(match.group()), settings["filter"]),
     }
-    if policy_files(settings["policy"]) and os.path.exists(settings["policy"]):
-        found["policy"] = os.path.realpath(settings["policy"])
+    found["policy"] = absolute_policy(settings["policy"])
     if "system" in settings:
         file, _, name = settings["system"].rpartition(":")
         found["system"] = f"{os.path.realpath(file)}:{name}"
@@ -31,9 +30,9 @@ def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_by(settings: Mapping[str, Any]) -> Iterator[Path]:
-    """The files that a cell reads, of which those of Python may not be all: see `with_imported`.
+    """Yield the files that a cell reads, without those that they import: see `with_imported`.
 
-    A policy that is not there is an unknown name, which `make_policy` says better.
+    A policy that does not exist is an unknown name, which `make_policy` reports.
     """
     if "system" in settings:
         yield Path(settings["system"].rpartition(":")[0])
@@ -42,11 +41,10 @@ def read_by(settings: Mapping[str, Any]) -> Iterator[Path]:
 
 
 def with_imported(path: Path) -> list[Path]:
-    """A file, and where it is one of Python those of its own folder that it imports, or that these
-    import.
+    """Return a file, and if it is Python the files of its folder that it imports, or that these do.
 
-    Nothing is run: every import statement counts, wherever in a file it stands. What is imported by
-    another folder or by a name that is made while the code runs is not found.
+    Nothing is run: every import statement counts, wherever in a file it is. Imports from another
+    folder, or by a name that is computed at run time, are not found.
     """
     found: dict[Path, None] = {}
     left = [path]
@@ -63,8 +61,7 @@ def with_imported(path: Path) -> list[Path]:
 
 
 def _imports(file: Path, root: Path) -> Iterable[tuple[Path, Sequence[str]]]:
-    """The import statements of a file: each as the folder in which it begins, and the names down
-    from there."""
+    """Yield the imports of a file: the folder in which each begins, and the names below it."""
     if file.suffix != ".py":
         return
     try:
@@ -72,7 +69,7 @@ def _imports(file: Path, root: Path) -> Iterable[tuple[Path, Sequence[str]]]:
             warnings.simplefilter("ignore")
             tree = ast.parse(read_bytes(file, MOST_BYTES_OF_TEXT))
     except (OSError, SyntaxError, ValueError, RecursionError, MemoryError):
-        return  # Who runs it says what is wrong.
+        return  # whoever runs it reports what is wrong
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((root, each.name.split(".")) for each in node.names)
@@ -85,7 +82,7 @@ def _imports(file: Path, root: Path) -> Iterable[tuple[Path, Sequence[str]]]:
 
 
 def _files_of(folder: Path, names: Sequence[str]) -> Iterable[Path]:
-    """The modules and packages that are there of a dotted name."""
+    """Yield the existing modules and packages of a dotted name."""
     for name in filter(None, names):
         yield from (
             path

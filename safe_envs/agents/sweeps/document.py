@@ -1,5 +1,4 @@
-"""What a sweep's YAML file holds, without what YAML takes in silence: settings given twice, and
-numbers that are not as they look."""
+"""Strict YAML: no settings given twice, no numbers in misleading forms, no aliases and tags."""
 
 from __future__ import annotations
 
@@ -25,10 +24,9 @@ _DATE = "tag:yaml.org,2002:timestamp"
 
 
 class _Loader(yaml.SafeLoader):
-    """Of YAML's data, without code, aliases and tags: a few aliases of aliases stand for more than
-    any memory holds."""
+    """A loader without aliases and tags: nested aliases stand for more than memory holds."""
 
-    # No setting takes a date, and there are texts that look like one.
+    # No setting takes a date, and some texts look like one.
     yaml_implicit_resolvers: ClassVar[Any] = {
         first: [(tag, form) for tag, form in found if tag != _DATE]
         for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
@@ -36,7 +34,7 @@ class _Loader(yaml.SafeLoader):
     depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """See `yaml.SafeLoader`; refuses aliases, tags, and what is nested deeper than any sweep."""
+        """Compose a node; refuse aliases, tags, and what is nested deeper than any sweep."""
         event: Any = self.peek_event()
         what = (
             "an alias"
@@ -59,7 +57,7 @@ class _Loader(yaml.SafeLoader):
             self.depth -= 1
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        """See `yaml.SafeLoader`; refuses a name that stands there twice, and one that is no word."""
+        """Construct a mapping; refuse a name that is given twice, and one that is no word."""
         seen = set()
         for key, _ in node.value:
             if not isinstance(key, yaml.ScalarNode):
@@ -72,8 +70,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def construct_number(self, node: Any) -> int | float:
-        """A decimal number; refuses 010, which YAML takes for 8, 1:30, which it takes for 90, 1_000
-        and their kind."""
+        """Construct a decimal number; refuse 010 (8 in YAML), 1:30 (90) and 1_000."""
         if not _PLAIN.fullmatch(node.value):
             raise ConstructorError(None, None, f"{node.value} is no plain number", node.start_mark)
         return whole_or_real(node.value)
@@ -84,11 +81,11 @@ for kind in ("int", "float"):
 
 
 def document_in(path: Path) -> Any:
-    """What a YAML file holds.
+    """Return the content of a YAML file.
 
     Raises:
-        ConfigurationError: it cannot be read, is no YAML, or holds a name twice or a number in an
-            odd form.
+        ConfigurationError: it cannot be read, is no YAML, or holds a name twice or a number in a
+            misleading form.
     """
     try:
         return value_of(read_bytes(path, _MOST_BYTES).decode(), str(path))
@@ -104,14 +101,14 @@ def document_in(path: Path) -> Any:
 
 
 def value_of(text: str, name: str) -> Any:
-    """What a text in YAML stands for.
+    """Return the value of a text in YAML.
 
     Args:
         text: in YAML.
-        name: where it is from, for the message.
+        name: where it comes from, for the message.
 
     Raises:
-        YAMLError: it is no YAML, or holds a name twice or a number in an odd form.
+        YAMLError: it is no YAML, or holds a name twice or a number in a misleading form.
     """
     if len(text) > _MOST_BYTES:
         raise yaml.YAMLError(f"it has {len(text)} characters, more than {_MOST_BYTES}")

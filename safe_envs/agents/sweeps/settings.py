@@ -1,5 +1,4 @@
-"""What a sweep's file may hold: its sections, the names of settings, and values of the kind that
-each takes."""
+"""The settings of a sweep: their sections in a file, their names, and the kinds of their values."""
 
 from __future__ import annotations
 
@@ -8,14 +7,16 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE
-from safe_envs.agents.sweeps.cell import ENV_OPTIONS, PARAMETERS
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import real
+from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS
 from safe_envs.registry import full_id
 
-_SECTIONS = ("fixed", "grid", "cells")
-_DEFAULTS: dict[str, Any] = {
+ENV_OPTIONS = ("system", *(name for name in OPTION_NAMES if name not in PARAMETER_GROUPS))
+"""Settings that are arguments of `gym.make`."""
+
+EVALUATION_DEFAULTS: dict[str, Any] = {
     "policy": "nominal",
     "knowledge": "model",
     "objective": "nearest",
@@ -23,19 +24,22 @@ _DEFAULTS: dict[str, Any] = {
     "episodes": 1000,
     "bounds": False,
 }
-_NAMES = ("env", "filter", *ENV_OPTIONS, *_DEFAULTS)
+"""Settings that are arguments of `evaluate`, with the values of a cell that leaves them out."""
+
+_SECTIONS = ("fixed", "grid", "cells")
+_NAMES = ("env", "filter", *ENV_OPTIONS, *EVALUATION_DEFAULTS)
 _WORDS = ("env", "system", "filter", "policy", "knowledge", "objective")
-_GROUPS = tuple(f"{group}.NAME" for group in PARAMETERS)
+_GROUPS = tuple(f"{group}.NAME" for group in PARAMETER_GROUPS)
 
 Settings = dict[str, Any]
 
 
 def sections(document: Any, what: str) -> tuple[Settings, dict[str, list[Any]], list[Settings]]:
-    """The sections `fixed`, `grid` and `cells` of a sweep, each checked by itself.
+    """Return the sections `fixed`, `grid` and `cells` of a sweep, each checked by itself.
 
     Args:
-        document: what the file holds.
-        what: how errors call it.
+        document: content of the file.
+        what: name of the sweep in errors.
 
     Raises:
         ConfigurationError: a section or a setting is unknown, or a value is not of its setting's
@@ -50,11 +54,14 @@ def sections(document: Any, what: str) -> tuple[Settings, dict[str, list[Any]], 
 
 
 def complete(settings: Settings, what: str) -> Settings:
-    """The settings of a cell, in one order, with what is the same for every env where it was left
-    open.
+    """Return the settings of a cell in a fixed order, with the defaults of an evaluation.
+
+    Args:
+        settings: as given; checked by `sections`.
+        what: name of the sweep in errors.
 
     Raises:
-        ConfigurationError: it has no filter, or not just one of env and system.
+        ConfigurationError: the cell has no filter, or not just one of env and system.
     """
     if ("env" in settings) == ("system" in settings):
         raise ConfigurationError(
@@ -62,9 +69,9 @@ def complete(settings: Settings, what: str) -> Settings:
         )
     if "filter" not in settings:
         raise ConfigurationError(
-            f"{what}: a cell has no filter; name one, or {BARE} for the bare env"
+            f"{what}: a cell has no filter; name one, or {UNFILTERED} for the unfiltered env"
         )
-    given = {**_DEFAULTS, **settings}
+    given = {**EVALUATION_DEFAULTS, **settings}
     return {
         name: given[name]
         for name in sorted(given, key=lambda name: (name not in _NAMES, _rank(name), name))
@@ -72,7 +79,7 @@ def complete(settings: Settings, what: str) -> Settings:
 
 
 def text_of(value: Any) -> str:
-    """The value of a setting as text; also of one that is not allowed, such as a date of YAML's."""
+    """Return the value of a setting as text, also one that is not allowed, such as a YAML date."""
     if isinstance(value, str):
         return value
     try:
@@ -82,7 +89,7 @@ def text_of(value: Any) -> str:
 
 
 def _rank(name: str) -> int:
-    return _NAMES.index(name) if name in _NAMES else PARAMETERS.index(name.partition(".")[0])
+    return _NAMES.index(name) if name in _NAMES else PARAMETER_GROUPS.index(name.partition(".")[0])
 
 
 def _mapping(given: Any, what: str, allowed: Sequence[str] | None) -> dict[str, Any]:
@@ -131,21 +138,21 @@ def _listed(given: Any, what: str) -> list[Settings]:
 
 def _is_known(name: str) -> bool:
     group, dot, parameter = name.partition(".")
-    return name in _NAMES or (group in PARAMETERS and bool(dot and parameter))
+    return name in _NAMES or (group in PARAMETER_GROUPS and bool(dot and parameter))
 
 
 def _require_known(name: str, what: str) -> None:
     if not _is_known(name):
         hint = (
             f"; give its parameters as {name}.NAME"
-            if name in PARAMETERS
+            if name in PARAMETER_GROUPS
             else f"; {nearest(name, (*_NAMES, *_GROUPS))}"
         )
         raise ConfigurationError(f"{what} has the setting {shown(name)}{hint}")
 
 
 def _value(name: str, value: Any, what: str) -> Any:
-    """A value of the kind that its setting takes, in one form where there are several."""
+    """Return a value of the kind that its setting takes, in one form where there are several."""
     if name in _WORDS:
         return _word(name, value, what)
     if name == "bounds":
@@ -183,10 +190,9 @@ def _word(name: str, value: Any, what: str) -> str:
 
 
 def _number(name: str, value: Any, what: str) -> Any:
-    """A finite number; of a barrier as it is, since that may count something, and of all else as a
-    float, to be one cell with its equals.
+    """Return a finite number, or a word where an env takes one.
 
-    Words pass where an env takes them.
+    All but those of a barrier, which may be counts, are floats, so that equal cells are one cell.
     """
     given = value
     if isinstance(value, str):

@@ -1,5 +1,4 @@
-"""What a sweep is: from a file that names settings and their values to cells, each of which is one
-evaluation."""
+"""A sweep: the cells that a file with settings and lists of their values describes."""
 
 from __future__ import annotations
 
@@ -10,24 +9,25 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.policies.registry import make_policy
-from safe_envs.agents.sweeps.cell import Cell, checksum, versions
+from safe_envs.agents.sweeps.cell import Cell, versions
 from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_imported
 from safe_envs.agents.sweeps.document import document_in
 from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_of
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.wrappers import LEARNED, SafetyFilter, require_readable
 
 _NO_PART = ("seed", "episodes", "bounds")
 """Settings that change neither the problem nor the filter nor the policy."""
 
-_BESIDE = {"filter": ("env", "system", "knowledge", "objective"), "policy": ("env", "system")}
-"""With what else a setting has to suit."""
+_TOGETHER = {"filter": ("env", "system", "knowledge", "objective"), "policy": ("env", "system")}
+"""Settings with which another one has to be compatible."""
 
 _MOST_CELLS = 50_000
-"""They are all told apart before the first is computed, in a second."""
+"""All of them are compared, in a second, before the first is computed."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +65,12 @@ def read_sweep(path: Path, trust: bool = False) -> Sweep:
 
 
 def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Sweep:
-    """A sweep from what its file holds, with names and kinds of values checked.
+    """Return the sweep of a file's content, with names and kinds of values checked.
 
     Args:
-        document: the file's mapping from sections.
+        document: mapping from the file's sections.
         trust: see `read_sweep`.
-        what: how errors call it.
+        what: name of the sweep in errors.
 
     Raises:
         ConfigurationError: a section or a setting is not allowed.
@@ -103,15 +103,14 @@ def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Swe
 
 
 def describe(cell: Cell, names: Iterable[str]) -> str:
-    """A cell in a few words: the settings of these names."""
+    """Return a cell in a few words: its settings of these names."""
     return ", ".join(
         f"{name} = {text_of(cell.settings[name])}" for name in names if name in cell.settings
     )
 
 
 def _equal(settings: Settings) -> str:
-    """The same for settings that differ in 1 and 1.0 of a barrier only, and so are of the same
-    episodes."""
+    """Return a text that is the same for settings that differ only in 1 and 1.0 of a barrier."""
 
     def one_form(value: Any) -> Any:
         return json.loads(json.dumps(value), parse_int=float)
@@ -130,7 +129,7 @@ def _cells(found: Iterable[Settings], trust: bool) -> Iterable[Cell]:
         settings, files = absolute(given), {}
         for path in read_by(settings):
             if path not in digests:
-                digests[path] = {str(each): checksum(each) for each in with_imported(path)}
+                digests[path] = {str(each): file_checksum(each) for each in with_imported(path)}
             files |= digests[path]
         yield Cell(settings, files, versions(), trust)
 
@@ -141,22 +140,23 @@ def _swept(settings: Sequence[Mapping[str, Any]]) -> Iterable[str]:
 
 
 def _check(sweep: Sweep, what: str) -> None:
-    """Make the problem, the filter and the policy of every cell that has a value, or one with its
-    env, that none before it had.
+    """Make the problem, filter and policy of each cell with a value, or a pair, that is new.
 
-    Others would repeat it, and to make the problem of a large system takes a second.
+    The others would repeat it, and the problem of a large system takes a second.
 
     Raises:
-        SafeEnvsError: one cannot be made; says of which cell.
+        SafeEnvsError: one cannot be made; the message names the cell.
     """
     seen: set[str] = set()
     for cell in sweep.cells:
-        beside = {
-            name: [cell.settings.get(other) for other in others] for name, others in _BESIDE.items()
+        together = {
+            name: [cell.settings.get(other) for other in others]
+            for name, others in _TOGETHER.items()
         }
-        looked_at = {name: value for name, value in cell.settings.items() if name not in _NO_PART}
         parts = {
-            name: json.dumps([name, value, beside.get(name)]) for name, value in looked_at.items()
+            name: json.dumps([name, value, together.get(name)])
+            for name, value in cell.settings.items()
+            if name not in _NO_PART
         }
         new = {name for name, part in parts.items() if part not in seen}
         if not new:
@@ -176,13 +176,13 @@ def _check_cell(cell: Cell, derive: bool) -> None:
             raise ConfigurationError(
                 f"{name} = {shown(settings[name])}; {nearest(settings[name], allowed)}"
             )
-    problem = load_problem(cell.env_id, cell.options)
-    if settings["filter"] != BARE:
+    problem = make_problem(cell.env_id, **cell.options)
+    if settings["filter"] != UNFILTERED:
         require_readable(settings["filter"], problem)
-        rests_on_learned = any(
+        needs_learning = any(
             part.split(":")[0] in LEARNED for part in settings["filter"].split("+")
         )
-        if derive and not rests_on_learned:
+        if derive and not needs_learning:
             SafetyFilter.for_problem(
                 problem, settings["filter"], settings["knowledge"], settings["objective"]
             )

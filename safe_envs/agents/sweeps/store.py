@@ -1,22 +1,20 @@
-"""Results of a sweep on disk: a Parquet file for each cell, there whole or not at all, and the
-table of all of them."""
+"""The results of a sweep on disk, and the table of all of them."""
 
 from __future__ import annotations
 
 import json
-import os
-import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safe_envs.agents.sweeps.cell import Cell, Outcome
+from safe_envs.agents.jobs.job import Outcome
+from safe_envs.agents.jobs.store import ResultStore, reading, remove_stale
+from safe_envs.agents.sweeps.cell import Cell
 from safe_envs.agents.sweeps.settings import text_of
 from safe_envs.agents.sweeps.spec import Sweep
-from safe_envs.atomic_io import write_atomically, write_json
-from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, open_regular, read_bytes
+from safe_envs.atomic_io import write_json
+from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 from safe_envs.errors import ConfigurationError, shortened
 
 if TYPE_CHECKING:
@@ -26,9 +24,6 @@ INDEX = "sweep.json"
 """Name of the file with the order of the cells and the names of the swept settings."""
 
 _CELLS = "cells"
-_STALE = 3600.0
-"""Age in seconds at which a temporary file is left over: to write one takes no second."""
-
 _COUNTS = ("safe", "violations")
 _STATISTICS = (
     "safety_rate",
@@ -42,52 +37,48 @@ _STATISTICS = (
     "return_mean",
     "estimated_bound",
 )
-_DOCUMENTS = ("settings", "files", "versions", "config", "row")
+_ADVICE = "remove it and start the sweep again"
 
 
 class Store:
     """The folder of a sweep.
 
     Args:
-        folder: made if it is not there.
-        sweep: whose cells are kept in it. Those of another sweep in the same folder stay, and are
-            read until one of this is there.
+        folder: created if it does not exist.
+        sweep: whose cells are kept in it. Those of another sweep in the same folder remain, and are
+            read until there is one of this sweep.
 
     Attributes:
         hidden: number of cells of another sweep, such as one with another grid or another version
             of the code.
 
     Raises:
-        ConfigurationError: the folder cannot be made or written, or pyarrow is not installed.
+        ConfigurationError: the folder cannot be created or written, or pyarrow is not installed.
     """
 
     def __init__(self, folder: Path, sweep: Sweep) -> None:
         _require_pyarrow()
         self._folder, self._cells = folder, {cell.key: cell for cell in sweep.cells}
-        try:
-            (folder / _CELLS).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigurationError(
-                f"{folder} cannot be made: {error.strerror}; give another folder"
-            ) from error
-        _remove_stale(folder)
-        there = {key for key in self._cells if _file_of(folder, key).is_file()}
-        self._finished = {key for key in there if _is_finished(_file_of(folder, key))}
+        self._results = ResultStore(folder / _CELLS)
+        self._results.remove_unfinished()
+        remove_stale(folder, f".{Path(INDEX).stem}.*")
+        there = {key for key in self._cells if self._results.path(key).is_file()}
+        self._finished = {key for key in there if self._is_finished(key)}
         self._failed = there - self._finished
         self._index = {"cells": list(self._cells), "swept": list(sweep.swept)}
         # The results of another sweep, as of another version of the code, can be read until there
         # is one of this.
         before = _keys_before(folder)
         self.hidden = sum(
-            _file_of(folder, key).is_file() for key in before if key not in self._cells
+            self._results.path(key).is_file() for key in before if key not in self._cells
         )
         self._is_indexed = bool(there) or not before
         if self._is_indexed:
-            self._write_index()
+            write_json(folder / INDEX, self._index)
 
     @property
     def missing(self) -> list[Cell]:
-        """Cells that are not there yet, and after them those that failed."""
+        """Cells that are not computed yet, followed by those that failed."""
         missing = [cell for key, cell in self._cells.items() if key not in self._finished]
         return sorted(missing, key=lambda cell: cell.key in self._failed)
 
@@ -97,42 +88,40 @@ class Store:
         Raises:
             ConfigurationError: it cannot be written, as on a full disk.
         """
-        path = _file_of(self._folder, outcome.key)
-        if not self._is_indexed:
-            self._write_index()
-        if outcome.error is None or not _is_finished(path):
-            self._write(
-                lambda: write_atomically(
-                    path, lambda part: _write_table(part, self._cells[outcome.key], outcome)
-                )
-            )
-            (self._finished if outcome.error is None else self._failed).add(outcome.key)
-        else:
-            self._finished.add(outcome.key)
-
-    def _write_index(self) -> None:
-        path = self._folder / INDEX
-        self._write(lambda: write_json(path, self._index))
-        self._is_indexed = True
-
-    def _write(self, write: Callable[[], None]) -> None:
+        key = outcome.key
+        if outcome.error is not None and self._is_finished(key):
+            self._finished.add(key)
+            return
+        result = outcome.result or {"row": None, "config": None}
+        content = {**result, "error": outcome.error, "seconds": outcome.seconds}
         try:
-            write()
+            if not self._is_indexed:
+                write_json(self._folder / INDEX, self._index)
+                self._is_indexed = True
+            self._results.keep(key, self._cells[key].configuration, content)
         except ConfigurationError as error:
             raise ConfigurationError(
                 f"{error}. {len(self._finished)} of {len(self._cells)} cells are finished and kept"
                 f" in {self._folder}; start again then, and only the others are computed"
             ) from error
+        (self._finished if outcome.error is None else self._failed).add(key)
+
+    def _is_finished(self, key: str) -> bool:
+        try:
+            found = self._results.read(key, self._cells[key].configuration)
+            return found is not None and found["error"] is None and isinstance(found["row"], dict)
+        except (ConfigurationError, KeyError):
+            return False
 
 
 def read(folder: Path | str) -> pa.Table:
-    """The cells of a sweep that are there, in the order of its file.
+    """Return the table of the cells of a sweep that are computed, in the order of its file.
 
-    Columns: `key`; each setting that is swept or that some cell has, null where another one leaves
-        it to the env; counts and
-    statistics as in the rows of `safe_envs.agents.evaluation.evaluate.evaluate`; `error`, null for
-    cells that did not fail; `seconds`, the only one that depends on the machine; and as JSON the
-    whole row, its configuration, the versions and the checksums of files.
+    Columns: `key`; each setting that is swept or that some cell has, null where a cell leaves it to
+    the env; counts and statistics as in the rows of
+    `safe_envs.agents.evaluation.evaluate.evaluate`; `error`, null for cells that did not fail;
+    `seconds`, the only one that depends on the machine; and as JSON the whole row, its
+    configuration, the versions and the checksums of files.
 
     Raises:
         ConfigurationError: the folder holds no sweep, a file in it cannot be read, or pyarrow is
@@ -142,33 +131,26 @@ def read(folder: Path | str) -> pa.Table:
     import pyarrow as pa
 
     folder = Path(folder)
-    index = read_index(folder)
-    paths = [path for key in index["cells"] if os.path.isfile(path := _file_of(folder, key))]
-    if not paths:
-        return _schema().empty_table()
-    try:
-        kept = pa.concat_tables([_table_in(path) for path in paths])
-        settings = [dict(json.loads(text)) for text in kept["settings"].to_pylist()]
-    except (OSError, pa.ArrowException, KeyError, RecursionError, TypeError, ValueError) as error:
-        raise ConfigurationError(
-            f"a file in {folder / _CELLS} cannot be read ({shortened(error)}); remove it and start"
-            " the sweep again"
-        ) from error
-    # A swept setting may be one of cells only that are not there yet.
-    names = dict.fromkeys([*(name for each in settings for name in each), *index["swept"]])
-    columns = {
-        "key": kept["key"],
-        **{name: _column([each.get(name) for each in settings]) for name in names},
-    }
-    return pa.table(
-        columns
-        | {name: kept[name] for name in kept.column_names if name not in ("key", "settings")}
-    )
+    index, results = read_index(folder), ResultStore(folder / _CELLS)
+    found = {key: results.document(key) for key in index["cells"]}
+    documents = {key: document for key, document in found.items() if document is not None}
+    with reading(folder / _CELLS, _ADVICE):
+        settings = [dict(each["configuration"]["settings"]) for each in documents.values()]
+        # A swept setting may be one of missing cells only.
+        names = dict.fromkeys([*(name for each in settings for name in each), *index["swept"]])
+        rows = [_columns(document) for document in documents.values()]
+        return pa.table(
+            {"key": pa.array(documents, pa.string())}
+            | {name: _column([each.get(name) for each in settings]) for name in names}
+            | {name: pa.array([row[name] for row in rows], kind) for name, kind in _kinds().items()}
+        )
 
 
 def read_index(folder: Path) -> dict[str, Any]:
-    """Keys of all cells of a sweep in their order, under "cells", and names of the swept settings,
-    under "swept".
+    """Return the order of a sweep's cells.
+
+    Returns:
+        The keys of all cells under "cells", and the names of the swept settings under "swept".
 
     Raises:
         ConfigurationError: the folder holds no sweep.
@@ -186,7 +168,7 @@ def read_index(folder: Path) -> dict[str, Any]:
     ):
         raise ConfigurationError(
             f"{folder / INDEX} is not as `safe-envs sweep` writes it; run the sweep again, which"
-            " writes it anew"
+            " writes it again"
         )
     return index
 
@@ -198,15 +180,6 @@ def _keys_before(folder: Path) -> list[str]:
         return []
 
 
-def _remove_stale(folder: Path) -> None:
-    """Remove what was being written when a run was killed: nothing that is young, which another run
-    may be writing."""
-    for path in (*folder.glob(f".{Path(INDEX).stem}.*"), *(folder / _CELLS).glob(".*.parquet")):
-        with suppress(OSError):
-            if time.time() - path.stat().st_mtime > _STALE:
-                path.unlink()
-
-
 def _require_pyarrow() -> None:
     if find_spec("pyarrow") is None:
         raise ConfigurationError(
@@ -214,93 +187,30 @@ def _require_pyarrow() -> None:
         )
 
 
-def _file_of(folder: Path, key: str) -> Path:
-    return folder / _CELLS / f"{key}.parquet"
-
-
-def _is_finished(path: Path) -> bool:
+def _kinds() -> dict[str, pa.DataType]:
+    """Return the types of the columns that `_columns` fills."""
     import pyarrow as pa
 
-    try:
-        return _table_in(path)["error"][0].as_py() is None
-    except (OSError, pa.ArrowException, ValueError):
-        return False
+    kinds = dict.fromkeys(_COUNTS, pa.int64()) | dict.fromkeys(_STATISTICS, pa.float64())
+    kinds |= {"error": pa.string(), "seconds": pa.float64()}
+    return kinds | dict.fromkeys(("files", "versions", "config", "row"), pa.string())
 
 
-def _table_in(path: Path) -> pa.Table:
-    """The row that the file of a cell holds.
-
-    Raises:
-        OSError, ArrowException, ValueError: it cannot be read, or is not as `_write_table` writes
-            it.
-    """
-    import pyarrow.parquet as pq
-
-    with open_regular(path, MOST_BYTES_OF_TEXT) as stream:
-        file = pq.ParquetFile(stream)
-        told = file.metadata
-        parts = [
-            told.row_group(i).column(j)
-            for i in range(told.num_row_groups)
-            for j in range(told.num_columns)
-        ]
-        # A few bytes under another compression, or in many rows, stand for more than the memory
-        # holds.
-        if told.num_rows != 1 or not {part.compression for part in parts} <= {
-            "SNAPPY",
-            "UNCOMPRESSED",
-        }:
-            raise ValueError("it is no cell of a sweep")
-        table = file.read()
-    if table.schema != _schema():
-        raise ValueError("its columns are not those of a cell of a sweep")
-    return table
-
-
-def _schema() -> pa.Schema:
-    import pyarrow as pa
-
-    kinds = [
-        ("key", pa.string()),
-        *((name, pa.int64()) for name in _COUNTS),
-        *((name, pa.float64()) for name in _STATISTICS),
-    ]
-    kinds += [
-        ("error", pa.string()),
-        ("seconds", pa.float64()),
-        *((name, pa.string()) for name in _DOCUMENTS),
-    ]
-    return pa.schema(kinds)
-
-
-def _write_table(path: Path, cell: Cell, outcome: Outcome) -> None:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    row: Mapping[str, Any] = outcome.row or {}
-    documents = {
-        "settings": cell.settings,
-        "files": cell.files,
-        "versions": cell.versions,
-        "config": outcome.config,
-        "row": outcome.row,
-    }
-    columns = {"key": outcome.key, "error": outcome.error, "seconds": outcome.seconds}
-    columns |= {name: row.get(name) for name in (*_COUNTS, *_STATISTICS)}
-    columns |= {
-        name: None if document is None else json.dumps(document)
-        for name, document in documents.items()
-    }
-    table = pa.Table.from_pylist([columns], schema=_schema())
-    with path.open("wb") as file:
-        pq.write_table(table, file)
-        # A disk may say only now that it is full.
-        file.flush()
-        os.fsync(file.fileno())
+def _columns(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a cell's row in the table, except for its settings."""
+    configuration, row = document["configuration"], document["row"]
+    texts = {name: configuration[name] for name in ("files", "versions")}
+    texts |= {"config": document["config"], "row": row}
+    statistics: Mapping[str, Any] = row or {}
+    return (
+        {name: statistics.get(name) for name in (*_COUNTS, *_STATISTICS)}
+        | {"error": document["error"], "seconds": document["seconds"]}
+        | {name: None if part is None else json.dumps(part) for name, part in texts.items()}
+    )
 
 
 def _column(values: Sequence[Any]) -> pa.Array:
-    """The values of a setting: numbers, truth values or texts as they are, and all others as JSON."""
+    """Return the values of a setting as a column: texts of JSON where they are not of one kind."""
     import pyarrow as pa
 
     kinds = {type(value) for value in values if value is not None}

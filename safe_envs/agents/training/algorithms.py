@@ -1,4 +1,4 @@
-"""The algorithms of Stable-Baselines3, made from hyperparameters by the RL Zoo's names."""
+"""The algorithms of Stable-Baselines3, made from hyperparameters of the RL Zoo."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from safe_envs.agents.training.hyperparameters import scheduled
+from safe_envs.agents.policies.sb3_actor import actor_of
+from safe_envs.agents.training.hyperparameters import OFF_POLICY, scheduled
+from safe_envs.agents.training.replay_buffer import replay_options
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 
@@ -18,13 +20,8 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecEnv
 
-OFF_POLICY = ("sac", "td3")
-
-ACTIONS = ("executed", "proposed", "both")
-"""On which these may learn behind a filter; see `safe_envs.agents.training.replay_buffer`."""
-
-SHOWN = 1000
-"""Characters of hyperparameters, or of what others say of them, at most, that a message repeats."""
+MOST_SHOWN = 1000
+"""Characters of hyperparameters, or of errors about them, at most, that a message repeats."""
 
 _OF_THE_ENV = ("normalize",)
 _OF_THE_NOISE = ("noise_type", "noise_std")
@@ -32,7 +29,7 @@ _OF_THE_BUFFER = ("replay_buffer_class", "replay_buffer_kwargs")
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """The class of "ppo", "a2c", "sac" or "td3"."""
+    """Return the class of "ppo", "a2c", "sac" or "td3"."""
     import stable_baselines3
 
     return getattr(stable_baselines3, name.upper())
@@ -46,24 +43,21 @@ def new_model(
     action: str | None,
     seed: int,
 ) -> BaseAlgorithm:
-    """Make an algorithm that has learned nothing yet; its `get_env()` is `envs`, normalised if the
-    settings say so.
+    """Make an untrained algorithm, whose `get_env()` is `envs`, normalised if the settings say so.
 
     Args:
         name: see `algorithm_class`.
         envs: on which it learns.
         problem: of the envs.
         settings: hyperparameters of the algorithm, and `normalize`, `noise_type` and `noise_std`.
-        action: on which an off-policy algorithm learns behind a filter; None without a filter, or
-            on-policy.
+        action: on which an off-policy algorithm learns with a filter in the loop; None without a
+            filter, or on-policy.
         seed: of the algorithm.
 
     Raises:
         ConfigurationError: the algorithm does not take these settings, or its policy cannot be
             saved as numbers.
     """
-    from safe_envs.agents.policies.sb3_actor import actor_of
-
     # Stable-Baselines3 writes into what it is given.
     left = scheduled(copy.deepcopy(dict(settings)))
     _require_known(name, left)
@@ -89,8 +83,8 @@ def new_model(
         ValueError,
     ) as error:
         raise ConfigurationError(
-            f"{name} does not take these hyperparameters: {str(error)[:SHOWN]}; they are"
-            f" {str(settings)[:SHOWN]}"
+            f"{name} does not take these hyperparameters: {str(error)[:MOST_SHOWN]}; they are"
+            f" {str(settings)[:MOST_SHOWN]}"
         ) from error
     # Better now than when the first checkpoint is written.
     actor_of(model.policy)
@@ -107,7 +101,7 @@ def _require_known(name: str, settings: Mapping[str, Any]) -> None:
             raise ConfigurationError(
                 f"{name} does not take the hyperparameter {shown(key)}; {nearest(key, allowed)}"
             )
-        # Stable-Baselines3 would fail after the first rollout only.
+        # Stable-Baselines3 would only fail after the first rollout.
         if (
             isinstance(value, str)
             and key in parameters
@@ -116,34 +110,8 @@ def _require_known(name: str, settings: Mapping[str, Any]) -> None:
             raise ConfigurationError(f"{key} = {shown(value)}; give a number")
 
 
-def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:
-    """The size of the minibatches that a rollout is cut into: the given one, or the largest below
-    it that leaves no rest.
-
-    Args:
-        batch_size: wanted.
-        rollout: steps of all envs.
-        asked_for: whether a user gave it, who is not to get another one.
-
-    Raises:
-        ConfigurationError: it is no whole number from 2, or it was asked for and leaves a rest.
-    """
-    if isinstance(batch_size, bool) or not isinstance(batch_size, int) or batch_size < 2:
-        raise ConfigurationError(f"batch_size = {batch_size!r}; give a whole number from 2")
-    fits = next(
-        (size for size in range(min(batch_size, rollout), 1, -1) if rollout % size == 0), rollout
-    )
-    if asked_for and fits != batch_size:
-        raise ConfigurationError(
-            f"batch_size = {batch_size} does not divide the rollout of n_steps x num_envs ="
-            f" {rollout} steps; give {fits}"
-        )
-    return fits
-
-
 def _normalized(envs: VecEnv, normalize: Any, gamma: float) -> VecEnv:
-    """The envs in a VecNormalize, as the Zoo's `normalize` says: a bool, a mapping, or the text of
-    one."""
+    """Return the envs, in a VecNormalize if the Zoo's `normalize` asks for it."""
     if isinstance(normalize, str):
         normalize = ast.literal_eval(normalize)
     if normalize is False or normalize is None:
@@ -172,13 +140,11 @@ def _action_noise(kind: str | None, deviation: float | None, inputs: int) -> dic
 
 
 def _replay(problem: SafetyProblem, action: str, settings: dict[str, Any]) -> dict[str, Any]:
-    """Take what the buffer needs out of the settings, and return the buffer's."""
-    from safe_envs.agents.training.replay_buffer import replay_options
-
+    """Move the settings that the replay buffer needs out of the others, and return its own."""
     given = [key for key in _OF_THE_BUFFER if key in settings]
     if given:
         raise ConfigurationError(
-            f"{', '.join(given)}: behind a filter the replay buffer is that of --action; leave"
+            f"{', '.join(given)}: with a filter in the loop the replay buffer is that of --action; leave"
             " it out"
         )
     return replay_options(

@@ -1,43 +1,55 @@
-"""What is trained, on what, and for how long."""
+"""The configuration of a training."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE
-from safe_envs.agents.training.algorithms import ACTIONS, OFF_POLICY, whole_batches
-from safe_envs.agents.training.hyperparameters import hyperparameters
+from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.agents.training.hyperparameters import (
+    ACTIONS,
+    OFF_POLICY,
+    hyperparameters,
+    whole_batches,
+)
 from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.registry import full_id
 
 _MOST_ROWS = 1_000_000
 
-PARTS = 10
-"""Into how many parts a training is cut unless it is said otherwise."""
+_PARTS = 10
+"""Number of parts of a training, each of which is evaluated, by default."""
+
+_LEAST = {
+    "n_timesteps": 1,
+    "num_envs": 1,
+    "seed": 0,
+    "eval_freq": 1,
+    "eval_episodes": 1,
+    "threads": 1,
+}
 
 
 @dataclass(frozen=True)
 class Training:
-    """What is trained, on what, and for how long. JSON-able; `Training.of` fills in what the
-    hyperparameters say.
+    """A training, JSON-able; `Training.of` fills in what the hyperparameters say.
 
     Attributes:
         env_id: full id.
         algorithm: "ppo", "a2c", "sac" or "td3".
-        filter: text of the filter in the loop; None for the bare env.
+        n_timesteps: control periods over all copies of the env.
+        num_envs: number of copies.
+        hyperparameters: of the algorithm, by the Zoo's names.
+        eval_freq: steps between evaluations, at each of which a checkpoint is kept.
+        filter: text of the filter in the loop; None for the unfiltered env.
         options: arguments of `gym.make`.
         knowledge: of the filter, "model" or "plant".
-        n_timesteps: control periods over all copies of the env.
-        num_envs: copies.
-        hyperparameters: of the algorithm, by the Zoo's names.
         seed: of everything random.
         action: on which an off-policy algorithm learns; see
             `safe_envs.agents.training.replay_buffer`.
         intervention_penalty: see `safe_envs.agents.training.vec_env.make_sb3_env`.
-        eval_freq: steps between evaluations, which are kept as checkpoints too.
         eval_episodes: of each evaluation.
         threads: of torch and BLAS. Small networks are many times slower on several threads of a
             busy machine.
@@ -48,18 +60,18 @@ class Training:
 
     env_id: str
     algorithm: str
-    filter: str | None
-    options: dict[str, Any]
-    knowledge: str
     n_timesteps: int
     num_envs: int
     hyperparameters: dict[str, Any]
-    seed: int
-    action: str
-    intervention_penalty: float
     eval_freq: int
-    eval_episodes: int
-    threads: int
+    filter: str | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+    knowledge: str = "model"
+    seed: int = 0
+    action: str = ACTIONS[0]
+    intervention_penalty: float = 0.0
+    eval_episodes: int = 200
+    threads: int = 1
 
     def __post_init__(self) -> None:
         try:
@@ -68,14 +80,7 @@ class Training:
             raise ConfigurationError(
                 f"a training is kept as JSON: {error}; give numbers, texts, lists and mappings"
             ) from error
-        for name, least in (
-            ("n_timesteps", 1),
-            ("num_envs", 1),
-            ("seed", 0),
-            ("eval_freq", 1),
-            ("eval_episodes", 1),
-            ("threads", 1),
-        ):
+        for name, least in _LEAST.items():
             require_whole(name, getattr(self, name), least)
         if self.seed >= 2**32:
             raise ConfigurationError(f"seed = {self.seed}; torch takes whole numbers below 2^32")
@@ -83,7 +88,7 @@ class Training:
             raise ConfigurationError(f"action = {self.action!r}; {nearest(self.action, ACTIONS)}")
         if self.action != ACTIONS[0] and not self.learns_on_executed:
             raise ConfigurationError(
-                f"action = {self.action!r} is for SAC and TD3 behind a filter; leave it out: others"
+                f"action = {self.action!r} is for SAC and TD3 with a filter in the loop; leave it out: others"
                 " learn on what they propose"
             )
         if self.action == ACTIONS[0] and self.learns_on_executed and self.intervention_penalty:
@@ -94,7 +99,7 @@ class Training:
 
     @property
     def learns_on_executed(self) -> bool:
-        """Whether there is a choice of the action on which is learned."""
+        """Whether the algorithm can learn on the executed action."""
         return self.algorithm in OFF_POLICY and self.filter is not None
 
     @classmethod
@@ -103,37 +108,23 @@ class Training:
         env_id: str,
         algorithm: str,
         *,
-        filter: str | None = None,  # noqa: A002  (the word of the whole project)
-        options: Mapping[str, Any] | None = None,
-        knowledge: str = "model",
+        settings: Mapping[str, Any] | None = None,
         n_timesteps: int | None = None,
         num_envs: int | None = None,
-        settings: Mapping[str, Any] | None = None,
-        seed: int = 0,
-        action: str = ACTIONS[0],
-        intervention_penalty: float = 0.0,
         eval_freq: int | None = None,
-        eval_episodes: int = 200,
-        threads: int = 1,
+        **attributes: Any,
     ) -> Training:
-        """A training with the hyperparameters of `agents/hyperparams`, as far as nothing else is
-        given.
+        """Return a training with the hyperparameters of `hyperparams`, except for what is given.
 
         Args:
             env_id: registered id, with or without its namespace.
-            algorithm: see the class, as all that is not named here.
-            filter: text of the filter in the loop; None or "none" for the bare env.
-            options: arguments of `gym.make`; those that are None are left out.
-            knowledge: see the class.
+            algorithm: see the class.
+            settings: hyperparameters in place of the file's.
             n_timesteps: by default that of the hyperparameters.
             num_envs: by default the hyperparameters' `n_envs`.
-            settings: hyperparameters in place of the file's.
-            seed: see the class.
-            action: see the class.
-            intervention_penalty: see the class.
             eval_freq: by default a tenth of the training.
-            eval_episodes: see the class.
-            threads: see the class.
+            **attributes: other attributes of the class; options that are None are left out, and the
+                filter may be "none".
 
         Raises:
             ConfigurationError: a value is not allowed.
@@ -141,10 +132,8 @@ class Training:
         known, given = full_id(env_id), dict(settings or {})
         found = {**hyperparameters(algorithm, known), **given}
         steps, copies = found.pop("n_timesteps"), found.pop("n_envs")
-        steps, copies = (
-            default if chosen is None else chosen
-            for chosen, default in ((n_timesteps, steps), (num_envs, copies))
-        )
+        steps = steps if n_timesteps is None else n_timesteps
+        copies = copies if num_envs is None else num_envs
         require_whole("n_timesteps", steps, 1)
         require_whole("num_envs", copies, 1)
         if algorithm == "ppo":
@@ -153,21 +142,19 @@ class Training:
                 found["batch_size"], found["n_steps"] * copies, "batch_size" in given
             )
         if algorithm in OFF_POLICY:
-            # The whole training, where Stable-Baselines3 would set aside a million rows.
-            found.setdefault("buffer_size", min(_MOST_ROWS, steps * (2 if action == "both" else 1)))
+            # The whole training, where Stable-Baselines3 would allocate a million rows.
+            rows = steps * (2 if attributes.get("action") == "both" else 1)
+            found.setdefault("buffer_size", min(_MOST_ROWS, rows))
+        if attributes.get("filter") == UNFILTERED:
+            attributes["filter"] = None
+        options = attributes.pop("options", None) or {}
         return cls(
             env_id=known,
             algorithm=algorithm,
-            filter=None if filter == BARE else filter,
-            options={k: v for k, v in (options or {}).items() if v is not None},
-            knowledge=knowledge,
             n_timesteps=steps,
             num_envs=copies,
             hyperparameters=found,
-            seed=seed,
-            action=action,
-            intervention_penalty=intervention_penalty,
-            eval_freq=max(1, steps // PARTS) if eval_freq is None else eval_freq,
-            eval_episodes=eval_episodes,
-            threads=threads,
+            eval_freq=max(1, steps // _PARTS) if eval_freq is None else eval_freq,
+            options={name: value for name, value in options.items() if value is not None},
+            **attributes,
         )

@@ -1,5 +1,4 @@
-"""Hyperparameters of Stable-Baselines3's algorithms for each env, in the RL Zoo's format and by its
-names."""
+"""Hyperparameters of the algorithms for each env, in the format of the RL Zoo and by its names."""
 
 from __future__ import annotations
 
@@ -11,13 +10,18 @@ from safe_envs.errors import ConfigurationError, nearest, shortened, shown
 from safe_envs.number_text import real
 
 ALGORITHMS = ("ppo", "a2c", "sac", "td3")
+OFF_POLICY = ("sac", "td3")
+
+ACTIONS = ("executed", "proposed", "both")
+"""Actions on which an off-policy algorithm may learn with a filter in the loop; see
+`safe_envs.agents.training.replay_buffer`."""
 
 _LINEAR = "lin_"
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 
 
 def hyperparameters(algorithm: str, env_id: str) -> dict[str, Any]:
-    """What `hyperparams/ALGORITHM.yml` says of an env, under `default` where it does not name it.
+    """Return the hyperparameters of an env in `hyperparams/ALGORITHM.yml`, or its defaults.
 
     Args:
         algorithm: one of `ALGORITHMS`.
@@ -36,9 +40,33 @@ def hyperparameters(algorithm: str, env_id: str) -> dict[str, Any]:
     return dict(table.get(env_id, table["default"]))
 
 
+def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:
+    """Return the largest size of minibatches up to a given one that divides a rollout.
+
+    Args:
+        batch_size: wanted, from 2.
+        rollout: steps of all envs together.
+        asked_for: whether a user chose the size, who is not to get another one.
+
+    Raises:
+        ConfigurationError: the size is no whole number from 2, or was asked for and does not divide
+            the rollout.
+    """
+    if isinstance(batch_size, bool) or not isinstance(batch_size, int) or batch_size < 2:
+        raise ConfigurationError(f"batch_size = {batch_size!r}; give a whole number from 2")
+    fits = next(
+        (size for size in range(min(batch_size, rollout), 1, -1) if rollout % size == 0), rollout
+    )
+    if asked_for and fits != batch_size:
+        raise ConfigurationError(
+            f"batch_size = {batch_size} does not divide the rollout of n_steps x num_envs ="
+            f" {rollout} steps; give {fits}"
+        )
+    return fits
+
+
 def scheduled(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings with the Zoo's texts such as lin_3e-4 as functions of the part of the training
-    that is left."""
+    """Return the settings, with texts such as lin_3e-4 as functions of the remaining progress."""
     return {
         k: _linear(k, v) if k in _SCHEDULED and isinstance(v, str) else v
         for k, v in settings.items()
@@ -54,5 +82,5 @@ def _linear(name: str, text: str) -> Callable[[float], float]:
         raise ConfigurationError(
             f"{name} = {shown(text)}; give a number, or {_LINEAR}NUMBER for one that falls to 0"
         ) from error
-    # Whole rollouts may lead beyond the end of the training, where less than nothing is left.
+    # Whole rollouts may exceed the training, which makes the remaining progress negative.
     return lambda left: max(left, 0.0) * first

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from safe_envs.atomic_io import require_writable, write_json
 from safe_envs.errors import SafeEnvsError, shortened
@@ -150,6 +151,11 @@ def stdout() -> Console:
         return kind(width=max(Console().width, _LEAST_WIDTH), quiet=_Terminal.silent)
     trimmed: Any = _Trimmed(sys.stdout)
     return kind(width=_PIPE_WIDTH, quiet=_Terminal.silent, file=trimmed)
+
+
+def say(console: Console, text: str | Text) -> None:
+    """Print a text as it is, in lines of any length."""
+    console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 def require_result(path: Path | None) -> None:

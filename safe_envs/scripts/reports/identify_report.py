@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from safe_envs.agents.evaluation.evaluate import package_versions
+from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.evaluation_report import describe_plant, describe_system
+from safe_envs.scripts.reports.tables import make_table
 from safe_envs.wrappers.learning import LearnedModel
 from safe_envs.wrappers.learning.data.collection import draw_states
 from safe_envs.wrappers.learning.data.transitions import Transitions
@@ -232,7 +233,7 @@ def print_report(console: Console, found: Identification) -> None:
     origin = f"seed {found.seed}" if found.source is None else f"data {found.source.path}"
     title.append(f" | method {found.learned.method} | {origin}", style="not bold")
     title.append(f"\n{found.setup}", style="not bold")
-    console.print(title, soft_wrap=True, highlight=False)
+    say(console, title)
     of, details = (
         ("", "") if found.source is None else (f" of {found.source.path}", f", {found.source}")
     )
@@ -240,8 +241,8 @@ def print_report(console: Console, found: Identification) -> None:
         f"{record.transitions:,} transitions{of} that last {record.observed:,.6g} s"
         f" together{details}"
     )
-    _say(console, f"\nLearned in {_seconds(record.seconds)} from {amount}")
-    _say(
+    say(console, f"\nLearned in {_seconds(record.seconds)} from {amount}")
+    say(
         console,
         "Settings:"
         f" {', '.join(f'{name} = {_setting(value)}' for name, value in record.settings.items())}",
@@ -260,8 +261,8 @@ def print_report(console: Console, found: Identification) -> None:
     if found.notes:
         console.print()
     for note in found.notes:
-        _say(console, f"Note: {note}")
-    _say(console, f"\nWritten to {found.out}; to use it:\n  {found.use}")
+        say(console, f"Note: {note}")
+    say(console, f"\nWritten to {found.out}; to use it:\n  {found.use}")
 
 
 def _say_vanishing(console: Console, found: Identification) -> None:
@@ -272,7 +273,7 @@ def _say_vanishing(console: Console, found: Identification) -> None:
     )
     more = len(names) - _MOST_NAMED
     if names:
-        _say(
+        say(
             console,
             "\n0 in truth and estimate:"
             f" {', '.join(names[:_MOST_NAMED])}{f' and {more} more' if more > 0 else ''}",
@@ -320,7 +321,7 @@ def _errors_table(errors: Mapping[str, float]) -> Table:
     ):
         whats, kinds, split = list(errors), ["error"], [(name, "error") for name in errors]
     values = dict(zip(split, errors.values(), strict=True))
-    table = _table("of", *kinds)
+    table = make_table("pr", "of", *kinds, indent=True)
     for what in whats:
         table.add_row(Text(what), *[_number(values[what, kind]) for kind in kinds])
     return table
@@ -328,16 +329,8 @@ def _errors_table(errors: Mapping[str, float]) -> Table:
 
 def _functions_table(functions: Sequence[Function]) -> Table:
     units = any(function.unit for function in functions)
-    table = _table(
-        "function",
-        "truth, rms",
-        "error, rms",
-        "relative",
-        "largest error",
-        *(["unit"] if units else []),
-    )
-    if units:
-        table.columns[-1].justify = "left"
+    titles = ("function", "truth, rms", "error, rms", "relative", "largest error")
+    table = make_table("prrrrl", *titles, *["unit"] * units, indent=True)
     for function in functions:
         relative = "-" if function.relative is None else percent(function.relative)
         cells = [
@@ -350,24 +343,8 @@ def _functions_table(functions: Sequence[Function]) -> Table:
     return table
 
 
-def _table(first: str, *columns: str) -> Table:
-    table = Table(
-        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=True, show_edge=False, collapse_padding=True
-    )
-    table.add_column(first, overflow="fold")
-    for name in columns:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table
-
-
 def _head(console: Console, name: str, text: str) -> None:
-    console.print(
-        Text.assemble((f"\n{name}", "bold"), f": {text}"), soft_wrap=True, highlight=False
-    )
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, highlight=False, markup=False)
+    say(console, Text.assemble((f"\n{name}", "bold"), f": {text}"))
 
 
 def _number(value: float) -> str:

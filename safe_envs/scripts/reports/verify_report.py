@@ -7,16 +7,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from rich import box
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 from rich.text import Text
 
 from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
+from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.evaluation_report import describe_system
-from safe_envs.scripts.reports.rates import percent, percent_in
+from safe_envs.scripts.reports.tables import make_table
 from safe_envs.wrappers import spec_of
 from safe_envs.wrappers.verification.feasibility import SMALL, BarrierFindings, Part, Verification
 from safe_envs.wrappers.verification.guarantee import Bound
@@ -54,7 +54,7 @@ def print_report(
         f"\n{describe_system(problem)}; the conditions know the {formulas.knowledge}",
         style="not bold",
     )
-    console.print(title, soft_wrap=True, highlight=False)
+    say(console, title)
     _section(console, "Safe set", _set_lines(found, starts))
     for barrier in found.barriers:
         _section(
@@ -72,8 +72,8 @@ def print_report(
     for measurement in measurements:
         _print_measurement(console, problem, policy, measurement, numbers)
     if measurements:
-        _say(console, _verdict(measurements, numbers))
-    _say(
+        say(console, _verdict(measurements, numbers))
+    say(
         console,
         "\nSuprema, shortfalls and shares are estimates from samples and a local search. The"
         f" bounds are about conditions that are met at every instant, not every {problem.dt:g} s,"
@@ -137,11 +137,7 @@ def _plain(value: Any) -> Any:
 def _section(console: Console, title: str, lines: Sequence[str]) -> None:
     console.print(f"\n[bold]{escape(title)}[/]", soft_wrap=True, highlight=False)
     for line in lines:
-        _say(console, f"  {line}")
-
-
-def _say(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, highlight=False, markup=False)
+        say(console, f"  {line}")
 
 
 def _searched(found: Verification) -> str:
@@ -270,24 +266,21 @@ def _print_bounds(
         f" {problem.duration:g} s",
         highlight=False,
     )
-    table = _table()
-    for name in ("", "bound", "value", "status with the c and m found", "why"):
-        table.add_column(
-            name, justify="right" if name == "value" else "left", no_wrap=name in ("", "value")
-        )
+    titles = ("", "bound", "value", "status with the c and m found", "why")
+    table = make_table("lprp", *titles, indent=True)
     for i, bound in enumerate(bounds, start=1):
         empty = bound.status == "estimated" and not bound.value
         status = f"[{_COLORS[bound.status]}]{bound.status}[/]{', but empty' if empty else ''}"
         table.add_row(str(i), escape(bound.name), _value(bound), status, escape(bound.reason))
     console.print(table)
     if any(bound.status == "estimated" for bound in bounds):
-        _say(
+        say(
             console,
             "Estimated: a theorem, with the c and m found. Larger ones that the search missed would"
             " make the bound smaller.",
         )
     if any(bound.status in _NO_BOUND and bound.value is not None for bound in bounds):
-        _say(
+        say(
             console,
             "In brackets: what a formula gives whose hypotheses fail here, or whose proof does;"
             " that is no bound.",
@@ -312,14 +305,9 @@ def _print_measurement(
     at = "" if found.state is None else f", {_state(problem, found.state)}"
     heading = f"from {found.start}{at}: {found.episodes} episodes of the policy {policy}"
     console.print(f"\n[bold]Measured[/] {escape(heading)}", highlight=False, soft_wrap=True)
-    table = _table()
     names = [bound.name for bound in found.horizons[0].bounds]
-    for name in (
-        "T",
-        "no violation [95 % interval]",
-        *[f"bound {numbers.setdefault(n, str(len(numbers) + 1))}" for n in names],
-    ):
-        table.add_column(name, justify="right", no_wrap=True)
+    bounds = [f"bound {numbers.setdefault(n, str(len(numbers) + 1))}" for n in names]
+    table = make_table("r", "T", "no violation [95 % interval]", *bounds, indent=True)
     for horizon in found.horizons:
         table.add_row(
             f"{horizon.time:g} s",
@@ -328,7 +316,7 @@ def _print_measurement(
         )
     console.print(table)
     if found.repeats:
-        _say(console, "Nothing is random here: all episodes are one and the same.")
+        say(console, "Nothing is random here: all episodes are one and the same.")
 
 
 def _marked(horizon: Horizon, names: Sequence[str]) -> list[str]:
@@ -359,12 +347,6 @@ def _verdict(measurements: Sequence[Measurement], numbers: dict[str, str]) -> st
     return (
         f"\nThe measurement contradicts bound {listing}. The interval of the rate lies below it,"
         " with the 5 % of error shared by all comparisons of this report."
-    )
-
-
-def _table() -> Table:
-    return Table(
-        box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=True, show_edge=False, collapse_padding=True
     )
 
 

@@ -1,29 +1,25 @@
-"""`safe-envs reproduce`: the tables and figures of the thesis, ours beside the print, on one page."""
+"""`safe-envs reproduce`: the tables and figures of the thesis next to ours, on one page."""
 
 from __future__ import annotations
 
-import os
-import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict
-from multiprocessing import active_children, get_context
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from safe_envs.errors import ConfigurationError, WorkersLostError, nearest
+from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.console import (
     Json,
-    progress_bar,
     require_result,
+    say,
     stdout,
     write_result,
 )
+from safe_envs.scripts.options.job_progress import run_jobs
 
 if TYPE_CHECKING:
     from safe_envs.scripts.reproduce.framework.artefact import Artefact, Sample
@@ -61,30 +57,28 @@ def reproduce(
     ] = False,
     json_file: Json = None,
 ) -> None:
-    """Compute the tables and figures of the thesis, and hold them against the print.
+    """Compute the tables and figures of the thesis, and compare them with the printed ones.
 
     Each gets a picture (PNG and SVG) or a table, a JSON file with all numbers, and, but for a quick
     run, a verdict from a fixed list by stated rules. DIR/index.html is one page with all that is in
     DIR by the same options, DIR/index.md the same as Markdown. What is computed is kept by its
     configuration and the version of the code: a run that was stopped goes on.
     """
+    from safe_envs.agents.jobs.executor import Backend
+    from safe_envs.agents.jobs.fingerprint import source_checksum
     from safe_envs.scripts.reproduce.framework.artefact import Sample
     from safe_envs.scripts.reproduce.framework.page import write_page
     from safe_envs.scripts.reproduce.framework.store import read, require_same_sample
+    from safe_envs.scripts.reproduce.framework.summary import summary_document, summary_table
 
     require_result(json_file)
     sample = Sample(episodes, seed, quick)
     chosen = _chosen(names or [_ALL])
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(
-            f"--out {out} cannot be made: {error.strerror}; give another folder"
-        ) from error
     require_same_sample(out, _chosen([_ALL]), sample)
     missing = [artefact for artefact in chosen if read(out, artefact, sample) is None]
-    with progress_bar(f"{len(missing)} of {len(chosen)} to do") as tell:
-        failures = _compute(missing, sample, out, jobs, tell or (lambda _: None))
+    tasks = [ArtefactJob(each.name, sample, out, source_checksum()) for each in missing]
+    backend = Backend(jobs=max(1, min(jobs, len(tasks))))
+    failures = run_jobs(tasks, backend, out, f"{len(missing)} of {len(chosen)} to do")
     found = [
         (artefact, *answer)
         for artefact in _chosen([_ALL])
@@ -92,12 +86,11 @@ def reproduce(
     ]
     write_page(out, found, sample)
     reported = [entry for entry in found if entry[0] in chosen]
-    _report(reported, sample, out)
-    write_result(json_file, lambda: _document(reported, sample))
+    stdout().print(summary_table(reported, sample))
+    say(stdout(), f"\nThe page: {out / 'index.html'}")
+    write_result(json_file, lambda: summary_document(reported, sample))
     if failures:
-        raise ConfigurationError(
-            "; ".join(f"{name} failed: {error}" for name, error in failures.items())
-        )
+        raise ConfigurationError("; ".join(f"{each.key} failed: {each.error}" for each in failures))
 
 
 def _chosen(names: Sequence[str]) -> list[Artefact]:
@@ -110,143 +103,41 @@ def _chosen(names: Sequence[str]) -> list[Artefact]:
     return [artefact for name, artefact in known.items() if _ALL in names or name in names]
 
 
-def _compute(
-    missing: Sequence[Artefact], sample: Sample, out: Path, jobs: int, tell: Callable[[float], None]
-) -> dict[str, str]:
-    """Compute and keep what is missing; return the errors of those that failed, which stop no
-    others."""
-    failures: dict[str, str] = {}
-    names = [artefact.name for artefact in missing]
-    ended = (
-        _one_by_one(names, sample, out)
-        if min(jobs, len(names)) < 2
-        else _in_processes(names, sample, out, jobs)
-    )
-    try:
-        for done, (name, error) in enumerate(ended, 1):
-            if error is not None:
-                failures[name] = f"{type(error).__name__}: {error}"
-            tell(done / len(names))
-    except KeyboardInterrupt:
-        # A job manager tells this process only, and the others would compute on to their ends.
-        for process in active_children():
-            process.terminate()
-        print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
-        raise
-    return failures
+@dataclass(frozen=True)
+class ArtefactJob:
+    """The computation of an artefact, which keeps its result itself, in whatever process.
 
-
-Ended = Iterator[tuple[str, BaseException | None]]
-"""Names of artefacts as they end, with their errors."""
-
-
-def _one_by_one(names: Sequence[str], sample: Sample, out: Path) -> Ended:
-    for name in names:
-        try:
-            compute_one(name, sample, out)
-        except Exception as error:
-            yield name, error
-        else:
-            yield name, None
-
-
-def _in_processes(names: Sequence[str], sample: Sample, out: Path, jobs: int) -> Ended:
-    """By a pool; what was lost with a process of it is computed again, each in a process of its
-    own."""
-    lost = []
-    for name, error in _pooled(names, sample, out, min(jobs, len(names))):
-        if isinstance(error, BrokenProcessPool):
-            lost.append(name)
-        else:
-            yield name, error
-    for name in lost:
-        for _, error in _pooled([name], sample, out, 1):
-            ended = isinstance(error, BrokenProcessPool)
-            yield (
-                name,
-                (
-                    WorkersLostError(
-                        "its process was ended from outside, as for want of memory; use fewer jobs"
-                    )
-                    if ended
-                    else error
-                ),
-            )
-
-
-def _pooled(names: Sequence[str], sample: Sample, out: Path, jobs: int) -> Ended:
-    from safe_envs.agents.jobs.processes import end_with_parent
-    from safe_envs.scripts.reproduce.framework.store import source_checksum
-
-    # Not by fork: torch's threads do not survive it.
-    pool = ProcessPoolExecutor(
-        jobs, mp_context=get_context("spawn"), initializer=end_with_parent, initargs=(os.getpid(),)
-    )
-    try:
-        left: dict[Any, str] = {
-            pool.submit(compute_one, name, sample, out, source_checksum()): name for name in names
-        }
-        for future in as_completed(left):
-            yield left[future], future.exception()
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
-
-
-def compute_one(name: str, sample: Sample, out: Path, source: str | None = None) -> None:
-    """Compute an artefact and keep it; what a process of the pool does.
-
-    Args:
-        name: of the artefact.
+    Attributes:
+        key: name of the artefact.
         sample: how much is simulated.
         out: folder of the results.
-        source: checksum of the code of the process that asks for it, if that is another one.
-
-    Raises:
-        ConfigurationError: the code has changed since then.
+        source: checksum of the code of the process that asks for it.
     """
-    import torch
 
-    from safe_envs.scripts.reproduce.framework.store import keep, source_checksum
+    key: str
+    sample: Sample
+    out: Path
+    source: str
 
-    # Before the code that computes is read, since results are kept by this checksum.
-    if source not in (None, source_checksum()):
-        raise ConfigurationError("the code changed during the run; start it again")
-    torch.set_num_threads(1)
-    (artefact,) = _chosen([name])
-    began = time.perf_counter()
-    outcome = artefact.compute(sample)
-    keep(out, artefact, sample, outcome, time.perf_counter() - began)
+    def compute(self) -> None:
+        """Compute the artefact and keep it.
 
+        Raises:
+            ConfigurationError: the code has changed since the command began.
+        """
+        import torch
 
-def _document(found: Sequence[tuple[Artefact, Any, float]], sample: Sample) -> dict[str, Any]:
-    """What was asked for, with its verdict and all that came out."""
-    from safe_envs.scripts.reproduce.framework.verdict import judge
+        from safe_envs.agents.jobs.fingerprint import source_checksum
+        from safe_envs.scripts.reproduce.framework.store import keep
 
-    rows = []
-    for artefact, outcome, seconds in found:
-        judgement = judge(artefact, outcome, sample)
-        verdict = {"verdict": judgement.verdict.value, "reasons": list(judgement.reasons)}
-        rows.append(
-            {"name": artefact.name, **verdict, "seconds": seconds, "outcome": outcome.document()}
-        )
-    return {"sample": asdict(sample), "artefacts": rows}
-
-
-def _report(found: Sequence[tuple[Artefact, Any, float]], sample: Sample, out: Path) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    from safe_envs.scripts.reproduce.framework.verdict import judge
-
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    for title in ("artefact", "verdict", "because"):
-        table.add_column(title, no_wrap=title != "because")
-    for artefact, outcome, _ in found:
-        judgement = judge(artefact, outcome, sample)
-        table.add_row(artefact.name, judgement.text, "; ".join(judgement.reasons))
-    console = stdout()
-    console.print(table)
-    console.print(f"\nThe page: {out / 'index.html'}", highlight=False, markup=False)
+        # Before the code that computes is imported, since results are kept by this checksum.
+        if self.source != source_checksum():
+            raise ConfigurationError("the code changed during the run; start it again")
+        torch.set_num_threads(1)
+        (artefact,) = _chosen([self.key])
+        began = time.perf_counter()
+        outcome = artefact.compute(self.sample)
+        keep(self.out, artefact, self.sample, outcome, time.perf_counter() - began)
 
 
 if __name__ == "__main__":

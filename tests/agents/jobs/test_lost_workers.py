@@ -1,22 +1,33 @@
-"""What a sweep makes of workers that end, with workers that are pretended."""
+"""Jobs whose workers end, with simulated workers."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import pytest
 
 from safe_envs.agents.jobs import clusters, executor
 from safe_envs.agents.jobs.executor import Backend, run
-from safe_envs.agents.sweeps.cell import Cell, Outcome
+from safe_envs.agents.jobs.job import Job, Outcome
 from safe_envs.errors import ConfigurationError, WorkersLostError
 
 pytestmark = pytest.mark.slow
 
-CELLS = [Cell({"number": k}) for k in range(8)]
-NUMBERS = {cell.key: cell.settings["number"] for cell in CELLS}
+
+@dataclass(frozen=True)
+class Numbered:
+    """A job that nobody computes."""
+
+    key: str
+
+    def compute(self) -> None:
+        raise NotImplementedError
+
+
+JOBS = [Numbered(str(k)) for k in range(8)]
 ENDED = "the process that computed it ended: it went away"
 
 
@@ -32,19 +43,19 @@ class Pretended:
     def compute(self) -> dict[int, str | None]:
         """The errors of cells, in the order in which they were kept."""
         run(
-            CELLS,
+            JOBS,
             Backend(),
-            lambda outcome: self.kept.update({NUMBERS[outcome.key]: outcome.error}),
+            lambda outcome: self.kept.update({int(outcome.key): outcome.error}),
         )
         return self.kept
 
-    def _outcomes(self, cells: Sequence[Cell], *_: Any) -> Iterator[Outcome]:
-        self.given.append(len(cells))
-        for k in range(0, len(cells), 2):
-            pair = cells[k : k + 2]
-            if self._ends({NUMBERS[cell.key] for cell in pair}):
-                raise executor._LossError("it went away", cells[: k + 2])
-            yield from (Outcome(cell.key, None, None, None, 0.0) for cell in pair)
+    def _outcomes(self, jobs: Sequence[Job], *_: Any) -> Iterator[Outcome]:
+        self.given.append(len(jobs))
+        for k in range(0, len(jobs), 2):
+            pair = jobs[k : k + 2]
+            if self._ends({int(job.key) for job in pair}):
+                raise executor._LossError("it went away", jobs[: k + 2])
+            yield from (Outcome(job.key, None, None, 0.0) for job in pair)
 
 
 @pytest.mark.parametrize("killing", [{0, 1, 2}, {5, 6, 7}, {0, 2, 4, 6}, {3}])
@@ -73,7 +84,7 @@ def test_cells_that_are_too_much_together_are_computed_one_by_one(monkeypatch: p
 def test_workers_that_end_whatever_they_compute(monkeypatch: pytest.MonkeyPatch):
     workers = Pretended(monkeypatch, lambda pair: True)
     with pytest.raises(
-        WorkersLostError, match=r"no cell could be computed, .* the last: it went away"
+        WorkersLostError, match=r"nothing could be computed, .* the last: it went away"
     ):
         workers.compute()
     assert workers.given == [8, 8, 8, *[1] * 5]

@@ -19,10 +19,11 @@ import pytest
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
+from safe_envs.agents.policies.base import DESCRIPTION, TENSORS
 from safe_envs.agents.policies.network import _checksum, load_policy
-from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS, make_policy
+from safe_envs.agents.policies.registry import make_policy
 from safe_envs.errors import ConfigurationError
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from tests.agents.policies.test_network import small
 from tests.test_bounded_reading import damaged_by
 from tests.wrappers.learning.models.test_hostile_files import changed
@@ -34,7 +35,7 @@ ENV_ID = "safe_envs/StochasticDubins-v0"
 
 @pytest.fixture(scope="module")
 def problem():
-    return load_problem(ENV_ID)
+    return make_problem(ENV_ID)
 
 
 @pytest.fixture(scope="module")

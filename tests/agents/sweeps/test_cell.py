@@ -4,54 +4,41 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from safe_envs.agents.jobs import fingerprint
+from safe_envs.agents.jobs.job import outcome_of
 from safe_envs.agents.sweeps import cell
-from safe_envs.agents.sweeps.cell import compute, versions
 from safe_envs.agents.sweeps.spec import sweep_of
 
 pytestmark = pytest.mark.slow
 
 
-def test_versions_change_with_each_byte_and_name_of_the_code(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(cell, "files", lambda package: tmp_path / package)
-    (tmp_path / "safe_envs" / "inner").mkdir(parents=True)
-    file = tmp_path / "safe_envs" / "inner" / "code.py"
-
-    def source() -> str:
-        return versions.__wrapped__()["source"]
-
-    file.write_text("a = 1")
-    first = source()
-    assert source() == first
-    file.write_text("a = 2")
-    second = source()
-    file.rename(file.with_name("other.py"))
-    assert len({first, second, source()}) == 3
-
-
 def test_a_file_that_changed_or_went_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     file = tmp_path / "model.npz"
     file.write_bytes(b"1")
-    monkeypatch.setattr(cell, "evaluate", lambda *_, **__: Evaluated([{"safe": 1}], {}))
+    monkeypatch.setattr(
+        cell,
+        "evaluate",
+        lambda *_, **__: Evaluated([SimpleNamespace(as_dict=lambda: {"safe": 1})], {}),
+    )
     (one,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
-    one = replace(one, files={str(file): cell.checksum(file)})
-    assert compute(one).row == {"safe": 1}
+    one = replace(one, files={str(file): fingerprint.file_checksum(file)})
+    assert outcome_of(one).result["row"] == {"safe": 1}
     file.write_bytes(b"2")
-    assert f"the worker finds another content in {file}" in str(compute(one).error)
+    assert f"the worker finds another content in {file}" in str(outcome_of(one).error)
     file.unlink()
-    assert f"{file} cannot be read" in str(compute(one).error)
+    assert f"{file} cannot be read" in str(outcome_of(one).error)
 
 
 class Evaluated(NamedTuple):
     """As much of an evaluation as a cell takes."""
 
-    rows: list[dict[str, Any]]
+    rows: list[Any]
     config: dict[str, Any]
 
 
@@ -60,12 +47,12 @@ def test_threads_of_a_worker_compute_one_cell_at_a_time(monkeypatch: pytest.Monk
 
     def evaluate(*_: Any, **__: Any) -> Evaluated:
         both.wait(0.3)
-        return Evaluated([], {})
+        return Evaluated([{}], {})
 
     monkeypatch.setattr(cell, "evaluate", evaluate)
     (one,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
     with ThreadPoolExecutor(2) as threads:
-        errors = [outcome.error for outcome in threads.map(compute, [one, one])]
+        errors = [outcome.error for outcome in threads.map(outcome_of, [one, one])]
     # Neither met the other.
     assert all(error is not None and error.startswith("BrokenBarrierError") for error in errors)
 
@@ -80,6 +67,6 @@ def test_a_cell_has_one_thread(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(cell, "evaluate", evaluate)
     (one,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
     with threadpool_limits(2):
-        assert "seen" in str(compute(one).error)
+        assert "seen" in str(outcome_of(one).error)
     assert seen
     assert set(seen) == {1}

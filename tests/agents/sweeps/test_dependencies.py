@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from safe_envs.agents.sweeps.cell import compute
+from safe_envs.agents.jobs.job import outcome_of
 from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_imported
 from safe_envs.agents.sweeps.spec import sweep_of
 
@@ -74,5 +74,5 @@ def test_a_cell_is_known_by_what_its_system_imports(folder: Path):
     (cell,) = sweep_of(document).cells
     (folder / "near" / "deep" / "end.py").write_text("y = 2")
     assert sweep_of(document).cells[0].key != cell.key
-    assert "another content in" in str(compute(cell).error)
-    assert "end.py" in str(compute(cell).error)
+    assert "another content in" in str(outcome_of(cell).error)
+    assert "end.py" in str(outcome_of(cell).error)

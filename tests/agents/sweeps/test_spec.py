@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from safe_envs.agents.sweeps.cell import Cell, compute
+from safe_envs.agents.jobs.job import outcome_of
+from safe_envs.agents.sweeps.cell import Cell
 from safe_envs.agents.sweeps.spec import describe, read_sweep, sweep_of
 from safe_envs.errors import ConfigurationError, RelativeDegreeError
 
@@ -193,17 +194,17 @@ def test_a_cell_is_known_by_all_that_its_result_hangs_on(
 
 def test_a_worker_with_other_versions_or_files_computes_nothing(tmp_path: Path):
     (cell,) = sweep_of({"fixed": SMALL}).cells
-    assert "numpy" in str(compute(replace(cell, versions={**cell.versions, "numpy": "0"})).error)
+    assert "numpy" in str(outcome_of(replace(cell, versions={**cell.versions, "numpy": "0"})).error)
     file = tmp_path / "file"
     file.write_text("text")
-    assert "another content" in str(compute(replace(cell, files={str(file): "0"})).error)
-    assert "share" in str(compute(replace(cell, files={str(tmp_path / "none"): "0"})).error)
+    assert "another content" in str(outcome_of(replace(cell, files={str(file): "0"})).error)
+    assert "share" in str(outcome_of(replace(cell, files={str(tmp_path / "none"): "0"})).error)
 
 
 def test_an_error_of_any_kind_is_the_outcome_of_its_cell():
-    outcome = compute(Cell({"env": "Scalar-v0"}))
-    assert outcome.row is None
+    outcome = outcome_of(Cell({"env": "Scalar-v0"}))
+    assert outcome.result is None
     assert re.fullmatch(
-        r"KeyError: 'policy' \(at sweeps/cell\.py:\d+ in _evaluated, from .*:\d+ in compute\)",
+        r"KeyError: 'policy' \(at sweeps/cell\.py:\d+ in .*, from .*:\d+ in outcome_of\)",
         str(outcome.error),
     )

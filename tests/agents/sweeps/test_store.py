@@ -1,22 +1,20 @@
 from __future__ import annotations
 
-import errno
 import json
 import os
-import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 
-from safe_envs.agents.sweeps.cell import Outcome, compute
+from safe_envs.agents.jobs.job import Outcome, outcome_of
+from safe_envs.agents.jobs.store import ResultStore
 from safe_envs.agents.sweeps.spec import Sweep, sweep_of
 from safe_envs.agents.sweeps.store import Store, read
 from safe_envs.errors import ConfigurationError
+from tests.oracles.full_disk import no_file_larger_than
 
 SMALL: dict[str, Any] = {"env": "Scalar-v0", "filter": "scbf", "episodes": 20, "horizon": 0.2}
 
@@ -30,7 +28,7 @@ def sweep() -> Sweep:
 
 @pytest.fixture(scope="module")
 def outcomes(sweep: Sweep) -> list[Outcome]:
-    return [compute(cell) for cell in sweep.cells]
+    return [outcome_of(cell) for cell in sweep.cells]
 
 
 def test_what_was_kept_is_read_in_the_order_of_the_file(
@@ -46,9 +44,8 @@ def test_what_was_kept_is_read_in_the_order_of_the_file(
     assert table["start"].to_pylist() == [None, None, "[0.5]"]
     assert table["episodes"].to_pylist() == [20] * 3
     for row, outcome in zip(table.to_pylist(), outcomes[1:], strict=True):
-        assert outcome.row is not None
         assert all(
-            row[name] == outcome.row[name]
+            row[name] == outcome.result["row"][name]
             for name in (
                 "safe",
                 "safety_rate",
@@ -58,7 +55,7 @@ def test_what_was_kept_is_read_in_the_order_of_the_file(
                 "estimated_bound",
             )
         )
-        assert json.loads(row["row"]) == outcome.row
+        assert json.loads(row["row"]) == outcome.result["row"]
         assert json.loads(row["config"])["problem"]["dt"] == 0.01
         assert set(json.loads(row["versions"])) > {"python", "numpy", "safe-envs", "source"}
     assert Store(tmp_path, sweep).missing == [sweep.cells[0]]
@@ -68,7 +65,7 @@ def test_a_failed_cell_is_told_and_tried_again(
     tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
 ):
     store = Store(tmp_path, sweep)
-    store.keep(Outcome(sweep.cells[0].key, None, None, "it broke", 0.1))
+    store.keep(Outcome(sweep.cells[0].key, None, "it broke", 0.1))
     assert read(tmp_path)["error"].to_pylist() == ["it broke"]
     # Those that failed come last, so that they keep no other from being computed.
     assert Store(tmp_path, sweep).missing == [*sweep.cells[1:], sweep.cells[0]]
@@ -81,7 +78,7 @@ def test_a_failure_replaces_no_result_of_another_run(
 ):
     store, other = Store(tmp_path, sweep), Store(tmp_path, sweep)
     other.keep(outcomes[0])
-    store.keep(Outcome(sweep.cells[0].key, None, None, "it broke", 0.1))
+    store.keep(Outcome(sweep.cells[0].key, None, "it broke", 0.1))
     assert read(tmp_path)["error"].to_pylist() == [None]
     assert store.missing == list(sweep.cells[1:])
 
@@ -113,7 +110,7 @@ def test_the_results_of_another_sweep_are_read_until_there_is_one_of_this(
 
 def test_what_was_being_written_when_a_run_was_killed_is_removed(tmp_path: Path, sweep: Sweep):
     Store(tmp_path, sweep)
-    old, young = tmp_path / "cells" / ".abc.x1.parquet", tmp_path / "cells" / ".abc.x2.parquet"
+    old, young = tmp_path / "cells" / ".abc.x1.json", tmp_path / "cells" / ".abc.x2.json"
     of_index = tmp_path / ".sweep.x1.json"
     for path in (old, young, of_index):
         path.touch()
@@ -137,22 +134,18 @@ def test_cells_of_another_sweep_stay_and_are_not_read(
 
 
 def test_a_full_disk_loses_nothing_that_is_finished(
-    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
 ):
     store = Store(tmp_path, sweep)
     store.keep(outcomes[0])
 
-    def full(table: Any, file: Any) -> None:
-        file.write(b"PAR1")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(pq, "write_table", full)
-        with pytest.raises(
-            ConfigurationError,
-            match=r"No space left on device; .*\. 1 of 4 cells are finished and kept",
-        ):
-            store.keep(outcomes[1])
+    with (
+        no_file_larger_than(300),
+        pytest.raises(
+            ConfigurationError, match=r"File too large; .*\. 1 of 4 cells are finished and kept"
+        ),
+    ):
+        store.keep(outcomes[1])
     assert [path.stem for path in (tmp_path / "cells").iterdir()] == [sweep.cells[0].key]
     again = Store(tmp_path, sweep)
     assert again.missing == list(sweep.cells[1:])
@@ -164,17 +157,21 @@ def test_a_broken_file_is_computed_again(tmp_path: Path, sweep: Sweep, outcomes:
     store = Store(tmp_path, sweep)
     store.keep(outcomes[0])
     (file,) = (tmp_path / "cells").iterdir()
-    kept = shutil.copy(file, tmp_path / "kept.parquet")
+    results, key = ResultStore(tmp_path / "cells"), sweep.cells[0].key
+    configuration = sweep.cells[0].configuration
     file.write_bytes(file.read_bytes()[:100])
-    with pytest.raises(ConfigurationError, match="remove it and start the sweep again"):
+    with pytest.raises(ConfigurationError, match="remove it, and it is computed again"):
         read(tmp_path)
     assert sweep.cells[0] in Store(tmp_path, sweep).missing
     # Whole, but with nothing in it, or with something else.
-    for table in (pq.read_table(kept).slice(0, 0), pq.read_table(kept).select(["key"])):
-        pq.write_table(table, file)
+    content = {**outcomes[0].result, "error": None, "seconds": 0.0}
+    for other in ({}, {**content, "row": 3}, {**content, "row": {"safe": "x"}, "config": []}):
+        results.keep(key, configuration, other)
+        with pytest.raises(ConfigurationError, match="remove it and start the sweep again"):
+            read(tmp_path)
+    for other in ({}, {**content, "row": 3}):
+        results.keep(key, configuration, other)
         assert sweep.cells[0] in Store(tmp_path, sweep).missing
-    with pytest.raises(ConfigurationError, match="remove it and start the sweep again"):
-        read(tmp_path)
 
 
 def test_folders_that_cannot_be(tmp_path: Path, sweep: Sweep):
@@ -197,27 +194,3 @@ def test_without_pyarrow_the_extra_is_named(
     monkeypatch.setattr("safe_envs.agents.sweeps.store.find_spec", lambda name: None)
     with pytest.raises(ConfigurationError, match=r"safe-envs\[sweep\]"):
         Store(tmp_path, sweep)
-
-
-def test_a_cell_that_is_a_bomb_or_no_file_is_not_read(
-    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
-):
-    Store(tmp_path, sweep).keep(outcomes[0])
-    (path,) = (tmp_path / "cells").iterdir()
-    row = pq.read_table(path)
-    pq.write_table(pa.concat_tables([row] * 2), path)
-    with pytest.raises(ConfigurationError, match="no cell of a sweep"):
-        read(tmp_path)
-    # A text of 10 MB, in a file of a few kB.
-    pq.write_table(
-        row.set_column(row.schema.get_field_index("row"), "row", pa.array(["x" * 10**7])),
-        path,
-        compression="zstd",
-    )
-    assert path.stat().st_size < 100_000
-    with pytest.raises(ConfigurationError, match="no cell of a sweep"):
-        read(tmp_path)
-    assert len(Store(tmp_path, sweep).missing) == len(sweep.cells)
-    path.unlink()
-    os.mkfifo(path)
-    assert read(tmp_path).num_rows == 0

@@ -15,13 +15,13 @@ import safe_envs
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.rollout import episode_seed
-from safe_envs.agents.training.algorithms import whole_batches
 from safe_envs.agents.training.callbacks import ProgressLog, SafetyFigures, read_progress
 from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.hyperparameters import ALGORITHMS, scheduled
-from safe_envs.agents.training.trainer import _Session, train
+from safe_envs.agents.training.hyperparameters import ALGORITHMS, scheduled, whole_batches
+from safe_envs.agents.training.session import TrainingSession
+from safe_envs.agents.training.trainer import train
 from safe_envs.agents.training.vec_env import make_sb3_env
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 
 pytestmark = pytest.mark.slow
 
@@ -59,7 +59,7 @@ def finished(request, tmp_path_factory):
     """A short training of each kind."""
     folder = tmp_path_factory.mktemp(request.param) / "run"
     told = []
-    train(training(request.param), folder, tell=told.append)
+    train(training(request.param), folder, progress=told.append)
     assert told == sorted(told)
     assert told[-1] == 1.0
     return request.param, folder
@@ -106,7 +106,7 @@ def test_its_figures_are_those_of_the_evaluation(finished):
             bounds=False,
             options=SMALL["options"],
         ).rows
-        assert {key: found[key] for key in ("safe", "return_mean", "violations")} == {
+        assert {key: getattr(found, key) for key in ("safe", "return_mean", "violations")} == {
             key: row[key] for key in ("safe", "return_mean", "violations")
         }
 
@@ -139,7 +139,7 @@ def test_a_training_that_was_interrupted_goes_on_as_if_it_had_not_been(finished,
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(training(algorithm), interrupted, tell=stop)
+        train(training(algorithm), interrupted, progress=stop)
     assert evaluations(interrupted)[-1]["timesteps"] < LENGTHS[algorithm][0]
     with pytest.raises(ConfigurationError, match="not finished"):
         evaluate(DUBINS, str(interrupted), ["none"], episodes=1)
@@ -168,7 +168,7 @@ def test_normalised_observations_are_part_of_the_policy(tmp_path):
     rows = evaluations(tmp_path / "run")
     given = {"episodes": 8, "seed": rows[-1]["seed"], "bounds": False, "options": SMALL["options"]}
     (found,) = evaluate(DUBINS, str(tmp_path / "run"), ["scbf"], **given).rows
-    assert found["return_mean"] == rows[-1]["return_mean"]
+    assert found.return_mean == rows[-1]["return_mean"]
     assert (tmp_path / "run" / "normalization.pkl").exists()
     assert (tmp_path / "run" / "best" / "normalization.pkl").exists()
     assert "normalization" in (tmp_path / "run" / "policy.json").read_text()
@@ -248,13 +248,13 @@ def test_hyperparameters_that_do_not_work_are_refused_and_leave_the_folder_to_ot
 
 
 def test_the_zoo_s_texts_and_lists_are_understood(tmp_path):
-    session = _Session(
+    session = TrainingSession(
         training(settings={"normalize": "{'norm_obs': False, 'norm_reward': True}", "gamma": 0.9}),
         tmp_path,
     )
     scales = session._model.get_env()
     assert (scales.norm_obs, scales.norm_reward, scales.gamma) == (False, True, 0.9)
-    session = _Session(
+    session = TrainingSession(
         training(
             "sac",
             settings={
@@ -287,9 +287,9 @@ def test_a_rollout_is_cut_into_whole_batches():
 
 
 def test_the_filter_in_the_loop_knows_what_it_is_to_know(tmp_path):
-    problem = load_problem("safe_envs/QuadrotorAltitude-v0")
+    problem = make_problem("safe_envs/QuadrotorAltitude-v0")
     for knowledge, system in (("model", problem.model), ("plant", problem.plant)):
-        session = _Session(
+        session = TrainingSession(
             Training.of("QuadrotorAltitude-v0", "ppo", filter="hocbf", knowledge=knowledge),
             tmp_path,
         )
@@ -365,7 +365,7 @@ def test_the_figures_are_those_of_the_evaluation_on_the_same_episodes():
         figures._on_step()
     assert dones.all()
     assert 0 < figures.figures()["rate"] < 1
-    assert figures.figures()["rate"] == row["safety_rate"]
+    assert figures.figures()["rate"] == row.safety_rate
 
 
 def test_the_files_have_the_form_that_the_zoo_reads():

@@ -273,9 +273,9 @@ def test_no_noise_leaves_no_gap_between_scbf_and_a_cbf_without_class_k_term():
     found = paired_rates.measured(
         cubic.ENV, {"noise": 0.0, "horizon": 0.5}, [cubic.WITHOUT, "scbf"], [], Sample(episodes=20)
     )
-    assert found["scbf"].row["safe"] == found[cubic.WITHOUT].row["safe"]
-    assert found["scbf"].row["min_h_median"] == pytest.approx(
-        found[cubic.WITHOUT].row["min_h_median"], rel=1e-6
+    assert found["scbf"].row.safe == found[cubic.WITHOUT].row.safe
+    assert found["scbf"].row.min_h_median == pytest.approx(
+        found[cubic.WITHOUT].row.min_h_median, rel=1e-6
     )
 
 

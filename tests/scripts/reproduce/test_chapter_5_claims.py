@@ -1,6 +1,8 @@
 """The claims and notes of chapter 5 follow from what they are given, and can say no."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +18,6 @@ from safe_envs.scripts.reproduce.chapter_5 import (
 from safe_envs.scripts.reproduce.framework.artefact import Sample
 from safe_envs.scripts.reproduce.framework.paired import (
     MeasuredFilter,
-    bits,
     difference,
     safer,
     with_interval,
@@ -28,12 +29,11 @@ def made(*safe, episodes=1000):
     """Runs in which the first so many episodes are safe, a number for each identification; or which
     ones, where an array is given."""
     flags = [np.arange(episodes) < each if isinstance(each, int) else each for each in safe]
-    kept = [found for values in flags for found in bits(values)]
     safe, trials = int(np.sum(flags)), len(flags) * episodes
     low, high = rate_interval(round(safe / len(flags)), episodes)
     counts = {"safe": safe, "episodes": trials, "violations": trials - safe}
-    row = {**counts, "safety_rate": safe / trials, "ci_low": low, "ci_high": high}
-    return MeasuredFilter(row, [float(np.mean(each)) for each in flags], kept, episodes)
+    row: Any = SimpleNamespace(**counts, safety_rate=safe / trials, ci_low=low, ci_high=high)
+    return MeasuredFilter(row, [float(np.mean(each)) for each in flags], flags, episodes)
 
 
 def test_a_root_mean_square_has_the_interval_of_its_mean_square():

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from safe_envs.agents import make_problem
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.lie import derivatives, generator
 from safe_envs.errors import RelativeDegreeError
-from safe_envs.registry import load_problem
 from safe_envs.scripts.reproduce.chapter_6 import (
     car_drift,
     car_rates,
@@ -129,7 +129,7 @@ def test_printed_numbers_and_settings_are_those_of_the_thesis():
     assert (cubic_drift.POINTS, cubic_drift.SHOWN, car_drift.FRESH) == (100, 30, 100)
     # Sec. 6.3.2: N = 300 and K = 10000 of DDSCBF; the starts are in the captions of the tables.
     assert (learning_times.POINTS, learning_times.GENERATOR_REPETITIONS) == (300, 10_000)
-    disk, car = load_problem(cubic_rates.ENV), load_problem(car_rates.ENV)
+    disk, car = make_problem(cubic_rates.ENV), make_problem(car_rates.ENV)
     starts = [disk.starts[name].state for name in cubic_rates.PLACES.values()] + [
         car.starts[car.start].state
     ]
@@ -189,7 +189,7 @@ def test_a_seed_gives_the_same_outcome_and_another_one_another(name):
 
 
 def test_the_error_of_the_drift_is_the_law_for_states_over_the_disk():
-    problem = load_problem(cubic_rates.ENV)
+    problem = make_problem(cubic_rates.ENV)
     x = np.random.default_rng(1).uniform(-0.6, 0.6, (400, 2))
     found = cubic_drift.study(problem, x, 10, range(6), 1000, 1)
     # Ten features, sigma = .2, K = 10, R = 1000, dt = .01. Near the centre the errors are smaller
@@ -253,7 +253,7 @@ def test_the_bounds_of_the_table_and_what_known_noise_makes_of_it():
 
 
 def test_the_printed_generator_of_the_disk_lacks_what_was_found():
-    problem = load_problem(cubic_rates.ENV)
+    problem = make_problem(cubic_rates.ENV)
     (x_1, x_2), (u,) = problem.plant.states, problem.plant.inputs
     printed = cubic_rates.printed_generator(problem)
     _, derived = derivatives(problem.plant, problem.barriers[0].expression, 1, generator)
@@ -263,7 +263,7 @@ def test_the_printed_generator_of_the_disk_lacks_what_was_found():
 
 
 def test_a_constraint_by_hand_gives_the_same_episodes_as_the_condition():
-    problem = load_problem(cubic_rates.ENV, {"start": "thesis-1"})
+    problem = make_problem(cubic_rates.ENV, start="thesis-1")
     (x_1, x_2), _ = problem.plant.states, problem.plant.inputs
     formula = cubic_rates.printed_generator(problem) + x_1 * x_2
     by_hand = printed_rate("", problem, formula, 60, 0)
@@ -271,7 +271,7 @@ def test_a_constraint_by_hand_gives_the_same_episodes_as_the_condition():
 
 
 def test_the_printed_second_generator_of_the_car_is_not_safe():
-    problem = replace(load_problem(car_rates.ENV), horizon=24.0)
+    problem = replace(make_problem(car_rates.ENV), horizon=24.0)
     printed = printed_rate("", problem, car_rates.printed_second_generator(problem), 20, 0)
     assert printed.ours < 30
     assert measure(problem, "scbf", 20, 0).rate > 60
@@ -295,7 +295,7 @@ def test_the_recursion_takes_longest():
 
 
 def test_a_controller_is_compared_on_the_episodes_of_the_reference():
-    problem = load_problem(cubic_rates.ENV, {"start": "thesis-2"})
+    problem = make_problem(cubic_rates.ENV, start="thesis-2")
     reference = measure(problem, "scbf", 30, 0)
     learned = identifications.identified(problem, 100, 0, cubic_rates.PRIOR)
     found = LearnedController.run(problem, "bayesian-scbf", [learned, learned], reference, 0)
@@ -306,7 +306,7 @@ def test_a_controller_is_compared_on_the_episodes_of_the_reference():
 
 
 def test_an_identification_without_any_input_is_counted_as_unfiltered(monkeypatch):
-    problem = load_problem(cubic_rates.ENV, {"start": "thesis-2"})
+    problem = make_problem(cubic_rates.ENV, start="thesis-2")
 
     def blind(*args, learned=(), **how):
         if learned:
@@ -316,5 +316,5 @@ def test_an_identification_without_any_input_is_counted_as_unfiltered(monkeypatc
     monkeypatch.setattr("safe_envs.scripts.reproduce.framework.paired.evaluate", blind)
     blinds: Any = [None, None]
     found = measure(problem, "bayesian-scbf", 20, 0, blinds)
-    free = evaluate(problem, filters=["none"], episodes=20, bounds=False).rows[0]["safety_rate"]
+    free = evaluate(problem, filters=["none"], episodes=20, bounds=False).rows[0].safety_rate
     assert found.rates == [free, free]

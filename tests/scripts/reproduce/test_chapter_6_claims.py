@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -172,8 +174,9 @@ def test_the_worst_case_is_for_ever_or_not():
 )
 def test_both_printed_rates_are_looked_for_at_one_horizon(second, said):
     def row(safe):
-        curve = {"time": [0.0, 0.5, 1.0], "safe": list(safe)}
-        return MeasuredFilter({"episodes": 1000, "curve": curve}, [], [], 1000)
+        curve = SimpleNamespace(time=[0.0, 0.5, 1.0], safe=list(safe))
+        found: Any = SimpleNamespace(episodes=1000, curve=curve)
+        return MeasuredFilter(found, [], [], 1000)
 
     text = worst_case.at_one_horizon(row((1000, 905, 850)), row(second), (91, 55))
     assert said in text

@@ -5,13 +5,8 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
-import os
-import time
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +15,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from safe_envs.agents.jobs.processes import end_with_parent
-from safe_envs.errors import ConfigurationError, WorkersLostError
+from safe_envs.agents.jobs.fingerprint import json_checksum, source_checksum
+from safe_envs.agents.jobs.store import ResultStore
+from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.reproduce.catalogue import ARTEFACTS
-from safe_envs.scripts.reproduce.command import compute_one
+from safe_envs.scripts.reproduce.command import ArtefactJob
 from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
 from safe_envs.scripts.reproduce.framework.page import write_page
-from safe_envs.scripts.reproduce.framework.store import keep, read, source_checksum
+from safe_envs.scripts.reproduce.framework.store import keep, read
 from tests.scripts.conftest import strictly
 from tests.scripts.reproduce.test_chapter_6 import outcome as outcome_of
 
@@ -187,23 +183,6 @@ def test_an_interrupt_ends_a_single_job_at_once(safe_envs_command, catalogue, co
     assert not list(Path("report").glob("table*"))
 
 
-def test_an_interrupt_ends_the_processes(monkeypatch, tmp_path, coin):
-    from safe_envs.scripts.reproduce import command
-
-    def interrupted(*_):
-        yield "table-0.1", None
-        raise KeyboardInterrupt
-
-    context = get_context("spawn")
-    process = context.Process(target=time.sleep, args=(600,), daemon=True)
-    process.start()
-    monkeypatch.setattr(command, "_in_processes", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        command._compute([coin, coin], Sample(), tmp_path, 2, print)
-    process.join(60)
-    assert process.exitcode is not None
-
-
 def test_a_result_that_cannot_be_written_leaves_the_one_before(tmp_path, coin, monkeypatch):
     keep(tmp_path, coin, Sample(100), coin.compute(Sample(100)), 1.0)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -225,7 +204,7 @@ def test_a_picture_without_its_numbers_is_not_taken_for_a_result(tmp_path, coin,
         raise ConfigurationError("no room")
 
     with monkeypatch.context() as patch:
-        patch.setattr("safe_envs.scripts.reproduce.framework.store.write_json", full)
+        patch.setattr(ResultStore, "keep", full)
         with pytest.raises(ConfigurationError, match="no room"):
             keep(
                 tmp_path,
@@ -251,29 +230,7 @@ def kept(tmp_path, coin):
 def with_checksum(document):
     """As somebody writes it who knows how."""
     document = {name: value for name, value in document.items() if name != "sha256"}
-    return json.dumps(
-        {
-            **document,
-            "sha256": hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest(),
-        }
-    )
-
-
-@pytest.mark.slow
-@given(data=st.data())
-@settings(max_examples=50, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_digit_that_was_changed_is_not_taken_for_a_result(data, kept, coin, tmp_path):
-    content = kept.read_text()
-    try:
-        place = data.draw(st.sampled_from([k for k, c in enumerate(content) if c.isdigit()]))
-        digit = data.draw(st.sampled_from([d for d in "0123456789" if d != content[place]]))
-        kept.write_text(content[:place] + digit + content[place + 1 :])
-        with suppress(ConfigurationError):
-            # One in its configuration makes it the result of another version, which is computed
-            # again.
-            assert read(tmp_path, coin, Sample(100)) is None
-    finally:
-        kept.write_text(content)
+    return json.dumps({**document, "sha256": json_checksum(document)})
 
 
 json_values = st.recursive(
@@ -356,47 +313,12 @@ def test_a_picture_that_is_none_is_told(tmp_path, coin, kept):
 
 
 def test_code_that_changed_during_a_run_is_not_kept(tmp_path, catalogue, computed):
+    job = ArtefactJob("table-0.1", Sample(), tmp_path, "another checksum")
     with pytest.raises(ConfigurationError, match="the code changed during the run"):
-        compute_one("table-0.1", Sample(), tmp_path, "another checksum")
+        job.compute()
     assert not computed
-    compute_one("table-0.1", Sample(), tmp_path, source_checksum())
+    replace(job, source=source_checksum()).compute()
     assert computed == ["table-0.1"]
-
-
-def test_what_a_lost_process_computed_is_computed_again(tmp_path, monkeypatch):
-    from safe_envs.scripts.reproduce import command
-
-    asked = []
-
-    def pooled(names, sample, out, jobs):
-        asked.append((list(names), jobs))
-        lost = len(names) > 1 or names == ["kills"]
-        yield from (
-            (name, BrokenProcessPool() if lost and name != "first" else None) for name in names
-        )
-
-    monkeypatch.setattr(command, "_pooled", pooled)
-    ended = dict(command._in_processes(["first", "kills", "beside"], Sample(), tmp_path, 2))
-    assert asked == [(["first", "kills", "beside"], 2), (["kills"], 1), (["beside"], 1)]
-    assert ended["first"] is ended["beside"] is None
-    assert isinstance(ended["kills"], WorkersLostError)
-
-
-def test_the_processes_watch_their_parent(monkeypatch, tmp_path):
-    from safe_envs.scripts.reproduce import command
-
-    given = {}
-
-    class Pool:
-        def __init__(self, jobs, **arguments):
-            given.update(arguments)
-
-        def shutdown(self, **_):
-            pass
-
-    monkeypatch.setattr(command, "ProcessPoolExecutor", Pool)
-    assert list(command._pooled([], Sample(), tmp_path, 2)) == []
-    assert (given["initializer"], given["initargs"]) == (end_with_parent, (os.getpid(),))
 
 
 @pytest.mark.slow
@@ -439,21 +361,10 @@ def test_what_it_cannot_take_ends_with_status_2(
 
 
 @pytest.mark.slow
-def test_processes_compute_what_a_single_one_does(safe_envs_command, monkeypatch, tmp_path):
-    """Over real artefacts, the quickest ones; in one process, whose start takes longer than they
-    do."""
-    from safe_envs.scripts.reproduce import command
-
-    asked = []
-
-    def pool(jobs, **arguments):
-        asked.append(jobs)
-        return ProcessPoolExecutor(1, **arguments)
-
-    monkeypatch.setattr(command, "ProcessPoolExecutor", pool)
+def test_processes_compute_what_a_single_one_does(safe_envs_command, tmp_path):
+    """Over real artefacts, the quickest ones."""
     names = ("figure-6.2", "figure-6.4")
     assert safe_envs_command("reproduce", *names, "--quick", "--jobs", 2, "--out", "by-2")[0] == 0
-    assert asked == [2]
     for name in names:
         found = strictly(tmp_path / "by-2" / f"{name}.json")["outcome"]
         assert found == json.loads(json.dumps(outcome_of(name).document()))

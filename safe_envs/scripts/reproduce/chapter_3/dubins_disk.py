@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from safe_envs import SafetyProblem
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_3.disk_starts import (
     PRINTED_START,
@@ -50,7 +50,7 @@ Learnings = Sequence[Sequence[Trajectory]]  # one run for each gain, for each le
 
 def disk(sample: Sample) -> SafetyProblem:
     """Return the problem, as long as the sample lets it be."""
-    world = load_problem(DISK)
+    world = make_problem(DISK)
     return world.configured(horizon=world.dt * sample.work(world.steps))
 
 
@@ -65,7 +65,7 @@ def compute_disk(sample: Sample) -> Outcome:
         for start, problem in at.items()
     }
     estimates, shares = zip(
-        *(printed_residuals(load_problem(DISK), sample, seed) for seed in seeds(sample)),
+        *(printed_residuals(make_problem(DISK), sample, seed) for seed in seeds(sample)),
         strict=True,
     )
     by_formula = trajectories(at[PRINTED_START], estimates, _NO_MARGIN)

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from safe_envs import SafetyProblem
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     CHAPTER,
@@ -50,13 +50,13 @@ def passages(sample: Sample, **model: float) -> dict[str, list[Trajectory]]:
         sample: how much is learned.
         model: parameters of the model.
     """
-    problem = load_problem(OBSTACLE, {"start": "thesis", "model": model or None})
+    problem = make_problem(OBSTACLE, start="thesis", model=model or None)
     return trajectories(problem, OBSTACLE_RATES, residuals(OBSTACLE, sample, **model))
 
 
 def compute_passage(sample: Sample) -> Outcome:
     """Compute the paths around the obstacle."""
-    found, problem = passages(sample), load_problem(OBSTACLE)
+    found, problem = passages(sample), make_problem(OBSTACLE)
     learned, none = found["learned"], found["none"][0]
     times = [run.steps * problem.dt for run in learned]
     return Outcome(
@@ -166,8 +166,8 @@ def _at(run: Trajectory, time: float, dt: float) -> dict[str, Any]:
 
 def compute_clearance(sample: Sample) -> Outcome:
     """Compute the barrier on the way around the obstacle."""
-    found, at_rest, problem = passages(sample), passages(sample, v_o=0.0), load_problem(OBSTACLE)
-    true_speed = load_problem(OBSTACLE, {"start": "thesis", "model": {"v": SPEED, "v_o": 0.0}})
+    found, at_rest, problem = passages(sample), passages(sample, v_o=0.0), make_problem(OBSTACLE)
+    true_speed = make_problem(OBSTACLE, start="thesis", model={"v": SPEED, "v_o": 0.0})
     blind = runs(true_speed, [f"hocbf:p={OBSTACLE_RATES}"])[0]
     shown = {**{kind: run for kind, (run, *_) in found.items()}, "printed": blind}
     return Outcome(
@@ -287,7 +287,7 @@ def draw_clearance(figure: Figure, outcome: Outcome) -> None:
 
 
 def _values(sample: Sample) -> dict[str, Any]:
-    return setting_values(load_problem(OBSTACLE), sample)
+    return setting_values(make_problem(OBSTACLE), sample)
 
 
 ARTEFACTS: tuple[Artefact, ...] = (

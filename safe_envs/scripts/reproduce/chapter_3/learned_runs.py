@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from safe_envs import ControlAffineSDE, SafetyProblem
-from safe_envs.agents import evaluate, load_problem
+from safe_envs.agents import evaluate, make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS
 from safe_envs.scripts.reproduce.framework.artefact import Number, Sample
 from safe_envs.scripts.reproduce.framework.paired import measure
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
+from safe_envs.wrappers import Condition
 from safe_envs.wrappers.learning.residual import ResidualModel, learn_residual
 
 CHAPTER = chapter(3)
@@ -115,7 +116,7 @@ def residuals(env_id: str, sample: Sample, **model: float) -> tuple[ResidualMode
         sample: how much is learned.
         model: parameters of the model.
     """
-    problem = load_problem(env_id, {"model": model or None})
+    problem = make_problem(env_id, model=model or None)
     states, epochs = learning_sizes(sample)
     label_dt = LEARNING["label_step"]
     return tuple(
@@ -126,7 +127,7 @@ def residuals(env_id: str, sample: Sample, **model: float) -> tuple[ResidualMode
 
 def runs(
     problem: SafetyProblem,
-    filters: Sequence[str],
+    filters: Sequence[str | Condition],
     model: ResidualModel | None = None,
     policy: str = "nominal",
     knowledge: str = "model",
@@ -135,7 +136,7 @@ def runs(
 
     Args:
         problem: with a fixed start.
-        filters: texts of the filters.
+        filters: conditions or their texts.
         model: of the learned filters, if any.
         policy: name of the policy.
         knowledge: what the filters know, "model" or "plant".
@@ -144,8 +145,8 @@ def runs(
     size = {"episodes": 1, "num_envs": 1, "bounds": False, "record": True}
     found = evaluate(
         problem, policy, filters, knowledge=knowledge, learned=learned, **size
-    ).recorders
-    return [cut(found[name].states[:, 0], found[name].barrier[:, 0]) for name in filters]
+    ).trajectories
+    return [cut(each.states[:, 0], each.barrier[:, 0]) for each in found.values()]
 
 
 def cut(states: np.ndarray, h: np.ndarray) -> Trajectory:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     CHAPTER,
@@ -20,13 +20,13 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     Trajectory,
     rates_around,
     residuals,
+    runs,
     setting_values,
     smallest_numbers,
     trajectories,
 )
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
-from safe_envs.scripts.reproduce.framework.episodes import periods
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.systems.quadrotor_altitude import g, m, z, zdot
 from safe_envs.wrappers import AffineConstraint
@@ -66,12 +66,7 @@ def printed_run(problem: SafetyProblem, knowledge: str) -> Trajectory:
         problem: with a fixed start.
         knowledge: "model" for the mass of the model, "plant" for the true one.
     """
-    condition = PrintedCondition(printed_hocbf)
-    found = list(periods(problem, condition, "nominal", range(1), 0, knowledge))
-    start = problem.starts[problem.start].state
-    states = np.array([start, *(period.states[0] for period in found)], dtype=float)
-    h = [found[0].before[0], *(period.after[0] for period in found)]
-    return Trajectory(states, np.array(h))
+    return runs(problem, [PrintedCondition(printed_hocbf)], knowledge=knowledge)[0]
 
 
 def compute(sample: Sample) -> Outcome:
@@ -108,7 +103,7 @@ def compute(sample: Sample) -> Outcome:
 
 def hover(sample: Sample) -> SafetyProblem:
     """Return the problem from the start of the thesis, as long as the sample lets it be."""
-    problem = load_problem(QUADROTOR, {"start": "thesis"})
+    problem = make_problem(QUADROTOR, start="thesis")
     return problem.configured(horizon=problem.dt * max(_LEAST_STEPS, sample.work(problem.steps)))
 
 

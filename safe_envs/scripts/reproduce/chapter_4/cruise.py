@@ -28,7 +28,7 @@ from safe_envs.scripts.reproduce.chapter_4.cruise_setting import (
 )
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 from safe_envs.scripts.reproduce.framework.episodes import violations
-from safe_envs.scripts.reproduce.framework.paired import bits, difference, is_above, with_interval
+from safe_envs.scripts.reproduce.framework.paired import difference, is_above, with_interval
 from safe_envs.systems.acc import WEIGHT
 
 COARSE = 0.2  # control period of a quick look at the table, in s
@@ -85,7 +85,7 @@ def outcome_of(safe: Safe) -> Outcome:
 
 def claims_of_table(safe: Safe) -> list[Claim]:
     """Return the claims of the text, each by the same episodes in two or all of the four cells."""
-    flags = {name: bits(each) for name, each in safe.items()}
+    flags = {name: [each] for name, each in safe.items()}
     unbounded = difference("", flags["SRCBF, unbounded"], flags["SCBF, unbounded"])
     bounded = difference("", flags["SCBF, bounded"], flags["SRCBF, bounded"])
     lost = {

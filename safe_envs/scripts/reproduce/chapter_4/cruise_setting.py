@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from scipy.special import ndtr
 
 from safe_envs import SafetyProblem
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.scripts.reproduce.framework.artefact import Sample
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
 from safe_envs.systems.acc import WEIGHT
@@ -48,7 +48,7 @@ class CruiseSettings:
         shape = {"tau": self.tau, "rate": self.rate, "slack_weight": self.slack_weight}
         box = [-limit, limit]
         options = {"barrier": shape, "box": box, "noise": NOISE, "start": START, "dt": step}
-        return load_problem(ACC, {**options, "horizon": HORIZON})
+        return make_problem(ACC, **options, horizon=HORIZON)
 
     @property
     def filters(self) -> dict[str, str]:

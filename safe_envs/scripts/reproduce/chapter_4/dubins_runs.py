@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, SafeVectorEnv
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.dynamics.lie import generator
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Outcome
 from safe_envs.scripts.reproduce.framework.episodes import Violations, episode_seed, violations
-from safe_envs.scripts.reproduce.framework.paired import bits, difference
+from safe_envs.scripts.reproduce.framework.paired import difference
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
 from safe_envs.wrappers import AffineConstraint, Condition
@@ -63,7 +63,7 @@ def dubins_problem(noise: float, start: Any) -> SafetyProblem:
     """
     box = (-SETTINGS["turn_rate"], SETTINGS["turn_rate"])
     options = {"noise": noise, "start": start, "box": box, "dt": STEP, "horizon": max(HORIZONS)}
-    return load_problem(DUBINS, {**options, "barrier": {"radius": RADIUS}})
+    return make_problem(DUBINS, **options, barrier={"radius": RADIUS})
 
 
 def simulate(
@@ -118,7 +118,7 @@ def ahead_of(rival: str, runs: ByFilter, horizon: float, where: str = "") -> Num
         horizon: up to which, in s.
         where: end of the number's name.
     """
-    first, second = (bits(runs[name].safe(step_of(horizon))) for name in ("SCBF", rival))
+    first, second = ([runs[name].safe(step_of(horizon))] for name in ("SCBF", rival))
     return difference(f"SCBF - {rival}{where}", first, second)
 
 

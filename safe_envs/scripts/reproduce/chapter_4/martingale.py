@@ -15,7 +15,8 @@ from scipy.special import ndtr
 
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import rate_interval
-from safe_envs.problem.problem import Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.signals import Variable
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_4.reciprocal_inputs import (
     CHAPTER,
@@ -111,7 +112,7 @@ def compute(sample: Sample) -> Outcome:
     closed = [
         [safe_up_to(s, t, step) for s in STARTS] for t, step in ((math.inf, 0.0), (HORIZON, STEP))
     ]
-    curves = [each.row["curve"] for each in attained]
+    curves = [each.row.curve for each in attained]
     note = partial(CHAPTER.note, "example-4.2.2", horizon=HORIZON)
     calm_rate = measure(SCALAR, "rcbf", 1, 0, options=calm).rate
     return Outcome(
@@ -130,11 +131,11 @@ def compute(sample: Sample) -> Outcome:
             "h": DISTANCES.tolist(),
             "asked": {name: values.tolist() for name, values in allowed.items()},
             "curves": [
-                {key: curve[key] for key in ("time", "rate", "ci_low", "ci_high")}
+                {key: getattr(curve, key) for key in ("time", "rate", "ci_low", "ci_high")}
                 | {"bound": b, "start": s}
                 for s, curve, b in zip(STARTS, curves, bounds, strict=True)
             ],
-            "closed": [[safe_up_to(s, t, STEP) for t in curves[0]["time"][1:]] for s in STARTS],
+            "closed": [[safe_up_to(s, t, STEP) for t in curves[0].time[1:]] for s in STARTS],
         },
         notes=[
             *(
@@ -148,8 +149,8 @@ def compute(sample: Sample) -> Outcome:
 
 def _together(row: Any) -> Number:
     """Return a rate with an interval that holds it at all of `STARTS` with 95 %."""
-    low, high = rate_interval(row["safe"], row["episodes"], 1.0 - 0.05 / len(STARTS))
-    return Number("", 100 * row["safe"] / row["episodes"], 100 * low, 100 * high, unit="%")
+    low, high = rate_interval(row.safe, row.episodes, 1.0 - 0.05 / len(STARTS))
+    return Number("", 100 * row.safe / row.episodes, 100 * low, 100 * high, unit="%")
 
 
 def _limited(limit: float, episodes: int, seed: int) -> list[Number]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS
 from safe_envs.scripts.reproduce.framework.artefact import Claim
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
@@ -32,7 +32,7 @@ def largest_inputs(text: str, noise: float) -> np.ndarray:
         text: of the condition.
         noise: sigma of the scalar system, in 1/sqrt(s).
     """
-    problem = load_problem(SCALAR, {"noise": noise, "box": [-UNBOUNDED, UNBOUNDED]})
+    problem = make_problem(SCALAR, noise=noise, box=[-UNBOUNDED, UNBOUNDED])
     answer = SafetyFilter.for_problem(problem, parse_conditions(text, problem))
     state = (1.0 - DISTANCES)[:, None]
     return answer.filter(state, np.full_like(state, UNBOUNDED)).action[:, 0]

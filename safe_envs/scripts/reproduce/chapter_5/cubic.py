@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     identifications,
@@ -157,7 +157,7 @@ def compare_with_no_filter(found: Levels) -> list[str]:
 
 def _no_bound(sample: Sample) -> list[str]:
     """Return why h/sup h says nothing here, in words."""
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     condition = SCBF().constraint(problem.model, problem.barriers[0])
     read = compile_function(
         problem.model.states,

@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from safe_envs.agents import evaluate, load_problem
+from safe_envs.agents import evaluate, make_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_5.cubic import CBF, ENV, LEVELS, SETTINGS
@@ -68,11 +68,13 @@ def paths(sample: Sample) -> dict[str, PlaneTrajectories]:
             bounds=False,
             record=True,
         )
-        recorder, row = run.recorders[name], run.rows[0]
+        recorded, row = run.trajectories[name], run.rows[0]
         found[key] = PlaneTrajectories(
-            MeasuredFilter(row, [row["safety_rate"]], run.flags[name], row["episodes"]),
-            recorder.states,
-            recorder.barrier[:, : recorder.states.shape[1]],
+            MeasuredFilter(
+                row, [row.safety_rate], [each.safe for each in run.episodes[name]], row.episodes
+            ),
+            recorded.states,
+            recorded.barrier[:, : recorded.states.shape[1]],
         )
     return found
 
@@ -137,7 +139,7 @@ def short_of_input(runs: MeasuredFilter) -> str:
     """Return how often the input bounds are too narrow for the CBF, in words."""
     return (
         "no input within 10 1/s meets the condition of the CBF at"
-        f" {runs.row['infeasible_rate']:.2%} of the steps up to a first violation"
+        f" {runs.row.infeasible_rate:.2%} of the steps up to a first violation"
     )
 
 
@@ -167,8 +169,8 @@ def kept(runs: MeasuredFilter) -> Claim:
     row = runs.row
     return Claim(
         "the CBF guarantees safe trajectories without noise",
-        row["violations"] == 0,
-        f"{row['safe']} of {row['episodes']} are safe",
+        row.violations == 0,
+        f"{row.safe} of {row.episodes} are safe",
     )
 
 
@@ -207,7 +209,7 @@ _CLAIMS: dict[str, Callable[[Mapping[str, PlaneTrajectories]], Claim]] = {
 
 def draw_paths(figure: Figure, outcome: Outcome) -> None:
     """Draw trajectories in the plane, one of them bold, with the unsafe region."""
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     axes = figure.subplots()
     lines = [np.array(line) for line in outcome.data["paths"]]
     thin: dict[str, Any] = {"color": COLORS[4], "linewidth": 0.8, "alpha": 0.8}

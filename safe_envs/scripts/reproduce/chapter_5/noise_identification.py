@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER
@@ -53,7 +53,7 @@ def identification(
         seed: of the data.
         whole: add the labels of all estimators.
     """
-    problem = load_problem(env_id, {"noise": noise})
+    problem = make_problem(env_id, noise=noise)
     data = collect(problem, points, repetitions, [[0.0]], seed=seed)
     estimators: tuple[Estimator, ...] = ("martingale", "printed")
     learned = {

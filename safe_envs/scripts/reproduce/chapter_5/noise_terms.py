@@ -12,7 +12,7 @@ import sympy as sp
 from matplotlib.figure import Figure
 
 from safe_envs import SafetyProblem
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient, ito_correction
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legend
@@ -74,7 +74,7 @@ def learning_outcome(
         formula: the same as a function of the state.
         sample: how much is simulated.
     """
-    problem, learned = load_problem(env_id, {"noise": noise}), repeated(env_id, noise, sample)
+    problem, learned = make_problem(env_id, noise=noise), repeated(env_id, noise, sample)
     first = learned[0]
     x = [draw_states(problem, VALIDATION, np.random.default_rng(each.seed)) for each in learned]
     repaired, printed = (

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.agents.evaluation.bound_check import starts_of
 from safe_envs.agents.evaluation.contradiction import by_rate
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
@@ -139,7 +139,7 @@ def outcome_of(
         ),
         runs[WITHOUT].number("CBF with alpha = 0"),
     ]
-    low, high = (100 * ddscbf.row[key] for key in ("ci_low", "ci_high"))
+    low, high = (100 * end for end in (ddscbf.row.ci_low, ddscbf.row.ci_high))
     above = (
         f"DDSCBF is safe in more than {THRESHOLD:g} % of the episodes, as counted, whatever its"
         " interval"
@@ -147,8 +147,8 @@ def outcome_of(
     claims = [
         Claim(
             "every trajectory is unsafe with the CBF",
-            cbf.row["safe"] == 0,
-            f"{cbf.row['safe']} of {cbf.row['episodes']} are safe",
+            cbf.row.safe == 0,
+            f"{cbf.row.safe} of {cbf.row.episodes} are safe",
         ),
         safer(
             "the noise makes trajectories unsafe with the CBF that are safe without it",
@@ -191,7 +191,7 @@ def _sampled(sample: Sample) -> str:
         found = measured(ENV, {**A.options(sample), "noise": noise}, [A.cbf, ahead], [], sample)
         plain = found[A.cbf]
         said.append(
-            f"{where} {plain.rate:.1f} % (median of the minimum h {plain.row['min_h_median']:.1g}),"
+            f"{where} {plain.rate:.1f} % (median of the minimum h {plain.row.min_h_median:.1g}),"
             " with a margin for it"
             f" {found[ahead].rate:.1f} %"
         )
@@ -208,7 +208,7 @@ def _horizons(setting: PendulumSetting, sample: Sample) -> str:
         numbers = found[text].at_each_horizon(PRINTED[name])
         times = found[text].curve["time"]
         agreeing.append({t for t, n in zip(times, numbers, strict=True) if disagreement(n) is None})
-    both, tried = sorted(agreeing[0] & agreeing[1]), len(found["scbf"].row["curve"]["time"])
+    both, tried = sorted(agreeing[0] & agreeing[1]), len(found["scbf"].row.curve.time)
     said = f"{len(both)} of {tried} horizons up to {setting.longest:g} s" + (
         f", from {both[0]:.3g} to {both[-1]:.3g} s" if both else ""
     )
@@ -217,7 +217,7 @@ def _horizons(setting: PendulumSetting, sample: Sample) -> str:
 
 def _bounds(first: Identification, scbf: MeasuredFilter, sample: Sample) -> list[str]:
     """Return what Prop. 4.2.8 gives, and what Prop. 5.2.2 asks for at the origin, in words."""
-    problem, model = load_problem(ENV, B.options(sample)), first.learned["martingale"]
+    problem, model = make_problem(ENV, **B.options(sample)), first.learned["martingale"]
     margin = next(iter(model.record.errors.values()))
     answer = SafetyFilter.for_problem(problem, DDSCBF(model, margin=margin))
     slack = float(np.max(answer.filter([0.0, 0.0], [0.0]).slack))
@@ -230,7 +230,7 @@ def _bounds(first: Identification, scbf: MeasuredFilter, sample: Sample) -> list
     if sample.quick:
         return notes
     bound = promise(verify(problem, (SCBF(),)), starts_of(problem), problem.duration)[0]
-    bound = bound.without(by_rate(bound.value, scbf.row["ci_high"]))
+    bound = bound.without(by_rate(bound.value, scbf.row.ci_high))
     value = f"none, {bound.reason}" if bound.value is None else f"{100 * bound.value:.1f} %"
     return [
         *notes,

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
     CHAPTER,
@@ -36,7 +36,7 @@ _NEAR = 0.1  # relative error up to which we should call an estimate near; the t
 
 def compute(sample: Sample) -> Outcome:
     """Compute Figure 6.3."""
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     x = draw_states(problem, FRESH, np.random.default_rng([sample.seed, 64]))
     truth, chosen = true_drift(problem, x), seeds(sample, _IDENTIFICATIONS)
     learned = [identified(problem, REPETITIONS[-1], seed, PRIOR) for seed in chosen]

@@ -10,7 +10,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs import SafetyProblem
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
     CHAPTER,
     REPETITIONS,
@@ -55,7 +55,7 @@ def printed_second_generator(problem: SafetyProblem) -> sp.Expr:
 
 
 def _world(sample: Sample) -> SafetyProblem:
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     return replace(problem, horizon=_QUICK_HORIZON) if sample.quick else problem
 
 

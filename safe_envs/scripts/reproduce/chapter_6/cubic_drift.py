@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from safe_envs import SafetyProblem
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
     AT_REST,
@@ -158,7 +158,7 @@ def falls_as_printed(
 
 def compute_errors(sample: Sample) -> Outcome:
     """Compute Table 6.1."""
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     x = draw_states(problem, POINTS, np.random.default_rng([sample.seed, 61]))
     chosen = seeds(sample, _IDENTIFICATIONS)
     found = {k: study(problem, x, k, chosen, STARTS, STEPS) for k in REPETITIONS}
@@ -207,7 +207,7 @@ def _compared_with_law(
 
 def compute_figure(sample: Sample) -> Outcome:
     """Compute Figure 6.1."""
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     x = draw_states(problem, SHOWN, np.random.default_rng([sample.seed, 62]))
     x = x[x[:, 0].argsort()]
     chosen = seeds(sample, _PICTURED)

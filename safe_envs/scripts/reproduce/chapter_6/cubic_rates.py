@@ -10,7 +10,7 @@ from typing import Any
 import sympy as sp
 
 from safe_envs import SafetyProblem
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.agents.evaluation.contradiction import by_rate
 from safe_envs.scripts.reproduce.chapter_6.cubic_drift import ENV, PRIOR
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
@@ -163,7 +163,7 @@ class _Column:
     @property
     def withheld(self) -> str:
         """Return what the rate of the SCBF says against that; empty if nothing."""
-        return by_rate(self.repaired, self.scbf.row["ci_high"])
+        return by_rate(self.repaired, self.scbf.row.ci_high)
 
     def late(self) -> Number:
         """Return the rate of the SCBF at a long horizon."""
@@ -198,7 +198,7 @@ class _Column:
 
 def compute(sample: Sample) -> Outcome:
     """Compute Table 6.2."""
-    world = load_problem(ENV)
+    world = make_problem(ENV)
     models, found = _Models.learn(world, sample), verify(world, [SCBF()], seed=sample.seed)
     worst = float(found.survey.suprema[0]), float(found.survey.missed[0])
     columns = [_Column.run(i, world, models, worst, sample) for i in range(len(PLACES))]

@@ -14,7 +14,6 @@ from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import rate_interval
 from safe_envs.scripts.reproduce.chapter_6.identifications import CHAPTER, one_more
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
-from safe_envs.scripts.reproduce.framework.episodes import violations
 from safe_envs.scripts.reproduce.framework.paired import (
     PRINTED_EPISODES,
     MeasuredFilter,
@@ -49,8 +48,7 @@ def printed_rate(
         seed: of all of them.
     """
     condition = PrintedCondition(partial(_constraint, formula))
-    found = violations(problem, condition, "nominal", episodes, seed)
-    return found.rate(name, problem.steps)
+    return measure(problem, condition, episodes, seed).number(name)
 
 
 def rate_of_one_more(

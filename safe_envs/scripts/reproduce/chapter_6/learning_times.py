@@ -6,7 +6,7 @@ import time
 from functools import cache
 from typing import Any
 
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
     CHAPTER,
     REPETITIONS,
@@ -45,7 +45,7 @@ def generator_values(sample: Sample) -> dict[str, int]:
 def recursion(sample: Sample) -> GeneratorModel:
     """Return DDSCBF's networks by the printed estimate, learned once for both tables."""
     how: dict[str, Any] = {"way": "network", "estimator": "printed", "seed": seeds(sample, 1)[0]}
-    return learn_generator(load_problem(ENV), **generator_work(sample), **how)
+    return learn_generator(make_problem(ENV), **generator_work(sample), **how)
 
 
 def sooner(ratio: float) -> list[Claim]:
@@ -69,7 +69,7 @@ def sooner(ratio: float) -> list[Claim]:
 
 def compute(sample: Sample) -> Outcome:
     """Compute Table 6.4."""
-    problem, networks = load_problem(ENV), recursion(sample)
+    problem, networks = make_problem(ENV), recursion(sample)
     how: dict[str, Any] = {"way": "direct", "seed": seeds(sample, 1)[0]}
     direct = learn_generator(problem, **generator_work(sample), **how).record.seconds
     seconds = []

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
     AT_REST,
@@ -60,7 +60,7 @@ def noise_levels(section: str, unit: tuple[str, ...], sample: Sample) -> Outcome
         sample: how much is simulated.
     """
     env, prior = (CHAPTER.settings[section][name] for name in ("env", "prior"))
-    problem = load_problem(env)
+    problem = make_problem(env)
     first, second, *_ = seeds(sample, 2)
     learned = identified(problem, REPETITIONS[-1], first, prior)
     data = collect(problem, sample.work(NOISE_STARTS), 1, AT_REST, steps=NOISE_STEPS, seed=second)

@@ -57,7 +57,7 @@ def at_one_horizon(first: MeasuredFilter, second: MeasuredFilter, printed: Seque
         second: the same from the second one.
         printed: of both, in per cent.
     """
-    times = first.row["curve"]["time"]
+    times = first.row.curve.time
     curves = [each.at_each_horizon(p) for each, p in zip((first, second), printed, strict=True)]
     both = [
         time for time, *pair in zip(times, *curves, strict=True) if not any(map(disagreement, pair))

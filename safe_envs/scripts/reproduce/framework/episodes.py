@@ -8,13 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from safe_envs import SafetyProblem, SafeVectorEnv
-from safe_envs.agents import Policy, make_policy
+from safe_envs.agents import Policy, evaluate, make_policy
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.envs.info import Info
 from safe_envs.scripts.reproduce.framework.artefact import Number
 from safe_envs.wrappers import Condition, SafetyFilterVectorWrapper, parse_conditions
-
-_BATCH = 1024
 
 
 @dataclass(frozen=True)
@@ -109,16 +107,7 @@ def violations(
         episodes: number of them.
         seed: of all of them.
     """
-    instants, counted, infeasible = [], 0, 0
-    for first in range(0, episodes, _BATCH):
-        batch = range(first, min(first + _BATCH, episodes))
-        instant = np.full(len(batch), problem.steps + 1)
-        for k, period in enumerate(periods(problem, condition, policy, batch, seed)):
-            if k == 0:
-                instant[period.before <= 0.0] = 0
-            counts = period.running & (instant > k)
-            counted += int(counts.sum())
-            infeasible += int((counts & ~period.info["feasible"]).sum())
-            instant[counts & (period.after <= 0.0)] = k + 1
-        instants.append(instant)
-    return Violations(np.concatenate(instants), infeasible / max(counted, 1))
+    found = evaluate(problem, policy, [condition], episodes=episodes, seed=seed, bounds=False)
+    results = next(iter(found.episodes.values()))[0]
+    instant = np.where(results.safe, problem.steps + 1, results.first_violation)
+    return Violations(instant, results.infeasible.sum() / max(results.counted.sum(), 1))

@@ -11,7 +11,7 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from PIL import Image
 
-from safe_envs.agents.evaluation.evaluate import package_versions
+from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.atomic_io import write_atomically
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,10 +10,12 @@ import numpy as np
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.comparison import SafetyBits, compare_all
+from safe_envs.agents.evaluation.comparison import compare_all
 from safe_envs.agents.evaluation.repeats import pooled
+from safe_envs.agents.evaluation.rows import EpisodeSummary
 from safe_envs.errors import RelativeDegreeError
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
+from safe_envs.wrappers import Condition
 from safe_envs.wrappers.learning import LearnedModel
 
 PRINTED_EPISODES = 1000
@@ -33,21 +35,21 @@ class MeasuredFilter:
         episodes: of each identification.
     """
 
-    row: Mapping[str, Any]
+    row: EpisodeSummary
     rates: Sequence[float]
-    flags: Sequence[SafetyBits]
+    flags: Sequence[np.ndarray]
     episodes: int
 
     @property
     def rate(self) -> float:
         """The safety rate in per cent."""
-        return 100 * self.row["safety_rate"]
+        return 100 * self.row.safety_rate
 
     @property
     def curve(self) -> dict[str, list[float]]:
         """Safety rate in per cent over time in s."""
-        curve = self.row["curve"]
-        return {"time": curve["time"], "rate": [100 * rate for rate in curve["rate"]]}
+        curve = self.row.curve
+        return {"time": curve.time, "rate": [100 * rate for rate in curve.rate]}
 
     def number(self, name: str, printed: float | None = None) -> Number:
         """Return the rate, with its interval over identifications and episodes.
@@ -56,21 +58,21 @@ class MeasuredFilter:
             name: of the number.
             printed: rate in the thesis, of 1000 runs, in per cent.
         """
-        low, high = (100 * self.row[key] for key in ("ci_low", "ci_high"))
+        low, high = (100 * end for end in (self.row.ci_low, self.row.ci_high))
         trials = None if printed is None else PRINTED_EPISODES
         return Number(name, self.rate, low, high, printed, trials, "%")
 
     def at_each_horizon(self, printed: float) -> list[Number]:
         """Return the rate up to each instant, with a printed one in per cent."""
         return [
-            Number.rate("", safe, self.row["episodes"], printed, PRINTED_EPISODES)
-            for safe in self.row["curve"]["safe"]
+            Number.rate("", safe, self.row.episodes, printed, PRINTED_EPISODES)
+            for safe in self.row.curve.safe
         ]
 
 
 def measure(
     problem: SafetyProblem | str,
-    text: str,
+    condition: str | Condition,
     episodes: int,
     seed: int,
     models: Sequence[LearnedModel] = (),
@@ -83,7 +85,7 @@ def measure(
 
     Args:
         problem: what to simulate, or its id.
-        text: of the filter.
+        condition: of the filter, or its text.
         episodes: with each model.
         seed: of the episodes.
         models: what a learned filter uses, one at a time; none for a filter that learns nothing.
@@ -93,37 +95,31 @@ def measure(
     for learned in [[model] for model in models] or [[]]:
         common = {"episodes": episodes, "seed": seed, "bounds": False, **how}
         try:
-            found.append(evaluate(problem, filters=[text], learned=learned, **common))
+            found.append(evaluate(problem, filters=[condition], learned=learned, **common))
         except RelativeDegreeError:
             if not learned:
                 raise
             found.append(evaluate(problem, filters=["none"], **common))
     rows = [each.rows[0] for each in found]
-    flags = [bits for each in found for bits in next(iter(each.flags.values()))]
-    rates = [row["safety_rate"] for row in rows]
+    flags = [results.safe for each in found for results in next(iter(each.episodes.values()))]
+    rates = [row.safety_rate for row in rows]
     return MeasuredFilter(pooled(rows, _CONFIDENCE), rates, flags, episodes)
 
 
-def bits(safe: np.ndarray) -> list[SafetyBits]:
-    """Return which episodes were safe, shape (episodes,), as `difference` takes it."""
-    found = SafetyBits()
-    found.add(safe)
-    return [found]
-
-
-def difference(name: str, first: Sequence[SafetyBits], second: Sequence[SafetyBits]) -> Number:
+def difference(name: str, first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> Number:
     """Return by how many points the rate of one filter is above another's on the same episodes.
 
     Args:
         name: of the number.
-        first: which episodes are safe with the one filter, for each identification.
+        first: which episodes are safe with the one filter, shape (episodes,), for each
+            identification.
         second: with the other.
 
     Returns:
         The difference with its 95 % interval over episodes and identifications.
     """
     (found,) = compare_all({"second": second, "first": first}, _CONFIDENCE)
-    middle, low, high = (100 * found[key] for key in ("difference", "ci_low", "ci_high"))
+    middle, low, high = (100 * end for end in (found.difference, found.ci_low, found.ci_high))
     return Number(name, middle, low, high, unit="points")
 
 

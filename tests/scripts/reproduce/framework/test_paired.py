@@ -7,7 +7,6 @@ import pytest
 
 from safe_envs.agents import paired_difference_interval
 from safe_envs.scripts.reproduce.framework.paired import (
-    bits,
     difference,
     is_above,
     is_below,
@@ -17,7 +16,7 @@ from safe_envs.scripts.reproduce.framework.paired import (
 
 def test_difference_is_of_pairs() -> None:
     """Pairs that agree make its interval narrower than that of two samples would be."""
-    first, second = bits(np.arange(100) < 60), bits(np.arange(100) < 50)
+    first, second = [np.arange(100) < 60], [np.arange(100) < 50]
     number = difference("gap", first, second)
     assert (number.name, number.unit, number.ours) == ("gap", "points", 10.0)
     assert is_above(number)
@@ -28,4 +27,4 @@ def test_difference_is_of_pairs() -> None:
         [100 * end for end in paired_difference_interval(50, 10, 0, 40)]
     )
     assert with_interval(number).startswith("+10.0 [")
-    assert not is_above(difference("", first, bits(np.arange(100) >= 50)))
+    assert not is_above(difference("", first, [np.arange(100) >= 50]))

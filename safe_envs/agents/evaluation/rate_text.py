@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 _MOST_DIGITS = 9
 
 
@@ -14,6 +17,11 @@ def percent_in(rate: float, low: float, high: float) -> str:
     """A rate with its interval, in per cent."""
     rate_text, low_text, high_text = _percents(rate, low, high)
     return f"{rate_text} % [{low_text}, {high_text}]"
+
+
+def rate_of(row: Mapping[str, Any]) -> str:
+    """Return the safety rate of a row with its interval, in per cent."""
+    return percent_in(row["safety_rate"], row["ci_low"], row["ci_high"])
 
 
 def _percents(*rates: float) -> list[str]:

@@ -1,0 +1,49 @@
+"""Jobs of a command, with a progress bar, until all are done or the user stops them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from safe_envs.scripts.options.console import progress_bar
+
+if TYPE_CHECKING:
+    from safe_envs.agents.jobs.executor import Backend
+    from safe_envs.agents.jobs.job import Job, Outcome
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    backend: Backend,
+    out: Path,
+    title: str,
+    keep: Callable[[Outcome], None] = lambda _: None,
+) -> list[Outcome]:
+    """Compute jobs; return the outcomes of those that failed.
+
+    Args:
+        jobs: what to compute.
+        backend: where.
+        out: folder of the results, from which the same command resumes after a stop.
+        title: of the progress bar.
+        keep: receives each outcome as soon as it exists.
+    """
+    from safe_envs.agents.jobs.executor import run
+
+    ended: list[Outcome] = []
+    with progress_bar(title) as tell:
+
+        def note(outcome: Outcome) -> None:
+            keep(outcome)
+            ended.append(outcome)
+            if tell:
+                tell(len(ended) / len(jobs))
+
+        try:
+            run(jobs, backend, note, lambda text: print(text, file=sys.stderr, flush=True))
+        except KeyboardInterrupt:
+            print(f"Stopped. The same command goes on after what is in {out}.", file=sys.stderr)
+            raise
+    return [outcome for outcome in ended if outcome.error is not None]
