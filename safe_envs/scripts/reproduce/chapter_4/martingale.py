@@ -39,7 +39,7 @@ from safe_envs.wrappers.verification.bounds import proposition_4_2_8
 LIMITS, STARTS, SCALE = (SETTINGS[name] for name in ("limits", "starts", "scale"))
 STEP, HORIZON, EPISODES = (SETTINGS[name] for name in ("step", "horizon", "episodes"))
 SHIFT = 0.5826
-"""Standard deviations of a step by which a boundary watched at the steps only seems further away."""
+"""By so many standard deviations of a step a boundary watched at the steps seems further away."""
 
 
 def attaining_problem(start: float) -> SafetyProblem:

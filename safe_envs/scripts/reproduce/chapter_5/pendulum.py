@@ -212,7 +212,7 @@ def _horizons(setting: PendulumSetting, sample: Sample) -> str:
     said = f"{len(both)} of {tried} horizons up to {setting.longest:g} s" + (
         f", from {both[0]:.3g} to {both[-1]:.3g} s" if both else ""
     )
-    return f"{setting.name}: the printed rates of SCBF and of CBF both are reproduced at {said}"
+    return f"{setting.name}: the printed rates of SCBF and of CBF are both reproduced at {said}"
 
 
 def _bounds(first: Identification, scbf: MeasuredFilter, sample: Sample) -> list[str]:
