@@ -42,7 +42,7 @@ def _versions() -> dict[str, str]:
 
 @cache
 def source_checksum(scripts: bool = True) -> str:
-    """Return the SHA-256 of this project's code and data, so that a developer's change is another version.
+    """Return the SHA-256 of this project's code and data: a developer's change is a version.
 
     Args:
         scripts: include `safe_envs.scripts`, on which no evaluation depends.
