@@ -31,7 +31,7 @@ def test_a_filter_keeps_an_example_safe(name):
         bounds=False,
     )
     bare, filtered = found.rows
-    assert bare["ci_high"] < filtered["ci_low"]
+    assert bare.ci_high < filtered.ci_low
     assert found.title == f"{path}:problem"
 
 

@@ -72,7 +72,7 @@ def _train(policy: Path) -> None:
             Training.of(ENV_ID, "ppo", n_timesteps=_STEPS, eval_freq=_STEPS),
             policy,
             resume=os.path.exists(policy),
-            tell=tell,
+            progress=tell,
         )
     say(stdout(), f"Trained in {seconds:.0f} s of processor time and saved in {policy}\n")
 

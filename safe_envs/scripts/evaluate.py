@@ -211,7 +211,7 @@ def evaluate(
             env.env_id if filter_spec and env.env_id and not env.system else env.full_id,
             policy,
             filters=names,
-            spec=filter_spec,
+            filter_spec=filter_spec,
             trust=trust,
             options=env.arguments,
             seed=seed,

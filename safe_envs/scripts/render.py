@@ -20,7 +20,7 @@ from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, w
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:
-    from safe_envs.agents.policies.registry import Policy
+    from safe_envs.agents.policies.base import Policy
     from safe_envs.problem.problem import SafetyProblem
     from safe_envs.wrappers import Condition
 
@@ -145,10 +145,11 @@ def split_filters(text: str) -> list[str]:
     Raises:
         ConfigurationError: one has no text.
     """
-    from safe_envs.agents.evaluation.evaluate import BARE
-    from safe_envs.wrappers import head_pattern
+    from safe_envs.agents.evaluation.spec import UNFILTERED
+    from safe_envs.wrappers import CONDITIONS, LEARNED
 
-    found = [part.strip() for part in re.split(rf",(?=\s*{head_pattern(BARE)})", text)]
+    names = "|".join(sorted((UNFILTERED, *CONDITIONS, *LEARNED), key=len, reverse=True))
+    found = [part.strip() for part in re.split(rf",(?=\s*(?:{names})\s*(?:[:+,]|$))", text)]
     if not all(found):
         raise ConfigurationError(
             f"--compare {shown(text)} names no filter at one place; give names with commas between:"
@@ -253,8 +254,8 @@ def make_runs(
         ConfigurationError: a filter or the policy is unknown or does not fit the problem.
         RelativeDegreeError: a filter does not suit a barrier.
     """
-    from safe_envs.agents.evaluation.evaluate import BARE
     from safe_envs.agents.evaluation.identification import Learning
+    from safe_envs.agents.evaluation.spec import UNFILTERED
     from safe_envs.agents.policies.registry import make_policy
     from safe_envs.errors import nearest, require_whole
     from safe_envs.wrappers import require_known, require_readable
@@ -264,13 +265,15 @@ def make_runs(
         raise ConfigurationError(
             f"knowledge = {shown(knowledge)}; {nearest(knowledge, ('model', 'plant'))}"
         )
+    known = (UNFILTERED, *CONDITIONS, *LEARNED)
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.
-        words = [word.strip() for word in re.split("[:+]", name)[0].split(",")]
-        for word in words if len(words) > 1 else [name]:
-            if word != BARE:
-                require_known(word, BARE)
-        if name != BARE:
+        for word in re.split("[:+]", name)[0].split(","):
+            if word.strip() not in known:
+                raise ConfigurationError(
+                    f"unknown filter {shown(word.strip())}; {nearest(word.strip(), known)}"
+                )
+        if name != UNFILTERED:
             require_readable(name, problem)
     actors = [make_policy(policy, problem, trust) for _ in names]
     learning = Learning(problem, names, learned, 1, seed)
@@ -279,7 +282,7 @@ def make_runs(
     return [
         Run(
             name,
-            () if name == BARE else learning.conditions(name, 0),
+            () if name == UNFILTERED else learning.conditions(name, 0),
             problem,
             actor,
             seed,

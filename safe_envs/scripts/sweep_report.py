@@ -1,4 +1,4 @@
-"""`safe-envs sweep-report`: the safety rates of a sweep over what was swept, and its worst cells."""
+"""`safe-envs sweep-report`: the safety rates of a sweep, and its worst cells."""
 
 from __future__ import annotations
 
@@ -81,13 +81,13 @@ def sweep_report(
     if done:
         layout = Layout.of(done, swept, x, lines)
         hidden = draw(done, layout, path)
-        told = f"The picture: {path}" + (
+        picture = f"The picture: {path}" + (
             f" (without {hidden} of its panels, which are too many; sweep less, or choose --x and"
             " --lines)" * bool(hidden)
         )
     else:
-        told = "There is no picture, since no cell is done."
-    say(stdout(), f"\n{told}")
+        picture = "There is no picture, since no cell is done."
+    say(stdout(), f"\n{picture}")
     write_result(json, lambda: report_document(index, rows, worst))
 
 

@@ -71,7 +71,7 @@ def train(
         str,
         typer.Option(
             metavar="executed|proposed|both",
-            help="On which action an off-policy algorithm learns behind a filter.",
+            help="On which action an off-policy algorithm learns with a filter in the loop.",
         ),
     ] = "executed",
     intervention_penalty: Annotated[
@@ -109,7 +109,7 @@ def train(
     cost and smallest h, and violations, interventions and infeasible steps in the training so far.
     The folder is what `safe-envs evaluate --policy DIR` reads.
     """
-    from safe_envs.agents.policies.registry import POLICY_FILE
+    from safe_envs.agents.policies.base import DESCRIPTION
     from safe_envs.agents.training.config import Training
 
     text_options.require_outputs(
@@ -141,7 +141,7 @@ def train(
     finished = resume and os.path.exists(out / POLICY_FILE)
     with progress_bar("Training") as tell:
         try:
-            train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)
+            train_agent(training, out, resume=resume, tensorboard=tensorboard, progress=tell)
         except KeyboardInterrupt:
             advice = "The same command with --resume goes on after the last checkpoint in"
             print(f"Stopped. {advice} {out}.", file=sys.stderr)

@@ -160,9 +160,9 @@ def test_unknown_factory_arguments_are_refused(arguments, message):
 @pytest.mark.parametrize("env_id", [FIELD, LIMITS])
 def test_natural_filter_keeps_safe_what_the_nominal_controller_does_not(env_id):
     bare, filtered = evaluate(env_id, episodes=30, bounds=False).rows
-    assert bare["safety_rate"] < 0.6
-    assert filtered["safety_rate"] > 0.95
-    assert filtered["infeasible_rate"] < 0.01
+    assert bare.safety_rate < 0.6
+    assert filtered.safety_rate > 0.95
+    assert filtered.infeasible_rate < 0.01
 
 
 def test_neighbours_circle_in_opposite_directions():

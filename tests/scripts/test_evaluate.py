@@ -180,7 +180,7 @@ def test_every_option_reaches_the_evaluation(safe_envs_command):
         confidence=0.9,
     )
     document = strictly("out.json")
-    assert document["rows"] == wanted.rows
+    assert document["rows"] == [row.as_dict() for row in wanted.rows]
     assert document["config"] == json.loads(json.dumps(wanted.config))
     for text in (
         DUBINS,
@@ -229,19 +229,16 @@ def test_table_shows_the_rows(safe_envs_command):
     }
     assert list(lines) == ["none", "scbf"]
     for row in answer.rows:
-        line = lines[row["filter"]]
+        line = lines[row.filter]
         for shown in (
-            (
-                f"{100 * row['safety_rate']:.1f} % [{100 * row['ci_low']:.1f},"
-                f" {100 * row['ci_high']:.1f}]"
-            ),
-            f"{row['min_h_median']:.3g}",
-            f" {row['violations']} ",
-            f"{row['effort_mean']:.3g}",
-            f"{row['return_mean']:.4g}",
+            f"{100 * row.safety_rate:.1f} % [{100 * row.ci_low:.1f}, {100 * row.ci_high:.1f}]",
+            f"{row.min_h_median:.3g}",
+            f" {row.violations} ",
+            f"{row.effort_mean:.3g}",
+            f"{row.return_mean:.4g}",
         ):
             assert shown in line
-    assert f"{100 * answer.rows[1]['intervention_rate']:.1f} %" in lines["scbf"]
+    assert f"{100 * answer.rows[1].intervention_rate:.1f} %" in lines["scbf"]
     assert "Note: nothing is random" not in out
 
 
@@ -350,7 +347,7 @@ def test_bounds_are_shown_where_there_are_any():
 
     def printed(*changes):
         console = Console(width=200, file=io.StringIO())
-        rows = [{**row, **change} for row, change in zip(answer.rows, changes, strict=True)]
+        rows = [replace(row, **change) for row, change in zip(answer.rows, changes, strict=True)]
         print_evaluation(console, replace(answer, rows=rows))
         return console.file.getvalue()
 
@@ -372,7 +369,7 @@ def test_bounds_are_shown_where_there_are_any():
     assert bounded.count("no bound for") == 1
     assert bounded.count("Note: a bound is estimated: ") == 1
     nothing = {"estimated_bound": None, "bound_note": "it ignores the noise"}
-    below = printed({}, nothing, judged({**answer.rows[2], "estimated_bound": 0.999}, 0.98))
+    below = printed({}, nothing, vars(judged(replace(answer.rows[2], estimated_bound=0.999), 0.98)))
     assert (
         "Note: no bound for scbf: withheld: the interval of the measured rate ends at 98.0 %, below"
         " 99.9 %" in below

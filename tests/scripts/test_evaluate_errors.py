@@ -71,8 +71,8 @@ USER_ERRORS = (
     ([DUBINS, "--confidence", "95"], ["confidence = 95.0", "such as 0.95"]),
     ([DUBINS, "--confidence", "nan"], ["confidence = nan"]),
     ([DUBINS, "--filter", "hocbf:p=1,2+scbf"], ["has 2 conditions"]),
-    ([DUBINS, "--filter", "hocbf+none"], ["'hocbf+none'", "'none' is the bare env"]),
-    ([DUBINS, "--filter", "none+hocbf:p=1,2"], ["'none' is the bare env"]),
+    ([DUBINS, "--filter", "hocbf+none"], ["'hocbf+none'", "'none' is the unfiltered env"]),
+    ([DUBINS, "--filter", "none+hocbf:p=1,2"], ["'none' is the unfiltered env"]),
     ([DUBINS, "--refine", "--episodes", "0"], ["episodes = 0"]),
     (
         ["Scalar-v0", "--refine", "--dt", "5e-324", "--horizon", "5e-324"],

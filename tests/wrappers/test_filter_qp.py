@@ -111,8 +111,8 @@ def test_margin_of_first_order_keeps_stiff_conditions_at_the_period_of_the_thesi
     plain, with_margin = evaluate(
         env_id, policy, names, options=options, episodes=30, knowledge="plant", bounds=False
     ).rows
-    assert plain["safe"] < 30
-    assert with_margin["safe"] == 30
+    assert plain.safe < 30
+    assert with_margin.safe == 30
 
 
 def test_numeric_margins_are_kept_and_first_order_needs_a_period():

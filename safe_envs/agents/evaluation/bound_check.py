@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.contradiction import by_rate, by_states
-from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate
-from safe_envs.agents.evaluation.visited_states import Seen
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents.evaluation.results import Evaluation
+from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import spec_of
 from safe_envs.wrappers.verification.feasibility import Verification
@@ -66,7 +67,7 @@ class Measurement:
         episodes: how many were simulated.
         repeats: whether nothing is random, so that all episodes are one and the same.
         horizons: the shortest first.
-        seen: states that say something against a bound.
+        visited: states that may contradict a bound.
     """
 
     start: str
@@ -74,7 +75,7 @@ class Measurement:
     episodes: int
     repeats: bool
     horizons: tuple[Horizon, ...]
-    seen: tuple[Seen, ...] = ()
+    visited: tuple[VisitedStates, ...] = ()
 
 
 def judged(
@@ -88,7 +89,9 @@ def judged(
         measurements: of the same conditions.
         verification: on which the bounds rest.
     """
-    of_all = by_states(verification.guarantee, [seen for m in measurements for seen in m.seen])
+    of_all = by_states(
+        from_survey(verification.survey), [visited for m in measurements for visited in m.visited]
+    )
     of_each: dict[str, str] = {}
     for m in measurements:
         for h in m.horizons:
@@ -178,7 +181,7 @@ def _measure(
     )
     runs = _runs(world, lasting, episodes)
     horizons: list[Horizon] = []
-    seen: list[Seen] = []
+    visited: list[VisitedStates] = []
     repeats = False
     done, whole = 0, sum(run[-1] for run in runs)
     for run in runs:
@@ -195,15 +198,15 @@ def _measure(
             ),
         )
         horizons += [_horizon(verification, answer, k * world.duration, starts) for k in run]
-        seen += answer.seen[answer.rows[0]["filter"]]
-        repeats, done = answer.repeats, done + run[-1]
+        visited += answer.visited[answer.rows[0].filter]
+        repeats, done = answer.is_deterministic, done + run[-1]
     return Measurement(
         name,
         starts[0] if len(starts) == 1 else None,
         episodes,
         repeats,
         tuple(horizons),
-        tuple(seen),
+        tuple(visited),
     )
 
 
@@ -226,15 +229,11 @@ def _horizon(
     verification: Verification, answer: Evaluation, horizon: float, starts: np.ndarray
 ) -> Horizon:
     """Read the curve of an evaluation at its last instant up to a horizon."""
-    curve = answer.rows[0]["curve"]
-    i = int(np.searchsorted(curve["time"], horizon * (1.0 + 1e-9), side="right")) - 1
-    time = curve["time"][i]
-    bounds = tuple(
-        b for b in verification.guarantee.applicable_bounds(starts, time) if b.value is not None
-    )
-    return Horizon(
-        time, curve["safe"][i], curve["rate"][i], curve["ci_low"][i], curve["ci_high"][i], bounds
-    )
+    curve = answer.rows[0].curve
+    i = int(np.searchsorted(curve.time, horizon * (1.0 + 1e-9), side="right")) - 1
+    time = curve.time[i]
+    bounds = tuple(b for b in promise(verification, starts, time) if b.value is not None)
+    return Horizon(time, curve.safe[i], curve.rate[i], curve.ci_low[i], curve.ci_high[i], bounds)
 
 
 def _all_compared(found: list[Measurement]) -> list[Measurement]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
@@ -14,57 +14,71 @@ from safe_envs.agents.evaluation.statistics import (
     repeated_interval,
 )
 
-Comparison = dict[str, Any]
 Table = tuple[int, int, int, int]
 
 
-class SafetyBits:
-    """A bit for each episode, in the order and the portions in which they come."""
+@dataclass(frozen=True)
+class Comparison:
+    """Two filters on the same episodes.
 
-    def __init__(self) -> None:
-        self._bits = bytearray()
-        self._count = 0
+    Attributes:
+        first: name of the one.
+        second: name of the other.
+        both: number of episodes that are safe with both.
+        only_first: with the first only.
+        only_second: with the second only.
+        neither: with neither.
+        difference: of the safety rates, the first less the second.
+        ci_low: lower end of its interval.
+        ci_high: upper end.
+        mcnemar_p: McNemar's exact p value; None with several identifications, which are no
+            independent pairs.
+    """
 
-    def add(self, values: np.ndarray) -> None:
-        """Keep the flags, shape (B,)."""
-        self._bits += np.packbits(values).tobytes()
-        self._count += len(values)
-
-    def table(self, other: SafetyBits) -> Table:
-        """Count episodes with the flag of both, of this only, of the other only, of neither.
-
-        Args:
-            other: of the same episodes, added in the same portions.
-        """
-        mine, others = np.frombuffer(self._bits, np.uint8), np.frombuffer(other._bits, np.uint8)
-        # A portion is filled up with zeros to whole bytes: they are no flag of either.
-        both, first, second = (
-            int(np.bitwise_count(bits).sum())
-            for bits in (mine & others, mine & ~others, others & ~mine)
-        )
-        return both, first, second, self._count - both - first - second
+    first: str
+    second: str
+    both: int
+    only_first: int
+    only_second: int
+    neither: int
+    difference: float
+    ci_low: float
+    ci_high: float
+    mcnemar_p: float | None
 
 
-def compare_all(flags: Mapping[str, Sequence[SafetyBits]], confidence: float) -> list[Comparison]:
-    """Compare every two filters by which of the same episodes were safe: each one with those before
-    it.
+def pair_counts(first: np.ndarray, second: np.ndarray) -> Table:
+    """Count the episodes that are safe with both, the first only, the second only, and neither.
+
+    Args:
+        first: which episodes are safe with the one, shape (E,).
+        second: which of the same are with the other.
+    """
+    counts = (first & second, first & ~second, second & ~first, ~(first | second))
+    both, only_first, only_second, neither = (int(np.count_nonzero(each)) for each in counts)
+    return both, only_first, only_second, neither
+
+
+def compare_all(safe: Mapping[str, Sequence[np.ndarray]], confidence: float) -> list[Comparison]:
+    """Compare each filter with those before it, by which of the same episodes are safe.
 
     A p value is of its pair alone: it is not adjusted for the number of pairs.
 
     Args:
-        flags: which episodes were safe, by filter: once, or with each of several identifications.
-        confidence: of the interval of the difference of their rates.
+        safe: by filter, which episodes are safe, shape (E,): once, or with each of several
+            identifications.
+        confidence: of the interval of the difference of the rates.
     """
     return [
-        _compare(second, first, _tables(flags[second], flags[first]), confidence)
-        for first, second in combinations(flags, 2)
+        _compare(second, first, _tables(safe[second], safe[first]), confidence)
+        for first, second in combinations(safe, 2)
     ]
 
 
-def _tables(first: Sequence[SafetyBits], second: Sequence[SafetyBits]) -> list[Table]:
-    """Counts with each identification; what has only one goes with all of the other's."""
+def _tables(first: Sequence[np.ndarray], second: Sequence[np.ndarray]) -> list[Table]:
+    """Count with each identification; what has only one is paired with all of the other's."""
     count = max(len(first), len(second))
-    return [first[r % len(first)].table(second[r % len(second)]) for r in range(count)]
+    return [pair_counts(first[r % len(first)], second[r % len(second)]) for r in range(count)]
 
 
 def _compare(first: str, second: str, tables: Sequence[Table], confidence: float) -> Comparison:
@@ -76,16 +90,16 @@ def _compare(first: str, second: str, tables: Sequence[Table], confidence: float
     if repeats > 1:
         differences = [(table[1] - table[2]) / sum(table) for table in tables]
         low, high = repeated_interval(differences, (low, high), confidence, (-1.0, 1.0))
-    return {
-        "first": first,
-        "second": second,
-        "both": both,
-        "only_first": only_first,
-        "only_second": only_second,
-        "neither": neither,
-        "difference": (only_first - only_second) / (both + only_first + only_second + neither),
-        "ci_low": low,
-        "ci_high": high,
+    return Comparison(
+        first,
+        second,
+        both,
+        only_first,
+        only_second,
+        neither,
+        difference=(only_first - only_second) / (both + only_first + only_second + neither),
+        ci_low=low,
+        ci_high=high,
         # Repeats on the same episodes are no independent pairs.
-        "mcnemar_p": mcnemar_p(only_first, only_second) if repeats == 1 else None,
-    }
+        mcnemar_p=mcnemar_p(only_first, only_second) if repeats == 1 else None,
+    )

@@ -11,23 +11,28 @@ measured rate lies below the bound. See
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
+from typing import TypeVar
 
-from safe_envs.agents.evaluation.visited_states import Seen
-from safe_envs.wrappers.verification.guarantee import Guarantee
+from safe_envs.agents.evaluation.rows import BoundSummary
+from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.wrappers.verification.estimated_bound import EstimatedBound
+from safe_envs.wrappers.verification.posterior_bound import PosteriorBound
+
+Bounded = TypeVar("Bounded", bound=BoundSummary)
 
 ADVICE = "bounds are of continuous time: try a smaller dt, or --refine"
 
 
-def by_states(bound: Guarantee, seen: Sequence[Seen]) -> str:
+def by_states(bound: EstimatedBound | PosteriorBound, visited: Sequence[VisitedStates]) -> str:
     """What the states of episodes say against the numbers that a bound rests on; "" if nothing.
 
     Args:
         bound: that was estimated.
-        seen: in the episodes.
+        visited: states of the episodes.
     """
     found = (
-        bound.contradiction(each.deepest, each.missed, each.actions, each.slack) for each in seen
+        bound.contradiction(each.deepest, each.missed, each.actions, each.slack) for each in visited
     )
     return next(filter(None, found), "")
 
@@ -48,37 +53,24 @@ def by_rate(bound: float | None, ci_high: float) -> str:
     )
 
 
-def judged(row: dict[str, Any], ci_high: float) -> dict[str, Any]:
-    """A row of an evaluation without the bounds that a rate contradicts; the reason is in
-    `withheld`.
+def judged(row: Bounded, ci_high: float) -> Bounded:
+    """Return a row without the bounds that a measured rate contradicts; `withheld` says why.
 
     Args:
-        row: with `estimated_bound`, `posterior_bound` and `withheld`, as
-            `safe_envs.agents.evaluation.guarantees.GuaranteeAverager.row` makes it.
+        row: of an evaluation.
         ci_high: upper end of the interval of the rate.
     """
-    posterior = row["posterior_bound"]
-    reason = by_rate(row["estimated_bound"], ci_high) or by_rate(
-        posterior and posterior["probability"], ci_high
+    posterior = row.posterior_bound
+    reason = by_rate(row.estimated_bound, ci_high) or by_rate(
+        posterior and posterior.probability, ci_high
     )
     return withheld(row, reason) if reason else row
 
 
-def withheld(row: dict[str, Any], reason: str) -> dict[str, Any]:
-    """A row without its bounds, and why."""
-    changed = {
-        **row,
-        "withheld": reason,
-        "estimated_bound": None,
-        "bound_note": f"withheld: {reason}",
-    }
-    if row["posterior_bound"] is not None:
-        changed |= {
-            "posterior_bound": {
-                **row["posterior_bound"],
-                "probability": None,
-                "note": f"withheld: {reason}",
-            }
-        }
-        changed["bound_note"] = row["bound_note"]
-    return changed
+def withheld(row: Bounded, reason: str) -> Bounded:
+    """Return a row without its bounds, and with the reason."""
+    note, posterior = f"withheld: {reason}", row.posterior_bound
+    row = replace(row, withheld=reason, estimated_bound=None)
+    if posterior is None:
+        return replace(row, bound_note=note)
+    return replace(row, posterior_bound=replace(posterior, probability=None, note=note))

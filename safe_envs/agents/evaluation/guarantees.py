@@ -7,14 +7,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from safe_envs.agents.evaluation.contradiction import by_states, withheld
-from safe_envs.agents.evaluation.rollout import Row
+from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorGuarantee
 from safe_envs.agents.evaluation.statistics import RunningSum, share
-from safe_envs.agents.evaluation.visited_states import Seen
-from safe_envs.dynamics.codegen import Components, compile_function, stacked
+from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
@@ -56,7 +57,7 @@ class GuaranteeAverager:
         self._total, self._count = RunningSum(), 0
         self._outside = _outside_of(conditions, problem, knowledge)
         self._lost, self._starts = 0, 0
-        self._against, self._nothing = "", Seen.nothing(problem)
+        self._against, self._nothing = "", VisitedStates.nothing(problem)
         if conditions and not why_not:
             self._look(conditions, problem, knowledge)
 
@@ -70,46 +71,43 @@ class GuaranteeAverager:
             # The bound looks at the whole safe set, where the episodes may never be.
             self._why_none = str(error)
 
-    def add(self, start: Components, count: int) -> None:
-        """Take the starts of a wave."""
-        states = np.stack(start, axis=1)[:count]
+    def add(self, starts: np.ndarray) -> None:
+        """Add the starts of a batch, shape (E, n)."""
         if self._found is not None and not self._why_none:
-            self._total.add(self._found.at(states, self._horizon))
+            self._total.add(self._found.at(starts, self._horizon))
             self._against = self._against or by_states(
-                self._found, [replace(self._nothing, deepest=states)]
+                self._found, [replace(self._nothing, deepest=starts)]
             )
-            self._count += count
+            self._count += len(starts)
         if self._outside is not None:
-            self._lost += int(np.count_nonzero(self._outside(states)))
-            self._starts += count
+            self._lost += int(np.count_nonzero(self._outside(starts)))
+            self._starts += len(starts)
 
-    def row(self, seen: Seen) -> Row:
-        """The mean of the bound, None where there is none, and why there is none or why it is weak.
-
-        Beside it the share of the starts with h > 0 that lie outside the sets C_j; None of the bare
-        env, and where numbers that are learned stand in the chain.
+    def summary(self, visited: VisitedStates) -> BoundSummary:
+        """Return the mean of the bound, or why there is none, and the share of starts outside C_j.
 
         Args:
-            seen: in the episodes; where it contradicts the bound, that is withheld.
+            visited: states of the episodes; where they contradict the bound, it is withheld.
         """
         bound, note = self._mean()
-        row: Row = {"withheld": None, "outside_rate": share(self._lost, self._starts)}
+        found = BoundSummary(
+            outside_rate=share(self._lost, self._starts), estimated_bound=bound, bound_note=note
+        )
         if self._of_posterior:
-            found = self._found if isinstance(self._found, PosteriorGuarantee) else None
-            sizes = {} if found is None else {name: getattr(found, name) for name in _SIZES}
-            row |= {
-                "estimated_bound": None,
-                "bound_note": "the condition is learned: see its bound over the posterior",
-            }
-            row |= {"posterior_bound": {"probability": bound, "note": note, **sizes}}
-        else:
-            row |= {"estimated_bound": bound, "bound_note": note, "posterior_bound": None}
+            of_posterior = isinstance(self._found, PosteriorBound)
+            sizes = {name: getattr(self._found, name) for name in _SIZES} if of_posterior else {}
+            found = replace(
+                found,
+                estimated_bound=None,
+                bound_note="it is learned: see its bound over the posterior",
+                posterior_bound=PosteriorGuarantee(bound, note, **sizes),
+            )
         reason = (
             ""
             if bound is None or self._found is None
-            else self._against or by_states(self._found, [seen])
+            else self._against or by_states(self._found, [visited])
         )
-        return withheld(row, reason) if reason else row
+        return withheld(found, reason) if reason else found
 
     def _mean(self) -> tuple[float | None, str | None]:
         if self._found is None or self._why_none:
@@ -154,25 +152,31 @@ def _outside_of(
     return outside
 
 
-def together(rows: Sequence[Row]) -> Row:
-    """The rows of several identifications as one: the mean of their bounds, with 0 for those that
-    have none, and the worst's note.
+def together(summaries: Sequence[BoundSummary]) -> BoundSummary:
+    """Return the bounds of several identifications as one.
 
-    A bound that the episodes of one identification contradict is withheld for all.
+    It has the mean of the bounds, with 0 for those that have none, and the worst's note. A bound
+    that the episodes of one identification contradict is withheld for all.
     """
-    outside = [row["outside_rate"] for row in rows]
-    first = {**rows[0], "outside_rate": None if None in outside else math.fsum(outside) / len(rows)}
-    found = [row["posterior_bound"] for row in rows]
-    if len(rows) == 1 or first["posterior_bound"] is None:
+    outside = [each.outside_rate for each in summaries if each.outside_rate is not None]
+    known = len(outside) == len(summaries)
+    first = replace(
+        summaries[0], outside_rate=math.fsum(outside) / len(summaries) if known else None
+    )
+    found = [each.posterior_bound for each in summaries if each.posterior_bound is not None]
+    if len(summaries) == 1 or not found:
         return first
-    worst = min(found, key=lambda c: (c["probability"] or 0.0, -c.get("shortfall", math.inf)))
-    reason = next((row["withheld"] for row in rows if row["withheld"]), None)
-    if worst["probability"] is None and all(c["probability"] is None for c in found):
-        return {**first, "withheld": reason, "posterior_bound": worst}
-    mean = {
-        key: math.fsum(c[key] or 0.0 for c in found) / len(rows)
+    worst = min(
+        found,
+        key=lambda c: (c.probability or 0.0, -(math.inf if c.shortfall is None else c.shortfall)),
+    )
+    reason = next((each.withheld for each in summaries if each.withheld), None)
+    if all(c.probability is None for c in found):
+        return replace(first, withheld=reason, posterior_bound=worst)
+    mean: dict[str, Any] = {
+        key: math.fsum(getattr(c, key) or 0.0 for c in found) / len(found)
         for key in ("probability", *_SIZES)
-        if all(key in c for c in found)
+        if key == "probability" or all(getattr(c, key) is not None for c in found)
     }
-    merged = {**first, "posterior_bound": {"note": worst["note"], **mean}}
+    merged = replace(first, posterior_bound=PosteriorGuarantee(note=worst.note, **mean))
     return withheld(merged, reason) if reason else merged

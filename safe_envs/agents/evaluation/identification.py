@@ -1,6 +1,4 @@
-"""What filters rest on that is learned: from files, or learned first, once or for each of several
-repeats.
-"""
+"""The models of learned filters: from files, or learned first, once or in several repeats."""
 
 from __future__ import annotations
 
@@ -8,11 +6,11 @@ import re
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from safe_envs.agents.evaluation.rollout import Progress
+from safe_envs.agents.evaluation.rows import LearningSummary
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import LEARNED, Condition, learned_parts, parse_conditions
@@ -20,19 +18,18 @@ from safe_envs.wrappers.learning import LearnedModel, learner_of, load_learned
 
 
 class Learning:
-    """Learns what filters rest on, each thing once.
+    """Learns the models of filters, each once.
 
     Args:
-        problem: of which is learned, with the defaults of each method.
+        problem: what is learned, with the defaults of each method.
         names: texts of the filters.
         given: models, or files of `safe-envs identify`, that are used in place of learning.
         repeats: how often to learn, each time with another seed.
         seed: of the first time; the others have children of it.
 
     Raises:
-        ConfigurationError: a file does not fit or no filter rests on it, two models are of one
-            method, or the number of repeats is not allowed, or more than 1 without anything to
-            learn.
+        ConfigurationError: A file does not fit or no filter uses it, two models are of one method,
+            or the number of repeats is not allowed, or more than 1 without anything to learn.
     """
 
     def __init__(
@@ -55,7 +52,7 @@ class Learning:
                 )
             if model.method not in self._methods:
                 raise ConfigurationError(
-                    f"{entry} holds {model.method}, on which no filter rests; add"
+                    f"{entry} holds {model.method}, which no filter uses; add"
                     f" {_filter_of(model.method)} or leave it out"
                 )
             type(model).check(model.signature, problem)
@@ -63,16 +60,16 @@ class Learning:
         self._learned: dict[tuple[str, int], LearnedModel] = {}
         if repeats > 1 and not self.missing():
             raise ConfigurationError(
-                f"repeats = {repeats}, but nothing is learned anew: no filter rests on it, or its"
-                " file was given"
+                f"repeats = {repeats}, but nothing is learned: no filter needs it, or its file was"
+                " given"
             )
 
     def repeats(self, name: str) -> int:
-        """How many identifications a filter is evaluated with."""
+        """Return how many identifications a filter is evaluated with."""
         return self._repeats if any(method not in self._given for method in _methods(name)) else 1
 
     def missing(self) -> list[tuple[str, int]]:
-        """What has yet to be learned: methods, and the number of the repeat."""
+        """Return what has yet to be learned: methods, and the number of the repeat."""
         needed = [
             (method, r)
             for method in self._methods
@@ -82,7 +79,13 @@ class Learning:
         return [each for each in needed if each not in self._learned]
 
     def learn(self, method: str, repeat: int, progress: Progress | None) -> None:
-        """Learn by a method, with the seed of a repeat. Its warnings are in the record."""
+        """Learn by a method, with the seed of a repeat; its warnings are in the record.
+
+        Args:
+            method: its name.
+            repeat: number of the repeat.
+            progress: called with the part that is done.
+        """
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             self._learned[method, repeat] = learner_of(method)(
@@ -90,10 +93,14 @@ class Learning:
             )
 
     def conditions(self, name: str, repeat: int) -> tuple[Condition, ...]:
-        """The conditions of a filter, with what was learned in a repeat.
+        """Return the conditions of a filter, with what was learned in a repeat.
+
+        Args:
+            name: text of the filter.
+            repeat: number of the repeat.
 
         Raises:
-            ConfigurationError: the text of the filter cannot be read.
+            ConfigurationError: The text of the filter cannot be read.
         """
         models = {
             method: self._given.get(method) or self._learned[method, repeat]
@@ -102,7 +109,7 @@ class Learning:
         return parse_conditions(name, self._problem, models)
 
     def models(self) -> list[LearnedModel]:
-        """What the first identifications of the filters rest on, each model once."""
+        """Return the models of the first identifications, each once."""
         return [self._given.get(method) or self._learned[method, 0] for method in self._methods]
 
     def _child(self, repeat: int) -> int:
@@ -113,8 +120,13 @@ class Learning:
 
 
 def _methods(name: str) -> list[str]:
-    """Return the methods of the models that a filter needs without naming their files."""
-    return [method for method, file in learned_parts(name) if file is None]
+    """Return the methods of the learned conditions in a filter's text that name no file."""
+    parts = [part.split(":") for part in name.split("+")]
+    return [
+        LEARNED[key].method
+        for key, *settings in parts
+        if key in LEARNED and not any(s.startswith("file=") for s in settings)
+    ]
 
 
 def _filter_of(method: str) -> str:
@@ -122,12 +134,14 @@ def _filter_of(method: str) -> str:
 
 
 def learned_of(conditions: Sequence[Condition]) -> list[LearnedModel]:
-    """Return the learned models that conditions need, each once."""
-    return list({id(m): m for c in conditions for m in c.learned_models}.values())
+    """Return the learned models of conditions, each once."""
+    return list(
+        {id(c.learned): c.learned for c in conditions if isinstance(c, LearnedCondition)}.values()
+    )
 
 
 def seconds_of(identifications: Sequence[Sequence[Condition]]) -> float | None:
-    """Mean time that learning took for an identification; None where nothing was learned."""
+    """Return the mean time of an identification in s; None where nothing was learned."""
     models = [model for conditions in identifications for model in learned_of(conditions)]
     return sum(model.record.seconds for model in models) / len(identifications) if models else None
 
@@ -137,22 +151,30 @@ def describe(
     rates: Sequence[float],
     problem: SafetyProblem,
     knowledge: str,
-) -> dict[str, Any] | None:
-    """What a row says of its learning: the method, its cost, and the rate with each identification;
-    None without any.
+) -> LearningSummary | None:
+    """Return what was learned for a filter, its cost, and the rate with each identification.
+
+    Args:
+        identifications: the conditions of the filter, with each identification.
+        rates: safety rate with each.
+        problem: what is simulated.
+        knowledge: of the filter, "model" or "plant".
+
+    Returns:
+        None where nothing was learned.
     """
     models = [model for conditions in identifications for model in learned_of(conditions)]
     if not models:
         return None
     records = [model.record for model in models]
-    return {
-        "methods": sorted({model.method for model in models}),
-        "repeats": len(identifications),
-        "transitions": sum(record.transitions for record in records) // len(identifications),
-        "seeds": [record.seed for record in records],
-        "sha256": [model.sha256 for model in models],
-        "files": sorted({str(model.path) for model in models if model.path is not None}),
-        "errors": (
+    return LearningSummary(
+        methods=sorted({model.method for model in models}),
+        repeats=len(identifications),
+        transitions=sum(record.transitions for record in records) // len(identifications),
+        seeds=[record.seed for record in records],
+        sha256=[model.sha256 for model in models],
+        files=sorted({str(model.path) for model in models if model.path is not None}),
+        errors=(
             {
                 name: float(np.mean([record.errors[name] for record in records]))
                 for name in records[0].errors
@@ -161,24 +183,24 @@ def describe(
             else {}
         ),
         # Those of other identifications differ in their figures only.
-        "warnings": list(
+        warnings=list(
             {
                 re.sub(r"[\d.e+-]+", "#", text): text
                 for record in reversed(records)
                 for text in record.warnings
             }.values()
         ),
-        "remarks": _remarks(identifications[0], problem, knowledge),
-        "rates": list(rates),
-    }
+        remarks=_remarks(identifications[0], problem, knowledge),
+        rates=list(rates),
+    )
 
 
 def _remarks(conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str) -> list[str]:
-    """What does not fit the heading of an evaluation: where the data came from, and what is known."""
+    """Return what the heading of an evaluation does not say: where the data came from, for one."""
     differing = dict.fromkeys(
         ", ".join(model.signature.differences(problem)) for model in learned_of(conditions)
     )
-    elsewhere = [f"it was learned of a plant with {text}" for text in differing if text]
+    elsewhere = [f"it was learned from a plant with {text}" for text in differing if text]
     corrects = knowledge == "plant" and any(condition.corrects_model for condition in conditions)
     return [
         *elsewhere,

@@ -6,8 +6,9 @@ import math
 from collections.abc import Iterator, Sequence
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
-from safe_envs.agents.evaluation.rollout import Played, Progress, play
-from safe_envs.agents.evaluation.spec import EvaluationSpec
+from safe_envs.agents.evaluation.episode_batch import PlayedBatch
+from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+from safe_envs.agents.evaluation.rollout import Progress, play
 from safe_envs.agents.jobs.processes import compute_in_order
 from safe_envs.wrappers import Condition
 
@@ -16,7 +17,7 @@ _PARTS = 4
 
 
 def play_in_processes(
-    setting: EvaluationSpec,
+    setting: ResolvedEvaluation,
     conditions: Sequence[Condition],
     episodes: int,
     seed: int,
@@ -24,22 +25,22 @@ def play_in_processes(
     jobs: int,
     bridge: bool,
     progress: Progress | None,
-) -> Iterator[Played]:
+) -> Iterator[PlayedBatch]:
     """Simulate episodes 0..episodes-1 by `jobs` processes, which remain for the next call.
 
     Args:
-        setting: Of the evaluation, with filters that were read.
-        conditions: Of the filter; none for the unfiltered env.
-        episodes: How many.
-        seed: Whose children seed the episodes.
-        num_envs: How many to simulate side by side in each process, at most.
-        jobs: Number of processes.
-        bridge: Whether to monitor h between control instants.
-        progress: Receives the number of episodes that are done.
+        setting: of the evaluation, with filters that were read.
+        conditions: of the filter; none for the unfiltered env.
+        episodes: how many.
+        seed: whose children seed the episodes.
+        num_envs: how many to simulate side by side in each process, at most.
+        jobs: number of processes.
+        bridge: whether to monitor h between control instants.
+        progress: receives the number of episodes that are done.
 
     Raises:
-        ConfigurationError: Something cannot be sent to a process, mostly a custom policy.
-        WorkersLostError: A process was ended from outside.
+        ConfigurationError: something cannot be sent to a process, mostly a custom policy.
+        WorkersLostError: a process was ended from outside.
     """
     size = max(1, math.ceil(episodes / (jobs * _PARTS)))
     parts = [range(first, min(first + size, episodes)) for first in range(0, episodes, size)]
@@ -51,12 +52,12 @@ def play_in_processes(
 
 
 def _played(
-    shared: tuple[EvaluationSpec, Sequence[Condition], int, int, bool], part: range
-) -> list[Played]:
+    shared: tuple[ResolvedEvaluation, Sequence[Condition], int, int, bool], part: range
+) -> list[PlayedBatch]:
     setting, conditions, seed, num_envs, bridge = shared
     env = setting.env(conditions, min(num_envs, len(part)))
     monitor = BrownianBridge(setting.problem) if bridge else None
     try:
-        return list(play(env, setting.actor, part, seed, bridge=monitor))
+        return list(play(env, setting.policy, part, seed, bridge=monitor))
     finally:
         env.close()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from safe_envs.agents.evaluation.comparison import pair_counts
 from safe_envs.agents.evaluation.contradiction import judged
-from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate
-from safe_envs.agents.evaluation.rollout import Progress, Row
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents.evaluation.results import Evaluation
+from safe_envs.agents.evaluation.rollout import Progress
+from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
@@ -21,8 +24,37 @@ TOLERANCE = 0.03
 
 
 @dataclass(frozen=True)
+class RefinementRow:
+    """The safety rate under a filter with smaller and smaller control periods.
+
+    Attributes:
+        filter: its name.
+        safe: number of safe episodes with each period.
+        safety_rate: their share.
+        ci_low: lower end of its interval.
+        ci_high: upper end.
+        change: of the rate from dt/2 to dt/4.
+        change_low: lower end of the interval of the change.
+        change_high: upper end.
+        verdict: see `refine`.
+        withheld: what the rates say against a bound, which is withheld then.
+    """
+
+    filter: str
+    safe: list[int]
+    safety_rate: list[float]
+    ci_low: list[float]
+    ci_high: list[float]
+    change: float
+    change_low: float
+    change_high: float
+    verdict: str
+    withheld: str | None
+
+
+@dataclass(frozen=True)
 class Refinement:
-    """The answer of `refine`.
+    """The result of `refine`.
 
     Attributes:
         evaluations: with the control period dt as given, dt/2 and dt/4.
@@ -31,7 +63,7 @@ class Refinement:
     """
 
     evaluations: tuple[Evaluation, ...]
-    rows: list[Row]
+    rows: list[RefinementRow]
 
     @property
     def periods(self) -> list[float]:
@@ -39,8 +71,9 @@ class Refinement:
         return [evaluation.problem.dt for evaluation in self.evaluations]
 
     def document(self) -> dict[str, Any]:
-        """The evaluation with the given dt, and what its refinement says, as JSON-able data."""
-        refinement = {"dt": self.periods, "tolerance": TOLERANCE, "rows": self.rows}
+        """Return the evaluation with the given dt and its refinement as JSON-able data."""
+        rows = [asdict(row) for row in self.rows]
+        refinement = {"dt": self.periods, "tolerance": TOLERANCE, "rows": rows}
         return {**self.evaluations[0].document(), "refinement": refinement}
 
 
@@ -55,7 +88,7 @@ def refine(
     """Evaluate with the control period dt of a problem, with dt/2 and with dt/4: has the safety
     rate converged?
 
-    What filters rest on that is learned, is learned once, with the period dt.
+    Learned filters are learned once, with the period dt.
 
     Control, noise and the check of safety go with the period; `substeps` stay as they are. The
     horizon is the number of whole periods dt that is simulated with the first. Episode i has the
@@ -84,14 +117,14 @@ def refine(
         raise ConfigurationError(
             "repeats are of the identification and refinement of the period: ask for one of the two"
         )
-    if arguments.get("spec") is not None:
+    if arguments.get("filter_spec") is not None:
         raise ConfigurationError(
-            "the control period of an env of somebody else is its own, and cannot be refined"
+            "the control period of a third-party env is its own, and cannot be refined"
         )
     first = evaluate(problem, policy, progress=_share(progress, 0), record=record, **arguments)
     arguments |= {
         "options": None,
-        "filters": [row["filter"] for row in first.rows],
+        "filters": first.spec.filters or [row.filter for row in first.rows],
         "bounds": False,
         "learned": first.learned,
     }
@@ -103,18 +136,14 @@ def refine(
     # The finer ones are nearer to continuous time, of which the bounds are.
     first = replace(first, rows=[_judged(row, finer) for row in first.rows])
     evaluations = (first, *finer)
-    return Refinement(evaluations, [_row(row["filter"], evaluations) for row in first.rows])
+    return Refinement(evaluations, [_row(row.filter, evaluations) for row in first.rows])
 
 
-def _judged(row: Row, finer: Sequence[Evaluation]) -> Row:
-    """A row without bounds that a rate with a finer period contradicts."""
+def _judged(row: EvaluationRow, finer: Sequence[Evaluation]) -> EvaluationRow:
+    """Return a row without bounds that a rate with a finer period contradicts."""
     for evaluation in finer:
-        row = judged(row, _of(evaluation, row["filter"])["ci_high"])
+        row = judged(row, evaluation.row(row.filter).ci_high)
     return row
-
-
-def _of(evaluation: Evaluation, name: str) -> Row:
-    return next(row for row in evaluation.rows if row["filter"] == name)
 
 
 def _share(progress: Progress | None, i: int) -> Progress | None:
@@ -132,24 +161,24 @@ def _divided(problem: SafetyProblem, divisor: int) -> SafetyProblem:
     return replace(problem, dt=problem.dt / divisor, horizon=problem.duration)
 
 
-def _row(name: str, evaluations: tuple[Evaluation, ...]) -> Row:
-    cells = [_of(evaluation, name) for evaluation in evaluations]
-    coarse, fine = evaluations[-2:]
+def _row(name: str, evaluations: tuple[Evaluation, ...]) -> RefinementRow:
+    rows = [evaluation.row(name) for evaluation in evaluations]
+    coarse, fine = (evaluation.episodes[name][0].safe for evaluation in evaluations[-2:])
     low, high = paired_difference_interval(
-        *fine.flags[name][0].table(coarse.flags[name][0]), fine.config["confidence"]
+        *pair_counts(fine, coarse), evaluations[0].spec.confidence
     )
-    return {
-        "filter": name,
-        **{
-            key: [cell[key] for cell in cells]
-            for key in ("safe", "safety_rate", "ci_low", "ci_high")
-        },
-        "change": cells[-1]["safety_rate"] - cells[-2]["safety_rate"],
-        "change_low": low,
-        "change_high": high,
-        "verdict": "contradicted" if cells[0]["withheld"] else verdict(low, high),
-        "withheld": cells[0]["withheld"],
-    }
+    return RefinementRow(
+        filter=name,
+        safe=[row.safe for row in rows],
+        safety_rate=[row.safety_rate for row in rows],
+        ci_low=[row.ci_low for row in rows],
+        ci_high=[row.ci_high for row in rows],
+        change=rows[-1].safety_rate - rows[-2].safety_rate,
+        change_low=low,
+        change_high=high,
+        verdict="contradicted" if rows[0].withheld else verdict(low, high),
+        withheld=rows[0].withheld,
+    )
 
 
 def verdict(low: float, high: float) -> str:

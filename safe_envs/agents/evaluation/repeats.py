@@ -1,6 +1,4 @@
-"""Several identifications of one filter, as one row: intervals over identifications and over
-episodes.
-"""
+"""Several identifications of one filter as one, with intervals over these and over episodes."""
 
 from __future__ import annotations
 
@@ -10,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.rollout import Row
-from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
+from safe_envs.agents.evaluation.rows import EpisodeSummary
+from safe_envs.agents.evaluation.statistics import Curve, rate_interval, repeated_interval
 
 _MEANS = (
     "min_h_median",
@@ -24,27 +22,38 @@ _MEANS = (
 _SUMS = ("episodes", "safe", "violations", "touching")
 
 
-def pooled(rows: Sequence[Row], confidence: float) -> Row:
-    """The rows of several identifications on the same episodes as one: sums, means, and intervals
-    over both.
+def pooled(summaries: Sequence[EpisodeSummary], confidence: float) -> EpisodeSummary:
+    """Return several identifications on the same episodes as one: sums, means, and intervals.
+
+    Args:
+        summaries: one for each identification.
+        confidence: of the intervals, which are over identifications and episodes.
     """
-    if len(rows) == 1:
-        return dict(rows[0])
-    episodes = rows[0]["episodes"]
-    rates = [row["safety_rate"] for row in rows]
-    low, high = interval_over(rates, episodes, confidence)
-    return {
-        **{key: sum(row[key] for row in rows) for key in _SUMS},
-        **{key: _mean([row[key] for row in rows]) for key in _MEANS},
-        "safety_rate": math.fsum(rates) / len(rates),
-        "ci_low": low,
-        "ci_high": high,
-        "curve": _curve([row["curve"] for row in rows], episodes, confidence),
-    }
+    first = summaries[0]
+    if len(summaries) == 1:
+        return first
+    rates = [each.safety_rate for each in summaries]
+    low, high = interval_over(rates, first.episodes, confidence)
+    sums: dict[str, Any] = {key: sum(getattr(s, key) for s in summaries) for key in _SUMS}
+    means: dict[str, Any] = {key: _mean([getattr(s, key) for s in summaries]) for key in _MEANS}
+    return EpisodeSummary(
+        **sums,
+        **means,
+        safety_rate=math.fsum(rates) / len(rates),
+        ci_low=low,
+        ci_high=high,
+        curve=_curve([each.curve for each in summaries], first.episodes, confidence),
+    )
 
 
 def interval_over(rates: Sequence[float], episodes: int, confidence: float) -> tuple[float, float]:
-    """Interval of the mean rate of identifications that were all evaluated on the same episodes."""
+    """Return the interval of the mean rate of identifications evaluated on the same episodes.
+
+    Args:
+        rates: one for each identification.
+        episodes: number of the episodes.
+        confidence: of the interval.
+    """
     mean = math.fsum(rates) / len(rates)
     safe = round(mean * episodes)
     return repeated_interval(
@@ -52,18 +61,16 @@ def interval_over(rates: Sequence[float], episodes: int, confidence: float) -> t
     )
 
 
-def _curve(
-    curves: Sequence[dict[str, list[Any]]], episodes: int, confidence: float
-) -> dict[str, list[Any]]:
-    rates = np.array([curve["rate"] for curve in curves])
+def _curve(curves: Sequence[Curve], episodes: int, confidence: float) -> Curve:
+    rates = np.array([curve.rate for curve in curves])
     intervals = [interval_over(column.tolist(), episodes, confidence) for column in rates.T]
-    return {
-        "time": curves[0]["time"],
-        "safe": np.sum([curve["safe"] for curve in curves], axis=0).tolist(),
-        "rate": rates.mean(axis=0).tolist(),
-        "ci_low": [low for low, _ in intervals],
-        "ci_high": [high for _, high in intervals],
-    }
+    return Curve(
+        curves[0].time,
+        np.sum([curve.safe for curve in curves], axis=0).tolist(),
+        rates.mean(axis=0).tolist(),
+        [low for low, _ in intervals],
+        [high for _, high in intervals],
+    )
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

@@ -1,200 +1,199 @@
-"""What an evaluation is of: a world, a policy and filters, read from its arguments."""
+"""What an evaluation is asked for: all that determines its result, and how it is run."""
 
 from __future__ import annotations
 
-import hashlib
+import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from safe_envs.agents.evaluation.identification import Learning
-from safe_envs.agents.evaluation.rollout import Env, Progress
-from safe_envs.agents.evaluation.targets import world_of
-from safe_envs.agents.policies.registry import policy_file
-from safe_envs.agents.rare_events.importance_sampling import TiltedNoiseEnv
-from safe_envs.bounded_reading import read_bytes
+from safe_envs.agents.evaluation.brownian_bridge import require_monitoring
+from safe_envs.agents.evaluation.statistics import require_confidence
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import (
-    Condition,
-    FilterSpec,
-    SafetyFilterVectorWrapper,
-    learned_parts,
-    parse_conditions,
-    require_known,
-    require_readable,
-    spec_of,
-)
+from safe_envs.wrappers import CONDITIONS, Condition, FilterSpec, spec_of
 from safe_envs.wrappers.learning import LearnedModel
 
-BARE = "none"
+UNFILTERED = "none"
 """Name of the row without any filter."""
 
+KNOWLEDGE = ("model", "plant")
+"""What filters may know."""
 
+OBJECTIVES = ("nearest", "clf")
+"""Objectives of filters."""
+
+Filter = str | Condition | Sequence[Condition]
+"""A text, a condition for every barrier, or one condition for each barrier."""
+
+
+@dataclass(frozen=True)
 class EvaluationSpec:
-    """A world, a policy and filters. See `safe_envs.agents.evaluation.evaluate.evaluate` for the
-    arguments and their errors.
+    """All that determines the result of an evaluation.
 
     Attributes:
-        simulated: what is simulated.
-        problem: its problem.
-        actor: who acts.
-        names: of the filters, each once.
-        learning: of what filters rest on.
-        filters: the conditions of each filter, in each repeat; there once everything is learned.
+        problem: what to simulate, or the id of a registered env; with a `filter_spec` the id of any
+            env that Gymnasium knows.
+        policy: a name, a place or a path for `make_policy`; or what `as_policy` takes: an object
+            with Stable-Baselines3's `predict`, a class that takes the problem, or a function of a
+            batch of observations.
+        filters: texts for `parse_conditions`, conditions, or tuples of one condition for each
+            barrier, and "none" for the unfiltered env; None for that and the problem's own.
+        options: arguments of `gym.make` for an id; those that are None do not count.
+        filter_spec: how filters see a third-party env, or FILE.py:NAME of that. There `problem` is
+            the model that filters believe, and episodes are simulated one by one.
+        learned: models, or files of `safe-envs identify`, to use in place of learning.
+        trust: load a policy's .zip, which runs code that it contains.
+        episodes: number for each filter.
+        seed: whole number from 0.
+        knowledge: what the filters know, "model" or "plant"; those that correct the model start
+            from it in any case.
+        objective: of the filters, "nearest" to the policy's action or "clf": see
+            `SafetyFilter.for_problem`.
+        confidence: of all intervals, between 0 and 1.
+        bounds: look for bounds, which takes a search of the safe set for each filter.
+        repeats: number of identifications of what is learned, from the seed and from children of
+            it; 1 where nothing is.
+        monitoring: where h is checked: "discrete" at control instants, "continuous" between them
+            too.
+
+    Raises:
+        ConfigurationError: A value is out of range.
     """
 
-    def __init__(
-        self,
-        problem: SafetyProblem | str,
-        policy: Any,
-        filters: Sequence[str] | str | None,
-        *,
-        trust: bool,
-        options: Mapping[str, Any] | None,
-        seed: int,
-        knowledge: str,
-        objective: str,
-        spec: FilterSpec | str | None,
-        learned: Sequence[LearnedModel | Path | str],
-        repeats: int,
-    ) -> None:
-        require_whole("seed", seed, 0)
-        for name, value, allowed in (
-            ("knowledge", knowledge, ("model", "plant")),
-            ("objective", objective, ("nearest", "clf")),
-        ):
+    problem: SafetyProblem | str
+    policy: Any = "nominal"
+    filters: Sequence[Filter] | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+    filter_spec: FilterSpec | str | None = None
+    learned: Sequence[LearnedModel | Path | str] = ()
+    trust: bool = False
+    episodes: int = 1000
+    seed: int = 0
+    knowledge: str = "model"
+    objective: str = "nearest"
+    confidence: float = 0.95
+    bounds: bool = True
+    repeats: int = 1
+    monitoring: str = "discrete"
+
+    def __post_init__(self) -> None:
+        for name, least in (("episodes", 1), ("seed", 0), ("repeats", 1)):
+            require_whole(name, getattr(self, name), least)
+        for name, allowed in (("knowledge", KNOWLEDGE), ("objective", OBJECTIVES)):
+            value = getattr(self, name)
             if value not in allowed:
                 raise ConfigurationError(f"{name} = {shown(value)}; {nearest(value, allowed)}")
-        self.simulated = world_of(problem, options, spec)
-        self.problem = self.simulated.problem
-        self.actor = self.simulated.policy(policy, trust) if isinstance(policy, str) else policy
-        asked = [filters] if isinstance(filters, str) else filters
-        self.names = list(dict.fromkeys((BARE, self.simulated.filter) if asked is None else asked))
-        self._texts = [_checked(name, self.problem) for name in self.names]
-        self.learning = Learning(self.problem, self.names, learned, repeats, seed)
-        if self.simulated.spec is not None and self.learning.missing():
-            raise ConfigurationError(
-                "a filter over an env of somebody else takes what was learned from a log:"
-                " NAME:file=FILE"
-            )
-        self._policy, self._spec, self._knowledge, self._objective = (
-            policy,
-            spec,
-            knowledge,
-            objective,
-        )
-        self.filters: dict[str, list[tuple[Condition, ...]]] = {}
+        require_confidence(self.confidence)
+        require_monitoring(self.monitoring)
+        filters = (self.filters,) if isinstance(self.filters, str | Condition) else self.filters
+        given = {k: v for k, v in (self.options or {}).items() if v is not None}
+        for name, value in (
+            ("filters", None if filters is None else tuple(filters)),
+            ("options", given),
+            ("learned", tuple(self.learned)),
+        ):
+            object.__setattr__(self, name, value)
 
-    def learn(self, part: Callable[[], Progress | None]) -> None:
-        """Learn what is missing, and read the filters.
+    def as_dict(self) -> dict[str, Any]:
+        """Return the spec as JSON-able data, from which `from_dict` makes an equal one.
 
-        Args:
-            part: the progress of the next part of the work.
+        Raises:
+            ConfigurationError: A part is an object that has no text, such as a policy.
         """
-        for method, repeat in self.learning.missing():
-            self.learning.learn(method, repeat, part())
-        for name in self.names:
-            repeats = range(self.learning.repeats(name))
-            self.filters[name] = [
-                () if name == BARE else self.learning.conditions(name, repeat) for repeat in repeats
-            ]
+        found = {f.name: getattr(self, f.name) for f in fields(self)}
+        if self.filters is not None:
+            found["filters"] = [filter_text(each) for each in self.filters]
+        found["options"] = dict(self.options)
+        found["learned"] = [str(m) if isinstance(m, Path) else m for m in self.learned]
+        for name, value in found.items():
+            try:
+                json.dumps(value, allow_nan=False)
+            except (TypeError, ValueError) as error:
+                raise ConfigurationError(
+                    f"{name} of the evaluation cannot be written as text; give the id of an env,"
+                    " FILE.py:NAME, or the path of a file in its place"
+                ) from error
+        return found
 
-    def env(self, conditions: Sequence[Condition], num_envs: int) -> Env:
-        """A batch of envs behind the filter of conditions, after a first step.
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> EvaluationSpec:
+        """Make a spec from what `as_dict` returned.
 
-        That step compiles what the filter needs: an error shows before a long run, and the timing
-        is of steps.
+        Raises:
+            ConfigurationError: A key is unknown, `problem` is missing, or a value is out of range.
         """
-        env = self.simulated.env(conditions, self._knowledge, self._objective, num_envs)
-        env.reset(seed=0)
-        space: Any = env.action_space
-        env.step(np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high))
-        return env
-
-    def drifting_env(self, conditions: Sequence[Condition], lengths: np.ndarray) -> Env:
-        """A batch of envs of this project's whose noise may drift, behind the filter of conditions;
-        see `TiltedNoiseEnv`.
-        """
-        env = TiltedNoiseEnv(self.problem, lengths)
-        return (
-            SafetyFilterVectorWrapper(env, conditions, self._knowledge, self._objective)
-            if conditions
-            else env
-        )
-
-    def config(self) -> dict[str, Any]:
-        """All of it as JSON-able data, for filters that were read."""
-        spec, simulated = self._spec, self.simulated
-        return {
-            "title": simulated.title,
-            "env_id": simulated.env_id,
-            "options": simulated.options,
-            "filter_spec": (
-                None if spec is None else spec if isinstance(spec, str) else type(spec).__name__
-            ),
-            "problem": _describe(self.problem),
-            "policy": _describe_policy(self._policy),
-            "filters": [
-                {"name": name, "spec": text or spec_of(self.filters[name][0])}
-                for name, text in zip(self.names, self._texts, strict=True)
-            ],
-            "knowledge": self._knowledge,
-            "objective": self._objective,
-        }
+        names = [f.name for f in fields(cls)]
+        for key in data:
+            if key not in names:
+                raise ConfigurationError(
+                    f"an evaluation has no {shown(key)}; {nearest(key, names)}"
+                )
+        if "problem" not in data:
+            raise ConfigurationError("an evaluation needs problem, the id of an env")
+        return cls(**data)
 
 
-class Work:
-    """Tells the progress of a number of equal parts, one after the other."""
+@dataclass(frozen=True)
+class RunSettings:
+    """How an evaluation is run, which does not change its result.
 
-    def __init__(self, progress: Progress | None, parts: int) -> None:
-        self._progress, self._parts, self._begun = progress, parts, 0
+    Attributes:
+        num_envs: episodes to simulate side by side.
+        jobs: number of processes.
+        record: keep trajectories for pictures.
+        progress: called with the part of the work that is done, from 0 to 1.
 
-    def part(self, whole: float = 1.0) -> Progress | None:
-        """The next part, told how much of `whole` is done."""
-        before, self._begun = self._begun, self._begun + 1
-        told = self._progress
-        return None if told is None else lambda done: told((before + done / whole) / self._parts)
-
-
-def _checked(name: str, problem: SafetyProblem) -> str | None:
-    """The text of a filter with all its parameters, where it rests on nothing learned; the others
-    are read once that is there.
+    Raises:
+        ConfigurationError: A value is out of range, or trajectories are asked of several processes.
     """
-    if name == BARE:
-        return BARE
-    if BARE in name.split("+"):
+
+    num_envs: int = 1024
+    jobs: int = 1
+    record: bool = False
+    progress: Callable[[float], None] | None = None
+
+    def __post_init__(self) -> None:
+        require_whole("num_envs", self.num_envs, 1)
+        require_whole("jobs", self.jobs, 1)
+        if self.jobs > 1 and self.record:
+            raise ConfigurationError(
+                f"jobs = {self.jobs}: trajectories for pictures are kept in one process; leave jobs"
+                " out, or the picture"
+            )
+
+
+def filter_text(given: Filter) -> str:
+    """Return the text of a filter, which is a text, a condition, or one for each barrier.
+
+    Raises:
+        ConfigurationError: It is a condition that `parse_conditions` cannot make from text.
+    """
+    if isinstance(given, str):
+        return given
+    conditions = conditions_in(given)
+    for condition in conditions:
+        if CONDITIONS.get(condition.name) is not type(condition):
+            raise ConfigurationError(
+                f"the condition {type(condition).__name__} has no text here; write it in a file and"
+                " give FILE.py:NAME"
+            )
+    return spec_of(conditions)
+
+
+def conditions_in(given: Condition | Sequence[Condition]) -> tuple[Condition, ...]:
+    """Return the conditions of a filter that is given as objects.
+
+    Raises:
+        ConfigurationError: Something in it is no condition.
+    """
+    found = (given,) if isinstance(given, Condition) else tuple(given)
+    strangers = [each for each in found if not isinstance(each, Condition)]
+    if strangers or not found:
+        wrong = type(strangers[0]).__name__ if strangers else "an empty tuple"
         raise ConfigurationError(
-            f"filter {shown(name)}: {BARE!r} is the bare env, no condition of a barrier; give it"
-            " alone or leave it out"
+            f"filters hold {wrong}; give texts such as 'hocbf:p=2,8', conditions, or tuples with a"
+            " condition for each barrier"
         )
-    require_known(name, BARE)
-    if learned_parts(name):
-        require_readable(name, problem)
-        return None
-    return spec_of(parse_conditions(name, problem))
-
-
-def _describe(problem: SafetyProblem) -> dict[str, Any]:
-    return {
-        "name": problem.name,
-        "plant": {p.name: v for p, v in problem.plant.parameters.items()},
-        "model": {p.name: v for p, v in problem.model.parameters.items()},
-        "barriers": [str(b.expression) for b in problem.barriers],
-        "box": [[float(low), float(high)] for low, high in problem.box],
-        "start": problem.start,
-        "dt": problem.dt,
-        "substeps": problem.substeps,
-        "horizon": problem.horizon,
-    }
-
-
-def _describe_policy(policy: Any) -> dict[str, Any]:
-    if not isinstance(policy, str):
-        return {"name": type(policy).__name__}
-    file = policy_file(policy)
-    if file is None:
-        return {"name": policy}
-    return {"name": policy, "sha256": hashlib.sha256(read_bytes(file)).hexdigest()}
+    return found

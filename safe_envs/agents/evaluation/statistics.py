@@ -1,16 +1,16 @@
-"""Statistics of episodes, in memory that does not grow with their number."""
+"""Intervals, tests and sums of the statistics of episodes."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from safe_envs.errors import ConfigurationError
 
-_KEPT = 65_536
 _MOST_INTERVALS = 200
 
 
@@ -235,65 +235,59 @@ class RunningSum:
     def __init__(self) -> None:
         self.total = 0.0
 
+    @classmethod
+    def of(cls, values: np.ndarray) -> float:
+        """Return the sum of values, shape (B,), added one after the other."""
+        found = cls()
+        found.add(values)
+        return found.total
+
     def add(self, values: np.ndarray) -> None:
         """Add values, shape (B,), one after the other."""
         # cumsum is sequential, where sum() would pair the values up by position.
         self.total = float(np.cumsum(np.concatenate(([self.total], values)))[-1])
 
 
-class FirstValues:
-    """The first 65536 values: of independent ones they give the quantiles well enough."""
-
-    def __init__(self) -> None:
-        self._parts: list[np.ndarray] = []
-        self._count = 0
-
-    def add(self, values: np.ndarray) -> None:
-        """Keep the values, shape (B,), as far as there is room."""
-        kept = values[: _KEPT - self._count]
-        if kept.size:
-            self._parts.append(kept.copy())
-            self._count += kept.size
-
-    def quantiles(self, levels: tuple[float, ...]) -> list[float]:
-        """Quantiles at the levels in [0, 1]."""
-        return np.quantile(np.concatenate(self._parts), levels).tolist()
-
-
-class SafetyCurve:
-    """How many episodes are safe so far, at instants that are spread over the horizon.
+@dataclass(frozen=True)
+class Curve:
+    """A safety rate over time, with its pointwise interval.
 
     Attributes:
-        instants: control instants, evenly spaced from 0, and the last one: at most 201, shape (q,).
+        time: instants in s, at most 201.
+        safe: number of episodes without a violation up to each.
+        rate: their share.
+        ci_low: lower end of its interval.
+        ci_high: upper end.
     """
 
-    def __init__(self, steps: int) -> None:
-        self.instants = np.append(np.arange(0, steps, -(-steps // _MOST_INTERVALS)), steps)
-        self._lost = np.zeros(len(self.instants) + 1, dtype=np.int64)
+    time: list[float]
+    safe: list[int]
+    rate: list[float]
+    ci_low: list[float]
+    ci_high: list[float]
 
-    def add(self, first_violation: np.ndarray) -> None:
-        """Add episodes by the instants of their first violations, shape (B,); beyond the last for
-        none.
-        """
-        self._lost += np.bincount(
-            np.searchsorted(self.instants, first_violation), minlength=len(self._lost)
-        )
 
-    def row(self, dt: float, confidence: float) -> dict[str, list[Any]]:
-        """Times in s, and for each the episodes safe up to it, their rate, and its pointwise
-        interval.
-        """
-        episodes = int(self._lost.sum())
-        safe = episodes - np.cumsum(self._lost)[:-1]
-        low, high = rate_band(safe, episodes, confidence)
-        columns = {
-            "time": self.instants * dt,
-            "safe": safe,
-            "rate": safe / episodes,
-            "ci_low": low,
-            "ci_high": high,
-        }
-        return {name: values.tolist() for name, values in columns.items()}
+def safety_curve(first_violation: np.ndarray, steps: int, dt: float, confidence: float) -> Curve:
+    """Return the rate of the episodes that are safe so far, at instants spread over the horizon.
+
+    Args:
+        first_violation: control instant of the first violation of each episode, shape (E,); -1
+            where there is none.
+        steps: number of control periods of the horizon.
+        dt: control period in s.
+        confidence: of the intervals.
+    """
+    instants = curve_instants(steps)
+    lost = np.searchsorted(instants, first_violation[first_violation >= 0])
+    safe = len(first_violation) - np.cumsum(np.bincount(lost, minlength=len(instants)))
+    low, high = rate_band(safe, len(first_violation), confidence)
+    columns = (instants * dt, safe, safe / len(first_violation), low, high)
+    return Curve(*(values.tolist() for values in columns))
+
+
+def curve_instants(steps: int) -> np.ndarray:
+    """Return the control instants of a curve, evenly spaced from 0, and the last one: at most 201."""
+    return np.append(np.arange(0, steps, -(-steps // _MOST_INTERVALS)), steps)
 
 
 def share(part: float, whole: float) -> float | None:

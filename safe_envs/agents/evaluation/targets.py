@@ -1,6 +1,4 @@
-"""What an evaluation simulates: an env of this project, or one of somebody else, seen through a
-filter's spec.
-"""
+"""What an evaluation simulates: a problem of this project, or a third-party env."""
 
 from __future__ import annotations
 
@@ -11,7 +9,9 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.agents.evaluation.rollout import Env
-from safe_envs.agents.policies.registry import POLICIES, Policy, is_data, make_policy, policy_file
+from safe_envs.agents.policies.base import Policy
+from safe_envs.agents.policies.custom import as_policy
+from safe_envs.agents.policies.registry import POLICIES, make_policy, policy_files
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -21,7 +21,7 @@ from safe_envs.registry import full_id, make_problem, title_of
 from safe_envs.wrappers import Condition, FilterSpec, SafetyFilterVectorWrapper, SafetyMonitorVector
 
 _MOST_ENVS = 64
-"""Envs of somebody else are stepped one by one: more of them at once would only take memory."""
+"""Third-party envs are stepped one by one: more of them at once would only take memory."""
 
 
 class NativeTarget:
@@ -33,32 +33,32 @@ class NativeTarget:
 
     Attributes:
         env_id: full id, None for a problem.
-        options: those given that are not None.
-        spec: None.
+        options: as given.
+        filter_spec: None.
         problem: what is simulated.
         why_no_bound: None; a bound may be looked for.
 
     Raises:
-        ConfigurationError: the id or an option is unknown, or options are given for a problem.
+        ConfigurationError: The id or an option is unknown, or options are given for a problem.
     """
 
-    spec = None
+    filter_spec = None
     why_no_bound = None
 
-    def __init__(self, problem: SafetyProblem | str, options: Mapping[str, Any] | None) -> None:
+    def __init__(self, problem: SafetyProblem | str, options: Mapping[str, Any]) -> None:
         self.env_id = full_id(problem) if isinstance(problem, str) else None
         if self.env_id is None and options:
             raise ConfigurationError(
                 "options are the arguments of a registered id; configure the problem itself instead"
             )
-        self.options = {k: v for k, v in (options or {}).items() if v is not None}
+        self.options = dict(options)
         self.problem = (
             problem if isinstance(problem, SafetyProblem) else make_problem(problem, **self.options)
         )
 
     @property
     def filter(self) -> str:
-        """The filter that suits it."""
+        """The default filter of the problem."""
         return self.problem.filter
 
     @property
@@ -66,21 +66,25 @@ class NativeTarget:
         """How results call it."""
         return self.problem.name if self.env_id is None else title_of(self.env_id, self.options)
 
-    def policy(self, name: str, trust: bool) -> Policy:
+    def make_policy(self, name: str, trust: bool) -> Any:
         """Make a policy from its name; see `make_policy`."""
         return make_policy(name, self.problem, trust)
+
+    def adapt_policy(self, given: Any) -> Any:
+        """Return a policy for an object, a class or a function; see `as_policy`."""
+        return as_policy(given, self.problem)
 
     def env(
         self, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int
     ) -> Env:
-        """A batch of envs behind the filter of conditions, or bare."""
+        """Return a batch of envs behind the filter of conditions, or unfiltered."""
         env = SafeVectorEnv(self.problem, num_envs)
         return (
             SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
         )
 
     def is_deterministic(self, policy: Any) -> bool:
-        """Whether all episodes are one and the same."""
+        """Return whether all episodes are one and the same."""
         noise = Integrator(
             self.problem.plant, self.problem.dt, self.problem.substeps, "arrays"
         ).channels
@@ -89,30 +93,29 @@ class NativeTarget:
 
 
 class ExternalTarget:
-    """A registered env that knows nothing of safety, with the model of it that filters believe for
-    its problem.
+    """A registered third-party env, with the model of it that filters believe as its problem.
 
     Args:
-        env_id: id of it.
-        spec: how a filter sees it.
+        env_id: its id.
+        filter_spec: how a filter sees it.
 
     Attributes:
         env_id: as given.
         options: none.
-        spec: as given.
+        filter_spec: as given.
         problem: the model as a problem.
-        why_no_bound: nobody knows whether the model is the env.
+        why_no_bound: that the model may not be the env.
 
     Raises:
-        ConfigurationError: the env is one of this project, has no time limit, or does not fit the
+        ConfigurationError: The env is one of this project, has no time limit, or does not fit the
             spec.
-        gymnasium.error.Error: there is no such env.
+        gymnasium.error.Error: There is no such env.
     """
 
     why_no_bound = "the env is not this project's, and may differ from the model"
 
-    def __init__(self, env_id: str, spec: FilterSpec) -> None:
-        self.env_id, self.spec = env_id, spec
+    def __init__(self, env_id: str, filter_spec: FilterSpec) -> None:
+        self.env_id, self.filter_spec = env_id, filter_spec
         self.options: dict[str, Any] = {}
         with gym.make(env_id) as env:
             if isinstance(getattr(env.unwrapped, "problem", None), SafetyProblem):
@@ -125,33 +128,41 @@ class ExternalTarget:
                     f"{env_id} has no time limit, so that its episodes have no length; register it"
                     " with max_episode_steps"
                 )
-            self.problem = spec.problem(env.unwrapped, env.action_space, env_id, steps)
+            self.problem = filter_spec.problem(env.unwrapped, env.action_space, env_id, steps)
             self._spaces = env.observation_space, env.action_space
 
     @property
     def filter(self) -> str:
-        """The filter that its spec names, or that suits the model."""
-        return self.spec.filter or self.problem.filter
+        """The filter that the filter spec names, or else the default one of the model."""
+        return self.filter_spec.filter or self.problem.filter
 
     @property
     def title(self) -> str:
         """How results call it."""
         return self.env_id
 
-    def policy(self, name: str, trust: bool) -> Policy:
-        """Make a policy from its name; see `make_policy`. The named ones see the model's state.
+    def adapt_policy(self, given: Any) -> Any:
+        """Return a policy for the env's own observations and actions; see `as_policy`."""
+        return as_policy(given, self.problem, self._spaces)
+
+    def make_policy(self, name: str, trust: bool) -> Any:
+        """Make a policy from its name; see `make_policy`. The built-in ones see the model's state.
+
+        Args:
+            name: of the policy, or a place or path.
+            trust: load a .zip, which runs code in it.
 
         Raises:
-            ConfigurationError: there is no such policy, or none for such an env.
+            ConfigurationError: There is no such policy, or none for such an env.
         """
-        if name == "nominal" and self.spec.nominal is None:
+        if name == "nominal" and self.filter_spec.nominal is None:
             raise ConfigurationError(
                 "the filter spec has no nominal controller; give it one, or --policy zero, random"
                 " or a .zip"
             )
         if name in POLICIES:
-            return _OfModel(
-                make_policy(name, self.problem), self.spec, self.problem, self._spaces[1]
+            return _ModelPolicy(
+                make_policy(name, self.problem), self.filter_spec, self.problem, self._spaces[1]
             )
         if is_data(policy_file(name)):
             raise ConfigurationError(
@@ -163,34 +174,34 @@ class ExternalTarget:
     def env(
         self, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int
     ) -> Env:
-        """A batch of envs behind the filter of conditions, or bare."""
+        """Return a batch of envs behind the filter of conditions, or unfiltered."""
         if knowledge != "model":
             raise ConfigurationError(
-                f"knowledge = {shown(knowledge)}: of an env of somebody else nothing is known but"
-                " the model"
+                f"knowledge = {shown(knowledge)}: of a third-party env nothing is known but the"
+                " model"
             )
         env = SafetyMonitorVector(
             gym.make_vec(
                 self.env_id, num_envs=min(num_envs, _MOST_ENVS), vectorization_mode="sync"
             ),
-            self.spec,
+            self.filter_spec,
         )
         return (
             SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
         )
 
     def is_deterministic(self, policy: Any) -> bool:
-        """Nobody knows whether all episodes are one and the same."""
+        """Return False: whether all episodes are one and the same is unknown."""
         return False
 
 
-class _OfModel(Policy):
-    """A policy for the model's problem as one for the env: from its observations to its actions."""
+class _ModelPolicy(Policy):
+    """A policy for the model's problem, from the env's observations to the env's actions."""
 
     def __init__(
-        self, policy: Policy, spec: FilterSpec, problem: SafetyProblem, space: Any
+        self, policy: Policy, filter_spec: FilterSpec, problem: SafetyProblem, space: Any
     ) -> None:
-        self._policy, self._spec, self._space = policy, spec, space
+        self._policy, self._filter_spec, self._space = policy, filter_spec, space
         self.deterministic = policy.deterministic
         self._center, self._half = (np.array(part) for part in center_and_half_width(problem))
 
@@ -206,31 +217,37 @@ class _OfModel(Policy):
         deterministic: bool = False,
     ) -> tuple[np.ndarray, Any]:
         """Choose actions of the env; see `Policy.predict`."""
-        x = self._spec.state(observation, np.shape(observation)[:-1])
+        x = self._filter_spec.state(observation, np.shape(observation)[:-1])
         actions, state = self._policy.predict(x, state, episode_start, deterministic)
         space = self._space
         return (
             np.clip(
-                self._spec.actions(self._center + self._half * actions), space.low, space.high
+                self._filter_spec.actions(self._center + self._half * actions),
+                space.low,
+                space.high,
             ).astype(space.dtype),
             state,
         )
 
 
-def world_of(
-    problem: SafetyProblem | str, options: Mapping[str, Any] | None, spec: FilterSpec | str | None
+def make_target(
+    problem: SafetyProblem | str,
+    options: Mapping[str, Any],
+    filter_spec: FilterSpec | str | None,
 ) -> NativeTarget | ExternalTarget:
-    """What to simulate; see `safe_envs.agents.evaluation.evaluate.evaluate` for the arguments.
+    """Return what to simulate; see `EvaluationSpec` for the arguments.
 
     Raises:
-        ConfigurationError: see the classes, or a spec comes with a problem or with options.
+        ConfigurationError: See the classes; or a filter spec comes with a problem or with options.
     """
-    if spec is None:
+    if filter_spec is None:
         return NativeTarget(problem, options)
-    given = [name for name, value in (options or {}).items() if value is not None]
+    given = list(options)
     if not isinstance(problem, str) or given:
         wrong = ", ".join(given) or "a SafetyProblem"
         raise ConfigurationError(
-            f"a filter spec is for the id of an env of somebody else, without {wrong}"
+            f"a filter spec is for the id of a third-party env, without {wrong}"
         )
-    return ExternalTarget(problem, FilterSpec.load(spec) if isinstance(spec, str) else spec)
+    if isinstance(filter_spec, str):
+        filter_spec = FilterSpec.load(filter_spec)
+    return ExternalTarget(problem, filter_spec)

@@ -16,7 +16,7 @@ _KEPT = 64
 
 
 @dataclass(frozen=True)
-class Seen:
+class VisitedStates:
     """The states of episodes where most was missed, and where h was largest.
 
     Attributes:
@@ -35,17 +35,19 @@ class Seen:
     depth: np.ndarray
 
     @classmethod
-    def nothing(cls, problem: SafetyProblem) -> Seen:
+    def nothing(cls, problem: SafetyProblem) -> VisitedStates:
         """Of no episodes."""
         n, m = len(problem.states), len(problem.inputs)
         return cls(np.empty((0, n)), np.empty((0, m)), np.empty(0), np.empty((0, n)), np.empty(0))
 
-    def joined(self, other: Seen) -> Seen:
+    def joined(self, other: VisitedStates) -> VisitedStates:
         """The most extreme states of both."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         missed, actions, slack, deepest, depth = (np.concatenate(pair) for pair in pairs)
         worst, highest = _first(slack), _first(depth)
-        return Seen(missed[worst], actions[worst], slack[worst], deepest[highest], depth[highest])
+        return VisitedStates(
+            missed[worst], actions[worst], slack[worst], deepest[highest], depth[highest]
+        )
 
 
 def _first(values: np.ndarray) -> np.ndarray:
@@ -53,7 +55,7 @@ def _first(values: np.ndarray) -> np.ndarray:
     return np.argsort(-values, kind="stable")[:_KEPT]
 
 
-class Watch:
+class StateWatch:
     """Keeps the extreme states of each episode of a wave."""
 
     def __init__(self, x: Components, h: np.ndarray, inputs: int) -> None:
@@ -104,12 +106,12 @@ class Watch:
         if lower.any():
             _keep(self.lowest, x, lower)
 
-    def seen(self, count: int) -> Seen:
+    def visited(self, count: int) -> VisitedStates:
         """What was seen in the first `count` episodes."""
         slack, depth = self._slack[:count], self.depth[:count]
         worst = _first(slack)
         worst, highest = worst[slack[worst] > 0.0], _first(depth)
-        return Seen(
+        return VisitedStates(
             self._missed.T[worst],
             self._actions.T[worst],
             slack[worst],

@@ -33,8 +33,8 @@ class TaskLostError(Exception):
     """A task ended outside of its function, as with its worker.
 
     Attributes:
-        reason: What the cluster reports.
-        jobs: Those of the task.
+        reason: what the cluster reports.
+        jobs: those of the task.
     """
 
     def __init__(self, reason: BaseException, jobs: Sequence[Job]) -> None:
@@ -43,16 +43,16 @@ class TaskLostError(Exception):
 
 
 @contextmanager
-def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[str, Any]]:
+def dask_settings(address: str, report: Callable[[str], None]) -> Iterator[dict[str, Any]]:
     """Yield the arguments of `joblib.Parallel` for a Dask scheduler.
 
     Args:
-        address: Of the scheduler.
-        tell: Receives a message when it has lost all its workers. If none come for minutes, joblib
+        address: of the scheduler.
+        report: receives a message when it has lost all its workers. If none come for minutes, joblib
             raises ConfigurationError.
 
     Raises:
-        ConfigurationError: There is no scheduler, or it has no workers.
+        ConfigurationError: there is no scheduler, or it has no workers.
     """
     from distributed import Client
     from joblib._dask import DaskDistributedBackend
@@ -102,7 +102,7 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
             ) from error
         backend, ended = Dask(client), threading.Event()
         watch = threading.Thread(
-            target=_watch, args=(client, address, tell, backend.give_up, ended), daemon=True
+            target=_watch, args=(client, address, report, backend.give_up, ended), daemon=True
         )
         watch.start()
         try:
@@ -115,7 +115,7 @@ def dask_settings(address: str, tell: Callable[[str], None]) -> Iterator[dict[st
 def _watch(
     client: Client,
     address: str,
-    tell: Callable[[str], None],
+    report: Callable[[str], None],
     give_up: Callable[[Exception], None],
     ended: threading.Event,
 ) -> None:
@@ -129,17 +129,17 @@ def _watch(
         if ended.is_set():
             return
         if looks == 1:
-            tell(
+            report(
                 f"The Dask scheduler at {address} has no workers any more; waiting for some. Start"
                 f" them by: dask worker {address}"
             )
         if looks == _MOST_LOOKS:
             minutes = _LOOK * _MOST_LOOKS / 60
-            told = (
+            message = (
                 f"the Dask scheduler at {address} has had no workers for {minutes:g} minutes; start"
                 f" some by: dask worker {address}"
             )
-            give_up(ConfigurationError(f"{told}, and start again: what was computed is kept"))
+            give_up(ConfigurationError(f"{message}, and start again: what was computed is kept"))
 
 
 @contextmanager
@@ -147,7 +147,7 @@ def ray_settings(address: str) -> Iterator[dict[str, Any]]:
     """Yield the arguments of `joblib.Parallel` for a Ray cluster.
 
     Raises:
-        ConfigurationError: It cannot be reached.
+        ConfigurationError: it cannot be reached.
     """
     import ray
     from ray.util.joblib.ray_backend import RayBackend

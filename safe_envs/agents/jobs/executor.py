@@ -37,7 +37,7 @@ class _LossError(Exception):
     """A worker ended.
 
     Attributes:
-        jobs: Those that it may have been computing.
+        jobs: those that it may have been computing.
     """
 
     def __init__(self, reason: str, jobs: Sequence[Job]) -> None:
@@ -50,12 +50,12 @@ class Backend:
     """Where to compute.
 
     Attributes:
-        backend: One of `BACKENDS`.
-        address: Of a Dask scheduler (tcp://HOST:PORT) or of a Ray cluster (HOST:PORT).
-        jobs: Number of processes of this machine, for "local"; a cluster uses all its workers.
+        backend: one of `BACKENDS`.
+        address: of a Dask scheduler (tcp://HOST:PORT) or of a Ray cluster (HOST:PORT).
+        jobs: number of processes of this machine, for "local"; a cluster uses all its workers.
 
     Raises:
-        ConfigurationError: The backend is unknown, an address is missing or does not apply, or a
+        ConfigurationError: the backend is unknown, an address is missing or does not apply, or a
             package is not installed.
     """
 
@@ -88,7 +88,7 @@ def run(
     jobs: Iterable[Job],
     backend: Backend,
     keep: Callable[[Outcome], None],
-    tell: Callable[[str], None] = lambda _: None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Compute jobs, each once.
 
@@ -98,22 +98,22 @@ def run(
     all was computed, some from the whole list are tried one by one in place of those.
 
     Args:
-        jobs: What to compute. The results do not depend on their order.
-        backend: Where.
-        keep: Receives each outcome as soon as it exists, in the order of completion.
-        tell: Receives what the user should know meanwhile, such as that a cluster has lost all its
+        jobs: what to compute. The results do not depend on their order.
+        backend: where.
+        keep: receives each outcome as soon as it exists, in the order of completion.
+        report: receives what the user should know meanwhile, such as that a cluster has lost all its
             workers; called by any thread.
 
     Raises:
-        ConfigurationError: A cluster cannot be reached, or has no workers.
-        WorkersLostError: Workers end before they have computed anything.
+        ConfigurationError: a cluster cannot be reached, or has no workers.
+        WorkersLostError: workers end before they have computed anything.
     """
     missing = {job.key: job for job in jobs}
     any_computed = False
 
     def take(some: Sequence[Job]) -> None:
         nonlocal any_computed
-        with closing(_outcomes(some, backend, tell)) as outcomes:
+        with closing(_outcomes(some, backend, report)) as outcomes:
             for outcome in outcomes:
                 keep(outcome)
                 del missing[outcome.key]
@@ -135,8 +135,8 @@ def run(
             for job in under_way or _spread(list(missing.values())):
                 error = loss if was_alone else _alone(job, take)
                 if error is not None:
-                    told = f"the process that computed it ended: {error}"
-                    keep(Outcome(job.key, None, told, 0.0))
+                    message = f"the process that computed it ended: {error}"
+                    keep(Outcome(job.key, None, message, 0.0))
                     del missing[job.key]
                 if any_computed and (error is not None or not under_way):
                     break
@@ -176,12 +176,12 @@ def _spread(jobs: Sequence[Job]) -> Sequence[Job]:
 
 
 def _outcomes(
-    jobs: Sequence[Job], backend: Backend, tell: Callable[[str], None]
+    jobs: Sequence[Job], backend: Backend, report: Callable[[str], None]
 ) -> Generator[Outcome, None, None]:
     """Yield outcomes in the order of completion.
 
     Raises:
-        _LossError: A worker ended.
+        _LossError: a worker ended.
     """
     from joblib import Parallel, delayed
 
@@ -192,7 +192,7 @@ def _outcomes(
             begun.append(job)
             yield delayed(outcome_of)(job)
 
-    with _settings(backend, len(jobs), tell) as settings:
+    with _settings(backend, len(jobs), report) as settings:
         # One job is one task, so that each outcome is kept as soon as it exists.
         parallel = Parallel(return_as="generator_unordered", batch_size=1, **settings)  # pyright: ignore[reportArgumentType]
         with (
@@ -206,18 +206,18 @@ def _outcomes(
             except SafeEnvsError:
                 raise
             except TaskLostError as error:
-                raise _LossError(_told(error.reason), error.jobs) from error
+                raise _LossError(_reason(error.reason), error.jobs) from error
             except Exception as error:  # those of jobs are in their outcomes
-                raise _LossError(_told(error), begun) from error
+                raise _LossError(_reason(error), begun) from error
 
 
-def _told(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}".splitlines()[0].rstrip(".")
 
 
 @contextmanager
 def _settings(
-    backend: Backend, count: int, tell: Callable[[str], None]
+    backend: Backend, count: int, report: Callable[[str], None]
 ) -> Iterator[dict[str, Any]]:
     """Yield the arguments of joblib for a backend, connected as long as the context lasts."""
     if backend.backend == "local":
@@ -225,7 +225,7 @@ def _settings(
         jobs = 1 if backend.jobs == 1 else max(2, min(backend.jobs, count))
         yield {"backend": local_processes(_IDLE), "n_jobs": jobs}
     elif backend.backend == "dask":
-        with dask_settings(str(backend.address), tell) as settings:
+        with dask_settings(str(backend.address), report) as settings:
             yield settings
     else:
         with ray_settings(str(backend.address)) as settings:

@@ -42,14 +42,14 @@ def _versions() -> dict[str, str]:
 
 @cache
 def source_checksum(scripts: bool = True) -> str:
-    """Return the SHA-256 of this project's code, so that a developer's change is another version.
+    """Return the SHA-256 of this project's code and data: a developer's change is a version.
 
     Args:
         scripts: include `safe_envs.scripts`, on which no evaluation depends.
     """
     digest = hashlib.sha256()
     root = Path(str(files("safe_envs")))
-    for path in sorted(root.rglob("*.py")):
+    for path in sorted((*root.rglob("*.py"), *root.rglob("*.yaml"))):
         if scripts or not path.is_relative_to(root / "scripts"):
             digest.update(f"{path.relative_to(root)}\0".encode() + path.read_bytes())
     return digest.hexdigest()
@@ -59,7 +59,7 @@ def file_checksum(path: Path) -> str:
     """Return the SHA-256 of a file.
 
     Raises:
-        ConfigurationError: The file cannot be read.
+        ConfigurationError: the file cannot be read.
     """
     try:
         return hashlib.sha256(read_bytes(path)).hexdigest()

@@ -36,10 +36,10 @@ class Outcome:
     """The end of a job.
 
     Attributes:
-        key: Of the job.
-        result: What it returned; None if it failed.
-        error: Why it failed, or None.
-        seconds: How long it took, the only part that depends on the machine.
+        key: of the job.
+        result: what it returned; None if it failed.
+        error: why it failed, or None.
+        seconds: how long it took, the only part that depends on the machine.
     """
 
     key: str
@@ -58,10 +58,10 @@ def outcome_of(job: Job) -> Outcome:
         # Jobs run side by side already.
         with _ONE_AT_A_TIME, threadpool_limits(1):
             result = job.compute()
-    except SafeEnvsError as told:
-        error = str(told)
-    except Exception as told:
-        error = f"{type(told).__name__}: {told}{_where(told)}"
+    except SafeEnvsError as raised:
+        error = str(raised)
+    except Exception as raised:
+        error = f"{type(raised).__name__}: {raised}{_where(raised)}"
     return Outcome(job.key, result, error, time.perf_counter() - began)
 
 

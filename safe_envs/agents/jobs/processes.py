@@ -24,7 +24,7 @@ def end_with_parent(parent: int) -> None:
     has ended another parent. (Windows does not: there it stays until it is idle.)
 
     Args:
-        parent: Id of the process that started this one.
+        parent: id of the process that started this one.
     """
 
     def watch() -> None:
@@ -39,7 +39,7 @@ def local_processes(idle: int = 300) -> Any:
     """Return joblib's backend of processes of this machine, each of which ends with this one.
 
     Args:
-        idle: Seconds after which a process ends that has nothing to do.
+        idle: seconds after which a process ends that has nothing to do.
     """
     from joblib._parallel_backends import LokyBackend
 
@@ -56,14 +56,14 @@ def compute_in_order(
     An exception of the function is raised here as it is.
 
     Args:
-        function: Importable by its name.
-        shared: What all parts have in common; it may hold functions and classes of a script.
-        parts: What differs.
-        jobs: Number of processes, which remain for the next call.
+        function: importable by its name.
+        shared: what all parts have in common; it may hold functions and classes of a script.
+        parts: what differs.
+        jobs: number of processes, which remain for the next call.
 
     Raises:
         ConfigurationError: `shared` cannot be sent to another process.
-        WorkersLostError: A process was ended from outside.
+        WorkersLostError: a process was ended from outside.
     """
     from joblib import Parallel, delayed
 

@@ -37,10 +37,10 @@ class ResultStore:
     file that was damaged or altered is never taken for a result.
 
     Args:
-        folder: Created if it does not exist.
+        folder: created if it does not exist.
 
     Raises:
-        ConfigurationError: The folder cannot be created.
+        ConfigurationError: the folder cannot be created.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -55,12 +55,12 @@ class ResultStore:
         """Write a result.
 
         Args:
-            key: Name of the file.
-            configuration: All that the result depends on, versions included; JSON-able.
-            content: The result, JSON-able, without the names "configuration" and "sha256".
+            key: name of the file.
+            configuration: all that the result depends on, versions included; JSON-able.
+            content: the result, JSON-able, without the names "configuration" and "sha256".
 
         Raises:
-            ConfigurationError: The file cannot be written, as on a full disk; the previous one
+            ConfigurationError: the file cannot be written, as on a full disk; the previous one
                 remains.
         """
         document = {"configuration": configuration, **content}
@@ -80,7 +80,7 @@ class ResultStore:
         """Return the content of a file with its configuration, whatever that is; None without one.
 
         Raises:
-            ConfigurationError: The file is damaged or altered.
+            ConfigurationError: the file is damaged or altered.
         """
         path = self.path(key)
         if not os.path.exists(path):
@@ -98,7 +98,7 @@ class ResultStore:
         """Return the content that was kept for a key under an equal configuration, or None.
 
         Raises:
-            ConfigurationError: The file is damaged or altered.
+            ConfigurationError: the file is damaged or altered.
         """
         document = self.document(key)
         return document if document and document["configuration"] == configuration else None
@@ -107,11 +107,11 @@ class ResultStore:
         """Check that no result of other options would be overwritten.
 
         Args:
-            keys: Of the results to look at.
-            options: What the configuration of each is to hold under "options".
+            keys: of the results to look at.
+            options: what the configuration of each is to hold under "options".
 
         Raises:
-            ConfigurationError: One has other options, or its file is damaged or altered.
+            ConfigurationError: one has other options, or its file is damaged or altered.
         """
         for key in keys:
             document = self.document(key)
@@ -130,7 +130,7 @@ def make_folder(folder: Path) -> None:
     """Create a folder for results, with those above it.
 
     Raises:
-        ConfigurationError: It cannot be created.
+        ConfigurationError: it cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -153,20 +153,20 @@ def reading(path: Path, advice: str = "remove it, and it is computed again") -> 
     """Report whatever the content of a damaged file raises as an error that names the file.
 
     Args:
-        path: Of the file or folder.
-        advice: What the user can do, to end the message with.
+        path: of the file or folder.
+        advice: what the user can do, to end the message with.
 
     Raises:
-        ConfigurationError: The block raised an exception, other than one of this project's.
+        ConfigurationError: the block raised an exception, other than one of this project's.
     """
     try:
         yield
     except SafeEnvsError:
         raise
     except Exception as error:
-        told = f"{type(error).__name__}: {shortened(error, _SHOWN)}"
+        reason = f"{type(error).__name__}: {shortened(error, _SHOWN)}"
         raise ConfigurationError(
-            f"{path} cannot be read ({told}); it is damaged or altered: {advice}"
+            f"{path} cannot be read ({reason}); it is damaged or altered: {advice}"
         ) from error
 
 

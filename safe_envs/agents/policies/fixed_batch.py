@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.policies.nominal import checked_observation
-from safe_envs.agents.policies.registry import Policy
+from safe_envs.agents.policies.base import Policy, checked_observation
 
 BLOCK = 128
 """Observations in a block."""

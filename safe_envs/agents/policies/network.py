@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.agents.policies.base import DESCRIPTION, TENSORS, saved_policy_files
 from safe_envs.agents.policies.fixed_batch import BlockPolicy
 from safe_envs.agents.policies.registry import POLICY_FILE, policy_file
 from safe_envs.agents.policies.sb3 import require_spaces

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.policies.registry import Policy
+from safe_envs.agents.policies.base import Policy, checked_observation
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.envs.spaces import center_and_half_width
-from safe_envs.errors import InvalidInputError, NumericalError
+from safe_envs.envs.simulation import center_and_half_width
+from safe_envs.errors import NumericalError
 from safe_envs.problem.problem import SafetyProblem
 
 _CHUNK = 128
@@ -143,17 +143,3 @@ class RandomPolicy(Policy):
             self._position = 0
         self._position += 1
         return 2.0 * self._drawn[:, self._position - 1] - 1.0, state
-
-
-def checked_observation(observation: Any, width: int) -> np.ndarray:
-    """Return the observations in double precision.
-
-    Raises:
-        InvalidInputError: they have another shape than (width,) or (B, width).
-    """
-    given = np.asarray(observation, dtype=np.float64)
-    if given.ndim not in (1, 2) or given.shape[-1] != width:
-        raise InvalidInputError(
-            f"the observation has shape {given.shape}; the policy takes ({width},) or (B, {width})"
-        )
-    return given

@@ -1,109 +1,75 @@
-"""What a policy is, and the policies that have a name."""
+"""Policies by name, by place and by file."""
 
 from __future__ import annotations
 
 import os
-from abc import ABC, abstractmethod
+import re
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
-
-from safe_envs.envs.spaces import action_box, observation_box
+from safe_envs.agents.policies.base import DESCRIPTION, TENSORS, Policy, Spaces, saved_policy_files
+from safe_envs.agents.policies.clf import CLFController
+from safe_envs.agents.policies.custom import as_policy
+from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
+from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.object_import import load_object, resolved
+from safe_envs.plugins import POLICIES as POLICY_PLUGINS
+from safe_envs.plugins import load_plugin, plugin_names
 from safe_envs.problem.problem import SafetyProblem
 
-POLICIES = ("nominal", "clf", "zero", "random")
-"""Names that `make_policy` knows besides paths."""
+_NAMED: dict[str, Any] = {
+    "nominal": NominalController,
+    "clf": CLFController,
+    "zero": ZeroController,
+    "random": RandomPolicy,
+}
 
-POLICY_FILE = "policy.npz"
-"""Name of a policy that was saved as data; see `safe_envs.agents.policies.network`."""
+POLICIES = tuple(_NAMED)
+"""Names that `make_policy` knows without any other package."""
 
-Spaces = tuple[gym.Space[Any], gym.Space[Any]]
-"""Of observations and of actions."""
-
-
-class Policy(ABC):
-    """Base of this project's policies, with the `predict` of Stable-Baselines3.
-
-    Attributes:
-        deterministic: whether equal observations get equal actions.
-    """
-
-    deterministic: bool = True
-
-    def begin(self, episodes: range, seed: int) -> None:  # noqa: B027  (most policies need not know)
-        """Learn which episodes the rows of the coming batches belong to, before each wave of an
-        evaluation.
-
-        What a policy does in an episode may depend on the episode and the seed, never on the other
-        rows: the answer of an evaluation must not depend on the size of its waves.
-
-        Args:
-            episodes: one for each row, surplus ones of the last wave included.
-            seed: of the evaluation.
-        """
-
-    @abstractmethod
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: Any = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, Any]:
-        """Choose actions.
-
-        Args:
-            observation: one observation (k,) or a batch (B, k).
-            state: hidden state of a recurrent policy, passed through.
-            episode_start: whether each episode starts here; for recurrent policies.
-            deterministic: ask for the mean action of a random policy that has one.
-
-        Returns:
-            Actions in [-1, 1], shape (m,) or (B, m), and the hidden state.
-        """
+_PLACE = re.compile(r".+\.py:\w+|[^\W\d]\w*(\.\w+)*:\w+")
 
 
 def make_policy(
     name: str, problem: SafetyProblem, trust: bool = False, spaces: Spaces | None = None
-) -> Policy:
-    """Return a named policy, or load one that was trained.
+) -> Any:
+    """Return a named policy, one from a Python file, or one that was trained.
 
     Args:
-        name: one of `POLICIES`; the folder where `safe-envs train` or
-            `safe_envs.agents.policies.network.save_policy` put a policy, or the path of its .npz;
-            or the path of a .zip of Stable-Baselines3.
+        name: one of `POLICIES`; a name that an installed package declares in the entry-point group
+            `safe_envs.policies`; FILE.py:NAME or MODULE:NAME of what `as_policy` takes, which runs
+            that code; the folder where `safe-envs train` or
+            `safe_envs.agents.policies.network.save_policy` put a policy, or one of the two files of
+            the policy in it; or the path of a .zip of Stable-Baselines3.
         problem: which the policy is to act in.
         trust: load a .zip too, which runs code that it contains.
-        spaces: of observations and actions, which a .zip is to fit; by default those of the
-            problem's env.
+        spaces: of observations and actions, which a policy that was trained or is a function is to
+            fit; by default those of the problem's env.
+
+    Returns:
+        A `Policy`, or another object with its `predict`.
 
     Raises:
-        ConfigurationError: there is neither such a name nor such a file, the file does not fit the
+        ConfigurationError: There is neither such a name nor such a file, the file does not fit the
             problem, or it is a .zip that is not trusted.
     """
-    from safe_envs.agents.policies import nominal
-    from safe_envs.agents.policies.clf import CLFController
-
-    named = {
-        "nominal": nominal.NominalController,
-        "clf": CLFController,
-        "zero": nominal.ZeroController,
-        "random": nominal.RandomPolicy,
-    }
-    if name in named:
-        return named[name](problem)
-    file = policy_file(name)
-    if is_data(file):
+    if name in _NAMED:
+        return _NAMED[name](problem)
+    if name in plugin_names(POLICY_PLUGINS):
+        return as_policy(load_plugin(POLICY_PLUGINS, name), problem, spaces)
+    if _is_place(name):
+        return as_policy(load_object(name), problem, spaces)
+    files = policy_files(name)
+    if len(files) > 1:
         from safe_envs.agents.policies.network import load_policy
 
         return load_policy(name, problem)
-    if file is None or not os.path.isfile(file):
+    if not os.path.isfile(files[0]):
+        known = (*POLICIES, *plugin_names(POLICY_PLUGINS))
         raise ConfigurationError(
-            f"unknown policy {shown(name)}; {nearest(name, POLICIES)}, a folder of `safe-envs"
-            " train`, or the path of a Stable-Baselines3 .zip: there is no such file"
+            f"unknown policy {shown(name)}; {nearest(name, known)}, FILE.py:NAME, a folder of"
+            " `safe-envs train`, or the path of a Stable-Baselines3 .zip: there is no such file"
         )
     return _make_of_archive(file, spaces or (observation_box(problem), action_box(problem)), trust)
 
@@ -121,15 +87,25 @@ def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
     return SB3Policy(path, *spaces)
 
 
-def policy_file(name: str) -> Path | None:
-    """Return the file that `make_policy` reads; None for one of `POLICIES`."""
-    if name in POLICIES:
-        return None
-    path = Path(name)
-    # Unlike a path, this takes any text for the name of a file.
-    return path / POLICY_FILE if os.path.isdir(path) else path
+def policy_files(name: str) -> list[Path]:
+    """Return the files that `make_policy` reads, the one with the numbers first.
+
+    There are none for the name of a policy, and for MODULE:NAME.
+    """
+    if name in POLICIES or name in plugin_names(POLICY_PLUGINS):
+        return []
+    if _is_place(name):
+        source = name.rpartition(":")[0]
+        return [Path(source)] if source.endswith(".py") else []
+    return saved_policy_files(Path(name)) or [Path(name)]
 
 
-def is_data(file: Path | None) -> bool:
-    """Return whether a policy's file is one of this project, and not a .zip that holds code."""
-    return file is not None and file.suffix == ".npz"
+def absolute_policy(name: str) -> str:
+    """Return the name of a policy with the whole path of its file, so that it holds in any folder."""
+    if _is_place(name):
+        return resolved(name)
+    return os.path.realpath(name) if policy_files(name) and os.path.exists(name) else name
+
+
+def _is_place(name: str) -> bool:
+    return _PLACE.fullmatch(name) is not None and not os.path.exists(name)

@@ -14,7 +14,7 @@ import numpy as np
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, smallest
 from safe_envs.agents.evaluation.rollout import Env, Progress
 from safe_envs.agents.jobs import blas_threads
-from safe_envs.agents.policies.registry import Policy
+from safe_envs.agents.policies.base import Policy
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import gradient
 from safe_envs.envs.simulation import NoiseStreams

@@ -10,7 +10,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, smallest
 from safe_envs.agents.evaluation.rollout import Env
-from safe_envs.agents.policies.registry import Policy
+from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.rare_events.importance_sampling import MakeDrifting
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable

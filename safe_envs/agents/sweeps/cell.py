@@ -26,10 +26,10 @@ class Cell:
     """One evaluation of a sweep; a `safe_envs.agents.jobs.job.Job`.
 
     Attributes:
-        settings: Value of every setting that is not the env's default, by name; paths are absolute.
+        settings: value of every setting that is not the env's default, by name; paths are absolute.
         files: SHA-256 of each file that it reads, by path.
-        versions: Versions by which it is to be computed; see `versions`.
-        trust: Load a policy's .zip, which runs code that it contains.
+        versions: versions by which it is to be computed; see `versions`.
+        trust: load a policy's .zip, which runs code that it contains.
     """
 
     settings: Mapping[str, Any]
@@ -53,7 +53,7 @@ class Cell:
         """Id of the env that it simulates, or under which custom systems are registered.
 
         Raises:
-            ConfigurationError: There is no such id, or neither or both of env and system are given.
+            ConfigurationError: there is no such id, or neither or both of env and system are given.
         """
         return which_env(self.settings.get("env"), self.settings.get("system"))
 
@@ -71,9 +71,9 @@ class Cell:
         """Return the "row" and the "config" of the evaluation, in any process of this project.
 
         Raises:
-            ConfigurationError: This process has other versions or other files than the one that
+            ConfigurationError: this process has other versions or other files than the one that
                 wrote the cell.
-            SafeEnvsError: The evaluation fails.
+            SafeEnvsError: the evaluation fails.
         """
         self._require_same_code()
         arguments = {name: self.settings[name] for name in EVALUATION_DEFAULTS}
@@ -84,7 +84,7 @@ class Cell:
             options=self.options,
             **arguments,
         )
-        return {"row": found.rows[0], "config": found.config}
+        return {"row": found.rows[0].as_dict(), "config": found.config}
 
     def _require_same_code(self) -> None:
         here = versions()

@@ -9,16 +9,18 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.registry import policy_file
+from safe_envs.agents.policies.registry import absolute_policy, policy_files
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 from safe_envs.wrappers import files_of, with_absolute_paths
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the settings of a cell with paths that mean the same in every process."""
-    found = {**settings, "filter": with_absolute_paths(settings["filter"])}
-    if policy_file(settings["policy"]) and os.path.exists(settings["policy"]):
-        found["policy"] = os.path.realpath(settings["policy"])
+    found = {
+        **settings,
+        "filter": _FILE.sub(lambda match: os.path.realpath(match.group()), settings["filter"]),
+    }
+    found["policy"] = absolute_policy(settings["policy"])
     if "system" in settings:
         file, _, name = settings["system"].rpartition(":")
         found["system"] = f"{os.path.realpath(file)}:{name}"
@@ -59,7 +61,7 @@ def with_imported(path: Path) -> list[Path]:
 
 
 def _imports(file: Path, root: Path) -> Iterable[tuple[Path, Sequence[str]]]:
-    """Yield the imports of a file: the folder in which each begins, and the names down from there."""
+    """Yield the imports of a file: the folder in which each begins, and the names below it."""
     if file.suffix != ".py":
         return
     try:

@@ -24,7 +24,7 @@ _DATE = "tag:yaml.org,2002:timestamp"
 
 
 class _Loader(yaml.SafeLoader):
-    """Loads YAML's data without aliases and tags: nested aliases stand for more than memory holds."""
+    """A loader without aliases and tags: nested aliases stand for more than memory holds."""
 
     # No setting takes a date, and some texts look like one.
     yaml_implicit_resolvers: ClassVar[Any] = {
@@ -70,7 +70,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def construct_number(self, node: Any) -> int | float:
-        """Construct a decimal number; refuse 010, which YAML reads as 8, 1:30, read as 90, and 1_000."""
+        """Construct a decimal number; refuse 010 (8 in YAML), 1:30 (90) and 1_000."""
         if not _PLAIN.fullmatch(node.value):
             raise ConstructorError(None, None, f"{node.value} is no plain number", node.start_mark)
         return whole_or_real(node.value)
@@ -84,7 +84,7 @@ def document_in(path: Path) -> Any:
     """Return the content of a YAML file.
 
     Raises:
-        ConfigurationError: It cannot be read, is no YAML, or holds a name twice or a number in a
+        ConfigurationError: it cannot be read, is no YAML, or holds a name twice or a number in a
             misleading form.
     """
     try:
@@ -104,11 +104,11 @@ def value_of(text: str, name: str) -> Any:
     """Return the value of a text in YAML.
 
     Args:
-        text: In YAML.
-        name: Where it comes from, for the message.
+        text: in YAML.
+        name: where it comes from, for the message.
 
     Raises:
-        YAMLError: It is no YAML, or holds a name twice or a number in a misleading form.
+        YAMLError: it is no YAML, or holds a name twice or a number in a misleading form.
     """
     if len(text) > _MOST_BYTES:
         raise yaml.YAMLError(f"it has {len(text)} characters, more than {_MOST_BYTES}")

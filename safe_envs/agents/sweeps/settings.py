@@ -7,7 +7,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import real
 from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS
@@ -38,11 +38,11 @@ def sections(document: Any, what: str) -> tuple[Settings, dict[str, list[Any]], 
     """Return the sections `fixed`, `grid` and `cells` of a sweep, each checked by itself.
 
     Args:
-        document: Content of the file.
-        what: Name of the sweep in errors.
+        document: content of the file.
+        what: name of the sweep in errors.
 
     Raises:
-        ConfigurationError: A section or a setting is unknown, or a value is not of its setting's
+        ConfigurationError: a section or a setting is unknown, or a value is not of its setting's
             kind.
     """
     given = _mapping(document, what, _SECTIONS)
@@ -57,11 +57,11 @@ def complete(settings: Settings, what: str) -> Settings:
     """Return the settings of a cell in a fixed order, with the defaults of an evaluation.
 
     Args:
-        settings: As given; checked by `sections`.
-        what: Name of the sweep in errors.
+        settings: as given; checked by `sections`.
+        what: name of the sweep in errors.
 
     Raises:
-        ConfigurationError: The cell has no filter, or not just one of env and system.
+        ConfigurationError: the cell has no filter, or not just one of env and system.
     """
     if ("env" in settings) == ("system" in settings):
         raise ConfigurationError(
@@ -69,7 +69,7 @@ def complete(settings: Settings, what: str) -> Settings:
         )
     if "filter" not in settings:
         raise ConfigurationError(
-            f"{what}: a cell has no filter; name one, or {BARE} for the unfiltered env"
+            f"{what}: a cell has no filter; name one, or {UNFILTERED} for the unfiltered env"
         )
     given = {**EVALUATION_DEFAULTS, **settings}
     return {

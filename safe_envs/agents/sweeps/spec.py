@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.policies.registry import make_policy
 from safe_envs.agents.sweeps.cell import Cell, versions
@@ -35,8 +35,8 @@ class Sweep:
     """Cells, in the order of their file.
 
     Attributes:
-        cells: Each once.
-        swept: Names of the settings that are not the same in all of them.
+        cells: each once.
+        swept: names of the settings that are not the same in all of them.
     """
 
     cells: tuple[Cell, ...]
@@ -51,13 +51,13 @@ def read_sweep(path: Path, trust: bool = False) -> Sweep:
     see `docs/guides/sweep.md`.
 
     Args:
-        path: Of the file. Paths in it begin at the working directory.
-        trust: Load a policy's .zip, which runs code that it contains.
+        path: of the file. Paths in it begin at the working directory.
+        trust: load a policy's .zip, which runs code that it contains.
 
     Raises:
-        ConfigurationError: The file cannot be read, or a section, setting, id, filter, policy or
+        ConfigurationError: the file cannot be read, or a section, setting, id, filter, policy or
             value is not allowed.
-        RelativeDegreeError: A filter does not suit a barrier.
+        RelativeDegreeError: a filter does not suit a barrier.
     """
     sweep = sweep_of(document_in(path), trust, what=str(path))
     _check(sweep, str(path))
@@ -68,12 +68,12 @@ def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Swe
     """Return the sweep of a file's content, with names and kinds of values checked.
 
     Args:
-        document: Mapping from the file's sections.
-        trust: See `read_sweep`.
-        what: Name of the sweep in errors.
+        document: mapping from the file's sections.
+        trust: see `read_sweep`.
+        what: name of the sweep in errors.
 
     Raises:
-        ConfigurationError: A section or a setting is not allowed.
+        ConfigurationError: a section or a setting is not allowed.
     """
     fixed, grid, given = sections(document, what)
     for name in (*grid, *itertools.chain.from_iterable(given)):
@@ -145,7 +145,7 @@ def _check(sweep: Sweep, what: str) -> None:
     The others would repeat it, and the problem of a large system takes a second.
 
     Raises:
-        SafeEnvsError: One cannot be made; the message names the cell.
+        SafeEnvsError: one cannot be made; the message names the cell.
     """
     seen: set[str] = set()
     for cell in sweep.cells:
@@ -177,7 +177,7 @@ def _check_cell(cell: Cell, derive: bool) -> None:
                 f"{name} = {shown(settings[name])}; {nearest(settings[name], allowed)}"
             )
     problem = make_problem(cell.env_id, **cell.options)
-    if settings["filter"] != BARE:
+    if settings["filter"] != UNFILTERED:
         require_readable(settings["filter"], problem)
         if derive and not learned_parts(settings["filter"]):
             SafetyFilter.for_problem(

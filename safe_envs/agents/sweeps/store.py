@@ -44,16 +44,16 @@ class Store:
     """The folder of a sweep.
 
     Args:
-        folder: Created if it does not exist.
-        sweep: Whose cells are kept in it. Those of another sweep in the same folder remain, and are
+        folder: created if it does not exist.
+        sweep: whose cells are kept in it. Those of another sweep in the same folder remain, and are
             read until there is one of this sweep.
 
     Attributes:
-        hidden: Number of cells of another sweep, such as one with another grid or another version
+        hidden: number of cells of another sweep, such as one with another grid or another version
             of the code.
 
     Raises:
-        ConfigurationError: The folder cannot be created or written, or pyarrow is not installed.
+        ConfigurationError: the folder cannot be created or written, or pyarrow is not installed.
     """
 
     def __init__(self, folder: Path, sweep: Sweep) -> None:
@@ -86,7 +86,7 @@ class Store:
         """Write an outcome, unless it failed and another run has the result.
 
         Raises:
-            ConfigurationError: It cannot be written, as on a full disk.
+            ConfigurationError: it cannot be written, as on a full disk.
         """
         key = outcome.key
         if outcome.error is not None and self._is_finished(key):
@@ -124,7 +124,7 @@ def read(folder: Path | str) -> pa.Table:
     configuration, the versions and the checksums of files.
 
     Raises:
-        ConfigurationError: The folder holds no sweep, a file in it cannot be read, or pyarrow is
+        ConfigurationError: the folder holds no sweep, a file in it cannot be read, or pyarrow is
             not installed.
     """
     _require_pyarrow()
@@ -153,7 +153,7 @@ def read_index(folder: Path) -> dict[str, Any]:
         The keys of all cells under "cells", and the names of the swept settings under "swept".
 
     Raises:
-        ConfigurationError: The folder holds no sweep.
+        ConfigurationError: the folder holds no sweep.
     """
     try:
         index = json.loads(read_bytes(folder / INDEX, MOST_BYTES_OF_TEXT))

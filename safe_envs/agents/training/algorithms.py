@@ -46,16 +46,16 @@ def new_model(
     """Make an untrained algorithm, whose `get_env()` is `envs`, normalised if the settings say so.
 
     Args:
-        name: See `algorithm_class`.
-        envs: On which it learns.
-        problem: Of the envs.
-        settings: Hyperparameters of the algorithm, and `normalize`, `noise_type` and `noise_std`.
-        action: On which an off-policy algorithm learns with a filter in the loop; None without a
+        name: see `algorithm_class`.
+        envs: on which it learns.
+        problem: of the envs.
+        settings: hyperparameters of the algorithm, and `normalize`, `noise_type` and `noise_std`.
+        action: on which an off-policy algorithm learns with a filter in the loop; None without a
             filter, or on-policy.
-        seed: Of the algorithm.
+        seed: of the algorithm.
 
     Raises:
-        ConfigurationError: The algorithm does not take these settings, or its policy cannot be
+        ConfigurationError: the algorithm does not take these settings, or its policy cannot be
             saved as numbers.
     """
     # Stable-Baselines3 writes into what it is given.
@@ -111,7 +111,7 @@ def _require_known(name: str, settings: Mapping[str, Any]) -> None:
 
 
 def _normalized(envs: VecEnv, normalize: Any, gamma: float) -> VecEnv:
-    """Return the envs, in a VecNormalize if the Zoo's `normalize` (bool, mapping or text) says so."""
+    """Return the envs, in a VecNormalize if the Zoo's `normalize` asks for it."""
     if isinstance(normalize, str):
         normalize = ast.literal_eval(normalize)
     if normalize is False or normalize is None:
@@ -144,7 +144,7 @@ def _replay(problem: SafetyProblem, action: str, settings: dict[str, Any]) -> di
     given = [key for key in _OF_THE_BUFFER if key in settings]
     if given:
         raise ConfigurationError(
-            f"{', '.join(given)}: behind a filter the replay buffer is that of --action; leave"
+            f"{', '.join(given)}: with a filter in the loop the replay buffer is that of --action; leave"
             " it out"
         )
     return replay_options(

@@ -1,6 +1,4 @@
-"""What happens while an agent is trained, for Stable-Baselines3's logger: safety of episodes,
-interventions, infeasible steps.
-"""
+"""Safety of episodes, interventions and infeasible steps during a training, for its logger."""
 
 from __future__ import annotations
 
@@ -25,8 +23,7 @@ _LONGEST = 1_000_000
 
 
 class SafetyFigures(BaseCallback):
-    """Counts what the infos of a `SafeVecEnv` say, and records it under `safety/` whenever a
-    rollout ends.
+    """Counts over the infos of a `SafeVecEnv`, recorded under `safety/` after each rollout.
 
     | key | meaning |
     |---|---|
@@ -37,7 +34,7 @@ class SafetyFigures(BaseCallback):
     | `interventions`, `infeasible` | shares of all steps so far, with a filter |
 
     Attributes:
-        counts: JSON-able, all that has to be kept to go on later.
+        counts: JSON-able, all that is needed to go on later.
     """
 
     def __init__(self) -> None:
@@ -89,7 +86,7 @@ class SafetyFigures(BaseCallback):
         self.counts = counts
 
     def figures(self) -> dict[str, float]:
-        """The figures by name; those of episodes from the first one on that ended."""
+        """Return the figures by name; those of episodes once one has ended."""
         counts = self.counts
         found = {"violations": float(counts["violations"])}
         found |= {
@@ -108,13 +105,11 @@ class SafetyFigures(BaseCallback):
 
 
 class ProgressLog(KVWriter):
-    """Everything that is logged, as a line of JSON for each dump, in a file that a resumed training
-    goes on with.
+    """A log with a line of JSON for each dump, which a resumed training continues.
 
     Args:
         path: of the file.
-        until: lines of later steps are dropped: they were written after the checkpoint from which a
-            training goes on.
+        until: step of the checkpoint from which the training goes on; later lines are dropped.
     """
 
     def __init__(self, path: Path, until: int) -> None:
@@ -124,7 +119,13 @@ class ProgressLog(KVWriter):
     def write(
         self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0
     ) -> None:
-        """Append a line; numbers that are not finite are null."""
+        """Append a line; numbers that are not finite become null.
+
+        Args:
+            key_values: values by name, of which the numbers are kept.
+            key_excluded: ignored.
+            step: of the training.
+        """
         numbers = {
             key: _number(value)
             for key, value in sorted(key_values.items())
@@ -134,11 +135,11 @@ class ProgressLog(KVWriter):
             stream.write(json.dumps({"step": step, **numbers}, allow_nan=False) + "\n")
 
     def close(self) -> None:
-        """There is nothing to close: each line is written at once."""
+        """Do nothing: each line is written at once."""
 
 
 def read_progress(path: Path) -> list[Mapping[str, Any]]:
-    """The lines of a `ProgressLog`."""
+    """Return the lines of a `ProgressLog`."""
     return [line for _, line in _lines(path)]
 
 
@@ -149,7 +150,7 @@ def _copy(path: Path, to: Path, until: int) -> None:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """The whole lines of a log, as they are and read."""
+    """Yield the complete lines of a log, as text and as data."""
     if not path.is_file():
         return
     with reading(path, "remove it"), path.open() as stream:

@@ -1,8 +1,7 @@
-"""Checkpoints of a training: written whole or not at all, and all that it takes to go on as if
-nothing had happened.
+"""Checkpoints of a training, from which it goes on exactly as if it had not been interrupted.
 
-What a training goes on from is data: JSON, and arrays in safetensors. `model.zip` and
-`normalization.pkl` are for the users of Stable-Baselines3; they hold code, and are never read here.
+A training resumes from data: JSON, and arrays in safetensors. `model.zip` and `normalization.pkl`
+are for users of Stable-Baselines3; they hold code, and are never read here.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from safetensors.numpy import load_file
 from safetensors.numpy import save as serialized
 
 from safe_envs.agents.jobs.store import reading
+from safe_envs.agents.policies.base import DESCRIPTION, TENSORS
 from safe_envs.agents.policies.network import save_policy
-from safe_envs.agents.policies.registry import POLICY_FILE
 from safe_envs.agents.training.learner_state import (
     Arrays,
     begin,
@@ -56,20 +55,19 @@ _MOST_TEXT = 1_000_000
 """Bytes of the JSON of a checkpoint, at most: it has a few hundred numbers."""
 
 _HEADER = 1_000_000
-"""Bytes, at most, of what a file of arrays has besides them: their names, types and shapes."""
+"""Bytes, at most, of the names, types and shapes in a file of arrays."""
 
 _PER_PARAMETER = 8
-"""Numbers, at most, that the networks and optimizers of a learner have for one of a new learner,
-which has no optimizers' state yet."""
+"""Ratio, at most, of the size of a learner with the states of its optimizers to that without."""
 
 
 def last_checkpoint(folder: Path) -> Path | None:
-    """The newest checkpoint in the folder of a training."""
+    """Return the newest checkpoint in the folder of a training."""
     return max(folder.glob(f"{_CHECKPOINT}*"), default=None)
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what a training left that was killed while it wrote a checkpoint."""
+    """Remove what a training left that was killed while writing a checkpoint."""
     for part in folder.glob(f".{_CHECKPOINT}*"):
         shutil.rmtree(part, ignore_errors=True)
 
@@ -77,17 +75,17 @@ def remove_unfinished(folder: Path) -> None:
 def keep_checkpoint(
     folder: Path, model: Any, problem: SafetyProblem, figures: SafetyFigures, seconds: float
 ) -> Path:
-    """Write a whole checkpoint beside the last one, and only then remove that.
+    """Write a complete checkpoint, and only then remove the previous one.
 
     Args:
         folder: of the training.
-        model: as it is between two rollouts.
+        model: between two rollouts.
         problem: of its env.
         figures: of the training so far.
         seconds: that it took.
 
     Raises:
-        ConfigurationError: it cannot be written, as on a full disk; the last one stays.
+        ConfigurationError: it cannot be written, as on a full disk; the previous one remains.
     """
     before = list(folder.glob(f"{_CHECKPOINT}*"))
     target = folder / f"{_CHECKPOINT}{model.num_timesteps:012d}"
@@ -124,16 +122,16 @@ def _write(part: Path, model: Any, problem: SafetyProblem, state: dict[str, Any]
 
 
 def restore_model(checkpoint: Path, model: Any, figures: SafetyFigures, n_timesteps: int) -> float:
-    """Give a new model what a checkpoint holds; no code of the checkpoint is run.
+    """Restore a model from a checkpoint, without running code from it.
 
     Args:
         checkpoint: of a model with the same hyperparameters.
-        model: new, over fresh envs, which `resume_episodes` puts where they were.
+        model: new, over fresh envs, whose episodes `resume_episodes` restores.
         figures: new, to go on with those of the checkpoint.
         n_timesteps: after which the training is finished.
 
     Returns:
-        The seconds that the training took until then.
+        Seconds that the training had taken by then.
 
     Raises:
         ConfigurationError: the checkpoint cannot be read, or is that of another model.
@@ -173,11 +171,14 @@ def restore_model(checkpoint: Path, model: Any, figures: SafetyFigures, n_timest
 
 
 def resume_episodes(checkpoint: Path, model: Any, seed: int) -> None:
-    """Put the envs of a model where they were at its checkpoint, with the randomness of a seed from
-    then on.
+    """Restore the episodes of a checkpoint, with the randomness of a seed from then on.
 
-    A training that goes on does this at each of its checkpoints too, so that one which was
-    interrupted does the same.
+    A training does this at each of its checkpoints, so that an interrupted one does the same.
+
+    Args:
+        checkpoint: of the model.
+        model: whose envs to restore.
+        seed: of the episodes from then on.
     """
     with reading(checkpoint, _ADVICE):
         envs = model.get_env()
@@ -185,7 +186,7 @@ def resume_episodes(checkpoint: Path, model: Any, seed: int) -> None:
 
 
 def _arrays(path: Path, most: int) -> Arrays:
-    """Return the arrays of a file, which together have at most so many bytes.
+    """Return the arrays of a file with at most so many bytes of numbers.
 
     Raises:
         OSError: it is no regular file, or larger.
@@ -195,17 +196,22 @@ def _arrays(path: Path, most: int) -> Arrays:
 
 
 def _size(arrays: Arrays) -> int:
-    """The bytes of arrays."""
+    """Return the total size of arrays in bytes."""
     return sum(array.nbytes for array in arrays.values())
 
 
 def _contiguous(arrays: Arrays) -> Arrays:
-    """The arrays in the order in which safetensors reads them."""
+    """Return the arrays in the memory layout that safetensors reads."""
     return {name: np.array(array, order="C") for name, array in arrays.items()}
 
 
 def copy_policy(checkpoint: Path, target: Path) -> None:
-    """Copy what an evaluation reads, and what Stable-Baselines3 does."""
+    """Copy the files of the policy, those for Stable-Baselines3 included.
+
+    Args:
+        checkpoint: to copy from.
+        target: folder to copy to.
+    """
     with writing(target):
         target.mkdir(exist_ok=True)
     for name in _OF_THE_POLICY:
@@ -216,6 +222,6 @@ def copy_policy(checkpoint: Path, target: Path) -> None:
 
 
 def drop_replay_buffer(checkpoint: Path) -> None:
-    """Remove the largest part of a checkpoint, which nobody goes on from."""
+    """Remove the largest part of a finished training's checkpoint."""
     with writing(checkpoint):
         (checkpoint / _BUFFER).unlink(missing_ok=True)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.training.hyperparameters import (
     ACTIONS,
     OFF_POLICY,
@@ -37,25 +37,25 @@ class Training:
     """A training, JSON-able; `Training.of` fills in what the hyperparameters say.
 
     Attributes:
-        env_id: Full id.
+        env_id: full id.
         algorithm: "ppo", "a2c", "sac" or "td3".
-        n_timesteps: Control periods over all copies of the env.
-        num_envs: Number of copies.
-        hyperparameters: Of the algorithm, by the Zoo's names.
-        eval_freq: Steps between evaluations, at each of which a checkpoint is kept.
-        filter: Text of the filter in the loop; None for the unfiltered env.
-        options: Arguments of `gym.make`.
-        knowledge: Of the filter, "model" or "plant".
-        seed: Of everything random.
-        action: On which an off-policy algorithm learns; see
+        n_timesteps: control periods over all copies of the env.
+        num_envs: number of copies.
+        hyperparameters: of the algorithm, by the Zoo's names.
+        eval_freq: steps between evaluations, at each of which a checkpoint is kept.
+        filter: text of the filter in the loop; None for the unfiltered env.
+        options: arguments of `gym.make`.
+        knowledge: of the filter, "model" or "plant".
+        seed: of everything random.
+        action: on which an off-policy algorithm learns; see
             `safe_envs.agents.training.replay_buffer`.
-        intervention_penalty: See `safe_envs.agents.training.vec_env.make_sb3_env`.
-        eval_episodes: Of each evaluation.
-        threads: Of torch and BLAS. Small networks are many times slower on several threads of a
+        intervention_penalty: see `safe_envs.agents.training.vec_env.make_sb3_env`.
+        eval_episodes: of each evaluation.
+        threads: of torch and BLAS. Small networks are many times slower on several threads of a
             busy machine.
 
     Raises:
-        ConfigurationError: A value is not allowed.
+        ConfigurationError: a value is not allowed.
     """
 
     env_id: str
@@ -88,7 +88,7 @@ class Training:
             raise ConfigurationError(f"action = {self.action!r}; {nearest(self.action, ACTIONS)}")
         if self.action != ACTIONS[0] and not self.learns_on_executed:
             raise ConfigurationError(
-                f"action = {self.action!r} is for SAC and TD3 behind a filter; leave it out: others"
+                f"action = {self.action!r} is for SAC and TD3 with a filter in the loop; leave it out: others"
                 " learn on what they propose"
             )
         if self.action == ACTIONS[0] and self.learns_on_executed and self.intervention_penalty:
@@ -117,17 +117,17 @@ class Training:
         """Return a training with the hyperparameters of `hyperparams`, except for what is given.
 
         Args:
-            env_id: Registered id, with or without its namespace.
-            algorithm: See the class.
-            settings: Hyperparameters in place of the file's.
-            n_timesteps: By default that of the hyperparameters.
-            num_envs: By default the hyperparameters' `n_envs`.
-            eval_freq: By default a tenth of the training.
-            **attributes: Other attributes of the class; options that are None are left out, and the
+            env_id: registered id, with or without its namespace.
+            algorithm: see the class.
+            settings: hyperparameters in place of the file's.
+            n_timesteps: by default that of the hyperparameters.
+            num_envs: by default the hyperparameters' `n_envs`.
+            eval_freq: by default a tenth of the training.
+            **attributes: other attributes of the class; options that are None are left out, and the
                 filter may be "none".
 
         Raises:
-            ConfigurationError: A value is not allowed.
+            ConfigurationError: a value is not allowed.
         """
         known, given = full_id(env_id), dict(settings or {})
         found = {**hyperparameters(algorithm, known), **given}
@@ -145,7 +145,7 @@ class Training:
             # The whole training, where Stable-Baselines3 would allocate a million rows.
             rows = steps * (2 if attributes.get("action") == "both" else 1)
             found.setdefault("buffer_size", min(_MOST_ROWS, rows))
-        if attributes.get("filter") == BARE:
+        if attributes.get("filter") == UNFILTERED:
             attributes["filter"] = None
         options = attributes.pop("options", None) or {}
         return cls(

@@ -24,11 +24,11 @@ def hyperparameters(algorithm: str, env_id: str) -> dict[str, Any]:
     """Return the hyperparameters of an env in `hyperparams/ALGORITHM.yml`, or its defaults.
 
     Args:
-        algorithm: One of `ALGORITHMS`.
-        env_id: Full id.
+        algorithm: one of `ALGORITHMS`.
+        env_id: full id.
 
     Raises:
-        ConfigurationError: The algorithm is unknown.
+        ConfigurationError: the algorithm is unknown.
     """
     import yaml
 
@@ -44,12 +44,12 @@ def whole_batches(batch_size: int, rollout: int, asked_for: bool) -> int:
     """Return the largest size of minibatches up to a given one that divides a rollout.
 
     Args:
-        batch_size: Wanted, from 2.
-        rollout: Steps of all envs together.
-        asked_for: Whether a user chose the size, who is not to get another one.
+        batch_size: wanted, from 2.
+        rollout: steps of all envs together.
+        asked_for: whether a user chose the size, who is not to get another one.
 
     Raises:
-        ConfigurationError: The size is no whole number from 2, or was asked for and does not divide
+        ConfigurationError: the size is no whole number from 2, or was asked for and does not divide
             the rollout.
     """
     if isinstance(batch_size, bool) or not isinstance(batch_size, int) or batch_size < 2:

@@ -1,4 +1,4 @@
-"""The info of one env of a batch, made from the batch's arrays only as far as it is read."""
+"""The info of one env of a batch, made from the batch's arrays as it is read."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class LazyInfo(dict[str, Any]):
         index: of the env in the batch.
 
     Args:
-        batch: see above; arrays that nobody changes any more.
+        batch: see above; arrays that are not changed any more.
         index: see above.
     """
 

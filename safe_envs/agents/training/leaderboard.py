@@ -7,7 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import BARE, evaluate
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.jobs.store import ResultStore, reading
 from safe_envs.agents.training.config import Training
@@ -28,11 +29,11 @@ class LeaderboardOptions:
     """What all rows of a leaderboard have in common.
 
     Attributes:
-        algo: Name of the algorithm.
-        seed: Of all randomness.
-        quick: Train for moments only.
-        episodes: Of each evaluation.
-        knowledge: Of the filters. With a wrong model they would have to be learned first, which is
+        algo: name of the algorithm.
+        seed: of all randomness.
+        quick: train for moments only.
+        episodes: of each evaluation.
+        knowledge: of the filters. With a wrong model they would have to be learned first, which is
             another comparison.
     """
 
@@ -44,18 +45,21 @@ class LeaderboardOptions:
 
 
 def leaderboard_rows(
-    env_ids: Sequence[str], options: LeaderboardOptions, out: Path, tell: Callable[[float], None]
+    env_ids: Sequence[str],
+    options: LeaderboardOptions,
+    out: Path,
+    progress: Callable[[float], None],
 ) -> list[Row]:
     """Return five rows for each env, computed unless a previous run has kept them.
 
     Args:
-        env_ids: Full ids.
-        options: Of the leaderboard.
-        out: Folder of the agents and of the results.
-        tell: Receives the part of the work that is done, from 0 to 1.
+        env_ids: full ids.
+        options: of the leaderboard.
+        out: folder of the agents and of the results.
+        progress: receives the part of the work that is done, from 0 to 1.
 
     Raises:
-        ConfigurationError: The folder has results of other options, or files that are damaged.
+        ConfigurationError: the folder has results of other options, or files that are damaged.
     """
     store = ResultStore(out / "results")
     store.require_same_options([_key(env_id) for env_id in ENV_IDS], asdict(options))
@@ -63,11 +67,13 @@ def leaderboard_rows(
     for k, env_id in enumerate(env_ids):
         rows = _kept(store, env_id, options)
         if rows is None:
-            of_env = _rows_of_env(env_id, options, out, lambda part, k=k: tell((k + part) / count))
+            of_env = _rows_of_env(
+                env_id, options, out, lambda part, k=k: progress((k + part) / count)
+            )
             rows = list(of_env)
             store.keep(_key(env_id), _configuration(env_id, options), {"rows": rows})
         found += rows
-        tell((k + 1) / count)
+        progress((k + 1) / count)
     return found
 
 
@@ -95,14 +101,14 @@ def _kept(store: ResultStore, env_id: str, options: LeaderboardOptions) -> list[
 
 
 def _rows_of_env(
-    env_id: str, options: LeaderboardOptions, out: Path, tell: Callable[[float], None]
+    env_id: str, options: LeaderboardOptions, out: Path, progress: Callable[[float], None]
 ) -> Iterator[Row]:
-    """Yield the rows of the nominal controller, of an agent, and of one with the filter in the loop."""
+    """Yield the rows of the nominal controller, and of agents without and with the filter."""
     default, algo = make_problem(env_id).filter, options.algo
-    yield from _evaluated(env_id, "nominal", "nominal", [BARE, default], options)
+    yield from _evaluated(env_id, "nominal", "nominal", [UNFILTERED, default], options)
     for i, (name, kind, in_loop, filters) in enumerate(
         (
-            (algo, "bare", None, [BARE, default]),
+            (algo, "unfiltered", None, [UNFILTERED, default]),
             (f"{algo}, filter in the loop", "filtered", default, [default]),
         )
     ):
@@ -119,7 +125,7 @@ def _rows_of_env(
             training,
             folder,
             resume=(folder / "config.json").exists(),
-            tell=lambda part, i=i: tell((i + part) / 2),
+            progress=lambda part, i=i: progress((i + part) / 2),
         )
         yield from _evaluated(env_id, name, str(folder), filters, options, seconds)
 
@@ -142,5 +148,5 @@ def _evaluated(
         bounds=False,
     )
     for row in found.rows:
-        statistics = {name: row[name] for name in ("filter", *_STATISTICS)}
+        statistics = {name: getattr(row, name) for name in ("filter", *_STATISTICS)}
         yield {"env_id": env_id, "policy": name, **statistics, "trained_in": seconds}

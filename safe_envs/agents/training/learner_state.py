@@ -1,9 +1,7 @@
-"""The state of a learner of Stable-Baselines3 as arrays, without pickle: reading it back runs no
-code.
+"""The state of a learner of Stable-Baselines3 as arrays; reading them runs no code.
 
-A restored learner is built from the hyperparameters of its training first, as a new one is. So a
-checkpoint holds only what training changes, and its arrays must have the names, shapes and types of
-those of the new learner.
+A learner is restored into a new one with the same hyperparameters. So a checkpoint holds only what
+training changes, and its arrays must have the names, shapes and types of those of the new learner.
 """
 
 from __future__ import annotations
@@ -29,14 +27,12 @@ these types."""
 
 
 def counters(model: Any) -> dict[str, int]:
-    """Return what a model counts while it learns, as JSON holds it."""
+    """Return the counters of a model, JSON-able."""
     return {name: getattr(model, name) for name in _COUNTERS if hasattr(model, name)}
 
 
 def begin(model: Any) -> None:
-    """Reset the envs of a new model, so that it has all arrays that one in training has but for
-    those of its optimizers.
-    """
+    """Reset the envs of a new model, so that only the states of its optimizers are missing."""
     envs, scales = model.get_env(), model.get_vec_normalize_env()
     model._last_obs = envs.reset()
     model._last_episode_starts = np.ones(envs.num_envs, dtype=bool)
@@ -47,7 +43,7 @@ def begin(model: Any) -> None:
 
 
 def learner_arrays(model: Any) -> Arrays:
-    """Return what a model has learned, and what it goes on from, by name.
+    """Return the learned arrays of a model, and those from which it goes on, by name.
 
     Args:
         model: between two rollouts, or after `begin`.
@@ -78,7 +74,7 @@ def learner_arrays(model: Any) -> Arrays:
 def restore_learner(
     model: Any, arrays: Mapping[str, np.ndarray], counts: Mapping[str, int]
 ) -> None:
-    """Give a new model what `learner_arrays` and `counters` returned of another one.
+    """Restore a new model from the `learner_arrays` and `counters` of another one.
 
     Args:
         model: with the same hyperparameters, after `begin`.
@@ -98,7 +94,7 @@ def restore_learner(
     _restore_tensors(model, arrays)
     for name in _OBSERVED:
         if name in arrays:
-            # As those of the envs lie in memory, on which it depends how sums are rounded.
+            # In the memory layout of the envs' arrays, on which the rounding of sums depends.
             setattr(model, name, np.empty_like(getattr(model, name)))
             getattr(model, name)[...] = arrays[name]
     for layer, moments in _moments(model.get_vec_normalize_env()):
@@ -114,8 +110,8 @@ def restore_learner(
 def buffer_arrays(buffer: ReplayBuffer) -> Arrays:
     """Return the rows of a replay buffer that are filled, as views.
 
-    A buffer that saves memory has the last next observation in the row after them, where the next
-    step's observation replaces it.
+    A buffer that saves memory has the last next observation in the row after them, which the next
+    step's observation overwrites.
     """
     rows = buffer.buffer_size if buffer.full else buffer.pos
     return {name: getattr(buffer, name)[:rows] for name in _ROWS if hasattr(buffer, name)}
@@ -124,7 +120,7 @@ def buffer_arrays(buffer: ReplayBuffer) -> Arrays:
 def restore_buffer(
     buffer: ReplayBuffer, arrays: Mapping[str, np.ndarray], pos: Any, full: Any
 ) -> None:
-    """Fill a new replay buffer with what `buffer_arrays` returned of one with the same arguments.
+    """Restore a new replay buffer from the `buffer_arrays` of one with the same arguments.
 
     Args:
         buffer: to fill.
@@ -146,18 +142,16 @@ def restore_buffer(
 
 
 def env_arrays(envs: VecEnv) -> Arrays:
-    """Return where the episodes of a `SafeVecEnv` and of the VecMonitor and VecNormalize over it
-    stand, as arrays by name.
-    """
+    """Return the states of the episodes of a `SafeVecEnv` and of the wrappers over it, by name."""
     found = dict(envs.unwrapped.snapshot())  # pyright: ignore[reportAttributeAccessIssue]
     return found | {f"{name}_of_layers": getattr(layer, name) for layer, name in _sums(envs)}
 
 
 def restore_envs(envs: VecEnv, arrays: Mapping[str, np.ndarray], seed: int) -> None:
-    """Go on from what `env_arrays` returned, with the randomness of a seed.
+    """Restore the `env_arrays`, with the randomness of a seed.
 
     Args:
-        envs: that were reset, or are to go on from where they are.
+        envs: that were reset, or that go on with their episodes.
         arrays: see `env_arrays`.
         seed: of the noise and of the starts from then on.
 
@@ -210,7 +204,7 @@ def _restore_tensors(model: Any, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def _networks(model: Any) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The tensors of each network, by name, which share memory with it."""
+    """Yield the tensors of each network, which share memory with it, by name."""
     optimizers = dict(_optimizers(model))
     yield from (
         (name, state) for name, state in model.get_parameters().items() if name not in optimizers
@@ -228,14 +222,12 @@ def _optimizers(model: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _variables(model: Any) -> list[str]:
-    """Names of the tensors outside of networks, such as SAC's coefficient of entropy."""
+    """Return the names of tensors outside of networks, such as SAC's entropy coefficient."""
     return model._get_torch_save_params()[1]
 
 
 def _shapes_by_parameter(model: Any) -> dict[str, tuple[int, ...]]:
-    """The shape of each parameter by NAME/NUMBER, under which an optimizer keeps what belongs to
-    it.
-    """
+    """Return the shape of each parameter by the NAME/NUMBER of its optimizer state."""
     found: dict[str, tuple[int, ...]] = {}
     for name, optimizer in _optimizers(model):
         parameters = [
@@ -246,7 +238,7 @@ def _shapes_by_parameter(model: Any) -> dict[str, tuple[int, ...]]:
 
 
 def _moments(scales: Any) -> Iterator[tuple[str, Any]]:
-    """The running means of a VecNormalize, by name."""
+    """Yield the running means of a VecNormalize, by name."""
     if scales is not None:
         yield from (
             (name, getattr(scales, name))
@@ -256,7 +248,7 @@ def _moments(scales: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _sums(envs: VecEnv) -> list[tuple[Any, str]]:
-    """What the wrappers add up in an episode."""
+    """Return the wrappers with the names of their sums over an episode."""
     from stable_baselines3.common.vec_env import VecMonitor, VecNormalize, unwrap_vec_wrapper
 
     monitor, scales = (unwrap_vec_wrapper(envs, layer) for layer in (VecMonitor, VecNormalize))

@@ -26,10 +26,10 @@ class NativeVecEnv(VecEnv):
     """Base of a `VecEnv` over one native vector env, whose attributes all its envs share.
 
     Attributes:
-        env: The native vector env, with or without a filter.
+        env: the native vector env, with or without a filter.
 
     Args:
-        env: See above.
+        env: see above.
     """
 
     def __init__(self, env: SafeVectorEnv | SafetyFilterVectorWrapper) -> None:
@@ -64,11 +64,11 @@ class NativeVecEnv(VecEnv):
         is one object for all.
 
         Args:
-            attr_name: Name of the attribute.
-            indices: Of the envs to ask for.
+            attr_name: name of the attribute.
+            indices: of the envs to ask for.
 
         Raises:
-            AttributeError: Neither has it.
+            AttributeError: neither has it.
         """
         value = self._find(_OF_ONE_ENV.get(attr_name, attr_name))
         if attr_name in _TUPLES_OF_ENVS:
@@ -79,13 +79,13 @@ class NativeVecEnv(VecEnv):
         """Set an attribute for all envs, where it exists or else on the native env.
 
         Args:
-            attr_name: Name of the attribute.
-            value: New value.
-            indices: Of all envs.
+            attr_name: name of the attribute.
+            value: new value.
+            indices: of all envs.
 
         Raises:
-            AttributeError: It is a property that cannot be set.
-            ConfigurationError: Some envs are left out, which share their attributes with the
+            AttributeError: it is a property that cannot be set.
+            ConfigurationError: some envs are left out, which share their attributes with the
                 others.
         """
         if set(self._get_indices(indices)) != set(range(self.num_envs)):
@@ -109,14 +109,14 @@ class NativeVecEnv(VecEnv):
         `render`, each env gets its picture.
 
         Args:
-            method_name: Name of the method.
-            *method_args: Its arguments.
-            indices: Of the envs to return a result for.
-            **method_kwargs: Its keyword arguments.
+            method_name: name of the method.
+            *method_args: its arguments.
+            indices: of the envs to return a result for.
+            **method_kwargs: its keyword arguments.
 
         Raises:
-            AttributeError: Neither has it.
-            ConfigurationError: The method advances the envs, which only this class may do.
+            AttributeError: neither has it.
+            ConfigurationError: the method advances the envs, which only this class may do.
         """
         # Gymnasium has these two for single envs only.
         if method_name == "get_wrapper_attr":
@@ -137,8 +137,8 @@ class NativeVecEnv(VecEnv):
         """Return whether each env is in such a wrapper.
 
         Args:
-            wrapper_class: To look for; `SafetyFilterWrapper` includes that of vector envs.
-            indices: Of the envs to ask for.
+            wrapper_class: to look for; `SafetyFilterWrapper` includes that of vector envs.
+            indices: of the envs to ask for.
         """
         wanted = (
             SafetyFilterVectorWrapper if wrapper_class is SafetyFilterWrapper else wrapper_class

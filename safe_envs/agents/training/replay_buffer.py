@@ -1,5 +1,4 @@
-"""Which action a learner behind a filter learns on: the executed one off-policy, the proposed one
-on-policy.
+"""Replay buffers for learning with a filter in the loop, on executed or on proposed actions.
 
 A policy proposes a, a filter executes u(a). Stable-Baselines3 stores a: `_store_transition` knows
 of no other action.
@@ -21,18 +20,17 @@ that.
 On-policy (PPO, A2C) the proposal has to stay, and no buffer for it is offered. The loss weights a
 sample by pi_new(a | s) / pi_old(a | s) with the stored log-probability of the a that was sampled.
 With u in its place the ratio is not 1 before the first update, and u has no density under pi that
-could be stored: all proposals beyond a barrier row are mapped onto it. The filter is part of the
-env there. Stable-Baselines3 treats its own clipping to the box in the same way:
+could be stored: all proposals beyond a constraint are mapped onto it. The filter is part of the
+env there. Stable-Baselines3 treats its own clipping to the action space in the same way:
 `OnPolicyAlgorithm.collect_rollouts` sends the clipped action to the env and stores the sampled one.
 
 Sources: Krasowski et al., "Provably Safe Reinforcement Learning: Conceptual Analysis, Survey, and
-    Benchmarking", 2022,
-arXiv:2205.06750, on the learning tuples; Gros, Zanon, Bemporad, "Safe Reinforcement Learning via
-Projection on a Safe Set: How to Achieve Optimality?", 2020, arXiv:2004.00915, on what a projection
-does to Q-learning and to policy gradients; Markgraf et al., "Safe Reinforcement Learning using
-Action Projection: Safeguard the Policy or the Environment?", 2025, arXiv:2509.12833, on actions
-that are mapped to one; Schulman et al., "Proximal Policy Optimization Algorithms", 2017,
-arXiv:1707.06347, on the ratio.
+    Benchmarking", 2022, arXiv:2205.06750, on the learning tuples; Gros, Zanon, Bemporad, "Safe
+    Reinforcement Learning via Projection on a Safe Set: How to Achieve Optimality?", 2020,
+    arXiv:2004.00915, on the effect of a projection on Q-learning and policy gradients; Markgraf et
+    al., "Safe Reinforcement Learning using Action Projection: Safeguard the Policy or the
+    Environment?", 2025, arXiv:2509.12833, on actions that are mapped to one; Schulman et al.,
+    "Proximal Policy Optimization Algorithms", 2017, arXiv:1707.06347, on the ratio.
 """
 
 from __future__ import annotations
@@ -50,7 +48,7 @@ from safe_envs.errors import ConfigurationError, nearest, require_whole
 from safe_envs.problem.problem import SafetyProblem
 
 _ROUNDING = 1e-6
-"""How far beyond [-1, 1] rounding may put an action of the box."""
+"""How far beyond [-1, 1] rounding may move an action on the input bounds."""
 
 
 class FilteredReplayBuffer(ReplayBuffer):
@@ -109,7 +107,7 @@ class FilteredReplayBuffer(ReplayBuffer):
             infos: of the step just taken, not of the reset after it.
 
         Raises:
-            ConfigurationError: an executed action is not in the box.
+            ConfigurationError: an executed action is out of the input bounds.
         """
         if self.action != "proposed":
             super().add(
@@ -124,9 +122,7 @@ class FilteredReplayBuffer(ReplayBuffer):
             super().add(obs, next_obs, action, reward, done, infos)
 
     def _executed(self, proposed: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
-        """The executed actions in [-1, 1], shape (n_envs, m); the proposals of envs without a
-        filter.
-        """
+        """Return the executed actions in [-1, 1], or proposals without a filter, shape (n_envs, m)."""
         each = _of_each(infos, "safe_action")
         if isinstance(each, np.ndarray):
             return self._normalized(each)
@@ -144,18 +140,19 @@ class FilteredReplayBuffer(ReplayBuffer):
             low, high = self._center - self._half, self._center + self._half
             raise ConfigurationError(
                 f"the executed actions {physical.tolist()} are not between {low.tolist()} and"
-                f" {high.tolist()}; give the box of the env's problem, as replay_options(env) does"
+                f" {high.tolist()}; give the input bounds of the env's problem, as replay_options(env) does"
             )
         return clipped
 
 
 class FilteredNStepReplayBuffer(FilteredReplayBuffer, NStepReplayBuffer):
-    """The same for n-step returns, with the arguments `n_steps` and `gamma`; the action is that of
-    the first step.
+    """A `FilteredReplayBuffer` for n-step returns, with the action of the first step.
+
+    Its further arguments are `n_steps` and `gamma`.
 
     Raises:
-        ConfigurationError: as above, or `action` is "both": consecutive rows have to be consecutive
-            steps.
+        ConfigurationError: as for `FilteredReplayBuffer`, or `action` is "both": consecutive
+            rows have to be consecutive steps.
     """
 
     def __init__(self, *args: Any, action: str = "executed", **kwargs: Any) -> None:
@@ -173,13 +170,14 @@ def replay_options(
     n_steps: int = 1,
     gamma: float = 0.99,
 ) -> dict[str, Any]:
-    """Arguments of SAC, TD3 and DDPG that make them learn on an action, as in `SAC("MlpPolicy",
-    env, **replay_options(env))`.
+    """Return the arguments of SAC, TD3 or DDPG with which they learn on an action.
+
+    Example: `SAC("MlpPolicy", env, **replay_options(env))`.
 
     Args:
         source: the problem, or an env of it with or without filter.
         action: "executed", "proposed" or "both".
-        n_steps: of the returns. It is not to be given to the algorithm, which ignores it beside a
+        n_steps: of the returns. Do not give it to the algorithm, which ignores it if it has a
             buffer class.
         gamma: discount. With `n_steps` > 1 the buffer needs it too, and it is among the returned
             arguments.
@@ -201,7 +199,7 @@ def replay_options(
 
 
 def _own_reward(reward: np.ndarray, infos: Sequence[Any]) -> np.ndarray:
-    """The envs' rewards before a penalty on interventions, shape (n_envs,)."""
+    """Return the rewards before a penalty on interventions, shape (n_envs,)."""
     penalties = _of_each(infos, "intervention_penalty")
     if isinstance(penalties, list):
         penalties = np.array([penalty or 0.0 for penalty in penalties])
@@ -209,10 +207,10 @@ def _own_reward(reward: np.ndarray, infos: Sequence[Any]) -> np.ndarray:
 
 
 def _of_each(infos: Sequence[Any], key: str) -> np.ndarray | list[Any]:
-    """An entry of every info: an array over the envs if they are views of one batch that has it;
-    else a list, None where it is missing.
+    """Return an entry of every info: an array if they are views of one batch, or a list.
 
-    An info may have `batch`, a dict of arrays over the envs, and `index`, its row in them.
+    An info may have `batch`, a dict of arrays over the envs, and `index`, its row in them. The list
+    has None for a missing entry.
     """
     batch = getattr(infos[0], "batch", None)
     if (
@@ -258,7 +256,7 @@ def _box_of(source: Any) -> tuple[tuple[float, float], ...]:
         ) from error
     if len(boxes) > 1:
         raise ConfigurationError(
-            f"the envs have different boxes {sorted(boxes)}; one learner needs one box for all of"
+            f"the envs have different input bounds {sorted(boxes)}; one learner needs the same for all of"
             " them"
         )
     return boxes.pop()

@@ -1,4 +1,4 @@
-"""The folder of a training, apart from its checkpoints: what it holds, and whether it may be used."""
+"""The folder of a training, apart from its checkpoints."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def require_folder(folder: Path, training: Training, resume: bool) -> None:
     """Check that a folder is new, or with `resume` that of the same training.
 
     Args:
-        folder: Of the training.
-        training: To do.
-        resume: Whether to go on with it.
+        folder: of the training.
+        training: to do.
+        resume: whether to go on with it.
 
     Raises:
-        ConfigurationError: It is not.
+        ConfigurationError: it is not.
     """
     if resume:
         _require_same_training(folder, training)
@@ -92,8 +92,8 @@ def prepare(folder: Path, training: Training) -> None:
     """Remove the remains of a training without a checkpoint, and write the configuration.
 
     Args:
-        folder: Of the training.
-        training: To begin.
+        folder: of the training.
+        training: to begin.
     """
     with writing(folder):
         for name in (EVALUATIONS, PROGRESS):
@@ -105,7 +105,7 @@ def read_evaluations(folder: Path) -> list[dict[str, Any]]:
     """Return the evaluations so far.
 
     Raises:
-        ConfigurationError: Their file is damaged or altered.
+        ConfigurationError: their file is damaged or altered.
     """
     path = folder / EVALUATIONS
     if not path.exists():

@@ -18,7 +18,8 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecMonitor
 
-from safe_envs.agents.evaluation.evaluate import BARE, evaluate
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.training.algorithms import MOST_SHOWN, new_model
 from safe_envs.agents.training.callbacks import ProgressLog, SafetyFigures
 from safe_envs.agents.training.checkpoints import (
@@ -51,12 +52,12 @@ class TrainingSession:
     """One run of a training, from its beginning or from a checkpoint.
 
     Attributes:
-        seconds: Processor time that the learning took, in all runs of the training so far.
+        seconds: processor time that the learning took, in all runs of the training so far.
 
     Args:
-        training: What to do.
-        folder: Of the training.
-        resume: Go on after the last checkpoint.
+        training: what to do.
+        folder: of the training.
+        resume: go on after the last checkpoint.
     """
 
     def __init__(self, training: Training, folder: Path, resume: bool = False) -> None:
@@ -102,7 +103,7 @@ class TrainingSession:
             outputs.append(of_run)
         self._model.set_logger(Logger(str(folder), outputs))
 
-    def run(self, tell: Callable[[float], None]) -> None:
+    def run(self, progress: Callable[[float], None]) -> None:
         """Train part by part, from the state of the model, and leave the finished policy."""
         training, model, folder = self._training, self._model, self._folder
         checkpoint = last_checkpoint(folder)
@@ -112,7 +113,7 @@ class TrainingSession:
             self._evaluate(checkpoint)
         while model.num_timesteps < training.n_timesteps:
             end = (model.num_timesteps // training.eval_freq + 1) * training.eval_freq
-            self._train_part(checkpoint, min(end, training.n_timesteps), tell)
+            self._train_part(checkpoint, min(end, training.n_timesteps), progress)
             checkpoint = keep_checkpoint(folder, model, self._problem, self._figures, self.seconds)
             self._evaluate(checkpoint)
         if checkpoint is not None:
@@ -120,7 +121,9 @@ class TrainingSession:
             drop_replay_buffer(checkpoint)
         model.get_env().close()
 
-    def _train_part(self, checkpoint: Path | None, end: int, tell: Callable[[float], None]) -> None:
+    def _train_part(
+        self, checkpoint: Path | None, end: int, progress: Callable[[float], None]
+    ) -> None:
         training, model = self._training, self._model
         seed = _child_seed(training.seed, model.num_timesteps)
         set_random_seed(seed)
@@ -131,7 +134,7 @@ class TrainingSession:
             resume_episodes(checkpoint, model, seed)
 
         def note(_: dict[str, Any], __: dict[str, Any]) -> bool:
-            tell(min(model.num_timesteps / training.n_timesteps, 1.0))
+            progress(min(model.num_timesteps / training.n_timesteps, 1.0))
             return True  # anything else would end the training
 
         # Schedules refer to the whole training, not to its part.
@@ -159,8 +162,8 @@ class TrainingSession:
                 raise
             raise ConfigurationError(
                 f"the training failed after {model.num_timesteps} steps ({type(error).__name__}:"
-                f" {str(error)[:MOST_SHOWN]}): it diverged, or a hyperparameter is not allowed; they are"
-                f" {str(training.hyperparameters)[:MOST_SHOWN]}"
+                f" {str(error)[:MOST_SHOWN]}): it diverged, or a hyperparameter is not allowed;"
+                f" they are {str(training.hyperparameters)[:MOST_SHOWN]}"
             ) from error
         finally:
             del model._update_current_progress_remaining
@@ -175,14 +178,14 @@ class TrainingSession:
         found = evaluate(
             training.env_id,
             str(checkpoint),
-            [training.filter or BARE],
+            [training.filter or UNFILTERED],
             options=training.options,
             episodes=training.eval_episodes,
             seed=seed,
             knowledge=training.knowledge,
             bounds=False,
         )
-        row = {k: v for k, v in found.rows[0].items() if k not in ("curve", "policy")}
+        row = {k: v for k, v in found.rows[0].as_dict().items() if k not in ("curve", "policy")}
         best = max((e["return_mean"] for e in self._evaluations), default=-np.inf)
         self._evaluations.append(
             {

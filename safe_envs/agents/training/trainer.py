@@ -24,7 +24,7 @@ def train(
     *,
     resume: bool = False,
     tensorboard: Path | None = None,
-    tell: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] | None = None,
 ) -> float:
     """Train an agent, and leave in a folder the agent and the record of its training.
 
@@ -36,19 +36,19 @@ def train(
     `safe-envs evaluate`.
 
     Args:
-        training: What to do.
-        folder: A new one, or with `resume` that of an interrupted training. Nothing in it is run;
+        training: what to do.
+        folder: a new one, or with `resume` that of an interrupted training. Nothing in it is run;
             Stable-Baselines3's files are not read.
-        resume: Go on after the last checkpoint.
-        tensorboard: Folder of logs for tensorboard, in which this training gets one named after its
+        resume: go on after the last checkpoint.
+        tensorboard: folder of logs for tensorboard, in which this training gets one named after its
             own.
-        tell: Receives the part of the training that is done, from 0 to 1.
+        progress: receives the part of the training that is done, from 0 to 1.
 
     Returns:
         Processor time of the learning in seconds, over all its runs and without evaluations.
 
     Raises:
-        ConfigurationError: The folder holds something else, another training writes to it, or it
+        ConfigurationError: the folder holds something else, another training writes to it, or it
             cannot be written, as on a full disk; or the training is not the one that is resumed.
     """
     torch.set_num_threads(training.threads)
@@ -76,5 +76,5 @@ def train(
             prepare(folder, training)
         session.log(tensorboard)
         with blas_threads.limited(training.threads):
-            session.run(tell or (lambda _: None))
+            session.run(progress or (lambda _: None))
     return session.seconds

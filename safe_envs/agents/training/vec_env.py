@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.training.lazy_info import LazyInfo
 from safe_envs.agents.training.native_vec_env import NativeVecEnv
 from safe_envs.envs.info import Info
@@ -44,20 +44,20 @@ def make_sb3_env(
     """Make the `VecEnv` of a registered env for the algorithms of Stable-Baselines3.
 
     Args:
-        env_id: Registered id, with or without its namespace.
-        num_envs: Size of the batch.
-        filter: A `Condition` for every barrier, one for each, or their text; None or "none" for the
+        env_id: registered id, with or without its namespace.
+        num_envs: size of the batch.
+        filter: a `Condition` for every barrier, one for each, or their text; None or "none" for the
             unfiltered env.
-        knowledge: What the filter knows; see `SafetyFilterWrapper`.
-        objective: Of the filter; see `SafetyFilterWrapper`.
-        intervention_penalty: See `SafeVecEnv`.
+        knowledge: what the filter knows; see `SafetyFilterWrapper`.
+        objective: of the filter; see `SafetyFilterWrapper`.
+        intervention_penalty: see `SafeVecEnv`.
         seed: Env i is seeded by seed + i at its first reset; an algorithm's own `seed` comes later
             and replaces it.
-        **options: Arguments of `gym.make`; those that are None are left out.
+        **options: arguments of `gym.make`; those that are None are left out.
 
     Raises:
-        ConfigurationError: An id, a filter or an argument is unknown or out of range.
-        RelativeDegreeError: The filter does not suit the env's barrier.
+        ConfigurationError: an id, a filter or an argument is unknown or out of range.
+        RelativeDegreeError: the filter does not suit the env's barrier.
     """
     require_whole("num_envs", num_envs, 1)
     if seed is not None:
@@ -72,7 +72,7 @@ def make_sb3_env(
         autoreset_mode=AutoresetMode.SAME_STEP.value,
         **given,
     )
-    if filter is not None and filter != BARE:
+    if filter is not None and filter != UNFILTERED:
         env = SafetyFilterVectorWrapper(env, filter, knowledge, objective)
     result = SafeVecEnv(env, intervention_penalty)
     if seed is not None:
@@ -97,17 +97,17 @@ class SafeVecEnv(NativeVecEnv):
     penalty.
 
     Attributes:
-        env: The native vector env, with or without a filter.
-        batch_info: Arrays by key of the last step or reset, with the batch in front; envs that are
+        env: the native vector env, with or without a filter.
+        batch_info: arrays by key of the last step or reset, with the batch in front; envs that are
             done have those of the last step of their episode.
 
     Args:
-        env: With same-step reset.
+        env: with same-step reset.
         intervention_penalty: c >= 0; the reward is reduced by c |u_safe - u_nominal|, the Euclidean
             distance of `info`'s actions in units of the half widths of the input bounds.
 
     Raises:
-        ConfigurationError: The env is another one, or resets otherwise; or the penalty is out of
+        ConfigurationError: the env is another one, or resets otherwise; or the penalty is out of
             range, or is given without a filter.
     """
 
@@ -154,8 +154,8 @@ class SafeVecEnv(NativeVecEnv):
             (num_envs,); a dict for each env.
 
         Raises:
-            InvalidInputError: The actions have another shape or are not finite.
-            NumericalError: The state of an env is no longer finite.
+            InvalidInputError: the actions have another shape or are not finite.
+            NumericalError: the state of an env is no longer finite.
         """
         observation, reward, terminated, truncated, info = self.env.step(self._actions)
         dones = terminated | truncated
@@ -186,8 +186,8 @@ class SafeVecEnv(NativeVecEnv):
         """Put each episode into the state of a snapshot; see `SafeVectorEnv.restore`.
 
         Args:
-            snapshot: Of `snapshot`.
-            seed: Of the noise and of the starts from then on.
+            snapshot: of `snapshot`.
+            seed: of the noise and of the starts from then on.
         """
         self.env.restore(snapshot, seed)  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -1,4 +1,4 @@
-"""How fast the native VecEnv is, next to Stable-Baselines3's own over the scalar envs."""
+"""The speed of the native VecEnv, compared with Stable-Baselines3's over the scalar envs."""
 
 from __future__ import annotations
 
@@ -21,18 +21,17 @@ def speeds(
     steps: int = 100,
     rounds: int = 6,
 ) -> dict[str, float]:
-    """Measure env steps per second of `SafeVecEnv` and of DummyVecEnv over the scalar envs, with
-    what every algorithm reads of infos.
+    """Measure the speed of `SafeVecEnv` and of DummyVecEnv, reading infos as every algorithm does.
 
     Args:
         env_id: registered id.
         num_envs: size of the batches.
-        filter: text of a condition; None for the bare env.
+        filter: text of a condition; None for the unfiltered env.
         steps: of a batch in a round.
-        rounds: of which the quickest counts.
+        rounds: of which the fastest counts.
 
     Returns:
-        Steps of single envs per second, by the class's name.
+        Steps of single envs per second, by the name of the class.
     """
 
     def scalar() -> gym.Env[Any, Any]:

@@ -13,13 +13,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from safe_envs.agents.evaluation.evaluate import BARE, Evaluation
-from safe_envs.agents.policies.registry import POLICY_FILE
+from safe_envs.agents.evaluation.evaluate import UNFILTERED, Evaluation
+from safe_envs.agents.evaluation.rate_text import percent
+from safe_envs.agents.policies.base import DESCRIPTION, TENSORS
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.reports.evaluation_report import describe_system
-from safe_envs.scripts.reports.rates import percent
 
 # Okabe and Ito's palette, which the colour-blind can tell apart; the bare env is always the same
 # warm colour.
@@ -81,8 +81,10 @@ def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
 
 
 def _colors(evaluation: Evaluation) -> dict[str, str]:
-    others = [row["filter"] for row in evaluation.rows if row["filter"] != BARE]
-    return {BARE: _BARE_COLOR} | {name: COLORS[i % len(COLORS)] for i, name in enumerate(others)}
+    others = [row.filter for row in evaluation.rows if row.filter != UNFILTERED]
+    return {UNFILTERED: _BARE_COLOR} | {
+        name: COLORS[i % len(COLORS)] for i, name in enumerate(others)
+    }
 
 
 def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
@@ -92,8 +94,8 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
     """
     lowest = highest = last = 0.0
     for row in evaluation.rows:
-        name = row["filter"]
-        h = evaluation.recorders[name].barrier
+        name = row.filter
+        h = evaluation.trajectories[name].barrier
         h = h[np.isfinite(h).mean(axis=1) >= 0.5]
         time = np.arange(len(h)) * evaluation.problem.dt
         low, median, high = np.nanquantile(h, (0.05, 0.5, 0.95), axis=1)
@@ -104,7 +106,7 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
             median,
             color=colors[name],
             linewidth=2.2,
-            label=f"{name}: {percent(row['safety_rate'])} safe",
+            label=f"{name}: {percent(row.safety_rate)} safe",
         )
         lowest, highest, last = (
             min(lowest, low.min()),
@@ -128,14 +130,12 @@ def _draw_curve(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> N
     violation.
     """
     for row in evaluation.rows:
-        curve, color = row["curve"], colors[row["filter"]]
-        low, rate, high = (100 * np.array(curve[key]) for key in ("ci_low", "rate", "ci_high"))
-        axes.fill_between(curve["time"], low, high, color=color, alpha=0.2, linewidth=0)
-        axes.plot(curve["time"], rate, color=color, linewidth=1.8)
-        axes.set_xlim(
-            right=max(axes.get_xlim()[1], curve["time"][curve["safe"].index(curve["safe"][-1])])
-        )
-    lowest = min(row["curve"]["ci_low"][-1] for row in evaluation.rows)
+        curve, color = row.curve, colors[row.filter]
+        low, rate, high = (100 * np.array(v) for v in (curve.ci_low, curve.rate, curve.ci_high))
+        axes.fill_between(curve.time, low, high, color=color, alpha=0.2, linewidth=0)
+        axes.plot(curve.time, rate, color=color, linewidth=1.8)
+        axes.set_xlim(right=max(axes.get_xlim()[1], curve.time[curve.safe.index(curve.safe[-1])]))
+    lowest = min(row.curve.ci_low[-1] for row in evaluation.rows)
     bottom = 100 * lowest - 4 * (1 - lowest)
     axes.set(ylim=(bottom, 100 + 4 * (1 - lowest)), xlabel="time (s)", ylabel="safe so far (%)")
     axes.set_title(
@@ -149,7 +149,7 @@ def _draw_plane(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> N
     names = [s.symbol.name for s in problem.states]
     units = [s.unit for s in problem.states]
     across, up = [names.index(name) for name in problem.plane or ()]
-    paths = {name: recorder.states[:, :_SHOWN] for name, recorder in evaluation.recorders.items()}
+    paths = {name: each.states[:, :_SHOWN] for name, each in evaluation.trajectories.items()}
     for name, states in paths.items():
         axes.plot(
             states[:, :, across], states[:, :, up], color=colors[name], linewidth=0.9, alpha=0.8

@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
 from safe_envs.atomic_io import write_atomically
 from safe_envs.scripts.figures.evaluation_figure import COLORS, STYLE, add_legend
@@ -131,7 +131,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
             for place in places
             if (rate := _rate(_at(of_kind, layout.x, place)))
         ]
-        color = _BARE_COLOR if kind == BARE else colors[k % len(colors)]
+        color = _BARE_COLOR if kind == UNFILTERED else colors[k % len(colors)]
         label = (
             None
             if layout.lines is None

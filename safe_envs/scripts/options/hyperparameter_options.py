@@ -13,7 +13,7 @@ def read_hyperparameters(texts: Sequence[str]) -> dict[str, Any]:
     """Return the values of NAME=VALUE entries, which are YAML, by name.
 
     Raises:
-        ConfigurationError: An entry has another form, or its value is no YAML.
+        ConfigurationError: an entry has another form, or its value is no YAML.
     """
     import yaml
 

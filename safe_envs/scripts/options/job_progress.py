@@ -24,11 +24,11 @@ def run_jobs(
     """Compute jobs; return the outcomes of those that failed.
 
     Args:
-        jobs: What to compute.
-        backend: Where.
-        out: Folder of the results, from which the same command resumes after a stop.
-        title: Of the progress bar.
-        keep: Receives each outcome as soon as it exists.
+        jobs: what to compute.
+        backend: where.
+        out: folder of the results, from which the same command resumes after a stop.
+        title: of the progress bar.
+        keep: receives each outcome as soon as it exists.
     """
     from safe_envs.agents.jobs.executor import run
 

@@ -7,13 +7,14 @@ from rich.text import Text
 
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
 from safe_envs.agents.evaluation.comparison import Comparison
-from safe_envs.agents.evaluation.evaluate import BARE, Evaluation
+from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.refinement import TOLERANCE, Refinement
-from safe_envs.agents.evaluation.rollout import Row
+from safe_envs.agents.evaluation.results import Evaluation
+from safe_envs.agents.evaluation.rows import EvaluationRow
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
-from safe_envs.scripts.reports.rates import percent, percent_in, rate_of
 from safe_envs.scripts.reports.tables import make_table, print_whole
 
 _COLUMNS = (
@@ -48,14 +49,14 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
     learned = learned_columns(evaluation.rows)
     titles = ("filter", f"safe [{interval}]", *learned, "estimated\nbound", *_COLUMNS)
     table = make_table("pr", *titles)
-    for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True):
-        name, rate, *rest = _cells(row, speed["steps_per_second"])
+    for row, speed in zip(evaluation.rows, evaluation.timing.rows, strict=True):
+        name, rate, *rest = _cells(row, speed.steps_per_second)
         table.add_row(Text(name), rate, *[cell(row, speed) for cell in learned.values()], *rest)
     print_whole(console, table)
     compared = (
         []
-        if evaluation.repeats
-        else [c for c in evaluation.comparisons if BARE not in (c["first"], c["second"])]
+        if evaluation.is_deterministic
+        else [c for c in evaluation.comparisons if UNFILTERED not in (c.first, c.second)]
     )
     if compared:
         say(console, f"Difference of the safety rates on the same episodes [{interval}]:")
@@ -78,17 +79,17 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
     )
     table = make_table("pr", "filter", *[f"dt = {dt:g} s" for dt in refinement.periods])
     for row in refinement.rows:
-        rates = zip(row["safety_rate"], row["ci_low"], row["ci_high"], strict=True)
-        table.add_row(Text(row["filter"]), *[percent_in(*rate) for rate in rates])
+        rates = zip(row.safety_rate, row.ci_low, row.ci_high, strict=True)
+        table.add_row(Text(row.filter), *[percent_in(*rate) for rate in rates])
     print_whole(console, table)
-    if refinement.evaluations[0].repeats:
+    if refinement.evaluations[0].is_deterministic:
         say(console, "Nothing is random here: what changes with the period, changes for sure.")
         return
     for row in refinement.rows:
-        change = _points(row["change"], row["change_low"], row["change_high"])
+        change = _points(row.change, row.change_low, row.change_high)
         say(
             console,
-            f"  {row['filter']}: {_VERDICTS[row['verdict']].format(change, row['withheld'])}",
+            f"  {row.filter}: {_VERDICTS[row.verdict].format(change, row.withheld)}",
         )
     reach = f"{100 * TOLERANCE:g} points"
     say(
@@ -102,9 +103,7 @@ def heading(evaluation: Evaluation) -> Text:
     """What was evaluated, in two lines."""
     config = evaluation.config
     title = Text(evaluation.title, style="bold")
-    repeats = max(
-        (row["learning"]["repeats"] for row in evaluation.rows if row["learning"]), default=1
-    )
+    repeats = max((row.learning.repeats for row in evaluation.rows if row.learning), default=1)
     often = f" x {repeats} identifications" if repeats > 1 else ""
     title.append(
         f" | policy {config['policy']['name']} | {config['episodes']} episodes{often} | seed"
@@ -160,33 +159,32 @@ def _interval(evaluation: Evaluation) -> str:
 
 
 def _describe(comparison: Comparison) -> str:
-    first, second, p = comparison["first"], comparison["second"], comparison["mcnemar_p"]
-    difference = _points(comparison["difference"], comparison["ci_low"], comparison["ci_high"])
+    first, second, p = comparison.first, comparison.second, comparison.mcnemar_p
+    difference = _points(comparison.difference, comparison.ci_low, comparison.ci_high)
     if p is None:
         return f"{first} - {second}: {difference}, over identifications and episodes"
     return (
         f"{first} - {second}: {difference}, McNemar p {'< 1e-10' if p < 1e-10 else f'= {p:.2g}'}"
-        f" (safe with one only: {first} {comparison['only_first']}, {second}"
-        f" {comparison['only_second']})"
+        f" (safe with one only: {first} {comparison.only_first}, {second}"
+        f" {comparison.only_second})"
     )
 
 
 def _notes(evaluation: Evaluation) -> list[str]:
     """What has to be known to read the table."""
     steps = evaluation.problem.steps
-    curve = evaluation.rows[0]["curve"]
-    notes = unsafe_starts(1.0 - curve["rate"][0])
+    notes = unsafe_starts(1.0 - evaluation.rows[0].curve.rate[0])
     notes += [note for row in evaluation.rows for note in (*_of_bound(row), *_of_violations(row))]
     notes += learned_notes(evaluation.rows, evaluation.problem)
-    if any(row["estimated_bound"] is not None for row in evaluation.rows):
+    if any(row.estimated_bound is not None for row in evaluation.rows):
         notes.append(ESTIMATED)
-    for row, speed in zip(evaluation.rows, evaluation.timing["rows"], strict=True):
-        length = speed["steps"] / row["episodes"]  # With repeats both are of all identifications.
+    for row, speed in zip(evaluation.rows, evaluation.timing.rows, strict=True):
+        length = speed.steps / row.episodes  # With repeats both are of all identifications.
         if length < 0.99 * steps:
-            notes.append(early_end(row["filter"], "mean episode", length, steps))
+            notes.append(early_end(row.filter, "mean episode", length, steps))
     if evaluation.config["monitoring"] == "continuous":
         notes += bridge_notes(evaluation.problem)
-    if evaluation.repeats:
+    if evaluation.is_deterministic:
         notes.append(
             "nothing is random here (no noise, a fixed start, a deterministic policy), so that all"
             " episodes are one and the same: the interval says nothing."
@@ -194,29 +192,29 @@ def _notes(evaluation: Evaluation) -> list[str]:
     return notes
 
 
-def _of_bound(row: Row) -> list[str]:
+def _of_bound(row: EvaluationRow) -> list[str]:
     """Why a row has no bound, or is promised nothing from some of its starts."""
-    name, notes = row["filter"], []
-    if name != BARE and row["estimated_bound"] is None and row["learning"] is None:
-        notes.append(f"no bound for {name}: {row['bound_note']}")
-    if row["outside_rate"]:
+    name, notes = row.filter, []
+    if name != UNFILTERED and row.estimated_bound is None and row.learning is None:
+        notes.append(f"no bound for {name}: {row.bound_note}")
+    if row.outside_rate:
         notes.append(
-            f"{100 * row['outside_rate']:.3g} % of the starts lie outside the sets C_j = {{b_j >="
+            f"{100 * row.outside_rate:.3g} % of the starts lie outside the sets C_j = {{b_j >="
             f" 0}}, j >= 1, that {name} keeps: nothing is promised from there"
         )
     return notes
 
 
-def _of_violations(row: Row) -> list[str]:
+def _of_violations(row: EvaluationRow) -> list[str]:
     """How many violations are no more than rounding."""
-    touching, violations = row["touching"], row["violations"]
+    touching, violations = row.touching, row.violations
     if not touching:
         return []
     some = (
         "all violations" if touching == violations else f"{touching} of the {violations} violations"
     )
     return [
-        f"{some} of {row['filter']} come no lower than h = 0 to rounding: they touch the edge, and"
+        f"{some} of {row.filter} come no lower than h = 0 to rounding: they touch the edge, and"
         " safe is h > 0"
     ]
 
@@ -237,29 +235,29 @@ def early_end(name: str, which: str, length: float, steps: int) -> str:
     )
 
 
-def _cells(row: Row, speed: float) -> list[str]:
-    filtered = row["filter"] != BARE
+def _cells(row: EvaluationRow, speed: float) -> list[str]:
+    filtered = row.filter != UNFILTERED
     return [
-        row["filter"],
-        rate_of(row),
+        row.filter,
+        percent_in(row.safety_rate, row.ci_low, row.ci_high),
         _bound(row),
-        f"{row['min_h_median']:.3g}",
-        f"{row['min_h_p05']:.3g}",
-        str(row["violations"]),
-        percent(row["intervention_rate"]) if filtered else "-",
-        percent(row["infeasible_rate"]) if filtered else "-",
-        "-" if row["effort_mean"] is None else f"{row['effort_mean']:.3g}",
-        f"{row['return_mean']:.4g}",
+        f"{row.min_h_median:.3g}",
+        f"{row.min_h_p05:.3g}",
+        str(row.violations),
+        percent(row.intervention_rate) if filtered else "-",
+        percent(row.infeasible_rate) if filtered else "-",
+        "-" if row.effort_mean is None else f"{row.effort_mean:.3g}",
+        f"{row.return_mean:.4g}",
         _thousands(speed),
     ]
 
 
-def _bound(row: Row) -> str:
-    if row["filter"] == BARE:
+def _bound(row: EvaluationRow) -> str:
+    if row.filter == UNFILTERED:
         return "-"
-    if row["estimated_bound"] is None:
-        return "withheld" if row["withheld"] and row["posterior_bound"] is None else "none"
-    return percent(row["estimated_bound"])
+    if row.estimated_bound is None:
+        return "withheld" if row.withheld and row.posterior_bound is None else "none"
+    return percent(row.estimated_bound)
 
 
 def _points(difference: float, low: float, high: float) -> str:

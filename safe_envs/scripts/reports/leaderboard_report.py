@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from safe_envs.scripts.reports.rates import rate_of
+from safe_envs.agents.evaluation.rate_text import rate_of
 from safe_envs.scripts.reports.tables import make_table
 
 Row = dict[str, Any]

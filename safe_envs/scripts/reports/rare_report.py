@@ -1,4 +1,4 @@
-"""The answer of `safe-envs evaluate --rare` as a table."""
+"""The result of `safe-envs evaluate --rare` as a table."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
-from safe_envs.agents.evaluation.rollout import Row
 from safe_envs.agents.rare_events.estimate import RareEvaluation, estimate_rare
+from safe_envs.agents.rare_events.rows import RareRow
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options.console import progress_bar, say, stdout, write_result
 from safe_envs.scripts.reports.evaluation_report import describe_system, early_end, unsafe_starts
@@ -63,11 +63,11 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
     say(console, _heading(answer))
     table = make_table("pr", "filter", f"P(violation) [{interval}]", *_COLUMNS)
     for row, speed in zip(answer.rows, answer.timing["rows"], strict=True):
-        table.add_row(Text(row["filter"]), *_cells(row, speed["steps_per_second"]))
+        table.add_row(Text(row.filter), *_cells(row, speed["steps_per_second"]))
     print_whole(console, table)
     reasons = Table.grid()
-    for reason in dict.fromkeys(row["reason"] for row in answer.rows if row["reason"]):
-        names = ", ".join(row["filter"] for row in answer.rows if row["reason"] == reason)
+    for reason in dict.fromkeys(row.reason for row in answer.rows if row.reason):
+        names = ", ".join(row.filter for row in answer.rows if row.reason == reason)
         reasons.add_row(Text(f"Splitting cannot work here for {names}: {reason}.", overflow="fold"))
     if reasons.row_count:
         console.print(reasons)
@@ -84,7 +84,7 @@ def _heading(answer: RareEvaluation) -> Text:
         style="not bold",
     )
     watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
-    goal = ", joint program with the goal" if config["objective"] == "clf" else ""
+    goal = ", joint QP with the goal" if config["objective"] == "clf" else ""
     title.append(
         f"\n{describe_system(answer.problem)}{watched}; filters know the"
         f" {config['knowledge']}{goal}",
@@ -93,44 +93,36 @@ def _heading(answer: RareEvaluation) -> Text:
     return title
 
 
-def _cells(row: Row, speed: float) -> list[str]:
-    plain = row["plain"]
-    p, needed = row["probability"], row["plain_episodes_needed"]
+def _cells(row: RareRow, speed: float) -> list[str]:
+    plain, needed = row.plain, row.plain_episodes_needed
     return [
-        "none, see below" if p is None else _probability(row),
-        row["method"] or "-",
-        f"{row['levels']:.1f}" if row["steps"] else "-",
-        _large(row["steps"]) if row["steps"] else "-",
+        "none, see below"
+        if row.probability is None
+        else f"{row.probability:.3g} [{row.ci_low:.3g}, {row.ci_high:.3g}]",
+        row.method or "-",
+        f"{row.levels:.1f}" if row.steps else "-",
+        _large(row.steps) if row.steps else "-",
         _large(needed) if needed else "-",
-        f"{plain['violations']} of {plain['episodes']}" if plain else "-",
-        _large(speed) if row["steps"] else "-",
+        f"{plain.violations} of {plain.episodes}" if plain else "-",
+        _large(speed) if row.steps else "-",
     ]
-
-
-def _probability(row: Row) -> str:
-    return f"{row['probability']:.3g} [{row['ci_low']:.3g}, {row['ci_high']:.3g}]"
 
 
 def _notes(answer: RareEvaluation) -> list[str]:
     rows, steps = answer.rows, answer.problem.steps
-    notes = [
-        f"doubt the estimate of {row['filter']}: {row['doubt']}." for row in rows if row["doubt"]
-    ]
+    notes = [f"doubt the estimate of {row.filter}: {row.doubt}." for row in rows if row.doubt]
     notes += [
-        f"the check on {row['filter']}, by {row['check']['method']}, is"
-        f" {_probability(row['check'])}"
+        f"the check on {row.filter}, by {row.check.method}, is {row.check}"
         for row in rows
-        if row["check"]
+        if row.check
     ]
-    plain = [row["plain"] for row in rows if row["plain"]]
+    plain = [row.plain for row in rows if row.plain]
     if plain:
-        notes += unsafe_starts(plain[0]["outside"] / plain[0]["episodes"])
+        notes += unsafe_starts(plain[0].outside / plain[0].episodes)
     notes += [
-        early_end(row["filter"], "mean episode without a violation", length, steps)
+        early_end(row.filter, "mean episode without a violation", length, steps)
         for row in rows
-        if row["plain"]
-        and (length := row["plain"]["kept_length"]) is not None
-        and length < 0.99 * steps
+        if row.plain and (length := row.plain.kept_length) is not None and length < 0.99 * steps
     ]
     if answer.config["monitoring"] == "continuous":
         notes += bridge_notes(answer.problem)

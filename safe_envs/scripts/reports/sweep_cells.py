@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text
 
-from safe_envs.agents.evaluation.evaluate import BARE
+from safe_envs.agents.evaluation.rate_text import percent, rate_of
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.rates import percent, rate_of
 from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:
@@ -28,10 +28,10 @@ def print_cells(console: Console, index: dict[str, Any], rows: Sequence[Row], wo
     """Print how many cells are computed, the worst of them, and those that failed.
 
     Args:
-        console: To print on.
-        index: Of the sweep; see `safe_envs.agents.sweeps.store.read_index`.
-        rows: Its cells; see `safe_envs.agents.sweeps.store.read`.
-        worst: How many of the worst to print.
+        console: to print on.
+        index: of the sweep; see `safe_envs.agents.sweeps.store.read_index`.
+        rows: its cells; see `safe_envs.agents.sweeps.store.read`.
+        worst: how many of the worst to print.
     """
     names = index["swept"]
     failed, missing = _failed(rows), len(index["cells"]) - len(rows)
@@ -42,7 +42,7 @@ def print_cells(console: Console, index: dict[str, Any], rows: Sequence[Row], wo
     )
     table = make_table("l" * len(names) + "r", *names, *_TITLES, tight=False)
     for row in _worst(rows, worst):
-        filtered = row["filter"] != BARE
+        filtered = row["filter"] != UNFILTERED
         rates = [
             row[name] if filtered else None for name in ("intervention_rate", "infeasible_rate")
         ]
@@ -80,8 +80,8 @@ def sweep_document(sweep: Sweep, failures: Sequence[Outcome]) -> dict[str, Any]:
     """Return what was swept and which cells failed, as JSON-able data.
 
     Args:
-        sweep: That was computed.
-        failures: Outcomes of the cells that failed.
+        sweep: that was computed.
+        failures: outcomes of the cells that failed.
     """
     from safe_envs.agents.sweeps.cell import versions
 
@@ -98,8 +98,8 @@ def failures_text(sweep: Sweep, failures: Sequence[Outcome]) -> str:
     """Return which cells failed and why, in the order of the file.
 
     Args:
-        sweep: That was computed.
-        failures: Outcomes of the cells that failed.
+        sweep: that was computed.
+        failures: outcomes of the cells that failed.
     """
     from safe_envs.agents.sweeps.spec import describe
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from rich.console import Console
 
+from safe_envs.agents.evaluation.rate_text import rate_of
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.rates import rate_of
 from safe_envs.scripts.reports.tables import make_table
 
 
@@ -18,9 +18,9 @@ def print_evaluations(
     """Print the safety and the return of the agent in each evaluation.
 
     Args:
-        console: To print on.
-        filter_name: Text of the filter in the loop.
-        rows: Content of `evaluations.json`.
+        console: to print on.
+        filter_name: text of the filter in the loop.
+        rows: content of `evaluations.json`.
     """
     titles = ("steps", "safe [95 % interval]", "return", "violations in training")
     table = make_table("r", *titles, tight=False)

@@ -1,1 +1,1 @@
-"""`safe-envs reproduce`: the thesis' tables and figures, ours beside the print."""
+"""`safe-envs reproduce`: the thesis' tables and figures, reproduced."""

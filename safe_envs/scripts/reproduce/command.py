@@ -109,10 +109,10 @@ class ArtefactJob:
     """The computation of an artefact, which keeps its result itself, in whatever process.
 
     Attributes:
-        key: Name of the artefact.
-        sample: How much is simulated.
-        out: Folder of the results.
-        source: Checksum of the code of the process that asks for it.
+        key: name of the artefact.
+        sample: how much is simulated.
+        out: folder of the results.
+        source: checksum of the code of the process that asks for it.
     """
 
     key: str
@@ -124,7 +124,7 @@ class ArtefactJob:
         """Compute the artefact and keep it.
 
         Raises:
-            ConfigurationError: The code has changed since the command began.
+            ConfigurationError: the code has changed since the command began.
         """
         import torch
 

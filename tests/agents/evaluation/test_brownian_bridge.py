@@ -80,8 +80,8 @@ def test_discrete_rate_flatters_and_continuous_rate_is_exact(dt, episodes):
     discrete, continuous = (
         evaluate(problem, monitoring=m, **arguments).rows[0] for m in ("discrete", "continuous")
     )
-    assert exact < discrete["ci_low"] < seen < discrete["ci_high"]
-    assert continuous["ci_low"] < exact < continuous["ci_high"] < seen
+    assert exact < discrete.ci_low < seen < discrete.ci_high
+    assert continuous.ci_low < exact < continuous.ci_high < seen
 
 
 def test_control_and_noise_are_those_of_discrete_monitoring():
@@ -98,14 +98,14 @@ def test_control_and_noise_are_those_of_discrete_monitoring():
         for m in ("discrete", "continuous")
     )
     for first, second in zip(discrete.rows, continuous.rows, strict=True):
-        assert first["return_mean"] == second["return_mean"]
-        assert second["safe"] < first["safe"]
-        assert second["min_h_median"] < first["min_h_median"]
-        assert second["curve"]["safe"][-1] == second["safe"]
-        name = first["filter"]
+        assert first.return_mean == second.return_mean
+        assert second.safe < first.safe
+        assert second.min_h_median < first.min_h_median
+        assert second.curve.safe[-1] == second.safe
+        name = first.filter
         assert (
-            discrete.recorders[name].barrier.tobytes()
-            == continuous.recorders[name].barrier.tobytes()
+            discrete.trajectories[name].barrier.tobytes()
+            == continuous.trajectories[name].barrier.tobytes()
         )
         # Whoever violates at an instant violates.
         assert continuous.flags[name][0].table(discrete.flags[name][0])[1] == 0
@@ -163,7 +163,7 @@ def test_several_barriers_have_bridges_of_their_own():
         confidence=0.99,
         bounds=False,
     ).rows[0]
-    assert row["ci_low"] < 1 - 2 * first_passage(1.0, 0.0, 0.5, 1.0) < row["ci_high"]
+    assert row.ci_low < 1 - 2 * first_passage(1.0, 0.0, 0.5, 1.0) < row.ci_high
 
 
 def test_unknown_word_and_env_of_somebody_else_are_refused():
@@ -171,4 +171,4 @@ def test_unknown_word_and_env_of_somebody_else_are_refused():
         evaluate("Scalar-v0", monitoring="continous")
     place = f"{Path(__file__).parents[3] / 'examples' / 'pendulum_v1.py'}:spec"
     with pytest.raises(ConfigurationError, match="not known"):
-        evaluate("Pendulum-v1", spec=place, monitoring="continuous", episodes=2)
+        evaluate("Pendulum-v1", filter_spec=place, monitoring="continuous", episodes=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +14,7 @@ from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import bound_check, refinement
 from safe_envs.agents.evaluation.contradiction import by_rate, judged
 from safe_envs.agents.evaluation.refinement import refine
+from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorGuarantee
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.verification import safe_set_analysis
@@ -62,33 +64,33 @@ def credulous(monkeypatch):
 @pytest.mark.parametrize(("make", "text", "reason"), [case[:3] for case in FALSE])
 def test_false_bounds_are_not_estimated(make, text, reason):
     (row,) = evaluate(make(), filters=text, episodes=40).rows
-    assert row["safety_rate"] < 0.2
-    assert row["estimated_bound"] is None
-    assert row["bound_note"].startswith(reason)
+    assert row.safety_rate < 0.2
+    assert row.estimated_bound is None
+    assert row.bound_note.startswith(reason)
 
 
 @pytest.mark.parametrize(("make", "text", "reason"), [(*case[:2], case[3]) for case in FALSE])
 @pytest.mark.usefixtures("credulous")
 def test_what_the_search_misses_the_episodes_contradict(make, text, reason):
     (row,) = evaluate(make(), filters=text, episodes=40).rows
-    assert row["estimated_bound"] is None
-    assert row["withheld"].startswith(reason)
-    assert row["bound_note"] == f"withheld: {row['withheld']}"
+    assert row.estimated_bound is None
+    assert row.withheld.startswith(reason)
+    assert row.bound_note == f"withheld: {row.withheld}"
 
 
 def test_margins_of_first_order_that_conflict_leave_no_bound():
     (row,) = evaluate(
         false_bounds.corridor(), filters="cbf:alpha=10:sampling_margin=first-order", episodes=2
     ).rows
-    assert (row["infeasible_rate"], row["safe"]) == (1.0, 0)
-    assert (row["estimated_bound"], row["bound_note"]) == (
+    assert (row.infeasible_rate, row.safe) == (1.0, 0)
+    assert (row.estimated_bound, row.bound_note) == (
         None,
         "the shortfall of several conditions together is not established",
     )
     (plain,) = evaluate(
         false_bounds.corridor(), filters="cbf:alpha=10", episodes=2, options=None
     ).rows
-    assert plain["infeasible_rate"] == 0.0
+    assert plain.infeasible_rate == 0.0
 
 
 @pytest.mark.filterwarnings(
@@ -99,16 +101,16 @@ def test_a_bound_over_a_posterior_sees_a_hidden_kink(monkeypatch):
     name = "bayesian-scbf:simultaneous=0.9"
     learned = identify(problem, starts=100, repetitions=30, degree=1)
     (row,) = evaluate(problem, filters=[name], learned=[learned], episodes=40).rows
-    assert row["posterior_bound"]["probability"] is None
-    assert row["posterior_bound"]["note"].startswith(
+    assert row.posterior_bound.probability is None
+    assert row.posterior_bound.note.startswith(
         "h is not twice differentiable, which Ito's formula asks for, near x = "
     )
     monkeypatch.setattr(
         "safe_envs.wrappers.verification.posterior_guarantee.roughness", lambda *_: ""
     )
     (row,) = evaluate(problem, filters=[name], learned=[learned], episodes=40).rows
-    assert row["posterior_bound"]["probability"] is None
-    assert row["withheld"].startswith("the interval of the measured rate ends at")
+    assert row.posterior_bound.probability is None
+    assert row.withheld.startswith("the interval of the measured rate ends at")
 
 
 @pytest.mark.slow
@@ -116,10 +118,10 @@ def test_a_bound_over_a_posterior_sees_a_hidden_kink(monkeypatch):
 def test_nothing_converges_beside_a_bound_that_is_contradicted():
     answer = refine(false_bounds.kink(), filters=["none", "szcbf:alphas=0.1"], episodes=100)
     bare, filtered = answer.rows
-    assert bare["verdict"] != "contradicted"
-    assert (filtered["verdict"], bool(filtered["withheld"])) == ("contradicted", True)
+    assert bare.verdict != "contradicted"
+    assert (filtered.verdict, bool(filtered.withheld)) == ("contradicted", True)
     # The change itself is small enough for the other verdict.
-    assert max(-filtered["change_low"], filtered["change_high"]) < 0.1
+    assert max(-filtered.change_low, filtered.change_high) < 0.1
 
 
 @pytest.mark.slow
@@ -157,21 +159,14 @@ def test_a_start_above_a_supremum_withholds_at_once(monkeypatch):
 
 
 def test_a_rate_with_a_smaller_period_withholds_too():
-    row = {
-        "filter": "scbf",
-        "estimated_bound": 0.5,
-        "bound_note": "",
-        "posterior_bound": None,
-        "withheld": None,
-    }
+    (row,) = evaluate("Scalar-v0", filters="scbf", episodes=2, bounds=False).rows
+    row = replace(row, estimated_bound=0.5, bound_note="")
     finer = [
-        SimpleNamespace(
-            rows=[{"filter": "none", "ci_high": 0.1}, {"filter": "scbf", "ci_high": high}]
-        )
+        SimpleNamespace(row=lambda name, high=high: SimpleNamespace(ci_high=high))
         for high in (0.6, 0.4)
     ]
     assert refinement._judged(row, finer[:1]) == row
-    assert refinement._judged(row, finer)["withheld"].startswith(
+    assert refinement._judged(row, finer).withheld.startswith(
         "the interval of the measured rate ends at 40.0 %, below 50.0 %"
     )
 
@@ -192,13 +187,13 @@ def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch):
         nominal=-5,
     )
     (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
-    assert (row["estimated_bound"], row["withheld"]) == (
+    assert (row.estimated_bound, row.withheld) == (
         pytest.approx((1 / 2 + 1 / 1.2) * np.exp(-0.1) - 1, abs=1e-3),
         None,
     )
     monkeypatch.setattr(safe_set_analysis.SafeSetAnalysis, "suprema", np.array([2.0, 0.8]))
     (row,) = evaluate(problem, filters="szcbf:alphas=0.1,0.1", episodes=20).rows
-    assert row["withheld"] == "b_1 reaches 1, above the supremum of 0.8 that the search found"
+    assert row.withheld == "b_1 reaches 1, above the supremum of 0.8 that the search found"
 
 
 @pytest.mark.parametrize(
@@ -208,22 +203,14 @@ def test_a_start_counts_at_every_stage_of_a_chain(monkeypatch):
 def test_an_interval_contradicts_a_bound_that_is_wholly_above_it(bound, high, reason):
     assert reason in by_rate(bound, high)
     assert bool(by_rate(bound, high)) == bool(reason)
-    row = {"estimated_bound": bound, "bound_note": "", "posterior_bound": None, "withheld": None}
+    row = BoundSummary(estimated_bound=bound, bound_note="")
     assert (judged(row, high) == row) == (not reason)
 
 
 def test_a_posterior_keeps_its_numbers_where_its_bound_is_withheld():
-    bound = {"probability": 0.9, "note": "", "delta": 0.1}
-    row = {
-        "estimated_bound": None,
-        "bound_note": "learned",
-        "posterior_bound": bound,
-        "withheld": None,
-    }
+    bound = PosteriorGuarantee(0.9, "", delta=0.1)
+    row = BoundSummary(bound_note="learned", posterior_bound=bound)
     found = judged(row, 0.2)
-    assert found["posterior_bound"] == {
-        "probability": None,
-        "note": f"withheld: {found['withheld']}",
-        "delta": 0.1,
-    }
-    assert found["bound_note"] == "learned"
+    note = f"withheld: {found.withheld}"
+    assert found.posterior_bound == PosteriorGuarantee(None, note, delta=0.1)
+    assert found.bound_note == "learned"

@@ -84,29 +84,27 @@ def test_episodes_replayed_by_hand(env_id, spec, policy, options):
         bounds=False,
     )
     row, trajectories = replay(env_id, options, spec, policy, episodes, seed)
-    assert set(answer.rows[0]) == KEYS
-    assert (answer.rows[0]["filter"], answer.rows[0]["policy"]) == (spec, policy)
+    assert set(answer.rows[0].as_dict()) == KEYS
+    assert (answer.rows[0].filter, answer.rows[0].policy) == (spec, policy)
     for key in COUNTS:
-        assert answer.rows[0][key] == row[key], key
+        assert getattr(answer.rows[0], key) == row[key], key
     for key in MEASURES + RATES:
-        assert answer.rows[0][key] == pytest.approx(row[key], rel=1e-7, abs=1e-9), key
-    recorded = answer.recorders[spec].barrier
+        assert getattr(answer.rows[0], key) == pytest.approx(row[key], rel=1e-7, abs=1e-9), key
+    recorded = answer.trajectories[spec].barrier
     for i, h in enumerate(trajectories):
         np.testing.assert_allclose(recorded[: len(h), i], h, rtol=1e-6, atol=1e-7)
         assert np.isnan(recorded[len(h) :, i]).all()
-    curve = answer.rows[0]["curve"]
-    assert curve["safe"] == safe_so_far(
-        trajectories, curve["time"], make_problem(env_id, **options).dt
+    curve = answer.rows[0].curve
+    assert curve.safe == safe_so_far(trajectories, curve.time, make_problem(env_id, **options).dt)
+    assert curve.rate == [count / episodes for count in curve.safe]
+    assert all(later <= earlier for earlier, later in itertools.pairwise(curve.safe))
+    assert (curve.rate[-1], curve.ci_low[-1], curve.ci_high[-1]) == tuple(
+        getattr(answer.rows[0], key) for key in ("safety_rate", "ci_low", "ci_high")
     )
-    assert curve["rate"] == [count / episodes for count in curve["safe"]]
-    assert all(later <= earlier for earlier, later in itertools.pairwise(curve["safe"]))
-    assert (curve["rate"][-1], curve["ci_low"][-1], curve["ci_high"][-1]) == tuple(
-        answer.rows[0][key] for key in ("safety_rate", "ci_low", "ci_high")
-    )
-    timing = answer.timing["rows"][0]
-    assert timing["steps"] == sum(len(h) - 1 for h in trajectories)
-    assert timing["seconds"] > 0
-    assert timing["steps_per_second"] == pytest.approx(timing["steps"] / timing["seconds"])
+    timing = answer.timing.rows[0]
+    assert timing.steps == sum(len(h) - 1 for h in trajectories)
+    assert timing.seconds > 0
+    assert timing.steps_per_second == pytest.approx(timing.steps / timing.seconds)
 
 
 def test_filters_that_know_the_plant_are_replayed_too():
@@ -116,8 +114,8 @@ def test_filters_that_know_the_plant_are_replayed_too():
             env_id, filters=["hocbf"], options=options, episodes=1, knowledge=knowledge
         )
         row, _ = replay(env_id, options, "hocbf", "nominal", 1, 0, knowledge)
-        assert answer.rows[0]["min_h_median"] == pytest.approx(row["min_h_median"], rel=1e-9)
-        assert answer.rows[0]["effort_mean"] == pytest.approx(row["effort_mean"], rel=1e-9)
+        assert answer.rows[0].min_h_median == pytest.approx(row["min_h_median"], rel=1e-9)
+        assert answer.rows[0].effort_mean == pytest.approx(row["effort_mean"], rel=1e-9)
 
 
 def test_counting_ends_with_the_first_violation_and_simulation_goes_on():
@@ -135,10 +133,10 @@ def test_counting_ends_with_the_first_violation_and_simulation_goes_on():
     assert h[10] == h.min() < 0
     policy = Schedule(problem, inputs)
     (row,) = evaluate(problem, policy, ["none"], episodes=3, num_envs=2).rows
-    assert (row["safe"], row["violations"], row["policy"]) == (0, 3, "Schedule")
-    assert row["min_h_median"] == pytest.approx(h.min(), rel=1e-6)
-    assert row["effort_mean"] == pytest.approx(np.mean(np.square(inputs[:4])))
-    assert row["return_mean"] == pytest.approx(np.exp(-((2 * h[1:]) ** 2)).sum(), rel=1e-6)
+    assert (row.safe, row.violations, row.policy) == (0, 3, "Schedule")
+    assert row.min_h_median == pytest.approx(h.min(), rel=1e-6)
+    assert row.effort_mean == pytest.approx(np.mean(np.square(inputs[:4])))
+    assert row.return_mean == pytest.approx(np.exp(-((2 * h[1:]) ** 2)).sum(), rel=1e-6)
     # Two waves of ten steps; a hidden state is None, and an episode starts, at the first of them
     # alone.
     assert policy.starts == 2 * [(True, True, True), *(9 * [(False, False, True)])]
@@ -148,8 +146,8 @@ def test_curve_of_one_episode_falls_at_its_first_violation_for_good():
     problem = make_problem("Scalar-v0", noise=0.0, start=[0.9], dt=0.05, horizon=0.5)
     inputs = [-0.5, -1.0, -0.9, 4.0, -9.0, -9.0, 0.0, 0.0, 9.0, 9.0]
     (row,) = evaluate(problem, Schedule(problem, inputs), ["none"], episodes=3, num_envs=2).rows
-    assert row["curve"]["time"] == [k * 0.05 for k in range(11)]
-    assert row["curve"]["safe"] == [3] * 4 + [0] * 7
+    assert row.curve.time == [k * 0.05 for k in range(11)]
+    assert row.curve.safe == [3] * 4 + [0] * 7
 
 
 def test_curve_of_a_long_episode_is_thinned_out():
@@ -159,14 +157,12 @@ def test_curve_of_a_long_episode_is_thinned_out():
     inputs = (x[1:] - math.exp(1e-3) * x[:-1]) / (math.exp(1e-3) - 1)
     for last in (301, 303, 700, 701):
         problem = make_problem(
-            "Scalar-v0", **options, barrier={"limit": float(x[last - 1] + x[last]) / 2}
+            "Scalar-v0", **{**options, "barrier": {"limit": float(x[last - 1] + x[last]) / 2}}
         )
         (row,) = evaluate(problem, Schedule(problem, inputs), ["none"], episodes=2).rows
-        assert len(row["curve"]["time"]) == 177
-        assert row["curve"]["time"][-1] == pytest.approx(0.701)
-        assert row["curve"]["safe"] == [
-            2 if round(t / 1e-3) < last else 0 for t in row["curve"]["time"]
-        ]
+        assert len(row.curve.time) == 177
+        assert row.curve.time[-1] == pytest.approx(0.701)
+        assert row.curve.safe == [2 if round(t / 1e-3) < last else 0 for t in row.curve.time]
 
 
 def test_interventions_after_a_violation_do_not_count():
@@ -184,29 +180,29 @@ def test_interventions_after_a_violation_do_not_count():
         x = math.exp(0.02) * x - 0.5 * (math.exp(0.02) - 1)
         steps += 1
     assert 1 < steps < 10
-    assert (row["intervention_rate"], row["infeasible_rate"], row["safe"]) == (1.0, 1.0, 0)
-    assert row["effort_mean"] == pytest.approx(0.25)
+    assert (row.intervention_rate, row.infeasible_rate, row.safe) == (1.0, 1.0, 0)
+    assert row.effort_mean == pytest.approx(0.25)
     (mixed,) = evaluate(
         problem,
         Schedule(problem, [-0.5] * steps + [1.0] * (10 - steps)),
         ["cbf:alpha=1"],
         episodes=1,
     ).rows
-    assert mixed["intervention_rate"] == 0.0
+    assert mixed.intervention_rate == 0.0
 
 
 def test_an_episode_that_starts_on_the_edge_is_unsafe_and_counts_no_step():
     options = {"noise": 0.0, "start": [1.0], "horizon": 0.1}
     answer = evaluate("Scalar-v0", Constant(-0.5), ["none", "scbf"], options=options, episodes=2)
     for row in answer.rows:
-        assert (row["safe"], row["violations"], row["safety_rate"]) == (0, 2, 0.0)
-        assert (row["intervention_rate"], row["infeasible_rate"], row["effort_mean"]) == (
+        assert (row.safe, row.violations, row.safety_rate) == (0, 2, 0.0)
+        assert (row.intervention_rate, row.infeasible_rate, row.effort_mean) == (
             None,
             None,
             None,
         )
-        assert row["min_h_median"] == row["min_h_p05"] == 0.0
-        assert row["return_mean"] > 0
+        assert row.min_h_median == row.min_h_p05 == 0.0
+        assert row.return_mean > 0
     json.dumps(answer.document(), allow_nan=False)
 
 
@@ -216,17 +212,17 @@ def test_touching_the_edge_is_unsafe():
     problem = make_problem("Scalar-v0", **options)
     reached = (
         evaluate(problem, Schedule(problem, up_and_down), ["none"], episodes=1, record=True)
-        .recorders["none"]
+        .trajectories["none"]
         .states[:, 0, 0]
     )
     assert reached[1] == reached.max()
     for limit, safe in ((reached[1], 0), (np.nextafter(reached[1], 1.0), 1)):
-        problem = make_problem("Scalar-v0", **options, barrier={"limit": float(limit)})
+        problem = make_problem("Scalar-v0", **{**options, "barrier": {"limit": float(limit)}})
         answer = evaluate(
             problem, Schedule(problem, up_and_down), ["none"], episodes=1, record=True
         )
-        assert answer.recorders["none"].barrier[1, 0] == limit - reached[1]
-        assert answer.rows[0]["safe"] == safe
+        assert answer.trajectories["none"].barrier[1, 0] == limit - reached[1]
+        assert answer.rows[0].safe == safe
 
 
 def test_smallest_h_counts_the_start_and_the_last_instant():
@@ -235,7 +231,7 @@ def test_smallest_h_counts_the_start_and_the_last_instant():
         evaluate("Scalar-v0", Constant(a), ["none"], options=options, episodes=1).rows[0]
         for a in (-1.0, 1.0)
     )
-    assert falling["min_h_median"] == 0.5
-    assert rising["min_h_median"] == pytest.approx(
+    assert falling.min_h_median == 0.5
+    assert rising.min_h_median == pytest.approx(
         1 - (math.exp(0.1) * 0.5 + (math.exp(0.1) - 1) * 10), rel=1e-6
     )

@@ -19,15 +19,15 @@ pytestmark = pytest.mark.slow
 
 PLACE = f"{Path(__file__).parents[3] / 'examples' / 'pendulum_v1.py'}:spec"
 SPEC = FilterSpec.load(PLACE)
-FEW = {"spec": SPEC, "episodes": 4}
+FEW = {"filter_spec": SPEC, "episodes": 4}
 
 
 def test_the_filter_of_the_spec_makes_the_difference():
     bare, filtered = evaluate("Pendulum-v1", **FEW).rows
-    assert (bare["safe"], filtered["safe"]) == (0, 4)
-    assert filtered["filter"] == SPEC.filter
-    assert filtered["estimated_bound"] is None
-    assert "may differ from the model" in filtered["bound_note"]
+    assert (bare.safe, filtered.safe) == (0, 4)
+    assert filtered.filter == SPEC.filter
+    assert filtered.estimated_bound is None
+    assert "may differ from the model" in filtered.bound_note
 
 
 def test_the_rate_is_that_of_episodes_played_by_hand():
@@ -50,9 +50,9 @@ def test_the_rate_is_that_of_episodes_played_by_hand():
             total += float(reward)
         smallest.append(info["h_min"])
         returns.append(total)
-    assert row["safe"] == sum(h > 0 for h in smallest)
-    assert row["min_h_median"] == pytest.approx(np.median(smallest))
-    assert row["return_mean"] == pytest.approx(np.mean(returns))
+    assert row.safe == sum(h > 0 for h in smallest)
+    assert row.min_h_median == pytest.approx(np.median(smallest))
+    assert row.return_mean == pytest.approx(np.mean(returns))
 
 
 @pytest.mark.slow
@@ -74,7 +74,7 @@ def test_an_agent_of_stable_baselines3_is_evaluated_behind_the_filter(tmp_path):
     model.learn(128)
     model.save(tmp_path / "agent.zip")
     found = evaluate("Pendulum-v1", str(tmp_path / "agent.zip"), trust=True, **FEW)
-    assert found.rows[1]["safe"] == 4
+    assert found.rows[1].safe == 4
     with pytest.raises(ConfigurationError, match="another observation space"):
         evaluate("safe_envs/Scalar-v0", str(tmp_path / "agent.zip"), trust=True, episodes=2)
 
@@ -87,13 +87,13 @@ def test_an_agent_of_stable_baselines3_is_evaluated_behind_the_filter(tmp_path):
         ({"knowledge": "plant"}, "nothing is known but the model"),
         ({"options": {"noise": 0.1}}, "without noise"),
         ({"problem": "safe_envs/Pendulum-v0"}, "barriers of its own"),
-        ({"spec": "nowhere.py:spec"}, "there is no file"),
-        ({"spec": PLACE.replace(":spec", ":pendulum")}, "give a FilterSpec"),
+        ({"filter_spec": "nowhere.py:spec"}, "there is no file"),
+        ({"filter_spec": PLACE.replace(":spec", ":pendulum")}, "give a FilterSpec"),
     ],
 )
 def test_what_does_not_fit_is_explained(arguments, says):
     with pytest.raises(ConfigurationError, match=says):
-        evaluate(**{"problem": "Pendulum-v1", "spec": SPEC, "episodes": 2, **arguments})
+        evaluate(**{"problem": "Pendulum-v1", "filter_spec": SPEC, "episodes": 2, **arguments})
 
 
 def test_inverted_pendulum_of_mujoco_where_it_is_installed():
@@ -109,8 +109,8 @@ def test_inverted_pendulum_of_mujoco_where_it_is_installed():
         (q, angle, v, w), (a,), [v, w, 0, 24 * angle], [0, 0, 9.8, -22.0], [0, 0, 0, 0]
     )
     spec = FilterSpec(model, 0.15**2 - angle**2, lambda o: o[..., :4], gains=(6.0, 6.0))
-    bare, filtered = evaluate("InvertedPendulum-v5", "zero", spec=spec, episodes=3).rows
-    assert filtered["min_h_median"] > bare["min_h_median"]
+    bare, filtered = evaluate("InvertedPendulum-v5", "zero", filter_spec=spec, episodes=3).rows
+    assert filtered.min_h_median > bare.min_h_median
 
 
 def test_the_command_prints_the_table():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import sympy as sp
@@ -9,6 +11,7 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.guarantees import together
+from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorGuarantee
 
 
 @pytest.fixture(scope="module")
@@ -36,27 +39,26 @@ def falling():
 def test_starts_outside_the_kept_sets_are_counted(falling, name, p):
     answer = evaluate(falling, filters=name, episodes=100, num_envs=64, record=True)
     (row,) = answer.rows
-    x, v = answer.recorders[name].states[0].T
+    x, v = answer.trajectories[name].states[0].T
     h, rate = np.stack((x, 1 - 0.5 * x)), np.stack((v, -0.5 * v))
     outside = (h > 0).all(axis=0) & (rate + p * h <= 0).any(axis=0)
     # Of those that are kept for pictures; the row has all of them.
     again = evaluate(falling, filters=[name], episodes=len(x), num_envs=7).rows[0]
-    assert again["outside_rate"] == np.mean(outside) > 0
-    assert 0 < row["outside_rate"] <= 1
+    assert again.outside_rate == np.mean(outside) > 0
+    assert 0 < row.outside_rate <= 1
 
 
 def test_where_there_is_no_chain_no_start_is_outside_of_it():
     bare, scbf = evaluate(
         "Scalar-v0", filters=["none", "scbf"], episodes=5, options={"horizon": 0.1}
     ).rows
-    assert bare["outside_rate"] is None
-    assert scbf["outside_rate"] == 0.0
+    assert bare.outside_rate is None
+    assert scbf.outside_rate == 0.0
 
 
 def test_of_several_identifications_the_mean_counts():
-    row = {"estimated_bound": None, "bound_note": "", "posterior_bound": None, "withheld": None}
-    rates = [{**row, "outside_rate": rate} for rate in (0.25, 0.5)]
-    assert together(rates)["outside_rate"] == 0.375
-    assert together([rates[0], {**row, "outside_rate": None}])["outside_rate"] is None
-    robust = [{**each, "posterior_bound": {"probability": 0.5, "note": ""}} for each in rates]
-    assert together(robust)["outside_rate"] == 0.375
+    rates = [BoundSummary(bound_note="", outside_rate=rate) for rate in (0.25, 0.5)]
+    assert together(rates).outside_rate == 0.375
+    assert together([rates[0], BoundSummary()]).outside_rate is None
+    robust = [replace(each, posterior_bound=PosteriorGuarantee(0.5, "")) for each in rates]
+    assert together(robust).outside_rate == 0.375

@@ -83,11 +83,11 @@ def test_what_does_not_fit_is_refused(posterior):
     with pytest.raises(LearnedFileError, match="Pendulum"):
         Learning(make_problem("Pendulum-v0"), LEARNED, [posterior], 1, 0)
     with pytest.raises(
-        ConfigurationError, match="holds bayesian, on which no filter rests; add bayesian-scbf"
+        ConfigurationError, match="holds bayesian, which no filter uses; add bayesian-scbf"
     ):
         Learning(DISK, ["scbf", "ddscbf"], [posterior], 1, 0)
     for names, given in ((["scbf"], ()), (LEARNED, [posterior])):
-        with pytest.raises(ConfigurationError, match="repeats = 2, but nothing is learned anew"):
+        with pytest.raises(ConfigurationError, match="repeats = 2, but nothing is learned"):
             Learning(DISK, names, given, 2, 0)
     for repeats in (0, -1, 1.5, True):
         with pytest.raises(ConfigurationError, match="repeats"):
@@ -109,15 +109,13 @@ def test_the_filter_from_a_file_gives_the_same_as_from_memory(posterior, tmp_pat
     )
     ignored = {"learning", "filter"}
     for rows in zip(*(each.rows for each in (memory, file, learned, named)), strict=True):
-        first, *others = ({k: v for k, v in row.items() if k not in ignored} for row in rows)
+        first, *others = (
+            {k: v for k, v in row.as_dict().items() if k not in ignored} for row in rows
+        )
         assert all(other == first for other in others)
-    assert [row["learning"]["files"] for row in file.rows] == [[str(tmp_path / "disk.npz")]] * 2
-    assert [row["learning"]["files"] for row in memory.rows] == [[]] * 2
-    assert (
-        file.rows[0]["learning"]["sha256"]
-        == memory.rows[0]["learning"]["sha256"]
-        == [posterior.sha256]
-    )
+    assert [row.learning.files for row in file.rows] == [[str(tmp_path / "disk.npz")]] * 2
+    assert [row.learning.files for row in memory.rows] == [[]] * 2
+    assert file.rows[0].learning.sha256 == memory.rows[0].learning.sha256 == [posterior.sha256]
 
 
 @pytest.mark.parametrize(
@@ -145,7 +143,7 @@ def test_the_answer_is_the_same_for_every_num_envs_and_from_a_file(
         ).rows[0]
         for num_envs, given in ((1, model), (2, model), (3, tmp_path / "model.npz"))
     ]
-    first, *others = ({k: v for k, v in row.items() if k != "learning"} for row in rows)
+    first, *others = ({k: v for k, v in row.as_dict().items() if k != "learning"} for row in rows)
     assert all(other == first for other in others)
 
 
@@ -153,35 +151,36 @@ def test_the_answer_is_the_same_for_every_num_envs_and_from_a_file(
 def test_rows_of_repeats_are_sums_means_and_wider_intervals(repeated):
     once = evaluate(LINE, filters=["none", "scbf", *LEARNED], episodes=40, bounds=False)
     for row, single in zip(repeated.rows, once.rows, strict=True):
-        if row["learning"] is None:
+        if row.learning is None:
             assert row == single
             continue
-        learning = row["learning"]
-        assert (learning["repeats"], len(learning["seeds"]), len(set(learning["sha256"]))) == (
+        learning = row.learning
+        assert (learning.repeats, len(learning.seeds), len(set(learning.sha256))) == (
             3,
             3,
             3,
         )
-        assert row["episodes"] == 120
-        assert row["safe"] == round(40 * sum(learning["rates"]))
-        assert row["safety_rate"] == pytest.approx(np.mean(learning["rates"]))
-        assert learning["rates"][0] == single["safety_rate"]
-        assert row["ci_low"] <= row["safety_rate"] <= row["ci_high"]
-        assert row["curve"]["rate"][-1] == pytest.approx(row["safety_rate"])
-        assert row["curve"]["ci_low"][-1] == pytest.approx(row["ci_low"])
+        assert row.episodes == 120
+        assert row.safe == round(40 * sum(learning.rates))
+        assert row.safety_rate == pytest.approx(np.mean(learning.rates))
+        assert learning.rates[0] == single.safety_rate
+        assert row.ci_low <= row.safety_rate <= row.ci_high
+        assert row.curve.rate[-1] == pytest.approx(row.safety_rate)
+        assert row.curve.ci_low[-1] == pytest.approx(row.ci_low)
         # Three identifications on the same 40 episodes are not 120 independent ones.
-        half = 1.96 * math.sqrt(row["safety_rate"] * (1 - row["safety_rate"]) / 120)
-        assert row["ci_high"] - row["ci_low"] > 2 * half
+        half = 1.96 * math.sqrt(row.safety_rate * (1 - row.safety_rate) / 120)
+        assert row.ci_high - row.ci_low > 2 * half
 
 
 @pytest.mark.slow
 def test_comparisons_of_repeats_have_no_p_value(repeated):
     for comparison in repeated.comparisons:
-        learned = any(name in LEARNED for name in (comparison["first"], comparison["second"]))
-        assert (comparison["mcnemar_p"] is None) == learned
-        pairs = sum(comparison[key] for key in ("both", "only_first", "only_second", "neither"))
+        learned = any(name in LEARNED for name in (comparison.first, comparison.second))
+        assert (comparison.mcnemar_p is None) == learned
+        c = comparison
+        pairs = c.both + c.only_first + c.only_second + c.neither
         assert pairs == (120 if learned else 40)
-        assert comparison["ci_low"] <= comparison["difference"] <= comparison["ci_high"]
+        assert comparison.ci_low <= comparison.difference <= comparison.ci_high
 
 
 @pytest.mark.slow
@@ -195,15 +194,15 @@ def test_bounds_over_posteriors_stand_beside_the_rates():
     name = "bayesian-scbf:simultaneous=0.9"
     found = evaluate(DISK, filters=["bayesian-scbf", name], episodes=30, repeats=2)
     plain, row = found.rows
-    assert plain["posterior_bound"] is None
-    assert "its bound over the posterior" in row["bound_note"]
-    assert row["posterior_bound"]["delta"] == pytest.approx(0.1)
+    assert plain.posterior_bound is None
+    assert "its bound over the posterior" in row.bound_note
+    assert row.posterior_bound.delta == pytest.approx(0.1)
     # (1 - delta)(h_0 - m T)/c, of h = 1 - x_1^2 - x_2^2 with c = 1, for the mean m of both
     # identifications.
-    expected = 0.9 * (1 - 0.1**2 - 0.7**2 - row["posterior_bound"]["shortfall"] * DISK.horizon)
-    assert row["posterior_bound"]["supremum"] == pytest.approx(1.0, abs=1e-6)
-    assert row["posterior_bound"]["probability"] == pytest.approx(expected, abs=1e-6)
-    assert row["ci_high"] >= row["posterior_bound"]["probability"] > 0
+    expected = 0.9 * (1 - 0.1**2 - 0.7**2 - row.posterior_bound.shortfall * DISK.horizon)
+    assert row.posterior_bound.supremum == pytest.approx(1.0, abs=1e-6)
+    assert row.posterior_bound.probability == pytest.approx(expected, abs=1e-6)
+    assert row.ci_high >= row.posterior_bound.probability > 0
 
 
 def test_progress_goes_from_the_learning_to_the_end():
@@ -237,9 +236,9 @@ def test_what_does_not_fit_the_heading_is_remarked(tmp_path):
                 knowledge=knowledge,
                 bounds=False,
             )
-            noise, *known = found.rows[0]["learning"]["remarks"]
+            noise, *known = found.rows[0].learning.remarks
             assert re.fullmatch(
-                r"it was learned of a plant with sigma_1 = .* \(here 0.3\), .*", noise
+                r"it was learned from a plant with sigma_1 = .* \(here 0.3\), .*", noise
             )
             assert bool(known) == (knowledge == "plant")
     assert (
@@ -250,6 +249,8 @@ def test_what_does_not_fit_the_heading_is_remarked(tmp_path):
             episodes=4,
             learned=[model],
             bounds=False,
-        ).rows[0]["learning"]["remarks"]
+        )
+        .rows[0]
+        .learning.remarks
         == []
     )

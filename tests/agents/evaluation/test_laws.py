@@ -40,7 +40,7 @@ def test_gaussian_law_of_adaptive_cruise_control(scheme, tolerance):
     ).rows
     deviation = tau * sigma * math.sqrt(horizon)
     shifted = 1 - 2 * norm.cdf(-(distance + 0.5826 * tau * sigma * math.sqrt(dt)) / deviation)
-    low, high = wilson_interval(row["safe"], row["episodes"], tolerance)
+    low, high = wilson_interval(row.safe, row.episodes, tolerance)
     assert low <= shifted <= high
     exact = survival(distance, round(horizon / dt), 1.0, tau * sigma * math.sqrt(dt))
     assert exact == pytest.approx(shifted, abs=1e-3)
@@ -52,7 +52,7 @@ def test_gaussian_law_of_adaptive_cruise_control(scheme, tolerance):
         )
         assert below == pytest.approx(level, abs=4.0 * math.sqrt(level * (1 - level) / 6000))
     if scheme == "filter":
-        assert (row["intervention_rate"], row["infeasible_rate"]) == (1.0, 0.0)
+        assert (row.intervention_rate, row.infeasible_rate) == (1.0, 0.0)
 
 
 @pytest.mark.slow
@@ -81,7 +81,7 @@ def test_law_of_the_scalar_system():
     assert survival(distance, 6 * 60, 1 - dt / 6, sigma * math.sqrt(dt / 6)) == pytest.approx(
         continuous, abs=0.03
     )
-    low, high = wilson_interval(row["safe"], row["episodes"], 0.999)
+    low, high = wilson_interval(row.safe, row.episodes, 0.999)
     assert low <= exact <= high
 
 

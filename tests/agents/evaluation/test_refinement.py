@@ -9,6 +9,7 @@ import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate, make_problem
+from safe_envs.agents.evaluation.comparison import pair_counts
 from safe_envs.agents.evaluation.refinement import TOLERANCE, refine, verdict
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
 from tests.oracles.laws import survival
@@ -39,28 +40,25 @@ def test_rates_are_those_of_evaluations_with_smaller_periods():
         )
         assert wanted.rows == answer.evaluations[i].rows
         for row, refined in zip(wanted.rows, answer.rows, strict=True):
-            assert refined["filter"] == row["filter"]
+            assert refined.filter == row.filter
             for key in ("safe", "safety_rate", "ci_low", "ci_high"):
-                assert refined[key][i] == row[key]
+                assert getattr(refined, key)[i] == getattr(row, key)
     for row in answer.rows:
-        assert row["change"] == pytest.approx((row["safe"][2] - row["safe"][1]) / 24)
-        table = (
-            answer.evaluations[2]
-            .flags[row["filter"]][0]
-            .table(answer.evaluations[1].flags[row["filter"]][0])
-        )
-        assert table[0] + table[1] == row["safe"][2]
-        assert table[0] + table[2] == row["safe"][1]
-        assert (row["change_low"], row["change_high"]) == paired_difference_interval(*table, 0.8)
+        assert row.change == pytest.approx((row.safe[2] - row.safe[1]) / 24)
+        fine, coarse = (e.episodes[row.filter][0].safe for e in answer.evaluations[:0:-1])
+        table = pair_counts(fine, coarse)
+        assert table[0] + table[1] == row.safe[2]
+        assert table[0] + table[2] == row.safe[1]
+        assert (row.change_low, row.change_high) == paired_difference_interval(*table, 0.8)
 
 
 @pytest.mark.parametrize(("episodes", "verdict"), [(200, "converged"), (100, "not resolved")])
 def test_rates_that_do_not_change_have_converged_if_there_are_episodes_enough(episodes, verdict):
     (row,) = refine("ACC-v0", filters=["scbf"], options={"horizon": 0.2}, episodes=episodes).rows
-    assert row["safety_rate"] == [1.0, 1.0, 1.0]
-    assert row["change_low"] == pytest.approx(-row["change_high"])
-    assert (row["change_high"] <= TOLERANCE) == (verdict == "converged")
-    assert row["verdict"] == verdict
+    assert row.safety_rate == [1.0, 1.0, 1.0]
+    assert row.change_low == pytest.approx(-row.change_high)
+    assert (row.change_high <= TOLERANCE) == (verdict == "converged")
+    assert row.verdict == verdict
 
 
 @pytest.mark.parametrize(
@@ -86,17 +84,17 @@ def test_a_rate_that_still_changes_is_said_to():
     options = {**SCALAR, "dt": 0.4, "horizon": 1.6}
     answer = refine("Scalar-v0", filters=["none"], options=options, episodes=4000)
     (row,) = answer.rows
-    for dt, low, high in zip(answer.periods, row["ci_low"], row["ci_high"], strict=True):
+    for dt, low, high in zip(answer.periods, row.ci_low, row.ci_high, strict=True):
         exact = survival(0.5, round(1.6 / dt), 1 - dt, 0.8 * math.sqrt(dt))
         assert low - 0.01 < exact < high + 0.01
-    assert row["change_low"] < row["change"] < row["change_high"] < 0
-    assert row["verdict"] == "still changing"
+    assert row.change_low < row.change < row.change_high < 0
+    assert row.verdict == "still changing"
 
 
 def test_horizons_that_are_no_multiple_of_the_period_stay_as_simulated():
     answer = refine("Scalar-v0", filters=["none"], options={"dt": 0.03, "horizon": 0.1}, episodes=4)
     assert [e.problem.steps for e in answer.evaluations] == [3, 6, 12]
-    ends = [e.rows[0]["curve"]["time"][-1] for e in answer.evaluations]
+    ends = [e.rows[0].curve.time[-1] for e in answer.evaluations]
     assert ends == [pytest.approx(0.09)] * 3
     assert answer.evaluations[0].config["problem"]["horizon"] == 0.1
 
@@ -106,11 +104,11 @@ def test_document_is_that_of_the_given_period_and_the_refinement():
     answer = refine(problem, episodes=6, record=True)
     document = json.loads(json.dumps(answer.document(), allow_nan=False))
     plain = evaluate(problem, episodes=6)
-    assert document["rows"] == plain.rows
+    assert document["rows"] == [row.as_dict() for row in plain.rows]
     assert document["config"] == json.loads(json.dumps(plain.config))
     assert document["refinement"]["dt"] == [0.01, 0.005, 0.0025]
-    assert document["refinement"]["rows"] == answer.rows
-    assert [len(e.recorders) for e in answer.evaluations] == [2, 0, 0]
+    assert document["refinement"]["rows"] == [vars(row) for row in answer.rows]
+    assert [len(e.trajectories) for e in answer.evaluations] == [2, 0, 0]
 
 
 def test_progress_goes_over_all_three():

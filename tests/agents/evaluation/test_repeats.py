@@ -9,7 +9,8 @@ import pytest
 
 from safe_envs import ConfigurationError
 from safe_envs.agents.evaluation.repeats import interval_over, pooled
-from safe_envs.agents.evaluation.statistics import rate_interval, repeated_interval
+from safe_envs.agents.evaluation.rows import EpisodeSummary
+from safe_envs.agents.evaluation.statistics import Curve, rate_interval, repeated_interval
 
 
 def row(safe, episodes, **changes):
@@ -22,13 +23,7 @@ def row(safe, episodes, **changes):
         "safety_rate": safe / episodes,
         "ci_low": 0.0,
         "ci_high": 1.0,
-        "curve": {
-            "time": [0.0, 1.0],
-            "safe": [episodes, safe],
-            "rate": rates,
-            "ci_low": rates,
-            "ci_high": rates,
-        },
+        "curve": Curve([0.0, 1.0], [episodes, safe], rates, rates, rates),
     }
     means = (
         "min_h_median",
@@ -38,7 +33,7 @@ def row(safe, episodes, **changes):
         "effort_mean",
         "return_mean",
     )
-    return {**row, **dict.fromkeys(means, safe / episodes), **changes}
+    return EpisodeSummary(**{**row, **dict.fromkeys(means, safe / episodes), **changes})
 
 
 def test_one_identification_is_left_as_it_is():
@@ -48,21 +43,21 @@ def test_one_identification_is_left_as_it_is():
 
 def test_several_are_summed_and_averaged():
     found = pooled([row(3, 10, effort_mean=None), row(5, 10, effort_mean=2.0)], 0.95)
-    assert (found["episodes"], found["safe"], found["violations"], found["touching"]) == (
+    assert (found.episodes, found.safe, found.violations, found.touching) == (
         20,
         8,
         12,
         2,
     )
-    assert found["safety_rate"] == found["return_mean"] == pytest.approx(0.4)
-    assert found["effort_mean"] == 2.0
-    assert found["curve"]["safe"] == [20, 8]
-    assert found["curve"]["rate"] == [1.0, pytest.approx(0.4)]
-    assert (found["ci_low"], found["ci_high"]) == (
-        found["curve"]["ci_low"][1],
-        found["curve"]["ci_high"][1],
+    assert found.safety_rate == found.return_mean == pytest.approx(0.4)
+    assert found.effort_mean == 2.0
+    assert found.curve.safe == [20, 8]
+    assert found.curve.rate == [1.0, pytest.approx(0.4)]
+    assert (found.ci_low, found.ci_high) == (
+        found.curve.ci_low[1],
+        found.curve.ci_high[1],
     )
-    assert pooled([row(3, 10, effort_mean=None)] * 2, 0.95)["effort_mean"] is None
+    assert pooled([row(3, 10, effort_mean=None)] * 2, 0.95).effort_mean is None
 
 
 def test_equal_identifications_have_the_interval_of_their_episodes():

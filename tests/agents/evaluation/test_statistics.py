@@ -12,14 +12,14 @@ from scipy.stats import binom, binomtest, multinomial, norm
 
 from safe_envs import ConfigurationError
 from safe_envs.agents.evaluation.statistics import (
-    FirstValues,
     RunningSum,
-    SafetyCurve,
+    curve_instants,
     log_normal_interval,
     mcnemar_p,
     paired_difference_interval,
     rate_band,
     rate_interval,
+    safety_curve,
     share,
     wilson_interval,
 )
@@ -252,7 +252,7 @@ def test_counts_that_cannot_be_are_named(call):
 
 @pytest.mark.parametrize("steps", [1, 2, 199, 200, 201, 400, 401, 1000, 100_001])
 def test_instants_of_a_curve_are_even_and_have_both_ends(steps):
-    instants = SafetyCurve(steps).instants
+    instants = curve_instants(steps)
     assert (instants[0], instants[-1]) == (0, steps)
     assert min(steps + 1, 101) <= len(instants) <= 201
     gaps = np.diff(instants)
@@ -260,21 +260,18 @@ def test_instants_of_a_curve_are_even_and_have_both_ends(steps):
     assert 0 < gaps[-1] <= gaps[0]
 
 
-@pytest.mark.parametrize("portion", [1, 7, 300])
-def test_curve_counts_the_episodes_that_are_safe_so_far(portion):
+def test_curve_counts_the_episodes_that_are_safe_so_far():
     steps, dt = 730, 0.02
     first = np.random.default_rng(3).integers(0, 1000, 300)
     first[:3] = (0, steps, steps + 1)
-    curve = SafetyCurve(steps)
-    for k in range(0, 300, portion):
-        curve.add(first[k : k + portion])
-    row = curve.row(dt, 0.9)
-    assert row["time"] == [k * dt for k in curve.instants.tolist()]
-    assert row["safe"] == [sum(f > k for f in first.tolist()) for k in curve.instants.tolist()]
-    assert row["safe"][0] == 300 - (first == 0).sum() < 300
-    assert row["rate"] == [safe / 300 for safe in row["safe"]]
-    assert list(zip(row["ci_low"], row["ci_high"], strict=True)) == [
-        rate_interval(safe, 300, 0.9) for safe in row["safe"]
+    row = safety_curve(np.where(first > steps, -1, first), steps, dt, 0.9)
+    instants = curve_instants(steps).tolist()
+    assert row.time == [k * dt for k in instants]
+    assert row.safe == [sum(f > k for f in first.tolist()) for k in instants]
+    assert row.safe[0] == 300 - (first == 0).sum() < 300
+    assert row.rate == [safe / 300 for safe in row.safe]
+    assert list(zip(row.ci_low, row.ci_high, strict=True)) == [
+        rate_interval(safe, 300, 0.9) for safe in row.safe
     ]
 
 
@@ -293,25 +290,6 @@ def test_running_sum_is_the_same_for_any_portions(portion):
     assert total.total == one_by_one
     # Summation by pairs differs, so that the order did matter.
     assert total.total != values.sum()
-
-
-@pytest.mark.parametrize("portion", [1000, 65_535, 65_536, 65_537, 200_000])
-def test_first_values_give_the_quantiles_of_the_first_ones(portion):
-    values = np.random.default_rng(2).standard_normal(200_000) + np.arange(200_000) / 50_000
-    kept = FirstValues()
-    for k in range(0, len(values), portion):
-        kept.add(values[k : k + portion])
-    levels = (0.0, 0.05, 0.5, 1.0)
-    assert kept.quantiles(levels) == np.quantile(values[:KEPT], levels).tolist()
-    assert sum(part.size for part in kept._parts) == KEPT
-
-
-def test_first_values_keep_no_view_of_what_they_were_given():
-    values = np.arange(5.0)
-    kept = FirstValues()
-    kept.add(values)
-    values[:] = 99.0
-    assert kept.quantiles((0.0, 0.5, 1.0)) == [0.0, 2.0, 4.0]
 
 
 def test_share_of_nothing_is_none():

@@ -1,4 +1,4 @@
-"""States that are kept of episodes: the same in whatever waves they come."""
+"""States that are kept of episodes: the same in whatever batches they come."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_envs.agents.evaluation.visited_states import Seen, Watch
+from safe_envs.agents.evaluation.visited_states import StateWatch, VisitedStates
 
 EPISODES, STEPS = 90, 4
 
@@ -16,7 +16,7 @@ EPISODES, STEPS = 90, 4
 def watched(x, slack, h):
     """What a watch keeps of episodes, from states (STEPS + 1, 2, B), slacks (STEPS, B) and h (STEPS
     + 1, B)."""
-    watch, safe, h_min = Watch(tuple(x[0]), h[0], 1), h[0] > 0, h[0].copy()
+    watch, safe, h_min = StateWatch(tuple(x[0]), h[0], 1), h[0] > 0, h[0].copy()
     alive = np.ones(len(h_min), dtype=bool)
     for k in range(STEPS):
         counts = alive & safe
@@ -32,18 +32,18 @@ def watched(x, slack, h):
     size=st.integers(1, EPISODES),
     missing=st.sampled_from([0.0, 0.5, 0.95, 1.0]),
 )
-def test_waves_of_any_size_keep_the_same(seed, size, missing):
+def test_batches_of_any_size_keep_the_same(seed, size, missing):
     rng = np.random.default_rng(seed)
     x, h = rng.normal(size=(STEPS + 1, 2, EPISODES)), rng.normal(size=(STEPS + 1, EPISODES)) + 1.0
     slack = rng.random((STEPS, EPISODES)) * (rng.random((STEPS, EPISODES)) >= missing)
     whole = watched(x, slack, h)
-    found = whole.seen(EPISODES)
+    found = whole.visited(EPISODES)
     parts = [slice(i, min(i + size, EPISODES)) for i in range(0, EPISODES, size)]
-    waves = [
-        watched(x[..., part], slack[:, part], h[:, part]).seen(part.stop - part.start)
+    batches = [
+        watched(x[..., part], slack[:, part], h[:, part]).visited(part.stop - part.start)
         for part in parts
     ]
-    joined = reduce(Seen.joined, waves)
+    joined = reduce(VisitedStates.joined, batches)
     for one, other in zip(vars(found).values(), vars(joined).values(), strict=True):
         np.testing.assert_array_equal(one, other)
     # By hand: the steps up to the first violation, and the worst of each episode.

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from safe_envs.agents import evaluate
-from safe_envs.agents.policies.registry import Policy
+from safe_envs.agents.policies.base import Policy
 from safe_envs.errors import ConfigurationError, WorkersLostError
 
 pytestmark = pytest.mark.slow
@@ -50,7 +50,12 @@ class _Stuck(Policy):
 def test_functions_of_a_file_go_along(tmp_path):
     place = tmp_path / "mine.py"
     place.write_text((Path(__file__).parents[3] / "examples" / "pendulum_v1.py").read_text())
-    arguments = {"filters": ["hocbf"], "episodes": 4, "bounds": False, "spec": f"{place}:spec"}
+    arguments = {
+        "filters": ["hocbf"],
+        "episodes": 4,
+        "bounds": False,
+        "filter_spec": f"{place}:spec",
+    }
     assert (
         evaluate("Pendulum-v1", jobs=2, **arguments).rows
         == evaluate("Pendulum-v1", **arguments).rows

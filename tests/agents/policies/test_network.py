@@ -148,8 +148,8 @@ def test_evaluation_is_the_same_for_every_num_envs(problem, tmp_path, algorithm,
     ]
     for other in answers[1:]:
         assert (other.rows, other.config) == (answers[0].rows, answers[0].config)
-        for name, recorder in answers[0].recorders.items():
-            assert recorder.states.tobytes() == other.recorders[name].states.tobytes()
+        for name, recorder in answers[0].trajectories.items():
+            assert recorder.states.tobytes() == other.trajectories[name].states.tobytes()
     one, all_of_them = (
         evaluate(
             ENV_ID,

@@ -128,8 +128,8 @@ def test_evaluation_is_the_same_for_every_num_envs(trained, name):
     for other in answers[1:]:
         assert other.rows == answers[0].rows
         assert other.config == answers[0].config
-        for filter_name, recorder in answers[0].recorders.items():
-            assert recorder.states.tobytes() == other.recorders[filter_name].states.tobytes()
+        for filter_name, recorder in answers[0].trajectories.items():
+            assert recorder.states.tobytes() == other.trajectories[filter_name].states.tobytes()
     few = [
         evaluate(
             ENV_ID,
@@ -183,9 +183,9 @@ def test_evaluation_of_a_file_and_of_the_model_agree(trained):
         for policy in (path, model)
     )
     for a, b in zip(by_file.rows, by_model.rows, strict=True):
-        assert (a["policy"], b["policy"]) == (path, "PPO")
-        assert (a["safe"], a["episodes"]) == (b["safe"], b["episodes"])
-        assert a["return_mean"] == pytest.approx(b["return_mean"], rel=1e-4)
+        assert (a.policy, b.policy) == (path, "PPO")
+        assert (a.safe, a.episodes) == (b.safe, b.episodes)
+        assert a.return_mean == pytest.approx(b.return_mean, rel=1e-4)
     assert len(by_file.config["policy"]["sha256"]) == 64
     assert (
         evaluate(ENV_ID, path, trust=True, options=OPTIONS, episodes=1, bounds=False).config[

@@ -13,13 +13,14 @@ from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import NominalController, evaluate
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.statistics import log_normal_interval
-from safe_envs.agents.rare_events.estimate import estimate_rare, verdict
+from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.agents.rare_events.importance_sampling import (
     Drifting,
     TiltedNoiseEnv,
     log_ratio,
     optimal_tilt,
 )
+from safe_envs.agents.rare_events.rows import Estimate, PlainEpisodes, verdict
 from safe_envs.agents.rare_events.splitting import Splitting
 from tests.oracles.laws import X, brownian, first_passage, walk_passage
 
@@ -139,8 +140,8 @@ def test_two_ways_to_fail_in_different_units_are_both_found():
         3.0, 20, 0.0, 3 / 5.15 * math.sqrt(0.05)
     )
     (row,) = estimate_rare(problem, filters=["none"], particles=400).rows
-    assert row["method"].startswith("splitting")
-    assert row["ci_low"] < exact < row["ci_high"]
+    assert row.method.startswith("splitting")
+    assert row.ci_low < exact < row.ci_high
 
 
 def test_without_noise_chance_may_come_from_the_policy():
@@ -152,25 +153,19 @@ def test_without_noise_chance_may_come_from_the_policy():
         "DubinsDisk-v0", "random", particles=50, repetitions=10, **arguments
     ).rows
     (plain,) = evaluate("DubinsDisk-v0", "random", episodes=2000, bounds=False, **arguments).rows
-    assert found["status"] == "estimated"
-    assert found["check"] is None
-    assert found["ci_low"] < 1 - plain["ci_low"]
-    assert found["ci_high"] > 1 - plain["ci_high"]
+    assert found.status == "estimated"
+    assert found.check is None
+    assert found.ci_low < 1 - plain.ci_low
+    assert found.ci_high > 1 - plain.ci_high
 
 
 def row(p, width, error, spread=0.1):
     estimates = p * np.exp(spread * np.resize((-1, 1), 20))
-    return {
-        "probability": p,
-        "ci_low": p / width,
-        "ci_high": p * width,
-        "relative_error": error,
-        "estimates": estimates.tolist(),
-    }
+    return Estimate("", p, p / width, p * width, error, estimates.tolist())
 
 
-NOTHING_SEEN = {"episodes": 5000, "violations": 0, "ci_low": 0.0, "ci_high": 7e-4}
-FEW_SEEN = {"episodes": 5000, "violations": 5, "ci_low": 4e-4, "ci_high": 2e-3}
+NOTHING_SEEN = PlainEpisodes(5000, 0, 0.0, 7e-4)
+FEW_SEEN = PlainEpisodes(5000, 5, 4e-4, 2e-3)
 
 
 @pytest.mark.parametrize(

@@ -46,14 +46,14 @@ def splitting_of(problem, bridge=None):
 
 def assert_holds(row, exact, within):
     """The interval holds the exact probability, and is narrow enough for that to mean something."""
-    assert row["status"] == "estimated"
-    assert row["doubt"] is None
+    assert row.status == "estimated"
+    assert row.doubt is None
     assert_near(row, exact, within)
 
 
 def assert_near(row, exact, within):
-    assert row["ci_low"] < exact < row["ci_high"]
-    assert row["ci_high"] / row["ci_low"] < within
+    assert row.ci_low < exact < row.ci_high
+    assert row.ci_high / row.ci_low < within
 
 
 @pytest.mark.slow
@@ -62,16 +62,16 @@ def test_gaussian_walk_of_probability_1e_8():
     assert 1e-8 < exact < 2e-8
     row = row_of(brownian(0.05, 2.0, -0.1, 0.15))
     assert_holds(row, exact, 2.0)
-    assert row["method"].startswith("drift of ")
-    assert row["check"]["method"] == "splitting on h/sqrt(T - t)"
-    assert_near(row["check"], exact, 2.0)
-    assert row["plain"]["violations"] == 0
+    assert row.method.startswith("drift of ")
+    assert row.check.method == "splitting on h/sqrt(T - t)"
+    assert_near(row.check, exact, 2.0)
+    assert row.plain.violations == 0
     # What plain episodes need for the same relative error, and how many steps these are.
-    assert row["plain_episodes_needed"] == pytest.approx(
-        1 / (row["probability"] * row["relative_error"] ** 2), rel=1e-6
+    assert row.plain_episodes_needed == pytest.approx(
+        1 / (row.probability * row.relative_error**2), rel=1e-6
     )
-    assert row["plain_steps_needed"] == pytest.approx(40 * row["plain_episodes_needed"])
-    assert row["probability"] == pytest.approx(np.mean(row["estimates"]))
+    assert row.plain_steps_needed == pytest.approx(40 * row.plain_episodes_needed)
+    assert row.probability == pytest.approx(np.mean(row.estimates))
 
 
 @pytest.mark.slow
@@ -80,7 +80,7 @@ def test_first_passage_of_probability_1e_8_with_continuous_monitoring():
     row = row_of(brownian(0.1, 2.0, -0.1, 0.15), monitoring="continuous", seed=1)
     assert_holds(row, exact, 2.0)
     # Looks at control instants only would see about half of it.
-    assert walk_passage(1.0, 20, -0.01, 0.15 * math.sqrt(0.1)) < row["ci_low"]
+    assert walk_passage(1.0, 20, -0.01, 0.15 * math.sqrt(0.1)) < row.ci_low
 
 
 @pytest.mark.slow
@@ -89,7 +89,7 @@ def test_geometric_martingale_of_probability_1e_8():
     exact = martingale_passage(1e-4, 140, 0.1)
     row = row_of(problem, "scbf", particles=120)
     assert_holds(row, exact, 3.0)
-    assert_near(row["check"] if "drift" in row["method"] else row, exact, 4.0)
+    assert_near(row.check if "drift" in row.method else row, exact, 4.0)
 
 
 @pytest.mark.slow
@@ -152,17 +152,17 @@ def test_agrees_with_plain_episodes_where_these_do(policy, monitoring, episodes)
         "Scalar-v0", policy, episodes=episodes, confidence=0.99, bounds=False, **arguments
     ).rows
     (rare,) = estimate_rare("Scalar-v0", policy, seed=3, particles=100, **arguments).rows
-    assert rare["ci_low"] < 1 - plain["ci_low"]
-    assert rare["ci_high"] > 1 - plain["ci_high"]
-    assert 0 < rare["plain"]["violations"] < rare["plain"]["episodes"]
-    assert rare["levels"] > 0
+    assert rare.ci_low < 1 - plain.ci_low
+    assert rare.ci_high > 1 - plain.ci_high
+    assert 0 < rare.plain.violations < rare.plain.episodes
+    assert rare.levels > 0
 
 
 def test_what_is_sure_needs_no_level():
     row = row_of(brownian(0.1, 1.0, 9.0, 0.1), **SHORT)
-    assert (row["probability"], row["levels"], row["plain_episodes_needed"]) == (1.0, 0.0, None)
-    assert row["ci_low"] > 0.99
-    assert row["ci_high"] == 1.0
+    assert (row.probability, row.levels, row.plain_episodes_needed) == (1.0, 0.0, None)
+    assert row.ci_low > 0.99
+    assert row.ci_high == 1.0
 
 
 def test_same_seed_is_the_same_answer_and_is_json():
@@ -185,23 +185,23 @@ def test_batches_do_not_change_what_is_estimated():
 def test_where_h_jumps_it_says_so():
     step = Barrier(sp.Piecewise((1, X < 1), (-1, True)))
     row = row_of(replace(brownian(0.1, 1.0, 0.0, 0.3), barriers=(step,)), **SHORT)
-    assert row["status"] == "none"
-    assert row["probability"] is row["ci_low"] is row["plain_episodes_needed"] is None
-    assert "stood at one level and none came below h = 1." in row["reason"]
+    assert row.status == "none"
+    assert row.probability is row.ci_low is row.plain_episodes_needed is None
+    assert "stood at one level and none came below h = 1." in row.reason
 
 
 def test_where_a_level_is_out_of_reach_it_says_so(monkeypatch):
     monkeypatch.setattr(splitting, "LEAST", 0.01)
     row = row_of(brownian(0.05, 1.0, 0.0, 0.25), **SHORT)
-    assert row["status"] == "none"
-    assert "in 10 of 10 repetitions the probability to come below h = 0." in row["reason"]
-    assert "may never be reached" in row["reason"]
+    assert row.status == "none"
+    assert "in 10 of 10 repetitions the probability to come below h = 0." in row.reason
+    assert "may never be reached" in row.reason
 
 
 def test_without_noise_there_is_nothing_to_split():
     row = row_of("DubinsDisk-v0", "hocbf")
-    assert row["status"] == "none"
-    assert "nothing is random after the start" in row["reason"]
+    assert row.status == "none"
+    assert "nothing is random after the start" in row.reason
 
 
 class Remembering(ZeroController):

@@ -58,7 +58,7 @@ def stopped(wanted, folder, steps=64):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(wanted, folder, tell=stop)
+        train(wanted, folder, progress=stop)
     (checkpoint,) = folder.glob("checkpoint_*")
     return checkpoint
 
@@ -318,7 +318,7 @@ def test_two_trainings_do_not_write_to_one_folder(tmp_path):
                     train(training(), tmp_path / "run", resume=resume)
         told.append(part)
 
-    train(training(), tmp_path / "run", tell=begin_another)
+    train(training(), tmp_path / "run", progress=begin_another)
     assert told
     assert not (tmp_path / "run" / ".lock").exists()
 

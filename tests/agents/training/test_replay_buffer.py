@@ -352,7 +352,7 @@ def test_actions_and_combinations_that_are_not_allowed():
 def test_executed_actions_beyond_the_box(executed):
     with pytest.raises(
         ConfigurationError,
-        match=r"not between \[0.0, -3.0\] and \[4.0, 5.0\]; give the box of the env's problem",
+        match=r"not between \[0.0, -3.0\] and \[4.0, 5.0\]; give the input bounds of the env's problem",
     ):
         add(buffer_of(envs=1), [{"safe_action": np.array(executed)}])
 
@@ -362,6 +362,7 @@ def test_envs_without_one_box():
         with pytest.raises(ConfigurationError, match="not one of this project's envs"):
             replay_options(source)
     with pytest.raises(
-        ConfigurationError, match=r"different boxes \[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]"
+        ConfigurationError,
+        match=r"different input bounds \[\(\(-3.0, 5.0\),\), \(\(-2.0, 2.0\),\)\]",
     ):
         replay_options(DummyVecEnv([make, lambda: make(box=(-2.0, 2.0))]))

@@ -60,7 +60,7 @@ def finished(request, tmp_path_factory):
     """A short training of each kind."""
     folder = tmp_path_factory.mktemp(request.param) / "run"
     told = []
-    train(training(request.param), folder, tell=told.append)
+    train(training(request.param), folder, progress=told.append)
     assert told == sorted(told)
     assert told[-1] == 1.0
     return request.param, folder
@@ -106,7 +106,7 @@ def test_its_figures_are_those_of_the_evaluation(finished):
             bounds=False,
             options=SMALL["options"],
         ).rows
-        assert {key: found[key] for key in ("safe", "return_mean", "violations")} == {
+        assert {key: getattr(found, key) for key in ("safe", "return_mean", "violations")} == {
             key: row[key] for key in ("safe", "return_mean", "violations")
         }
 
@@ -137,7 +137,7 @@ def test_a_training_that_was_interrupted_goes_on_as_if_it_had_not_been(finished,
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        train(training(algorithm), interrupted, tell=stop)
+        train(training(algorithm), interrupted, progress=stop)
     assert evaluations(interrupted)[-1]["timesteps"] < LENGTHS[algorithm][0]
     with pytest.raises(ConfigurationError, match="not finished"):
         evaluate(DUBINS, str(interrupted), ["none"], episodes=1)
@@ -164,7 +164,7 @@ def test_normalised_observations_are_part_of_the_policy(tmp_path):
     rows = evaluations(tmp_path / "run")
     given = {"episodes": 8, "seed": rows[-1]["seed"], "bounds": False, "options": SMALL["options"]}
     (found,) = evaluate(DUBINS, str(tmp_path / "run"), ["scbf"], **given).rows
-    assert found["return_mean"] == rows[-1]["return_mean"]
+    assert found.return_mean == rows[-1]["return_mean"]
     assert (tmp_path / "run" / "normalization.pkl").exists()
     assert (tmp_path / "run" / "best" / "normalization.pkl").exists()
     assert load(tmp_path / "run" / "policy.npz").details["normalization"]
@@ -361,7 +361,7 @@ def test_the_figures_are_those_of_the_evaluation_on_the_same_episodes():
         figures._on_step()
     assert dones.all()
     assert 0 < figures.figures()["rate"] < 1
-    assert figures.figures()["rate"] == row["safety_rate"]
+    assert figures.figures()["rate"] == row.safety_rate
 
 
 def test_the_files_have_the_form_that_the_zoo_reads():

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
+from safe_envs.agents.evaluation.results import Timing
 from safe_envs.agents.evaluation.rounding import touches
 from safe_envs.scripts.reports.evaluation_report import print_evaluation
 from tests.scripts.conftest import strictly
@@ -108,22 +109,22 @@ def test_an_early_end_is_noted_by_the_mean_length_of_all_episodes():
         evaluate(moving(0.2, 2 - X), filters=["none"], episodes=5, bounds=False)
     )
     # Of three identifications the steps and the episodes are three times as many.
-    (row,), (speed,) = answer.rows, answer.timing["rows"]
-    thrice = replace(
-        answer, rows=[{**row, "episodes": 15}], timing={"rows": [{**speed, "steps": 45}]}
-    )
-    assert early in printed(thrice)
-    assert "the mean episode" not in printed(
-        replace(thrice, timing={"rows": [{**speed, "steps": 120}]})
-    )
+    (row,), (speed,) = answer.rows, answer.timing.rows
+    thrice = replace(answer, rows=[replace(row, episodes=15)])
+
+    def taking(steps):
+        return replace(thrice, timing=Timing(1, [replace(speed, steps=steps)]))
+
+    assert early in printed(taking(45))
+    assert "the mean episode" not in printed(taking(120))
 
 
 def test_violations_that_are_no_more_than_rounding_are_told():
     # h halves in each step, and is 0 once the sum of the halves is 1 to rounding.
     edge = moving(0.0, 1 - X, horizon=40.0, nominal=1)
     (row,) = evaluate(edge, filters="cbf:alpha=1", episodes=3, bounds=False).rows
-    assert (row["safe"], row["violations"], row["touching"]) == (0, 3, 3)
-    assert abs(row["min_h_median"]) < 1e-15
+    assert (row.safe, row.violations, row.touching) == (0, 3, 3)
+    assert abs(row.min_h_median) < 1e-15
     told = (
         "all violations of cbf:alpha=1 come no lower than h = 0 to rounding: they touch the edge,"
         " and safe is h > 0"
@@ -131,7 +132,7 @@ def test_violations_that_are_no_more_than_rounding_are_told():
     assert told in printed(evaluate(edge, filters="cbf:alpha=1", episodes=3, bounds=False))
     # What is below by more than rounding is a violation like any other, however little it is.
     below = evaluate(moving(1e-12, 1e-12 - X, start=0.0), filters="none", episodes=3, bounds=False)
-    assert (below.rows[0]["violations"], below.rows[0]["touching"]) == (3, 0)
+    assert (below.rows[0].violations, below.rows[0].touching) == (3, 0)
     assert "touch the edge" not in printed(below)
     # The terms are those at the lowest state, not at the start: here h is x, and the state itself
     # is as far below 0.
@@ -141,8 +142,8 @@ def test_violations_that_are_no_more_than_rounding_are_told():
         episodes=3,
         bounds=False,
     )
-    assert -1e-14 < passed.rows[0]["min_h_median"] < 0.0
-    assert (passed.rows[0]["violations"], passed.rows[0]["touching"]) == (3, 0)
+    assert -1e-14 < passed.rows[0].min_h_median < 0.0
+    assert (passed.rows[0].violations, passed.rows[0].touching) == (3, 0)
 
 
 @pytest.mark.parametrize(

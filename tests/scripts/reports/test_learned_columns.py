@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import io
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
 from safe_envs.agents import evaluate
+from safe_envs.agents.evaluation.rows import LearningSummary, PosteriorGuarantee
 from safe_envs.registry import make_problem
 from safe_envs.scripts.evaluate import LEARNED_PARAMETERS
 from safe_envs.scripts.reports.evaluation_report import heading, print_evaluation
@@ -17,27 +19,13 @@ from safe_envs.scripts.reports.learned_columns import learned_columns, learned_n
 from safe_envs.wrappers import LEARNED
 
 NO_BOUND = "no bound for what rests on something learned"
-LEARNING = {
-    "repeats": 1,
-    "transitions": 20,
-    "files": [],
-    "remarks": [],
-    "warnings": [],
-    "rates": [0.9],
-}
-OFTEN = {**LEARNING, "repeats": 3, "rates": [0.9, 0.5, 0.8]}
-POSTERIOR_BOUND = {
-    "probability": 0.4,
-    "note": "",
-    "delta": 0.1,
-    "shortfall": 0.0,
-    "bias": 0.0,
-    "supremum": 1.0,
-}
+LEARNING = LearningSummary([], 1, 20, [], [], [], {}, [], [], rates=[0.9])
+OFTEN = replace(LEARNING, repeats=3, rates=[0.9, 0.5, 0.8])
+POSTERIOR_BOUND = PosteriorGuarantee(0.4, "", delta=0.1, shortfall=0.0, bias=0.0, supremum=1.0)
 
 
 def row(learning=None, bound=None, name="bayesian-scbf"):
-    return {"filter": name, "learning": learning, "posterior_bound": bound}
+    return SimpleNamespace(filter=name, learning=learning, posterior_bound=bound)
 
 
 @pytest.mark.parametrize(
@@ -52,7 +40,7 @@ def row(learning=None, bound=None, name="bayesian-scbf"):
             ),
         ),
         ("CubicSDEDisk-v0", [row(LEARNING), row(LEARNING, POSTERIOR_BOUND)], f"{NO_BOUND}."),
-        ("CubicSDEDisk-v0", [row(LEARNING, {"probability": None, "note": "none"})], f"{NO_BOUND}."),
+        ("CubicSDEDisk-v0", [row(LEARNING, PosteriorGuarantee(None, "none"))], f"{NO_BOUND}."),
         ("StochasticDubins-v0", [row(LEARNING)], f"{NO_BOUND}."),
         ("DubinsObstacles-v0", [row(LEARNING)], f"{NO_BOUND}."),
     ],
@@ -71,7 +59,7 @@ def test_nothing_is_said_where_nothing_was_learned():
 def test_repeats_are_means_and_their_intervals_have_a_condition():
     problem = make_problem("CubicSDEDisk-v0")
     rows = [row(), row(LEARNING), row(OFTEN)]
-    speeds = [{"learning_seconds": seconds} for seconds in (None, 1.5, 1.5)]
+    speeds = [SimpleNamespace(learning_seconds=seconds) for seconds in (None, 1.5, 1.5)]
     columns = learned_columns(rows)
     assert [list(map(cell, rows, speeds)) for cell in columns.values()] == [
         ["-", "1.50 s", "1.50 s"],
@@ -99,7 +87,7 @@ def test_texts_of_the_user_are_no_markup_and_the_heading_counts_what_was_learned
     )
     rows = [
         answer.rows[0],
-        {**answer.rows[1], "filter": "scbf:file=[red]x.npz", "learning": LEARNING},
+        replace(answer.rows[1], filter="scbf:file=[red]x.npz", learning=LEARNING),
     ]
     console = Console(width=200, file=io.StringIO())
     changed = replace(answer, rows=rows, config={**answer.config, "repeats": 2})

@@ -1,14 +1,13 @@
-"""Residuals of a barrier of degree 2, learned from the differences of Eq. (3.28) as it is printed."""
+"""Residuals of a barrier of degree 2, learned from the printed differences of Eq. (3.28)."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from safe_envs import ControlAffineSDE, SafetyProblem
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import derivatives, lie_derivative_f, lie_derivative_g
-from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.reproduce.chapter_3.learned_runs import settings
+from safe_envs.scripts.reproduce.chapter_3.learned_runs import learning_sizes
 from safe_envs.scripts.reproduce.framework.artefact import Sample
 from safe_envs.wrappers.learning.base import Record
 from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
@@ -20,14 +19,20 @@ from safe_envs.wrappers.learning.models.signature import Signature
 def printed_residuals(
     problem: SafetyProblem, sample: Sample, seed: int
 ) -> tuple[ResidualModel, float]:
-    """What is learned from differences over control periods, and the median share of the input's
-    gain in them.
+    """Return what is learned from differences over control periods.
+
+    Also return the median share of the input's gain in them.
 
     The backward period is driven straight on, the forward one under either of two inputs.
 
+    Args:
+        problem: with a single input.
+        sample: how much is learned.
+        seed: of the states and of the network.
+
     Source: thesis Eq. (3.28), with Eq. (3.24).
     """
-    count, epochs = settings(sample)
+    count, epochs = learning_sizes(sample)
     before = draw_states(problem, count, np.random.default_rng(seed))
     x = _stepped(problem, before, 0.0)
     first, second = problem.exploration.inputs[0][0], problem.exploration.inputs[-1][0]
@@ -54,7 +59,7 @@ def printed_residuals(
 
 
 def _stepped(problem: SafetyProblem, states: np.ndarray, u: float) -> np.ndarray:
-    """States (B, n) a control period later, under one input held."""
+    """Return states, shape (B, n), a control period later under one held input."""
     return collect_paths(problem, states, np.full((len(states), 1), u), 1, problem.dt)[:, 1]
 
 
@@ -76,7 +81,7 @@ def _barrier(problem: SafetyProblem, states: np.ndarray) -> np.ndarray:
 def _lie_derivatives(
     system: ControlAffineSDE, problem: SafetyProblem, states: np.ndarray
 ) -> np.ndarray:
-    """h, L_f h, L_f^2 h and L_g L_f h at states, shape (4, B)."""
+    """Return h, L_f h, L_f^2 h and L_g L_f h at states, shape (4, B)."""
     along = derivatives(system, problem.barriers[0].expression, 2, lie_derivative_f)
     expressions = [system.numeric(e) for e in (*along, *lie_derivative_g(system, along[1]))]
     return stacked(

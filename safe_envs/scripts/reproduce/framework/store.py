@@ -24,8 +24,8 @@ def configuration(artefact: Artefact, sample: Sample) -> dict[str, Any]:
     """Return everything that a result depends on, as JSON-able data.
 
     Args:
-        artefact: To compute.
-        sample: How much is simulated.
+        artefact: to compute.
+        sample: how much is simulated.
     """
     return {
         "artefact": artefact.name,
@@ -39,12 +39,12 @@ def require_same_sample(folder: Path, artefacts: Iterable[Artefact], sample: Sam
     """Check that a folder holds no results of another sample, which would be overwritten.
 
     Args:
-        folder: Of the results.
-        artefacts: To look for.
-        sample: By which they are to be computed.
+        folder: of the results.
+        artefacts: to look for.
+        sample: by which they are to be computed.
 
     Raises:
-        ConfigurationError: It does, or holds a file that is damaged or altered.
+        ConfigurationError: it does, or holds a file that is damaged or altered.
     """
     names = [artefact.name for artefact in artefacts]
     ResultStore(folder).require_same_options(names, asdict(sample))
@@ -54,12 +54,12 @@ def read(folder: Path, artefact: Artefact, sample: Sample) -> tuple[Outcome, flo
     """Return a kept outcome and its seconds, or None without one of the same configuration.
 
     Args:
-        folder: Of the results.
-        artefact: Whose outcome to read.
-        sample: By which it is to be computed.
+        folder: of the results.
+        artefact: whose outcome to read.
+        sample: by which it is to be computed.
 
     Raises:
-        ConfigurationError: The result is damaged or altered.
+        ConfigurationError: the result is damaged or altered.
     """
     store = ResultStore(folder)
     document = store.read(artefact.name, configuration(artefact, sample))
@@ -85,14 +85,14 @@ def keep(
     """Draw an outcome, and write it after its pictures, whose checksums it holds.
 
     Args:
-        folder: Of the results.
-        artefact: That was computed.
-        sample: By which.
-        outcome: To keep.
-        seconds: That the computation took.
+        folder: of the results.
+        artefact: that was computed.
+        sample: by which.
+        outcome: to keep.
+        seconds: that the computation took.
 
     Raises:
-        ConfigurationError: It cannot be written, as on a full disk.
+        ConfigurationError: it cannot be written, as on a full disk.
     """
     content = {
         "outcome": outcome.document(),

@@ -20,8 +20,8 @@ def summary_document(found: Found, sample: Sample) -> dict[str, Any]:
     """Return artefacts with their verdicts and outcomes, as JSON-able data.
 
     Args:
-        found: What was computed.
-        sample: By which.
+        found: what was computed.
+        sample: by which.
     """
     rows = []
     for artefact, outcome, seconds in found:

@@ -1,0 +1,224 @@
+"""From what an evaluation is asked for to what it needs: a target, a policy, filters."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from safe_envs.agents.evaluation.identification import Learning
+from safe_envs.agents.evaluation.rollout import Env, Progress
+from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec, Filter, conditions_in
+from safe_envs.agents.evaluation.targets import make_target
+from safe_envs.agents.policies.custom import policy_name
+from safe_envs.agents.policies.registry import policy_files
+from safe_envs.bounded_reading import read_bytes
+from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.plugins import CONDITIONS as CONDITION_PLUGINS
+from safe_envs.plugins import plugin_names
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers import (
+    CONDITIONS,
+    LEARNED,
+    Condition,
+    parse_conditions,
+    require_readable,
+    spec_of,
+)
+
+
+class ResolvedEvaluation:
+    """A spec with everything made that it names: what is simulated, the policy, the filters.
+
+    Args:
+        spec: what is asked for.
+
+    Attributes:
+        spec: as given.
+        target: what is simulated.
+        problem: its problem.
+        policy: who acts.
+        names: of the filters, each once.
+        learning: what filters learn.
+        filters: the conditions of each filter, in each repeat; there once everything is learned.
+
+    Raises:
+        ConfigurationError: The spec names something unknown, or parts of it do not fit together.
+        RelativeDegreeError: A condition does not suit a barrier.
+    """
+
+    def __init__(self, spec: EvaluationSpec) -> None:
+        self.spec = spec
+        self.target = make_target(spec.problem, spec.options, spec.filter_spec)
+        self.problem = self.target.problem
+        if spec.monitoring == "continuous" and self.target.filter_spec is not None:
+            raise ConfigurationError(
+                "monitoring = 'continuous': the path of a third-party env between its steps is"
+                " unknown; use 'discrete'"
+            )
+        given = spec.policy
+        self.policy = (
+            self.target.make_policy(given, spec.trust)
+            if isinstance(given, str)
+            else self.target.adapt_policy(given)
+        )
+        asked = (UNFILTERED, self.target.filter) if spec.filters is None else spec.filters
+        filters = {_name_of(each): each for each in asked}
+        self.names = list(filters)
+        self._given = {
+            name: self._fitted(conditions_in(each))
+            for name, each in filters.items()
+            if not isinstance(each, str)
+        }
+        texts = [name for name in self.names if name not in self._given]
+        self._texts = {name: _checked(name, self.problem) for name in texts}
+        self.learning = Learning(self.problem, texts, spec.learned, spec.repeats, spec.seed)
+        if self.target.filter_spec is not None and self.learning.missing():
+            raise ConfigurationError(
+                "a filter over a third-party env takes what was learned from a log: NAME:file=FILE"
+            )
+        self.filters: dict[str, list[tuple[Condition, ...]]] = {}
+
+    def learn(self, part: Callable[[], Progress | None]) -> None:
+        """Learn what is missing, and read the filters.
+
+        Args:
+            part: returns the progress of the next part of the work.
+        """
+        for method, repeat in self.learning.missing():
+            self.learning.learn(method, repeat, part())
+        for name in self.names:
+            self.filters[name] = [
+                self._conditions(name, repeat) for repeat in range(self.repeats(name))
+            ]
+
+    def repeats(self, name: str) -> int:
+        """Return how many identifications a filter is evaluated with."""
+        return 1 if name in self._given else self.learning.repeats(name)
+
+    def _conditions(self, name: str, repeat: int) -> tuple[Condition, ...]:
+        if name == UNFILTERED:
+            return ()
+        return self._given.get(name) or self.learning.conditions(name, repeat)
+
+    def _fitted(self, conditions: tuple[Condition, ...]) -> tuple[Condition, ...]:
+        """Return a condition for each barrier, checked against the problem."""
+        count = len(self.problem.barriers)
+        if len(conditions) not in (1, count):
+            allowed = "one" if count == 1 else f"one for all {count} barriers, or one for each"
+            raise ConfigurationError(
+                f"a filter holds {len(conditions)} conditions; {self.problem.name} takes {allowed}"
+            )
+        fitted = conditions * count if len(conditions) == 1 else conditions
+        for condition in fitted:
+            condition.require_fit(self.problem)
+        return fitted
+
+    def env(self, conditions: Sequence[Condition], num_envs: int) -> Env:
+        """Return a batch of envs behind a filter, after a first step.
+
+        That step compiles what the filter needs: an error shows before a long run, and the timing
+        is of steps.
+
+        Args:
+            conditions: one for each barrier; none for the unfiltered env.
+            num_envs: size of the batch.
+        """
+        env = self.target.env(conditions, self.spec.knowledge, self.spec.objective, num_envs)
+        env.reset(seed=0)
+        space: Any = env.action_space
+        env.step(np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high))
+        return env
+
+    def config(self) -> dict[str, Any]:
+        """Return all that determines the result as JSON-able data, once filters are read."""
+        spec, target, filter_spec = self.spec, self.target, self.spec.filter_spec
+        named = filter_spec is None or isinstance(filter_spec, str)
+        return {
+            "title": target.title,
+            "env_id": target.env_id,
+            "options": target.options,
+            "filter_spec": filter_spec if named else type(filter_spec).__name__,
+            "problem": _describe(self.problem),
+            "policy": _describe_policy(spec.policy),
+            "filters": [
+                {"name": name, "spec": self._texts.get(name) or spec_of(self.filters[name][0])}
+                for name in self.names
+            ],
+            "knowledge": spec.knowledge,
+            "objective": spec.objective,
+        }
+
+
+class WorkParts:
+    """The progress of a number of equal parts of some work, one after the other.
+
+    Args:
+        progress: called with the part of the whole work that is done, from 0 to 1.
+        parts: how many there are.
+    """
+
+    def __init__(self, progress: Progress | None, parts: int) -> None:
+        self._progress, self._parts, self._begun = progress, parts, 0
+
+    def part(self, whole: float = 1.0) -> Progress | None:
+        """Return the progress of the next part, which is called with how much of `whole` is done."""
+        before, self._begun = self._begun, self._begun + 1
+        report = self._progress
+        return (
+            None if report is None else lambda done: report((before + done / whole) / self._parts)
+        )
+
+
+def _name_of(given: Filter) -> str:
+    return given if isinstance(given, str) else spec_of(conditions_in(given))
+
+
+def filter_names() -> tuple[str, ...]:
+    """Return the names of all filters, "none" and those of other packages included."""
+    return (UNFILTERED, *CONDITIONS, *LEARNED, *plugin_names(CONDITION_PLUGINS))
+
+
+def _checked(name: str, problem: SafetyProblem) -> str | None:
+    """Return the text of a filter with all its parameters; None where it has to be learned first."""
+    if name == UNFILTERED:
+        return UNFILTERED
+    if UNFILTERED in name.split("+"):
+        raise ConfigurationError(
+            f"filter {shown(name)}: {UNFILTERED!r} is the unfiltered env, no condition; give it"
+            " alone or leave it out"
+        )
+    head, known = re.split("[:+]", name)[0], filter_names()
+    # What has a dot is the place of a condition of one's own.
+    if head not in known and "." not in head:
+        raise ConfigurationError(f"unknown filter {shown(name)}; {nearest(name, known)}")
+    if any(re.split(":", part)[0] in LEARNED for part in name.split("+")):
+        require_readable(name, problem)
+        return None
+    return spec_of(parse_conditions(name, problem))
+
+
+def _describe(problem: SafetyProblem) -> dict[str, Any]:
+    return {
+        "name": problem.name,
+        "plant": {p.name: v for p, v in problem.plant.parameters.items()},
+        "model": {p.name: v for p, v in problem.model.parameters.items()},
+        "barriers": [str(b.expression) for b in problem.barriers],
+        "box": [[float(low), float(high)] for low, high in problem.box],
+        "start": problem.start,
+        "dt": problem.dt,
+        "substeps": problem.substeps,
+        "horizon": problem.horizon,
+    }
+
+
+def _describe_policy(policy: Any) -> dict[str, Any]:
+    if not isinstance(policy, str):
+        return {"name": policy_name(policy)}
+    files = policy_files(policy)
+    if not files:
+        return {"name": policy}
+    return {"name": policy, "sha256": hashlib.sha256(read_bytes(files[0])).hexdigest()}

@@ -1,0 +1,187 @@
+"""The result of an evaluation."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from safe_envs.agents.evaluation.comparison import Comparison
+from safe_envs.agents.evaluation.rate_text import percent, percent_in
+from safe_envs.agents.evaluation.rows import EpisodeResults, EvaluationRow
+from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
+from safe_envs.agents.evaluation.trajectories import Trajectories
+from safe_envs.agents.evaluation.visited_states import VisitedStates
+from safe_envs.agents.jobs.fingerprint import package_versions
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.learning import LearnedModel
+
+_TEXT_TITLES = ("bound", "min h, median", "violations", "intervened", "infeasible", "return")
+
+
+@dataclass(frozen=True)
+class FilterTiming:
+    """How long the episodes under a filter took.
+
+    Attributes:
+        filter: its name.
+        seconds: wall-clock time.
+        steps: control periods of all episodes.
+        steps_per_second: steps/seconds.
+        learning_seconds: mean time of an identification; None where nothing was learned.
+    """
+
+    filter: str
+    seconds: float
+    steps: int
+    steps_per_second: float
+    learning_seconds: float | None
+
+
+@dataclass(frozen=True)
+class Timing:
+    """The part of a result that depends on the machine.
+
+    Attributes:
+        num_envs: episodes side by side.
+        rows: one for each filter.
+    """
+
+    num_envs: int
+    rows: list[FilterTiming]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The result of `evaluate`. `print` shows it as a table.
+
+    Attributes:
+        problem: what was simulated.
+        spec: what was asked for.
+        config: all that determines the result, as JSON-able data.
+        rows: statistics, one row for each filter.
+        comparisons: of every two rows, by which of the same episodes were safe.
+        timing: the only part that depends on the machine and on `num_envs`.
+        trajectories: of each filter, if they were asked for.
+        episodes: results of each episode, for each filter and identification.
+        visited: states of the episodes that contradict a bound, if any do, for each filter and
+            identification.
+        learned: models of the first identifications.
+        is_deterministic: whether nothing is random, so that all episodes are one and the same.
+    """
+
+    problem: SafetyProblem
+    spec: EvaluationSpec
+    config: dict[str, Any]
+    rows: list[EvaluationRow]
+    comparisons: list[Comparison]
+    timing: Timing
+    trajectories: dict[str, Trajectories]
+    episodes: dict[str, list[EpisodeResults]]
+    visited: dict[str, list[VisitedStates]]
+    learned: list[LearnedModel]
+    is_deterministic: bool
+
+    @property
+    def title(self) -> str:
+        """How results call what was evaluated."""
+        return self.config["title"]
+
+    def row(self, name: str) -> EvaluationRow:
+        """Return the row of a filter.
+
+        Raises:
+            KeyError: No row has the name.
+        """
+        return {row.filter: row for row in self.rows}[name]
+
+    def document(self) -> dict[str, Any]:
+        """Return the whole as JSON-able data."""
+        return {
+            "config": self.config,
+            "versions": package_versions(),
+            "rows": [row.as_dict() for row in self.rows],
+            "comparisons": [asdict(comparison) for comparison in self.comparisons],
+            "timing": asdict(self.timing),
+        }
+
+    def episode_columns(self) -> dict[str, np.ndarray]:
+        """Return the results of all episodes as columns, in the order of filters and episodes.
+
+        Returns:
+            Arrays of equal length: filter, identification, episode, safe, return, min_h,
+            first_violation (s, NaN where there is none), length (steps), interventions,
+            infeasible, effort.
+        """
+        found: dict[str, list[Any]] = {}
+        for name, identifications in self.episodes.items():
+            for repeat, results in enumerate(identifications):
+                count = len(results.length)
+                time = self.problem.dt * results.first_violation
+                columns = {
+                    "filter": np.full(count, name),
+                    "identification": np.full(count, repeat),
+                    "episode": np.arange(count),
+                    "safe": results.safe,
+                    "return": results.returns,
+                    "min_h": results.min_h,
+                    "first_violation": np.where(results.safe, np.nan, time),
+                    "length": results.length,
+                    "interventions": results.interventions,
+                    "infeasible": results.infeasible,
+                    "effort": results.effort,
+                }
+                for key, values in columns.items():
+                    found.setdefault(key, []).append(values)
+        return {key: np.concatenate(parts) for key, parts in found.items()}
+
+    def to_dataframe(self, episodes: bool = False) -> Any:
+        """Return a pandas DataFrame with a row for each filter, or for each episode.
+
+        Args:
+            episodes: whether to return the columns of `episode_columns`.
+
+        Raises:
+            ConfigurationError: pandas is not installed.
+        """
+        try:
+            import pandas as pd  # pyright: ignore[reportMissingImports]
+        except ImportError as error:
+            raise ConfigurationError(
+                "to_dataframe needs pandas, which is not installed: pip install pandas, or use"
+                " rows or episode_columns()"
+            ) from error
+        if episodes:
+            return pd.DataFrame(self.episode_columns())
+        nested = ("curve", "posterior_bound", "learning")
+        return pd.DataFrame(
+            [{k: v for k, v in row.as_dict().items() if k not in nested} for row in self.rows]
+        )
+
+    def __str__(self) -> str:
+        level = f"{100 * self.spec.confidence:.10g}"
+        titles = ("filter", f"safe [{level} % interval]", *_TEXT_TITLES)
+        table = [titles, *map(_text_cells, self.rows)]
+        widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+        lines = [
+            "  ".join(f"{cell:{'<' if i == 0 else '>'}{widths[i]}}" for i, cell in enumerate(cells))
+            for cells in table
+        ]
+        heading = f"{self.title}, policy {self.rows[0].policy}, {self.spec.episodes} episodes"
+        return "\n".join([heading, *lines])
+
+
+def _text_cells(row: EvaluationRow) -> tuple[str, ...]:
+    filtered = row.filter != UNFILTERED
+    return (
+        row.filter,
+        percent_in(row.safety_rate, row.ci_low, row.ci_high),
+        percent(row.estimated_bound),
+        f"{row.min_h_median:.3g}",
+        str(row.violations),
+        percent(row.intervention_rate) if filtered else "-",
+        percent(row.infeasible_rate) if filtered else "-",
+        f"{row.return_mean:.4g}",
+    )

@@ -1,0 +1,185 @@
+"""What an evaluation says of each episode, and of each filter in a row."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from safe_envs.agents.evaluation.statistics import Curve
+
+
+@dataclass(frozen=True)
+class EpisodeResults:
+    """What became of each episode, in their order: arrays of shape (E,).
+
+    Attributes:
+        returns: sum of the rewards of the whole episode.
+        min_h: minimum h of the whole episode.
+        first_violation: control instant of the first h <= 0; -1 where there is none.
+        length: control periods until the episode ended.
+        interventions: periods in which the filter changed the action, up to a first violation.
+        infeasible: those of them in which no action met all conditions.
+        effort: mean |u|^2 of the periods up to a first violation; NaN where there is none.
+    """
+
+    returns: np.ndarray
+    min_h: np.ndarray
+    first_violation: np.ndarray
+    length: np.ndarray
+    interventions: np.ndarray
+    infeasible: np.ndarray
+    effort: np.ndarray
+
+    @property
+    def safe(self) -> np.ndarray:
+        """Whether each episode is safe."""
+        return self.first_violation < 0
+
+    @property
+    def counted(self) -> np.ndarray:
+        """Periods up to a first violation, those in which conditions mean something."""
+        return np.where(self.safe, self.length, self.first_violation)
+
+    @classmethod
+    def joined(cls, parts: Sequence[EpisodeResults]) -> EpisodeResults:
+        """Return the episodes of all parts, one part after the other."""
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeSummary:
+    """Statistics of the episodes under a filter.
+
+    Attributes:
+        episodes: how many; with several identifications of all of them.
+        safe: number of safe ones.
+        safety_rate: their share.
+        ci_low: lower end of its interval.
+        ci_high: upper end.
+        min_h_median: median over episodes of the minimum h.
+        min_h_p05: 5 % quantile of it.
+        violations: number of episodes that are not safe.
+        touching: how many of these come no lower than h = 0 to rounding.
+        intervention_rate: share of the steps up to a first violation; None if there is no such.
+        infeasible_rate: share of these steps.
+        effort_mean: mean over episodes of the mean |u|^2 of these steps.
+        return_mean: mean return.
+        curve: safety rate over time.
+    """
+
+    episodes: int
+    safe: int
+    safety_rate: float
+    ci_low: float
+    ci_high: float
+    min_h_median: float
+    min_h_p05: float
+    violations: int
+    touching: int
+    intervention_rate: float | None
+    infeasible_rate: float | None
+    effort_mean: float | None
+    return_mean: float
+    curve: Curve
+
+
+@dataclass(frozen=True)
+class PosteriorGuarantee:
+    """A bound over the posterior of what was learned, averaged over the starts.
+
+    Attributes:
+        probability: the bound; None where there is none.
+        note: why there is none, or why it is weak.
+        delta: probability that the identification misses the system; None, as those below, where
+            no bound was looked for.
+        supremum: c.
+        shortfall: m, in 1/s.
+        bias: e of the steps, in 1/s.
+    """
+
+    probability: float | None
+    note: str | None
+    delta: float | None = None
+    supremum: float | None = None
+    shortfall: float | None = None
+    bias: float | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return it as JSON-able data, less the numbers that are not there."""
+        given = asdict(self)
+        head = {name: given.pop(name) for name in ("probability", "note")}
+        return head | {name: value for name, value in given.items() if value is not None}
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoundSummary:
+    """The bounds of a filter, averaged over the starts, as far as the episodes do not contradict it.
+
+    Attributes:
+        withheld: what the episodes say against a bound, which is withheld then.
+        outside_rate: share of the starts in the safe set outside the sets C_j, which no bound
+            covers; None without a filter, and where the sets are not known.
+        estimated_bound: on the probability of being safe; None where there is none.
+        bound_note: why there is none, or why it is weak.
+        posterior_bound: that over the posterior; None where the filter is not robust over one.
+    """
+
+    withheld: str | None = None
+    outside_rate: float | None = None
+    estimated_bound: float | None = None
+    bound_note: str | None = None
+    posterior_bound: PosteriorGuarantee | None = None
+
+
+@dataclass(frozen=True)
+class LearningSummary:
+    """What was learned for a filter.
+
+    Attributes:
+        methods: names of the methods.
+        repeats: number of identifications.
+        transitions: of each identification.
+        seeds: of each.
+        sha256: of each model.
+        files: from which models were read.
+        errors: mean held-out errors by name.
+        warnings: of the learning.
+        remarks: what does not fit the heading of an evaluation.
+        rates: safety rate with each identification.
+    """
+
+    methods: list[str]
+    repeats: int
+    transitions: int
+    seeds: list[int | None]
+    sha256: list[str]
+    files: list[str]
+    errors: dict[str, float]
+    warnings: list[str]
+    remarks: list[str]
+    rates: list[float]
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationRow(BoundSummary, EpisodeSummary):
+    """Everything an evaluation says of one filter.
+
+    Attributes:
+        filter: its name, "none" without one.
+        policy: name of the policy.
+        learning: what was learned for the filter; None where nothing was.
+    """
+
+    filter: str
+    policy: str
+    learning: LearningSummary | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the row as JSON-able data."""
+        head = {"filter": self.filter, "policy": self.policy}
+        bound = self.posterior_bound
+        return head | asdict(self) | {"posterior_bound": bound and bound.as_dict()}

@@ -1,0 +1,113 @@
+"""Policies from outside this project: functions, classes, and any object with `predict`."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from safe_envs.agents.policies.base import Policy, Spaces, checked_observation
+from safe_envs.errors import ConfigurationError, InvalidInputError, SafeEnvsError, shortened
+from safe_envs.problem.problem import SafetyProblem
+
+
+class FunctionPolicy(Policy):
+    """A function of a batch of observations as a policy.
+
+    Args:
+        function: maps observations (B, k) to actions (B, m) in [-1, 1]; with one input (B,) will
+            do too. The action of a row may depend on that row only.
+        width: k.
+        inputs: m.
+    """
+
+    def __init__(self, function: Callable[[np.ndarray], Any], width: int, inputs: int) -> None:
+        self._function = function
+        self._width, self._m = width, inputs
+        self.name = policy_name(function)
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, Any]:
+        """Call the function; see `Policy.predict`.
+
+        Raises:
+            InvalidInputError: The function fails, or returns anything but (B, m) finite numbers.
+        """
+        given = checked_observation(observation, self._width)
+        rows = np.atleast_2d(given)
+        try:
+            actions = np.asarray(self._function(rows), dtype=np.float64)
+        except SafeEnvsError:
+            raise
+        except Exception as error:
+            raise InvalidInputError(
+                f"the policy {self.name} failed on observations of shape {rows.shape}"
+                f" ({type(error).__name__}: {shortened(error)}); it is called with a batch (B,"
+                f" {self._width})"
+            ) from error
+        if self._m == 1 and actions.shape == (len(rows),):
+            actions = actions[:, None]
+        if actions.shape != (len(rows), self._m) or not np.isfinite(actions).all():
+            reason = (
+                f"returned actions of shape {actions.shape}"
+                if actions.shape != (len(rows), self._m)
+                else "returned actions that are not finite"
+            )
+            raise InvalidInputError(
+                f"the policy {self.name} {reason} for {len(rows)} observations; return finite"
+                f" numbers in [-1, 1] of shape ({len(rows)}, {self._m}), a row for each observation"
+            )
+        return actions.reshape(*given.shape[:-1], self._m), state
+
+
+def as_policy(given: Any, problem: SafetyProblem, spaces: Spaces | None = None) -> Any:
+    """Return an object with `predict` for a policy from outside this project.
+
+    Args:
+        given: an object with `predict`; a class that takes the problem and makes one; or a
+            function of a batch of observations, see `FunctionPolicy`.
+        problem: which the policy is to act in.
+        spaces: of observations and actions; by default those of the problem's env.
+
+    Raises:
+        ConfigurationError: It is none of these, or the class cannot be called with the problem.
+    """
+    made: Any = given
+    if inspect.isclass(given):
+        make: Any = given
+        try:
+            made = make(problem)
+        except SafeEnvsError:
+            raise
+        except Exception as error:
+            raise ConfigurationError(
+                f"the policy {given.__name__} cannot be made with the problem {problem.name}"
+                f" ({type(error).__name__}: {shortened(error)}); a class takes the SafetyProblem as"
+                " its only argument"
+            ) from error
+    if callable(getattr(made, "predict", None)):
+        return made
+    if callable(made):
+        if spaces is None:
+            return FunctionPolicy(made, len(problem.features), len(problem.inputs))
+        return FunctionPolicy(made, *map(gym.spaces.flatdim, spaces))
+    raise ConfigurationError(
+        f"a {type(made).__name__} is no policy; give an object with predict(observation, state,"
+        " episode_start, deterministic), a class that takes the SafetyProblem, or a function of a"
+        " batch of observations (B, k) that returns actions (B, m)"
+    )
+
+
+def policy_name(given: Any) -> str:
+    """Return how results call a policy that is an object: its function's or its class's name."""
+    if isinstance(given, FunctionPolicy):
+        return given.name
+    return str(getattr(given, "__name__", type(given).__name__)).strip("<>")

@@ -1,0 +1,163 @@
+"""Estimates of rare violations, and which of two is the result."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from safe_envs.agents.evaluation.statistics import log_normal_interval
+
+BETTER = 2.0
+"""How many times smaller the relative error of importance sampling has to be."""
+
+_ROUGH = 1.0
+"""Standard deviation of the logarithms of repetitions above which their interval is rough."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A probability, from independent repetitions.
+
+    Attributes:
+        method: by which it was estimated.
+        probability: mean of the repetitions.
+        ci_low: lower end of its interval.
+        ci_high: upper end.
+        relative_error: standard error of the mean over the mean.
+        estimates: of the repetitions.
+    """
+
+    method: str
+    probability: float
+    ci_low: float
+    ci_high: float
+    relative_error: float
+    estimates: list[float]
+
+    @classmethod
+    def of(cls, method: str, estimates: np.ndarray, confidence: float) -> Estimate:
+        """Make an estimate from those of the repetitions, shape (R,), all above 0.
+
+        Args:
+            method: by which they were estimated.
+            estimates: of the repetitions.
+            confidence: of the interval.
+        """
+        low, high = log_normal_interval(estimates, confidence)
+        p = math.fsum(estimates) / len(estimates)
+        error = float(np.std(estimates, ddof=1)) / math.sqrt(len(estimates)) / p
+        return cls(method, p, low, min(high, 1.0), error, estimates.tolist())
+
+    def __str__(self) -> str:
+        return f"{self.probability:.3g} [{self.ci_low:.3g}, {self.ci_high:.3g}]"
+
+
+@dataclass(frozen=True)
+class PlainEpisodes:
+    """The episodes with which splitting begins.
+
+    Attributes:
+        episodes: how many.
+        violations: among them.
+        ci_low: lower end of the interval of their share.
+        ci_high: upper end.
+        outside: how many start where h <= 0.
+        kept_length: mean length of those that do not violate, in control periods; None without any.
+    """
+
+    episodes: int
+    violations: int
+    ci_low: float
+    ci_high: float
+    outside: int = 0
+    kept_length: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RareRow:
+    """What is estimated for one filter.
+
+    Attributes:
+        filter: its name.
+        policy: name of the policy.
+        status: "estimated" or "none".
+        reason: why there is no estimate.
+        method: as all up to `estimates` see `Estimate`; None without one.
+        probability: of a violation.
+        ci_low: lower end of its interval.
+        ci_high: upper end.
+        relative_error: of the probability.
+        estimates: of the repetitions.
+        plain_episodes_needed: for the same relative error without splitting.
+        plain_steps_needed: control periods of these.
+        doubt: what contradicts the estimate.
+        check: the other estimate, if there are two.
+        levels: mean number of levels.
+        steps: control periods that were simulated.
+        plain: the episodes at the beginning.
+    """
+
+    filter: str
+    policy: str
+    status: str
+    reason: str | None = None
+    method: str | None = None
+    probability: float | None = None
+    ci_low: float | None = None
+    ci_high: float | None = None
+    relative_error: float | None = None
+    estimates: tuple[float, ...] | list[float] = ()
+    plain_episodes_needed: float | None = None
+    plain_steps_needed: float | None = None
+    doubt: str | None = None
+    check: Estimate | None = None
+    levels: float = 0.0
+    steps: int = 0
+    plain: PlainEpisodes | None = None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the row as JSON-able data."""
+        return asdict(self) | {"estimates": list(self.estimates)}
+
+
+def verdict(
+    split: Estimate, drift: Estimate | None, plain: PlainEpisodes
+) -> tuple[Estimate, Estimate | None, str | None]:
+    """Return which of two estimates is the result, which its check, and what contradicts it.
+
+    Importance sampling's is the result if its relative error is less than half of splitting's and
+    their intervals overlap.
+
+    Args:
+        split: by splitting.
+        drift: by importance sampling, if there is one.
+        plain: the plain episodes.
+    """
+    agree = drift is None or _overlap(split, drift)
+    found, check = split, drift
+    if drift is not None and agree and BETTER * drift.relative_error < split.relative_error:
+        found, check = drift, split
+    doubt = None
+    if check is not None and not agree:
+        doubt = (
+            f"importance sampling says {check.probability:.2g} [{check.ci_low:.2g},"
+            f" {check.ci_high:.2g}]: take more particles"
+        )
+    elif not _overlap(found, plain):
+        doubt = (
+            f"its first episodes are plain ones, and {plain.violations} violations among"
+            f" {plain.episodes} contradict it: take more particles"
+        )
+    elif float(np.std(np.log(found.estimates))) > _ROUGH:
+        doubt = (
+            "its repetitions differ by large factors, so that the interval is rough: take more"
+            " particles"
+        )
+    return found, check, doubt
+
+
+def _overlap(one: Estimate, other: Estimate | PlainEpisodes) -> bool:
+    return one.ci_low <= other.ci_high and other.ci_low <= one.ci_high
