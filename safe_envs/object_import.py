@@ -55,6 +55,15 @@ def resolved(place: str) -> str:
     return f"{os.path.realpath(source)}:{name}" if source.endswith(".py") else place
 
 
+def place_of(stated: type) -> str:
+    """Return the place from which `load_object` imports a class: FILE.py:NAME for one of a script or
+    of a file that was loaded by its place, MODULE:NAME for others."""
+    name, place = stated.__module__, f"{stated.__module__}:{stated.__qualname__}"
+    path = Path(getattr(sys.modules.get(name), "__file__", None) or "/")
+    of_file = name in ("__main__", _module_name(path)) and path.suffix == ".py"
+    return f"{path.resolve()}:{stated.__qualname__}" if of_file else place
+
+
 def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) -> Any:
     """The value of a function that stands at a place.
 
@@ -74,14 +83,13 @@ def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) 
 
 
 def _stated_in(module: ModuleType) -> list[str]:
-    """Names of what a module states itself: its functions, and objects that are neither modules nor
-    classes nor symbols."""
+    """Names of what a module states itself: its functions and classes, and objects that are neither
+    modules nor symbols."""
     return [
         name
         for name, value in vars(module).items()
         if not name.startswith("_")
         and not inspect.ismodule(value)
-        and not inspect.isclass(value)
         and getattr(value, "__module__", module.__name__)
         in (
             module.__name__,
@@ -101,14 +109,22 @@ def _of_file(path: Path) -> ModuleType:
         raise ConfigurationError(
             f"{shortened(path)} cannot be read: {error.strerror}; {_ADVICE}"
         ) from error
+    main = sys.modules["__main__"]
+    # The script that runs is there already; a second run would state its classes again.
+    if Path(getattr(main, "__file__", None) or "/").resolve() == path.resolve():
+        return main
     return _loaded(path.resolve(), changed)
+
+
+def _module_name(path: Path) -> str:
+    return f"_{path.stem}_{zlib.crc32(bytes(path)):08x}"
 
 
 @lru_cache(maxsize=32)
 def _loaded(path: Path, _changed: int) -> ModuleType:
     """Remembered until the file changes, so that the symbols of all envs of a file are compiled
     once."""
-    name = f"_{path.stem}_{zlib.crc32(bytes(path)):08x}"
+    name = _module_name(path)
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ConfigurationError(f"{path} cannot be read as Python")

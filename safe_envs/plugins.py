@@ -17,6 +17,17 @@ def plugin_names(group: str) -> tuple[str, ...]:
     return tuple(sorted({point.name for point in entry_points(group=group)}))
 
 
+def name_of(group: str, extension: type) -> str | None:
+    """Return the name under which an installed package declares a class; None if none does.
+
+    Args:
+        group: `CONDITIONS`, `POLICIES` or `SYSTEMS`.
+        extension: the class.
+    """
+    value = f"{extension.__module__}:{extension.__qualname__}"
+    return next((point.name for point in entry_points(group=group) if point.value == value), None)
+
+
 def load_plugin(group: str, name: str) -> Any:
     """Import what an installed package declares under a name, which runs the code there.
 

@@ -144,10 +144,9 @@ def split_filters(text: str) -> list[str]:
         ConfigurationError: one has no text.
     """
     from safe_envs.agents.evaluation.spec import UNFILTERED
-    from safe_envs.wrappers import CONDITIONS, LEARNED
+    from safe_envs.wrappers import head_pattern
 
-    names = "|".join(sorted((UNFILTERED, *CONDITIONS, *LEARNED), key=len, reverse=True))
-    found = [part.strip() for part in re.split(rf",(?=\s*(?:{names})\s*(?:[:+,]|$))", text)]
+    found = [part.strip() for part in re.split(rf",(?=\s*{head_pattern(UNFILTERED)})", text)]
     if not all(found):
         raise ConfigurationError(
             f"--compare {shown(text)} names no filter at one place; give names with commas between:"
@@ -252,41 +251,24 @@ def make_runs(
         ConfigurationError: a filter or the policy is unknown or does not fit the problem.
         RelativeDegreeError: a filter does not suit a barrier.
     """
-    from safe_envs.agents.evaluation.identification import Learning
-    from safe_envs.agents.evaluation.spec import UNFILTERED
+    from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+    from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
     from safe_envs.agents.policies.registry import make_policy
-    from safe_envs.errors import nearest, require_whole
-    from safe_envs.wrappers import CONDITIONS, LEARNED, require_readable
+    from safe_envs.wrappers import require_known
 
-    require_whole("seed", seed, 0)
-    if knowledge not in ("model", "plant"):
-        raise ConfigurationError(
-            f"knowledge = {shown(knowledge)}; {nearest(knowledge, ('model', 'plant'))}"
-        )
-    known = (UNFILTERED, *CONDITIONS, *LEARNED)
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.
-        for word in re.split("[:+]", name)[0].split(","):
-            if word.strip() not in known:
-                raise ConfigurationError(
-                    f"unknown filter {shown(word.strip())}; {nearest(word.strip(), known)}"
-                )
-        if name != UNFILTERED:
-            require_readable(name, problem)
-    actors = [make_policy(policy, problem, trust) for _ in names]
-    learning = Learning(problem, names, learned, 1, seed)
-    for method, repeat in learning.missing():
-        learning.learn(method, repeat, None)
+        words = [word.strip() for word in re.split("[:+]", name)[0].split(",")]
+        for word in words[:-1] and [word for word in words if word != UNFILTERED]:
+            require_known(word, UNFILTERED)
+    spec = EvaluationSpec(
+        problem, policy, names, learned=learned, trust=trust, seed=seed, knowledge=knowledge
+    )
+    resolved = ResolvedEvaluation(spec)
+    resolved.learn(lambda: None)
     return [
-        Run(
-            name,
-            () if name == UNFILTERED else learning.conditions(name, 0),
-            problem,
-            actor,
-            seed,
-            knowledge,
-        )
-        for name, actor in zip(names, actors, strict=True)
+        Run(name, conditions, problem, make_policy(policy, problem, trust), seed, knowledge)
+        for name, (conditions, *_) in resolved.filters.items()
     ]
 
 

@@ -19,7 +19,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.clf import CLF
 from safe_envs.wrappers.conditions import AffineConstraint
-from safe_envs.wrappers.conditions.base import Terms
+from safe_envs.wrappers.conditions.constraint import Terms
 from safe_envs.wrappers.qp import dispatch, one_row, second_order_row
 from safe_envs.wrappers.qp.rows import ROUNDING, tolerance, tolerances
 

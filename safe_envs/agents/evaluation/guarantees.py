@@ -17,7 +17,7 @@ from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import BayesianSCBF, Condition, LearnedCondition
+from safe_envs.wrappers import Condition
 from safe_envs.wrappers.verification.estimated_bound import EstimatedBound, estimated_bound
 from safe_envs.wrappers.verification.posterior_bound import PosteriorBound, posterior_bound
 
@@ -50,9 +50,7 @@ class GuaranteeAverager:
         why_not: str | None = None,
     ) -> None:
         self._horizon = problem.duration
-        self._of_posterior = any(
-            isinstance(c, BayesianSCBF) and c.simultaneous is not None for c in conditions
-        )
+        self._of_posterior = any(c.credible_set is not None for c in conditions)
         self._found: EstimatedBound | PosteriorBound | None = None
         self._why_none: str | None = why_not if conditions else "there is no filter"
         self._total, self._count = RunningSum(), 0
@@ -69,7 +67,7 @@ class GuaranteeAverager:
             if self._of_posterior:
                 self._found = posterior_bound(problem, conditions)
                 self._why_none = None
-            elif any(isinstance(c, LearnedCondition) for c in conditions):
+            elif any(c.is_learned for c in conditions):
                 self._why_none = (
                     "it rests on something learned; for bayesian-scbf:simultaneous=P a bound is"
                     " estimated over the posterior"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import os
-import re
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,16 +11,12 @@ from typing import Any
 
 from safe_envs.agents.policies.registry import absolute_policy, policy_files
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
-
-_FILE = re.compile("(?<=file=)[^:+]+")
+from safe_envs.wrappers import files_of, with_absolute_paths
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
     """The settings of a cell with paths that mean the same in every process."""
-    found = {
-        **settings,
-        "filter": _FILE.sub(lambda match: os.path.realpath(match.group()), settings["filter"]),
-    }
+    found = {**settings, "filter": with_absolute_paths(settings["filter"])}
     found["policy"] = absolute_policy(settings["policy"])
     if "system" in settings:
         file, _, name = settings["system"].rpartition(":")
@@ -36,7 +31,7 @@ def read_by(settings: Mapping[str, Any]) -> Iterator[Path]:
     """
     if "system" in settings:
         yield Path(settings["system"].rpartition(":")[0])
-    yield from (Path(match) for match in _FILE.findall(settings["filter"]))
+    yield from files_of(settings["filter"])
     yield from (path for path in policy_files(settings["policy"]) if os.path.exists(path))
 
 

@@ -18,7 +18,7 @@ from safe_envs.agents.sweeps.document import document_in
 from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_of
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
 from safe_envs.registry import load_problem
-from safe_envs.wrappers import LEARNED, SafetyFilter, require_readable
+from safe_envs.wrappers import SafetyFilter, learned_parts, require_readable
 
 _NO_PART = ("seed", "episodes", "bounds")
 """Settings that change neither the problem nor the filter nor the policy."""
@@ -179,10 +179,7 @@ def _check_cell(cell: Cell, derive: bool) -> None:
     problem = load_problem(cell.env_id, cell.options)
     if settings["filter"] != UNFILTERED:
         require_readable(settings["filter"], problem)
-        rests_on_learned = any(
-            part.split(":")[0] in LEARNED for part in settings["filter"].split("+")
-        )
-        if derive and not rests_on_learned:
+        if derive and not learned_parts(settings["filter"]):
             SafetyFilter.for_problem(
                 problem, settings["filter"], settings["knowledge"], settings["objective"]
             )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from safe_envs import plugins
 from safe_envs.systems import ENV_IDS
 
 FILTERS = (
@@ -48,7 +49,12 @@ def words(allowed: Sequence[str]) -> Callable[[str], list[str]]:
     return complete
 
 
-filters, policies, algorithms = (words(names) for names in (FILTERS, POLICIES, ALGORITHMS))
+def filters(incomplete: str) -> list[str]:
+    """Names of filters, those of installed packages too."""
+    return words((*FILTERS, *plugins.plugin_names(plugins.CONDITIONS)))(incomplete)
+
+
+policies, algorithms = words(POLICIES), words(ALGORITHMS)
 
 
 def artefacts(incomplete: str) -> list[str]:

@@ -8,90 +8,36 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import sympy as sp
 
-from safe_envs.dynamics.codegen import Components
 from safe_envs.dynamics.identities import pieces_fit
-from safe_envs.dynamics.lie import (
-    Derivative,
-    generator,
-    has_kinks,
-    lie_derivative_f,
-    lie_derivative_g,
-    relative_degree,
-    tidied,
-)
+from safe_envs.dynamics.lie import Derivative, generator, lie_derivative_f, lie_derivative_g
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, RelativeDegreeError, SystemDefinitionError, shown
+from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.class_k import ClassK, Rate, applied
+from safe_envs.wrappers.conditions.chain import not_smooth, resolved
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
+    from safe_envs.wrappers.learning.base import LearnedModel
+    from safe_envs.wrappers.learning.posterior import Posterior
 
 FIRST_ORDER = "first-order"
 
 
-class Terms(Protocol):
-    """Numbers that a row takes from something learned: they stand in its expressions as symbols of
-    their own."""
-
-    @property
-    def symbols(self) -> tuple[sp.Symbol, ...]:
-        """What stands for them."""
-        ...
-
-    def floats(self, x: Sequence[float]) -> Sequence[float]:
-        """The values at one state, given by components."""
-        ...
-
-    def arrays(self, x: Components) -> Components:
-        """The values at a batch of states, components of shape (B,) in and out."""
-        ...
-
-
-@dataclass(frozen=True)
-class AffineConstraint:
-    """The row a(x) u + b(x) >= 0 that a condition asks for.
+class CredibleSet(NamedTuple):
+    """The identified systems for all of which a condition is met.
 
     Attributes:
-        coefficient: a, an expression for each input.
-        offset: b.
-        chain: b_0 = h, ..., b_(r-1); the condition keeps the intersection of {b_j >= 0}, not C
-            itself.
-        demand: of a reciprocal condition, which asks for a u + b >= demand where h > 0 and has no
-            meaning elsewhere. There a u + b is the rate of h, and all that is left is to make that
-            as large as the other rows allow.
-        change: rate of the row while the input is held, an expression of states and inputs, where a
-            margin of first order is asked for.
-        uncertainty: where a and b are known up to an error only, the entries (i, j), i <= j, of the
-            symmetric Q(x) with which the condition asks for a u + b >= sqrt([1, u]' Q [1, u]).
-        terms: what stands for numbers of something learned in the expressions, besides the states.
+        posterior: their distribution.
+        miss_probability: of the systems that the set leaves out.
     """
 
-    coefficient: tuple[sp.Expr, ...]
-    offset: sp.Expr
-    chain: tuple[sp.Expr, ...]
-    demand: sp.Expr | None = None
-    change: sp.Expr | None = None
-    uncertainty: tuple[sp.Expr, ...] | None = None
-    terms: Terms | None = None
-
-    @classmethod
-    def after(
-        cls,
-        model: ControlAffineSDE,
-        chain: Sequence[sp.Expr],
-        offset: sp.Expr,
-        demand: sp.Expr | None = None,
-    ) -> AffineConstraint:
-        """The constraint L_g b_(r-1) u + offset >= 0, or >= demand, at the end of a chain."""
-        a = lie_derivative_g(model, chain[-1])
-        return cls(
-            tuple(tidied(a[0, j]) for j in range(model.m)), tidied(offset), tuple(chain), demand
-        )
+    posterior: Posterior
+    miss_probability: float
 
 
 @dataclass(frozen=True)
@@ -107,10 +53,14 @@ class Condition(ABC):
     number.
 
     Attributes:
-        name: by which `parse_condition` and the command line know it.
+        name: under which messages show it; by default that of the class. Names of
+            `safe_envs.wrappers.conditions.registry` are those of the command line.
         stochastic: whether it takes the noise into account.
+        almost_sure: whether it keeps every path in the safe set under noise, where it can be met.
+            Then it asks for unbounded control wherever noise acts at the edge.
         corrects_model: whether it corrects what the model gets wrong, so that it is of no use to a
             filter that knows the plant.
+        method: by which the models that it needs are learned; None if it needs none.
         sampling_margin: "none", "first-order", or a number >= 0 in the units of the row.
 
     Raises:
@@ -119,9 +69,14 @@ class Condition(ABC):
 
     name: ClassVar[str]
     stochastic: ClassVar[bool] = False
+    almost_sure: ClassVar[bool] = False
     corrects_model: ClassVar[bool] = False
+    method: ClassVar[str | None] = None
 
     sampling_margin: str | float = field(default="none", kw_only=True)
+
+    def __init_subclass__(cls) -> None:
+        cls.name = cls.__dict__.get("name", cls.__name__)
 
     def __post_init__(self) -> None:
         margin = self.sampling_margin
@@ -147,12 +102,25 @@ class Condition(ABC):
     def constraint(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint for a model and a barrier, in the model's symbols.
 
+        Args:
+            model: system that the filter knows.
+            barrier: barrier h.
+
         Raises:
-            RelativeDegreeError: the condition does not suit the barrier's relative degree.
-            SystemDefinitionError: a class-K function cannot be differentiated as often as the chain
+            RelativeDegreeError: The condition does not suit the barrier's relative degree.
+            SystemDefinitionError: A class-K function cannot be differentiated as often as the chain
                 needs.
+            ConfigurationError: The code of a condition from outside fails.
         """
-        return _constraint(self, model, barrier)
+        try:
+            return _constraint(self, model, barrier)
+        except SafeEnvsError:
+            raise
+        except Exception as error:
+            raise ConfigurationError(
+                f"{self.name} cannot derive its constraint on {barrier.name}"
+                f" ({type(error).__name__}: {shortened(error)}); correct its class"
+            ) from error
 
     def believed(self, model: ControlAffineSDE) -> ControlAffineSDE:
         """The system that the condition differentiates along: the model, unless it has learned
@@ -164,9 +132,24 @@ class Condition(ABC):
         """Derive the constraint without a margin for sampling."""
 
     @classmethod
-    @abstractmethod
     def for_gains(cls, gains: Sequence[float]) -> Condition:
-        """The condition with the rates p_1..p_r of a problem for its parameters."""
+        """Return the condition with the rates p_1..p_r of a problem; its defaults if it has none."""
+        return cls()
+
+    @property
+    def learned_models(self) -> tuple[LearnedModel, ...]:
+        """Learned models that the condition needs."""
+        return ()
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the condition needs a learned model."""
+        return bool(self.learned_models)
+
+    @property
+    def credible_set(self) -> CredibleSet | None:
+        """Identified systems for all of which the condition is met at once; None without any."""
+        return None
 
     def chain_rates(self, degree: int) -> tuple[float, ...] | None:
         """alpha_1..alpha_r of the chain b_j = D b_(j-1) + alpha_j b_(j-1); None where it is not of
@@ -175,23 +158,9 @@ class Condition(ABC):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """What makes the same condition again, besides the margin."""
-        return {key: value for key, value in vars(self).items() if key != "sampling_margin"}
-
-    @property
-    def spec(self) -> str:
-        """The text from which `parse_condition` makes the same condition."""
-        margin = {} if self.sampling_margin == "none" else {"sampling_margin": self.sampling_margin}
-        return ":".join(
-            [
-                self.name,
-                *(f"{key}={_text(value)}" for key, value in {**self.parameters, **margin}.items()),
-            ]
-        )
-
-
-def _text(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        """Arguments that make the same condition, besides the sampling margin."""
+        given = {key: value for key, value in vars(self).items() if key != "sampling_margin"}
+        return {key: value for key, value in given.items() if value is not None}
 
 
 @lru_cache(maxsize=256)
@@ -209,7 +178,7 @@ def _constraint(
         model.states,
         (2 if condition.stochastic and model.noisy else 1) * times - 1,
     ):
-        raise _not_smooth(barrier)
+        raise not_smooth(barrier)
     if condition.sampling_margin == FIRST_ORDER:
         row = (
             sum(a * u for a, u in zip(found.coefficient, model.inputs, strict=True))
@@ -221,61 +190,3 @@ def _constraint(
     if condition.sampling_margin != "none":
         return replace(found, offset=found.offset - sp.Float(condition.sampling_margin, 17))
     return found
-
-
-def chain_of(
-    model: ControlAffineSDE, barrier: Barrier, alphas: Sequence[Rate] | None, derivative: Derivative
-) -> tuple[list[sp.Expr], sp.Expr]:
-    """b_0 = h, b_j = D b_(j-1) + alpha_j(b_(j-1)) for j < r, and the part of b_r without the input.
-
-    Args:
-        model: the system that D differentiates along.
-        barrier: h.
-        alphas: alpha_1..alpha_r; None for zeros, with r computed.
-        derivative: D, the Lie derivative or the Ito generator.
-
-    Raises:
-        RelativeDegreeError: the number of functions is not the relative degree, or there is none.
-        SystemDefinitionError: the barrier or a class-K function cannot be differentiated as often
-            as the chain needs.
-    """
-    degree = relative_degree(model, barrier.expression, derivative)
-    if alphas is not None and len(alphas) != degree:
-        raise RelativeDegreeError(
-            f"barrier {barrier.name} has relative degree {degree} and needs as many rates;"
-            f" {len(alphas)} given"
-        )
-    for j, alpha in enumerate(alphas or (), start=1):
-        if isinstance(alpha, ClassK) and not alpha.is_smooth(degree - j):
-            raise SystemDefinitionError(
-                f"class-K function {alpha} is the {j}. of {degree} and needs {degree - j}"
-                " continuous derivatives, which it has not at 0; use an odd power or another"
-                " smooth function there"
-            )
-    chain = [barrier.expression]
-    for alpha in alphas or (None,) * degree:
-        term = 0 if alpha is None else applied(alpha, chain[-1])
-        chain.append(resolved(derivative(model, chain[-1]), barrier) + term)
-    return chain[:-1], chain[-1]
-
-
-def resolved(expression: Any, barrier: Barrier) -> sp.Expr:
-    """A derivative of a chain without what sympy adds at the kinks of class-K functions like s |s|,
-    where it has no weight.
-
-    Raises:
-        SystemDefinitionError: the kink is the barrier's own: there the chain would jump, and Ito's
-            formula miss a local time.
-    """
-    if not expression.has(sp.DiracDelta, sp.Derivative, sp.Subs):
-        return expression
-    if expression.has(sp.Derivative, sp.Subs) or has_kinks(barrier.expression):
-        raise _not_smooth(barrier)
-    return expression.replace(sp.DiracDelta, lambda *_: sp.Integer(0))
-
-
-def _not_smooth(barrier: Barrier) -> SystemDefinitionError:
-    return SystemDefinitionError(
-        f"barrier {barrier.name} = {barrier.expression} cannot be differentiated as often as is"
-        " needed; give a smooth one, of real symbols, or one barrier for each of its pieces"
-    )

@@ -15,8 +15,10 @@ from safe_envs.dynamics.lie import derivatives, lie_derivative_f, relative_degre
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, shortened, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import AffineConstraint, Condition, chain_of
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.chain import chain_of
 from safe_envs.wrappers.conditions.class_k import ClassK, Rate, positive_rates, rates
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 _STEPS = 100
 """Of the search for poles. Gains of real negative ones need fewer; others could keep it busy for

@@ -3,7 +3,6 @@ SRCBF."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import sympy as sp
@@ -12,8 +11,10 @@ from safe_envs.dynamics.lie import quadratic_variation_rate, relative_degree
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, nearest, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import AffineConstraint, Condition, resolved
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.chain import resolved
 from safe_envs.wrappers.conditions.class_k import positive_rates
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 _H = sp.Symbol("h", positive=True)
 _FORMS = {"inverse": 1 / _H, "log": -sp.log(_H / (1 + _H))}
@@ -67,11 +68,6 @@ class _Reciprocal(Condition):
             model, (h,), resolved(self.derivative(model, h), barrier), demand.subs(_H, h)
         )
 
-    @classmethod
-    def for_gains(cls, gains: Sequence[float]) -> _Reciprocal:
-        """The condition with gamma = 1, as in the thesis: gamma is no rate."""
-        return cls()
-
 
 @dataclass(frozen=True)
 class RCBF(_Reciprocal):
@@ -81,7 +77,8 @@ class RCBF(_Reciprocal):
     as infeasible.
 
     Attributes:
-        gamma: weight > 0, in 1/s times the square of the unit of B.
+        gamma: weight > 0, in 1/s times the square of the unit of B; no rate, so that the gains of a
+            problem do not set it.
         form: "inverse" for B = 1/h, "log" for B = -log(h/(1 + h)).
 
     Source: thesis Sec. 2.1.2, Def. 2.1.6.
@@ -99,7 +96,8 @@ class SRCBF(_Reciprocal):
     there, flagged as infeasible.
 
     Attributes:
-        gamma: weight > 0, in 1/s times the square of the unit of B.
+        gamma: weight > 0, in 1/s times the square of the unit of B; no rate, so that the gains of a
+            problem do not set it.
         form: "inverse" for B = 1/h, "log" for B = -log(h/(1 + h)).
 
     Source: thesis Def. 4.2.1, Sec. 4.2.2 and 4.3.1.
@@ -107,3 +105,4 @@ class SRCBF(_Reciprocal):
 
     name = "srcbf"
     stochastic = True
+    almost_sure = True

@@ -9,8 +9,10 @@ from dataclasses import dataclass
 from safe_envs.dynamics.lie import generator
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import AffineConstraint, Condition, chain_of
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.chain import chain_of
 from safe_envs.wrappers.conditions.class_k import positive_rates
+from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 
 @dataclass(frozen=True)
@@ -30,11 +32,6 @@ class SCBF(Condition):
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
         """Derive the constraint; see `chain_of` for what it raises."""
         return AffineConstraint.after(model, *chain_of(model, barrier, None, generator))
-
-    @classmethod
-    def for_gains(cls, gains: Sequence[float]) -> SCBF:
-        """The SCBF has no rates."""
-        return cls()
 
     def chain_rates(self, degree: int) -> tuple[float, ...]:
         """Zeros; see `Condition.chain_rates`."""

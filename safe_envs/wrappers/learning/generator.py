@@ -62,7 +62,7 @@ class LearnedGenerator:
     """What noise adds to the derivatives of one barrier of relative degree r: A^j h = L_f^j h +
     M_j(x) (+ the input's part).
 
-    Implements `safe_envs.wrappers.conditions.base.Terms`: the row of a condition takes M_r and, for
+    Implements `safe_envs.wrappers.conditions.constraint.Terms`: the row of a condition takes M_r and, for
     r >= 2, the slopes of M_(r-1), for
 
         A^r h(x, u) = L_f^r h + M_r + (L_g L_f^(r-1) h + grad M_(r-1) . g) u.

@@ -6,7 +6,6 @@ from __future__ import annotations
 import numpy as np
 
 from safe_envs.dynamics.lie import has_kinks
-from safe_envs.wrappers.conditions import SRCBF
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
 
@@ -18,11 +17,10 @@ def no_bound(formulas: Formulas) -> str:
     for condition, stage in zip(formulas.conditions, formulas.stages, strict=True):
         if not condition.stochastic:
             return f"{condition.name} ignores the noise"
-        if condition.chain_rates(stage.stop - stage.start) is None and not isinstance(
-            condition, SRCBF
-        ):
+        rates = condition.chain_rates(stage.stop - stage.start)
+        if rates is None and not condition.almost_sure:
             return f"{condition.name} has no chain of rates, as the bounds need under noise"
-    if not formulas.certain and any(isinstance(c, SRCBF) for c in formulas.conditions):
+    if not formulas.certain and any(c.almost_sure for c in formulas.conditions):
         return "the barriers have conditions of different kinds"
     return _kinked(formulas)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from safe_envs.errors import require_whole
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import Condition
+from safe_envs.wrappers.conditions import Condition, spec_of
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set import Region
 from safe_envs.wrappers.verification.safe_set_analysis import (
@@ -220,7 +220,7 @@ def _barrier(i: int, survey: SafeSetAnalysis) -> BarrierFindings:
     )
     return BarrierFindings(
         name=formulas.problem.barriers[i].name,
-        condition=formulas.conditions[i].spec,
+        condition=spec_of(formulas.conditions[i]),
         degree=stages.stop - stages.start,
         leading=max(-negated, 0.0),
         leading_at=leading_at,

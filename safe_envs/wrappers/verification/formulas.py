@@ -13,7 +13,7 @@ from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import quadratic_variation_rate
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import SRCBF, Condition, LearnedCondition
+from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification.safe_set import Region, region_of
 
@@ -48,7 +48,7 @@ class Formulas:
         self, problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str
     ) -> None:
         self.problem, self.conditions, self.knowledge = problem, tuple(conditions), knowledge
-        if any(isinstance(c, LearnedCondition) for c in self.conditions):
+        if any(c.is_learned for c in self.conditions):
             raise ConfigurationError(
                 "what a condition promises is known for a known system only; this one rests on"
                 " something learned"
@@ -80,9 +80,8 @@ class Formulas:
 
     @property
     def certain(self) -> bool:
-        """Whether the conditions, where they can be met, keep every path and not only some: without
-        noise, or SRCBF."""
-        return not self.noisy or all(isinstance(c, SRCBF) for c in self.conditions)
+        """Whether the conditions, where they can be met, keep every path and not only some."""
+        return not self.noisy or all(c.almost_sure for c in self.conditions)
 
     @property
     def expressions(self) -> list[Any]:

@@ -14,7 +14,7 @@ from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import has_kinks
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import BayesianSCBF, Condition
+from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification import bounds
 from safe_envs.wrappers.verification.safe_set import (
@@ -115,23 +115,18 @@ def posterior_bound(
             what the posterior takes for granted, h is not twice differentiable, or C has no end in
             a workspace that has none, where neither c nor m is known.
     """
-    if (
-        len(conditions) != 1
-        or not isinstance(conditions[0], BayesianSCBF)
-        or conditions[0].simultaneous is None
-    ):
+    credible = conditions[0].credible_set if len(conditions) == 1 else None
+    if credible is None:
         raise ConfigurationError(
             "a bound over a posterior is for one barrier with bayesian-scbf:simultaneous=P"
         )
-    condition = conditions[0]
-    _require_consistent(condition.learned)
-    robust = SafetyFilter.for_problem(problem, condition)
-    expression = condition.learned.system.numeric(problem.barriers[0].expression)
+    posterior = credible.posterior
+    _require_consistent(posterior)
+    robust = SafetyFilter.for_problem(problem, conditions)
+    expression = posterior.system.numeric(problem.barriers[0].expression)
     barrier = compile_function(problem.plant.states, [expression], "arrays")
     row = robust.constraints[0]
-    region = region_of(
-        problem, condition.learned.system, [expression, *row.coefficient, row.offset]
-    )
+    region = region_of(problem, posterior.system, [expression, *row.coefficient, row.offset])
 
     def level(x: np.ndarray) -> np.ndarray:
         return _values(barrier, x)
@@ -152,17 +147,21 @@ def posterior_bound(
     _require_smooth(problem, expression, level, points, region, np.random.default_rng([seed, 4]))
     highest, _ = largest(level, points, region, np.random.default_rng([seed, 2]))
     shortfall, _ = largest(missed, points, region, np.random.default_rng([seed, 3]))
-    bias = rate_bias(condition.learned, expression, np.array(problem.box), points)
+    bias = rate_bias(posterior, expression, np.array(problem.box), points)
     remarks = [f"no action meets the robust condition somewhere, by up to {shortfall:.3g}"] * (
         shortfall > 0.0
     )
     remarks += [
-        f"steps of {condition.learned.dt:g} s in the data may shift the rate of h by up to"
-        f" {bias:.3g}"
+        f"steps of {posterior.dt:g} s in the data may shift the rate of h by up to {bias:.3g}"
     ] * (bias > 0.0)
-    delta, ends = condition.delta_theta + condition.delta_sigma, workspace_of(problem)
     return PosteriorBound(
-        delta, highest, max(shortfall, 0.0), bias, "; ".join(remarks), barrier, ends
+        credible.miss_probability,
+        highest,
+        max(shortfall, 0.0),
+        bias,
+        "; ".join(remarks),
+        barrier,
+        workspace_of(problem),
     )
 
 

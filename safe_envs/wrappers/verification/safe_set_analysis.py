@@ -11,7 +11,6 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.conditions import SRCBF
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set import (
     Region,
@@ -157,7 +156,7 @@ class SafeSetAnalysis:
         SRCBF with noise there."""
         rows = enumerate(self.formulas.conditions)
         return self.formulas.noisy and any(
-            isinstance(c, SRCBF) and self._noise_at_the_edge(i) for i, c in rows
+            c.almost_sure and self._noise_at_the_edge(i) for i, c in rows
         )
 
     def _noise_at_the_edge(self, i: int) -> bool:

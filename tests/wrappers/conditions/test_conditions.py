@@ -130,7 +130,7 @@ def test_ecbf_needs_real_negative_poles():
 def test_ecbf_takes_multiple_poles_and_its_text_is_read_as_the_same(count):
     ecbf = ECBF(poles=(-1 / 3,) * count)
     assert ecbf.chain_rates(count) == (1 / 3,) * count
-    assert parse_condition(ecbf.spec, ()) == ecbf
+    assert parse_condition(spec_of(ecbf), ()) == ecbf
     assert (
         parse_condition(f"ecbf:sampling_margin={0.5}", (1 / 3,) * count).chain_rates(count)
         == (1 / 3,) * count
@@ -280,8 +280,8 @@ def test_several_barriers_take_one_text_or_one_each():
 )
 def test_text_round_trips(text):
     condition = parse_condition(text, (1.0,))
-    assert condition.spec == text
-    assert parse_condition(condition.spec, ()) == condition
+    assert spec_of(condition) == text
+    assert parse_condition(spec_of(condition), ()) == condition
 
 
 def test_parameters_default_to_the_gains():

@@ -1,0 +1,87 @@
+"""Condition classes by name: those of this package, of installed packages, and of a user's files."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from safe_envs import plugins
+from safe_envs.errors import ConfigurationError, nearest, shortened, shown
+from safe_envs.object_import import load_object, place_of
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.bayesian import BayesianSCBF
+from safe_envs.wrappers.conditions.cbf import CBF, ECBF, HOCBF
+from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, LearnedHOCBF
+from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
+from safe_envs.wrappers.conditions.stochastic import SCBF, SZCBF
+
+CONDITIONS: dict[str, type[Condition]] = {
+    c.name: c for c in (CBF, ECBF, HOCBF, RCBF, SRCBF, SZCBF, SCBF)
+}
+"""Conditions that need nothing but a model of the system."""
+
+LEARNED: dict[str, type[LearnedCondition]] = {
+    c.name: c for c in (LearnedHOCBF, DDSCBF, BayesianSCBF)
+}
+"""Conditions that need a learned model."""
+
+_BUILT_IN: dict[str, type[Condition]] = {**CONDITIONS, **LEARNED}
+
+
+def condition_names() -> tuple[str, ...]:
+    """Return the names of all conditions: the built-in ones, then those of installed packages."""
+    declared = plugins.plugin_names(plugins.CONDITIONS)
+    return (*_BUILT_IN, *(name for name in declared if name not in _BUILT_IN))
+
+
+def condition_class(name: str) -> type[Condition]:
+    """Return the class of a condition, for which a user's file is run.
+
+    Args:
+        name: one of `condition_names`, or FILE.py:NAME or MODULE:NAME.
+
+    Raises:
+        ConfigurationError: There is none of that name, or it is no concrete subclass of `Condition`.
+    """
+    if name in _BUILT_IN:
+        return _BUILT_IN[name]
+    if ":" in name:
+        return _checked(name, load_object(name))
+    if name not in condition_names():
+        raise unknown_filter(name)
+    return _checked(name, plugins.load_plugin(plugins.CONDITIONS, name))
+
+
+def name_of(condition: type[Condition]) -> str:
+    """Return the name from which `condition_class` finds a class."""
+    if _BUILT_IN.get(condition.name) is condition:
+        return condition.name
+    return plugins.name_of(plugins.CONDITIONS, condition) or place_of(condition)
+
+
+def unknown_filter(name: str, *more: str) -> ConfigurationError:
+    """Return the error of a filter that nobody knows.
+
+    Args:
+        name: what was given.
+        more: names that are allowed besides those of conditions.
+    """
+    allowed = (*more, *condition_names(), "FILE.py:NAME")
+    return ConfigurationError(f"unknown filter {shown(name)}; {nearest(name, allowed)}")
+
+
+def _checked(name: str, found: Any) -> type[Condition]:
+    if not (inspect.isclass(found) and issubclass(found, Condition)):
+        kind = "a class" if inspect.isclass(found) else f"a {type(found).__name__}"
+        raise ConfigurationError(
+            f"filter {shortened(name)} is {kind}, no subclass of safe_envs.wrappers.Condition"
+        )
+    missing = ", ".join(sorted(found.__abstractmethods__))
+    if missing:
+        raise ConfigurationError(f"filter {shortened(name)} does not define {missing}")
+    if inspect.get_annotations(found) and "__dataclass_fields__" not in found.__dict__:
+        raise ConfigurationError(
+            f"filter {shortened(name)} states its parameters without @dataclass(frozen=True); put"
+            " that before its class"
+        )
+    return found

@@ -1,0 +1,210 @@
+"""Conditions as text: `hocbf:p=2,8`, or `hocbf:p=2,8+cbf:alpha=1` for two barriers.
+
+A condition of a user's file is `FILE.py:NAME`, of a module `MODULE:NAME`, and its parameters follow:
+`my_filter.py:Eager:gain=2`.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shortened, shown
+from safe_envs.number_text import real_or_complex
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.conditions.base import Condition
+from safe_envs.wrappers.conditions.registry import condition_class, name_of
+from safe_envs.wrappers.conditions.text_parts import Part, part_of, parts_of
+from safe_envs.wrappers.learning import LearnedModel, load_learned
+
+_MOST_ENTRIES = 12
+"""Of a parameter, as for the longest chain of integrators that anybody filters: the poles of a
+dozen gains take a second."""
+
+Learned = Mapping[str, LearnedModel]
+"""Learned models by method."""
+
+
+def parse_conditions(
+    text: str, problem: SafetyProblem, learned: Learned | None = None
+) -> tuple[Condition, ...]:
+    """Read a condition for every barrier of a problem.
+
+    Args:
+        text: one for all barriers, or one for each with "+" between; see `parse_condition`.
+            `ddscbf:file=FILE` reads the learned model from a file of `safe-envs identify`.
+        problem: problem whose barriers and gains are taken.
+        learned: models for the conditions that name no file.
+
+    Returns:
+        As many conditions as barriers.
+
+    Raises:
+        ConfigurationError: As `parse_condition`, or there are neither one nor as many texts as
+            barriers.
+    """
+    return _parsed(
+        text,
+        problem,
+        lambda condition, path: _learned_for(text, condition, path, problem, learned or {}),
+    )
+
+
+def require_readable(text: str, problem: SafetyProblem) -> None:
+    """Raise ConfigurationError where `parse_conditions` would, without reading learned models.
+
+    Args:
+        text: as for `parse_conditions`.
+        problem: problem whose barriers and gains are taken.
+    """
+    _parsed(text, problem, lambda condition, path: None)
+
+
+def parse_condition(text: str, gains: Sequence[float]) -> Condition:
+    """Read a condition from its name, or its name and parameters.
+
+    Args:
+        text: name, and parameters as `key=value` with commas between the entries of a tuple:
+            `scbf`, `hocbf:p=2,8`, `cbf:alpha=2*s**3`, `my_filter.py:Eager:gain=2`.
+        gains: rates p_1..p_r in 1/s that set the parameters where the text names none of them.
+
+    Raises:
+        ConfigurationError: The name or a parameter is unknown or comes twice, or a value is not
+            allowed.
+    """
+    part = part_of(text)
+    return _of_model(part, *_settings(part), gains)
+
+
+def spec_of(conditions: Condition | Sequence[Condition]) -> str:
+    """Return the text from which `parse_conditions` makes the same conditions.
+
+    That of a class from a user's file holds the whole path of the file.
+    """
+    each = [conditions] if isinstance(conditions, Condition) else conditions
+    texts = [_spec(condition) for condition in each]
+    return texts[0] if len(set(texts)) == 1 else "+".join(texts)
+
+
+def _parsed(
+    text: str, problem: SafetyProblem, learned_for: Callable[[Any, str | None], Any]
+) -> tuple[Condition, ...]:
+    parts, count = parts_of(text), len(problem.barriers)
+    if len(parts) not in (1, count):
+        allowed = "one" if count == 1 else f"one for all {count} barriers, or one for each"
+        raise ConfigurationError(
+            f"filter {shown(text)} has {len(parts)} conditions; {problem.name} takes {allowed}"
+        )
+    found: list[Condition] = []
+    for i, part in enumerate(parts * count if len(parts) == 1 else parts):
+        condition, given = _settings(part)
+        if condition.method is not None:
+            learned = learned_for(condition, given.pop("file", None))
+            found.append(_made(part, condition.from_learned, learned, problem.gains_of(i), **given))
+        else:
+            found.append(_of_model(part, condition, given, problem.gains_of(i)))
+    return tuple(found)
+
+
+def _of_model(
+    part: Part, condition: Any, given: dict[str, Any], gains: Sequence[float]
+) -> Condition:
+    if condition.method is not None or set(given) <= {"sampling_margin"}:
+        return replace(_made(part, condition.for_gains, gains), **given)
+    return _made(part, condition, **given)
+
+
+def _made(part: Part, make: Callable[..., Condition], *args: Any, **given: Any) -> Condition:
+    """Call what makes a condition; an error of a user's class becomes one of ours."""
+    try:
+        return make(*args, **given)
+    except SafeEnvsError:
+        raise
+    except Exception as error:
+        raise ConfigurationError(
+            f"filter {shown(part.text)} cannot be made"
+            f" ({type(error).__name__}: {shortened(error)}); correct {part.name}"
+        ) from error
+
+
+def _learned_for(
+    text: str, condition: Any, path: str | None, problem: SafetyProblem, learned: Learned
+) -> LearnedModel:
+    if path is not None:
+        return load_learned(path, problem, condition.method)
+    if condition.method not in learned:
+        raise ConfigurationError(
+            f"filter {shown(text)} needs a learned model: run `safe-envs identify`, and name its"
+            f" file as {condition.name}:file=FILE"
+        )
+    return learned[condition.method]
+
+
+def _settings(part: Part) -> tuple[Any, dict[str, Any]]:
+    """Return the class of a condition, and the arguments that its text sets."""
+    condition = condition_class(part.name)
+    parameters = dict(inspect.signature(condition).parameters)
+    if condition.method is not None:
+        parameters.pop("learned", None)
+    names = [*parameters, *["file"] * (condition.method is not None)]
+    given: dict[str, Any] = {}
+    for setting in part.settings:
+        key, _, value = setting.partition("=")
+        if key in given:
+            raise ConfigurationError(f"filter {shown(part.text)} names {shown(key)} twice")
+        if key not in names:
+            hint = _hint(key, names, given)
+            raise ConfigurationError(f"filter {part.name} has no parameter {shown(key)}; {hint}")
+        given[key] = value if key == "file" else _value(part.text, parameters[key], value)
+    return condition, given
+
+
+def _hint(key: str, names: Sequence[str], given: Mapping[str, Any]) -> str:
+    if key == "sha256":
+        return "it stands for a learned model without a file: save it, and name that as file=FILE"
+    if "file" in given:
+        return (
+            f"{nearest(key, names)}; a file whose name holds a colon is given by --learned, or read"
+            " by load_learned"
+        )
+    return nearest(key, names)
+
+
+def _value(text: str, parameter: inspect.Parameter, value: str) -> Any:
+    """Return the value of a parameter: one entry, or a tuple where that is annotated or default."""
+    default = parameter.default
+    several = isinstance(default, tuple) or "tuple" in str(parameter.annotation)
+    entries, most = value.split(","), _MOST_ENTRIES if several else 1
+    if len(entries) > most:
+        allowed = f"at most {most} values" if several else "one value"
+        raise ConfigurationError(
+            f"filter {shown(text)}: {parameter.name} takes {allowed}; {len(entries)} were given"
+        )
+    if several:
+        return tuple(map(_entry, entries))
+    if isinstance(default, bool) and value in ("True", "False"):
+        return value == "True"
+    entry = _entry(value)
+    whole = type(default) is int and isinstance(entry, float) and entry.is_integer()
+    return int(entry) if whole else entry
+
+
+def _entry(text: str) -> Any:
+    """Return a number where the text is one; the condition says what else it takes."""
+    try:
+        return real_or_complex(text)
+    except ValueError:
+        return text
+
+
+def _spec(condition: Condition) -> str:
+    given = dict(condition.parameters)
+    if condition.sampling_margin != "none":
+        given["sampling_margin"] = condition.sampling_margin
+    settings = [
+        f"{key}={','.join(map(str, value)) if isinstance(value, tuple) else value}"
+        for key, value in given.items()
+    ]
+    return ":".join([name_of(type(condition)), *settings])

@@ -1,0 +1,125 @@
+"""The text of a filter taken apart: names and places of conditions, their settings, their files."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+from safe_envs.object_import import resolved
+from safe_envs.wrappers.conditions.registry import condition_class, condition_names, unknown_filter
+
+_FILE = r"(?:\.{0,2}/[^:]{0,4096}?|[^+:,/][^+:,]{0,4096}?)\.py:[A-Za-z_]\w*"
+"""FILE.py:NAME; only a path from / or ./ may hold a "+" or a comma, for these divide conditions."""
+
+_MODULE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(?=\s*(?:[:+,]|$))"
+"""MODULE:NAME; a parameter is none, for a "=" follows its name."""
+
+
+class Part(NamedTuple):
+    """The text of one condition, taken apart: its name or place, and what sets its parameters."""
+
+    text: str
+    name: str
+    settings: list[str]
+
+
+def head_pattern(*more: str) -> str:
+    """Return the regular expression of what the text of a condition begins with.
+
+    Args:
+        more: names that are accepted besides those of conditions.
+    """
+    names = sorted((*more, *condition_names()), key=len, reverse=True)
+    return rf"(?:(?:{'|'.join(map(re.escape, names))})(?=\s*(?:[:+,]|$))|{_FILE}|{_MODULE})"
+
+
+def require_known(text: str, *more: str) -> None:
+    """Raise ConfigurationError unless the text of a filter begins with a condition.
+
+    Args:
+        text: as for `parse_conditions`.
+        more: names that the message lists besides those of conditions.
+    """
+    name = parts_of(text)[0].name
+    if not _is_known(name):
+        raise unknown_filter(name, *more)
+
+
+def _is_known(name: str) -> bool:
+    return ":" in name or name in condition_names()
+
+
+def parts_of(text: str) -> list[Part]:
+    """Take the text of a filter apart: a "+" divides where the head of a condition follows it."""
+    head = re.compile(head_pattern())
+    start = len(_head(text, head))
+    # A class-K function, a complex pole or the path of a file may hold a "+" too.
+    first, *others = re.split(rf"\+(?={head.pattern})", text[start:])
+    return [_part(part, head) for part in (text[:start] + first, *others)]
+
+
+def part_of(text: str) -> Part:
+    """Take the text of one condition apart."""
+    return _part(text, re.compile(head_pattern()))
+
+
+def _part(text: str, head: re.Pattern[str]) -> Part:
+    name = _head(text, head)
+    rest, *settings = text[len(name) :].split(":")
+    return Part(text, name + rest, settings)
+
+
+def _head(text: str, head: re.Pattern[str]) -> str:
+    """Return the name or the place at the beginning of a text."""
+    found = head.match(text)
+    name = found.group() if found else ""
+    source, colon, _ = name.rpartition(":")
+    is_there = found and (not colon or source.endswith(".py") or _has_module(source))
+    return name if is_there else text.split(":")[0]
+
+
+def _has_module(name: str) -> bool:
+    top = name.split(".")[0]
+    return top in sys.modules or importlib.util.find_spec(top) is not None
+
+
+def learned_parts(text: str) -> list[tuple[str, str | None]]:
+    """Return the method and the file, None without one, of each condition that needs a model."""
+    return [
+        (method, next((s[len("file=") :] for s in part.settings if s.startswith("file=")), None))
+        for part in parts_of(text)
+        if _is_known(part.name) and (method := condition_class(part.name).method) is not None
+    ]
+
+
+def files_of(text: str) -> tuple[Path, ...]:
+    """Return the files that the text of a filter names, of Python or of a learned model.
+
+    Nothing is run and no file is opened.
+    """
+    parts = parts_of(text)
+    sources = [part.name.rpartition(":")[0] for part in parts]
+    settings = [s.partition("=") for part in parts for s in part.settings]
+    return tuple(
+        Path(path)
+        for path in (
+            *(source for source in sources if source.endswith(".py")),
+            *(value for key, _, value in settings if key == "file"),
+        )
+    )
+
+
+def with_absolute_paths(text: str) -> str:
+    """Return the text of a filter with the whole paths of its files, as it holds in any folder."""
+    return "+".join(
+        ":".join([resolved(part.name), *map(_absolute, part.settings)]) for part in parts_of(text)
+    )
+
+
+def _absolute(setting: str) -> str:
+    key, _, value = setting.partition("=")
+    return f"file={os.path.realpath(value)}" if key == "file" else setting

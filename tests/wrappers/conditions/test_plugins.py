@@ -1,0 +1,235 @@
+"""Conditions from outside: of a file, of a module, and of an installed package."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.dynamics.lie import lie_derivative_f
+from safe_envs.errors import ConfigurationError
+from safe_envs.scripts.options import completion
+from safe_envs.wrappers import (
+    CBF,
+    AffineConstraint,
+    Condition,
+    SafetyFilter,
+    condition_names,
+    files_of,
+    learned_parts,
+    parse_condition,
+    parse_conditions,
+    require_readable,
+    spec_of,
+    with_absolute_paths,
+)
+from tests.conftest import problem_of
+
+SCALAR = problem_of("safe_envs/Scalar-v0")
+DISK = problem_of("safe_envs/DubinsDisk-v0")
+
+STATED = """
+from dataclasses import dataclass
+
+from safe_envs.dynamics.lie import lie_derivative_f
+from safe_envs.wrappers import CBF, AffineConstraint, Condition
+
+
+@dataclass(frozen=True)
+class Eager(Condition):
+    gain: float = 1.0
+    powers: tuple[float, ...] = (1.0,)
+    order: int = 1
+    strict: bool = False
+    note: str | None = None
+
+    def derived(self, model, barrier):
+        h = barrier.expression
+        total = sum(self.gain * h ** int(power) for power in self.powers)
+        return AffineConstraint.after(model, (h,), lie_derivative_f(model, h) + total)
+
+
+@dataclass(frozen=True)
+class Picky(Eager):
+    def __post_init__(self):
+        range(self.order)
+        if self.gain > 9:
+            raise ValueError("too eager")
+
+
+@dataclass(frozen=True)
+class Alike(CBF):
+    pass
+
+
+class Undecorated(Eager):
+    other: float = 1.0
+
+
+@dataclass(frozen=True)
+class Unfinished(Condition):
+    pass
+
+
+@dataclass(frozen=True)
+class Failing(Condition):
+    def derived(self, model, barrier):
+        return barrier.nothing
+
+
+instance = Eager()
+"""
+
+
+@pytest.fixture
+def stated(tmp_path, monkeypatch):
+    """A folder with a file of conditions, where the tests then are."""
+    (tmp_path / "my_filter.py").write_text(STATED)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def installed(stated, monkeypatch):
+    """The same file as a module of an installed package that declares one condition."""
+    (stated / "my_package.py").write_text(STATED)
+    meta = stated / "my_package-1.0.dist-info"
+    meta.mkdir()
+    (meta / "METADATA").write_text("Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n")
+    (meta / "entry_points.txt").write_text("[safe_envs.conditions]\neager = my_package:Eager\n")
+    monkeypatch.syspath_prepend(str(stated))
+    yield stated
+    sys.modules.pop("my_package", None)
+
+
+def test_a_condition_of_a_file_filters_as_the_one_that_it_states(stated):
+    (condition,) = parse_conditions("my_filter.py:Eager:gain=2", SCALAR)
+    x, u = np.array([[0.2], [0.9]]), np.array([[1.0], [1.0]])
+    one, other = (SafetyFilter.for_problem(SCALAR, c) for c in (condition, CBF(2.0)))
+    assert np.array_equal(one.filter(x, u).action, other.filter(x, u).action)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "my_filter.py:Eager",
+        "my_filter.py:Eager:gain=2.5:powers=1,3:order=2:strict=True:note=fast",
+        "./my_filter.py:Picky:powers=3:sampling_margin=0.25",
+        "my_filter.py:Alike:alpha=s+s**3",
+    ],
+)
+def test_text_round_trips(stated, text):
+    condition = parse_condition(text, (1.0,))
+    assert parse_condition(spec_of(condition), ()) == condition
+    assert spec_of(parse_condition(spec_of(condition), ())) == spec_of(condition)
+    assert spec_of(condition).startswith(f"{stated.resolve()}/my_filter.py:")
+
+
+def test_parameters_are_of_the_types_of_their_defaults(stated):
+    found = parse_condition("my_filter.py:Eager:order=2:strict=False:powers=3:note=fast", ())
+    assert repr(found.parameters) == (
+        "{'gain': 1.0, 'powers': (3.0,), 'order': 2, 'strict': False, 'note': 'fast'}"
+    )
+
+
+def test_several_barriers_take_conditions_of_files_as_well(tmp_path, monkeypatch):
+    folder = tmp_path / "c++, folder"
+    folder.mkdir()
+    (folder / "my_filter.py").write_text(STATED)
+    monkeypatch.chdir(folder)
+    limits = problem_of("safe_envs/QuadrotorLimits-v0")
+    for text in (
+        "my_filter.py:Alike:alpha=s+s**3+hocbf:p=1,2+my_filter.py:Eager",
+        f"hocbf+{folder}/my_filter.py:Alike+{folder}/my_filter.py:Eager:powers=1,3",
+    ):
+        conditions = parse_conditions(text, limits)
+        assert sorted(c.name for c in conditions) == ["Alike", "Eager", "hocbf"]
+        assert parse_conditions(spec_of(conditions), limits) == conditions
+
+
+def test_the_files_of_a_text_are_known_without_running_them(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = "my_filter.py:Eager:gain=2+ddscbf:file=gap.json+scbf"
+    assert files_of(text) == (Path("my_filter.py"), Path("gap.json"))
+    assert files_of(with_absolute_paths(text)) == tuple(
+        (tmp_path / name).resolve() for name in ("my_filter.py", "gap.json")
+    )
+    assert learned_parts("ddscbf:file=gap.json") == [("ddscbf", "gap.json")]
+
+
+def test_an_installed_condition_is_known_by_its_name(installed):
+    assert "eager" in condition_names()
+    assert completion.filters("ea") == ["eager"]
+    (condition,) = parse_conditions("eager:gain=2", SCALAR)
+    assert spec_of(condition).startswith("eager:gain=2.0:")
+    assert parse_conditions(spec_of(condition), SCALAR) == (condition,)
+    with pytest.raises(ConfigurationError, match="did you mean 'eager'"):
+        require_readable("eagr", SCALAR)
+
+
+def test_a_condition_of_a_module_is_known_by_its_place(installed):
+    condition = parse_condition("my_package:Picky:gain=2", ())
+    assert spec_of(condition).startswith("my_package:Picky:gain=2.0")
+    assert parse_condition(spec_of(condition), ()) == condition
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("my_filter.py:Eagr", "did you mean 'Eager'"),
+        ("my_filter.py:Eager:gian=2", "has no parameter 'gian'; did you mean 'gain'"),
+        ("my_filter.py:Eager:gain=1,2", "gain takes one value; 2 were given"),
+        ("my_filter.py:Eager:gain=1:gain=2", "names 'gain' twice"),
+        ("my_filter.py:Eager:file=x", "has no parameter 'file'"),
+        ("my_filter.py:Picky:gain=10", r"cannot be made \(ValueError: too eager\)"),
+        ("my_filter.py:Picky:order=few", r"cannot be made \(TypeError"),
+        ("my_filter.py:Undecorated", r"@dataclass\(frozen=True\)"),
+        ("my_filter.py:Unfinished", "does not define derived"),
+        ("my_filter.py:instance", "is a Eager, no subclass of safe_envs.wrappers.Condition"),
+        ("nowhere.py:Eager", "there is no file nowhere.py"),
+        ("json:dumps", "is a function, no subclass"),
+        ("my_filtr:Eager", "unknown filter 'my_filtr'"),
+        ("my_filter.py:Eager+scbf", "has 2 conditions; Scalar takes one"),
+        ("my_filter.py:Eager,none", "has no 'Eager,none'"),
+    ],
+)
+def test_text_that_makes_no_condition_is_explained(stated, text, message):
+    with pytest.raises(ConfigurationError, match=message):
+        parse_conditions(text, SCALAR)
+
+
+def test_code_that_fails_is_an_error_of_its_condition(stated):
+    with pytest.raises(ConfigurationError, match="Failing cannot derive its constraint on h"):
+        SafetyFilter.for_problem(SCALAR, "my_filter.py:Failing")
+
+
+def test_an_evaluation_names_the_condition_and_where_it_is(stated):
+    name = "my_filter.py:Eager:gain=2"
+    found = evaluate("Scalar-v0", filters=["none", name], episodes=20, bounds=False)
+    assert [row["filter"] for row in found.rows] == ["none", name]
+    (spec,) = (f["spec"] for f in found.config["filters"] if f["name"] == name)
+    assert spec.startswith(f"{stated.resolve()}/my_filter.py:Eager:gain=2.0")
+
+
+@dataclass(frozen=True)
+class Certain(Condition):
+    """As a condition from outside says that it keeps every path."""
+
+    stochastic = almost_sure = True
+
+    def derived(self, model, barrier):
+        h = barrier.expression
+        return AffineConstraint.after(model, (h,), lie_derivative_f(model, h) + h)
+
+
+def test_what_bounds_ask_of_a_condition_it_says_itself():
+    from safe_envs.wrappers.verification.formulas import Formulas
+
+    assert Formulas(SCALAR, (Certain(),), "model").certain
+    assert not Formulas(SCALAR, (CBF(),), "model").certain
+    assert Certain.name == "Certain"
+    assert spec_of(Certain()) == f"{__name__}:Certain"
