@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from safe_envs.registry import load_problem
 from safe_envs.scripts.reproduce.chapter_3 import (
     dubins_disk,
-    dubins_learning,
+    dubins_obstacle,
     learned_runs,
     quadrotor,
 )
@@ -18,11 +18,13 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import runs, thinned
 from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
 from safe_envs.scripts.reproduce.framework import store, verdict
 from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.wrappers import HOCBF
 
 pytestmark = pytest.mark.slow
 ARTEFACTS = {
-    artefact.name: artefact for artefact in (*dubins_learning.ARTEFACTS, *quadrotor.ARTEFACTS)
+    artefact.name: artefact
+    for artefact in (*dubins_disk.ARTEFACTS, *dubins_obstacle.ARTEFACTS, *quadrotor.ARTEFACTS)
 }
 QUICK = Sample(episodes=8, quick=True)
 
@@ -61,7 +63,7 @@ def test_the_module_has_the_figures_of_the_chapter():
     assert list(ARTEFACTS) == ["figure-3.1", "figure-3.2a", "figure-3.2b", "figure-3.3"]
 
 
-def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
+def test_settings_and_numbers_are_those_of_the_thesis(outcomes):
     # Sec. 3.5.1, static case, with Eq. (3.27), (3.28).
     world = dubins_disk.disk(Sample())
     assert (world.dt, world.horizon, world.steps) == (0.05, 50.0, 1000)
@@ -74,11 +76,11 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
     assert [n.printed for n in outcome.numbers] == [3, None, None, None]
     assert all(
         [n.printed for n in other.numbers] == [3, None, None, None]
-        for other in outcome.elsewhere.values()
+        for other in outcome.alternative_settings.values()
     )
     assert {c["p"] for c in outcome.data["curves"]} == {0.5, 1.0, 5.0}
     # Sec. 3.5.1, moving case, with Fig. 3.2; p_1 = p_2 = 1 are of thesis-notes.
-    world = load_problem(dubins_learning.OBSTACLE, {"start": "thesis"})
+    world = load_problem(dubins_obstacle.OBSTACLE, {"start": "thesis"})
     assert [learned_runs.parameters(world.plant)[name] for name in ("v", "v_o")] == [0.8, 0.5]
     assert [learned_runs.parameters(world.model)[name] for name in ("v", "v_o")] == [0.5, 0.5]
     instants = outcomes["figure-3.2a"].data["instants"]
@@ -86,9 +88,9 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
     assert [instants[0][what] for what in ("vehicle", "obstacle")] == [[-2.0, -2.0], [-1.0, 0.0]]
     assert [instant["obstacle"][0] for instant in instants] == pytest.approx([-1.0, 1.0, 2.5])
     assert (
-        dubins_learning.OBSTACLE_RADIUS,
-        dubins_learning.SPEED,
-        dubins_learning.OBSTACLE_RATES,
+        dubins_obstacle.OBSTACLE_RADIUS,
+        dubins_obstacle.SPEED,
+        dubins_obstacle.OBSTACLE_RATES,
     ) == (0.5, 0.8, "1,1")
     # Sec. 3.5.2 with Fig. 3.3.
     world = quadrotor.hover(Sample())
@@ -99,7 +101,7 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
     assert (quadrotor.GAINS, quadrotor.HALF_WIDTH) == ((2.0, 8.0), 2.0)
     assert outcomes["figure-3.3"].data["true"]["z"][0] == 5.0
     # Sec. 3.5.1, 3.5.2: 500 epochs; the rest is of thesis-notes, and three learnings are ours.
-    assert learned_runs.settings(Sample()) == (2000, 500)
+    assert learned_runs.learning_sizes(Sample()) == (2000, 500)
     assert len(learned_runs.seeds(Sample())) == 3
 
 
@@ -133,14 +135,14 @@ def test_settings_are_those_of_the_sample():
 
 
 def test_what_is_told_of_the_learning_is_so(outcomes):
-    for env_id in (dubins_disk.DISK, dubins_learning.OBSTACLE, quadrotor.QUADROTOR):
+    for env_id in (dubins_disk.DISK, dubins_obstacle.OBSTACLE, quadrotor.QUADROTOR):
         models = learned_runs.residuals(env_id, QUICK)
         assert len(models) == 2
         told = {"states": 400, "label_dt": 1e-3, "hidden": [100, 30], "epochs": 80}
         assert [model.record.settings for model in models] == [told, told]
     coordinates = [
         list(map(str, load_problem(env_id).exploration.coordinates))
-        for env_id in (dubins_disk.DISK, dubins_learning.OBSTACLE)
+        for env_id in (dubins_disk.DISK, dubins_obstacle.OBSTACLE)
     ]
     assert coordinates == [
         ["x", "y", "cos(theta)", "sin(theta)"],
@@ -148,9 +150,9 @@ def test_what_is_told_of_the_learning_is_so(outcomes):
     ]
     assert load_problem(quadrotor.QUADROTOR).exploration.inputs == ((3.0,), (9.0,))
     for name in ("figure-3.1", "figure-3.2a", "figure-3.2b"):
-        assert any("3 inputs; " in line for line in ARTEFACTS[name].corrections)
+        assert any("3 inputs; " in line for line in ARTEFACTS[name].errata)
     assert all(
-        any("0.001 s" in line for line in artefact.corrections) for artefact in ARTEFACTS.values()
+        any("0.001 s" in line for line in artefact.errata) for artefact in ARTEFACTS.values()
     )
 
 
@@ -172,10 +174,10 @@ def test_an_outcome_is_drawn_and_judged(name, outcomes, tmp_path, pictures):
 def test_the_same_seed_gives_the_same_outcome(name, outcomes):
     """One of each module; figure-3.2a shows the runs of figure-3.2b, and rates as figure-3.3 does."""
     if name == "figure-3.2b":
-        dubins_learning.passages.cache_clear()
+        dubins_obstacle.passages.cache_clear()
     if name == "figure-3.3":
         # This one learns anew, too.
-        dubins_learning.residuals.cache_clear()
+        dubins_obstacle.residuals.cache_clear()
     assert compute(name).document() == outcomes[name].document()
 
 
@@ -184,8 +186,8 @@ def test_names_of_numbers_are_unique_and_printed_forms_have_one_of_ours(name, ou
     outcome = outcomes[name]
     names = [number.name for number in outcome.numbers]
     assert len(set(names)) == len(names)
-    assert {number.name for number in outcome.as_printed} <= set(names)
-    for other in outcome.elsewhere.values():
+    assert {number.name for number in outcome.printed_formula} <= set(names)
+    for other in outcome.alternative_settings.values():
         assert [number.name for number in other.numbers] == names
         assert [claim.sentence for claim in other.claims] == [
             claim.sentence for claim in outcome.claims if claim.printed
@@ -247,7 +249,7 @@ def test_exact_derivatives_leave_the_disk_from_the_printed_start_too():
 
 
 def test_other_settings_of_the_disk_are_tried_with_every_learning(outcomes):
-    others = outcomes["figure-3.1"].elsewhere
+    others = outcomes["figure-3.1"].alternative_settings
     assert [
         ("start (0.0, 0.1, 0.0)" in name, "pi" in name, "margin" in name) for name in others
     ] == [
@@ -267,7 +269,7 @@ def test_the_disk_knows_the_exact_filter_and_the_direction_of_the_error(outcomes
     assert not held(outcome.claims, "All trajectories")
     assert "outside C_2 for every gain" in outcome.notes[0]
     assert "inside C_2 for every gain" in outcome.notes[1]
-    printed, corrected = ours(outcome.as_printed), ours(outcome.numbers)
+    printed, corrected = ours(outcome.printed_formula), ours(outcome.numbers)
     # Half of the gain makes the filter turn twice as much.
     assert printed["smallest h, p = 0.5"] > corrected["smallest h, p = 0.5"]
 
@@ -283,19 +285,19 @@ def test_the_way_past_the_obstacle_is_longer_at_the_same_speed(outcomes):
     )
     assert (
         found["path, none"]
-        > math.dist((-2, -2), dubins_learning.GOAL) - dubins_learning.GOAL_RADIUS
+        > math.dist((-2, -2), dubins_obstacle.GOAL) - dubins_obstacle.GOAL_RADIUS
     )
     assert held(outcome.claims, "longer")
 
 
 def test_the_nominal_and_the_printed_derivatives_collide_and_the_true_ones_do_not(outcomes):
     outcome = outcomes["figure-3.2b"]
-    found, printed = ours(outcome.numbers), ours(outcome.as_printed)
+    found, printed = ours(outcome.numbers), ours(outcome.printed_formula)
     assert (
         found["smallest h, true"] > 0 > max(found["smallest h, nominal"], found["smallest h, none"])
     )
     assert printed["smallest h, true"] < 0
-    (at_rest,) = outcome.elsewhere.values()
+    (at_rest,) = outcome.alternative_settings.values()
     assert (
         ours(at_rest.numbers)["smallest h, nominal"]
         == printed["smallest h, nominal"]
@@ -307,7 +309,7 @@ def test_the_nominal_and_the_printed_derivatives_collide_and_the_true_ones_do_no
 
 def test_the_printed_formula_of_the_quadrotor_diverges_and_the_corrected_one_does_not(outcomes):
     outcome = outcomes["figure-3.3"]
-    found, printed = ours(outcome.numbers), ours(outcome.as_printed)
+    found, printed = ours(outcome.numbers), ours(outcome.printed_formula)
     assert found["smallest h, true"] > 0 > found["smallest h, nominal"]
     assert printed["smallest h, true"] < -10
     assert printed["time in the workspace, true"] < 3.0
@@ -338,7 +340,7 @@ def test_the_printed_row_differs_from_the_derived_one_as_the_errata_say():
     barrier, model = problem.barriers[0], problem.model
     derived, printed = (
         condition.constraint(model, barrier)
-        for condition in (HOCBF(quadrotor.GAINS), quadrotor.PrintedHOCBF())
+        for condition in (HOCBF(quadrotor.GAINS), PrintedCondition(quadrotor.printed_hocbf))
     )
     at = {quadrotor.z: 6.5, quadrotor.zdot: 0.7, **model.parameters}
     assert float((derived.coefficient[0] + printed.coefficient[0]).subs(at)) == pytest.approx(

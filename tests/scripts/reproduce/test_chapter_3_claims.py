@@ -8,19 +8,19 @@ import numpy as np
 import pytest
 
 from safe_envs.registry import load_problem
-from safe_envs.scripts.reproduce.chapter_3 import dubins_disk, dubins_learning, quadrotor
-from safe_envs.scripts.reproduce.chapter_3.learned_runs import Run
+from safe_envs.scripts.reproduce.chapter_3 import dubins_disk, dubins_obstacle, quadrotor
+from safe_envs.scripts.reproduce.chapter_3.learned_runs import Trajectory
 from safe_envs.scripts.reproduce.framework import verdict
 from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
 
 GOAL = (3.0, 1.5)
-OBSTACLE = load_problem(dubins_learning.OBSTACLE)
+OBSTACLE = load_problem(dubins_obstacle.OBSTACLE)
 
 
 def run_with(*h, at=(0.0, 0.0), lengths=()):
     """A made-up run: its barrier, and its way along x from a point."""
     x = at[0] + np.concatenate([[0.0], np.cumsum(lengths or [0.0] * (len(h) - 1))])
-    return Run(np.stack([x, np.full(len(h), at[1])], axis=1), np.array(h, dtype=float))
+    return Trajectory(np.stack([x, np.full(len(h), at[1])], axis=1), np.array(h, dtype=float))
 
 
 def held(claims, word):
@@ -34,12 +34,12 @@ def runs_of_the_disk(*counts):
     return [[run_with(1.0, 0.1 if i < safe else -0.1) for i in range(3)] for safe in counts]
 
 
-def passage(learned=(1.0, 0.2), nominal=(1.0, -0.1), end=(3.0, 1.5), lengths=None, bare=None):
+def passage(learned=(1.0, 0.2), nominal=(1.0, -0.1), end=(3.0, 1.5), lengths=None, unfiltered=None):
     """Made-up ways past the obstacle of at least one control period, which end where they are told
     to, at .8 m/s unless told otherwise."""
     lengths = lengths or [0.04] * (len(learned) - 1)
     way = run_with(*learned, at=(end[0] - sum(lengths), end[1]), lengths=lengths)
-    none = run_with(1.0, -0.1, at=GOAL, lengths=[bare or 0.02])
+    none = run_with(1.0, -0.1, at=GOAL, lengths=[unfiltered or 0.02])
     return {"learned": [way, way], "nominal": [run_with(*nominal, at=GOAL)], "none": [none]}
 
 
@@ -62,10 +62,10 @@ def test_the_printed_differences_give_the_print_if_all_are_safe_in_every_learnin
         found = Outcome(
             outcome.numbers,
             outcome.claims,
-            as_printed=dubins_disk.disk_numbers(runs_of_the_disk(*counts)),
+            printed_formula=dubins_disk.disk_numbers(runs_of_the_disk(*counts)),
         )
-        judged = verdict.judge(dubins_disk.FIGURE, found, Sample())
-        assert (judged.wrong_formula, judged.gives_print) == (True, same)
+        judged = verdict.judge(dubins_disk.ARTEFACTS[0], found, Sample())
+        assert (judged.wrong_formula, judged.matches_thesis) == (True, same)
 
 
 @pytest.mark.parametrize(
@@ -84,12 +84,12 @@ def test_the_theory_of_the_disk_can_fail(learned, nominal, holds):
         ("goal", {"end": (3.0, 1.81)}),
         ("collides", {"nominal": (1.0, 0.01)}),
         ("longer", {"lengths": [0.039]}),
-        ("longer", {"bare": 0.05}),
+        ("longer", {"unfiltered": 0.05}),
     ],
 )
 def test_each_claim_about_the_way_can_fail(word, changed):
-    assert held(dubins_learning.passage_claims(passage(), OBSTACLE), word)
-    assert not held(dubins_learning.passage_claims(passage(**changed), OBSTACLE), word)
+    assert held(dubins_obstacle.passage_claims(passage(), OBSTACLE), word)
+    assert not held(dubins_obstacle.passage_claims(passage(**changed), OBSTACLE), word)
 
 
 @pytest.mark.parametrize(
@@ -102,23 +102,23 @@ def test_each_claim_about_the_way_can_fail(word, changed):
     ],
 )
 def test_each_claim_about_the_barrier_can_hold_and_fail(word, good, bad):
-    assert held(dubins_learning.clearance_claims(passage(**good), OBSTACLE), word)
-    assert not held(dubins_learning.clearance_claims(passage(**bad), OBSTACLE), word)
+    assert held(dubins_obstacle.clearance_claims(passage(**good), OBSTACLE), word)
+    assert not held(dubins_obstacle.clearance_claims(passage(**bad), OBSTACLE), word)
 
 
 def test_claims_hold_only_if_they_do_in_every_learning():
     fine, worse = passage(), passage((1.0, -0.01), end=(9.0, 9.0))
     mixed = {**fine, "learned": [fine["learned"][0], worse["learned"][0]]}
     for claims, words in (
-        (dubins_learning.passage_claims, ("avoids", "goal")),
-        (dubins_learning.clearance_claims, ("always positive",)),
+        (dubins_obstacle.passage_claims, ("avoids", "goal")),
+        (dubins_obstacle.clearance_claims, ("always positive",)),
     ):
         assert not any(held(claims(mixed, OBSTACLE), word) for word in words)
     steps = {**fine, "learned": [passage((1.0, 0.2, 0.2))["learned"][0], fine["learned"][0]]}
-    assert not held(dubins_learning.clearance_claims(steps, OBSTACLE), "more time steps")
+    assert not held(dubins_obstacle.clearance_claims(steps, OBSTACLE), "more time steps")
     slow = {**fine, "learned": [passage(lengths=[0.039])["learned"][0], fine["learned"][0]]}
-    assert not held(dubins_learning.clearance_claims(slow, OBSTACLE), "slows down")
-    assert not held(dubins_learning.passage_claims(slow, OBSTACLE), "longer")
+    assert not held(dubins_obstacle.clearance_claims(slow, OBSTACLE), "slows down")
+    assert not held(dubins_obstacle.passage_claims(slow, OBSTACLE), "longer")
 
 
 def test_a_turn_at_full_speed_is_no_slowing_down():
@@ -128,7 +128,7 @@ def test_a_turn_at_full_speed_is_no_slowing_down():
     for length, slower in ((chord, False), (chord - 1e-6, True)):
         assert (
             held(
-                dubins_learning.clearance_claims(passage(lengths=[length]), OBSTACLE), "slows down"
+                dubins_obstacle.clearance_claims(passage(lengths=[length]), OBSTACLE), "slows down"
             )
             is slower
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,14 +24,17 @@ from safe_envs.scripts.reproduce.chapter_4 import (
     dubins_points,
     dubins_runs,
     martingale,
+    reciprocal_inputs,
 )
 from safe_envs.scripts.reproduce.framework import store
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
 from safe_envs.wrappers import SZCBF
 
 pytestmark = pytest.mark.slow
-ARTEFACTS = {a.name: a for module in (martingale, cruise, dubins_noise) for a in module.ARTEFACTS}
+MODULES = (martingale, cruise, cruise_effort, dubins_noise, dubins_points)
+ARTEFACTS = {a.name: a for module in MODULES for a in module.ARTEFACTS}
 QUICK = Sample(quick=True)
 BROWNIAN_HORIZON = 2.5
 """Of the rates with closed forms, in s: long enough for noise to make a fifth of the episodes
@@ -77,7 +81,7 @@ def test_what_the_thesis_prints() -> None:
     }
     # Sec. 4.3.1 and the caption of Table 4.1: the start, sigma_1 = 1, steps of .05 s, 100 s, 50
     # trajectories.
-    problem = cruise_setting.TAKEN.problem(1000.0)
+    problem = cruise_setting.ASSUMED.problem(1000.0)
     assert (cruise_setting.START, cruise_setting.NOISE, problem.dt, problem.horizon) == (
         (15.0, 20.0, 150.0),
         1.0,
@@ -110,9 +114,9 @@ def test_what_the_thesis_prints() -> None:
     assert vehicle.barriers[0].expression.subs({x: 3, y: 0, theta: 0}) == 0
     # thesis-notes, "What chapters 3 and 4 leave open".
     assert (
-        cruise_setting.TAKEN.tau,
-        cruise_setting.TAKEN.gamma,
-        cruise_setting.TAKEN.slack_weight,
+        cruise_setting.ASSUMED.tau,
+        cruise_setting.ASSUMED.gamma,
+        cruise_setting.ASSUMED.slack_weight,
     ) == (1.8, 1.0, 0.02)
     fitted = cruise_setting.FITTED
     assert (fitted.tau, fitted.slack_weight, fitted.rate, fitted.gamma, fitted.limit) == (
@@ -157,8 +161,8 @@ def test_goes_through_json_and_is_judged(artefact: Artefact) -> None:
     assert judge(artefact, again, Sample()) == judge(artefact, outcome, Sample())
     names = [number.name for number in outcome.numbers]
     assert len(set(names)) == len(names)
-    assert {number.name for number in outcome.as_printed} <= set(names)
-    for other in outcome.elsewhere.values():
+    assert {number.name for number in outcome.printed_formula} <= set(names)
+    for other in outcome.alternative_settings.values():
         assert [claim.sentence for claim in other.claims if claim.printed] == [
             claim.sentence for claim in outcome.claims if claim.printed
         ]
@@ -185,10 +189,10 @@ def test_same_seed_same_outcome(artefact: Artefact, monkeypatch: pytest.MonkeyPa
 
 def test_printed_inequalities() -> None:
     """u <= h^3 - x and u <= h^3 - x - sigma^2/h."""
-    h = martingale.DISTANCES
-    assert np.allclose(martingale.largest_inputs("rcbf", 0.0), h**3 - (1 - h), rtol=1e-6)
+    h = reciprocal_inputs.DISTANCES
+    assert np.allclose(reciprocal_inputs.largest_inputs("rcbf", 0.0), h**3 - (1 - h), rtol=1e-6)
     assert np.allclose(
-        martingale.largest_inputs("srcbf", 0.3), h**3 - (1 - h) - 0.09 / h, rtol=1e-6
+        reciprocal_inputs.largest_inputs("srcbf", 0.3), h**3 - (1 - h) - 0.09 / h, rtol=1e-6
     )
 
 
@@ -216,7 +220,7 @@ def test_scalar_system_under_scbf_is_brownian() -> None:
 def test_force_near_the_edge() -> None:
     """At equal speeds SCBF balances the drag, and SRCBF brakes by M tau sigma^2/h more, which turns
     round at the h of the note."""
-    h, setting = cruise_effort.DISTANCES, cruise_setting.TAKEN
+    h, setting = cruise_effort.DISTANCES, cruise_setting.ASSUMED
     drag = 0.1 + 5 * cruise_effort.NEAR + 0.25 * cruise_effort.NEAR**2
     asked = drag - 1650.0 / setting.tau * (
         (setting.tau * cruise_setting.NOISE) ** 2 / h - setting.gamma * h**3
@@ -232,7 +236,7 @@ def test_force_near_the_edge() -> None:
 
 def test_printed_program() -> None:
     """The minimiser of (u^2 + d^2)/2 with a + b u <= d, V = (x_1 - 22)^2."""
-    problem = cruise_setting.PRINTED_PROGRAM.problem(cruise_setting.UNBOUNDED)
+    problem = cruise_setting.PRINTED_QP.problem(cruise_setting.UNBOUNDED)
     for speed in (10.0, 21.9, 30.0):
         drag = 0.1 + 5 * speed + 0.25 * speed**2
         a, b = -2 * (speed - 22) * drag / 1650 + 1.0, 2 * (speed - 22) / 1650
@@ -245,14 +249,14 @@ def test_printed_program() -> None:
 
 def test_printed_table_is_out_of_reach_of_the_default() -> None:
     """The Gaussian law, its inverse, and the simulation agree."""
-    assert cruise_setting.TAKEN.most_unsafe() == pytest.approx(2 * ndtr(-(150 - 15 * 1.8) / 18.0))
-    assert cruise_setting.TAKEN.most_unsafe() < 1e-11
+    assert cruise_setting.ASSUMED.most_unsafe() == pytest.approx(2 * ndtr(-(150 - 15 * 1.8) / 18.0))
+    assert f"at most {cruise_setting.ASSUMED.most_unsafe():.1g}," in ARTEFACTS["table-4.1"].argument
     assert cruise.headway_for(cruise_setting.FITTED.most_unsafe()) == pytest.approx(
         cruise_setting.FITTED.tau
     )
     assert ours("table-4.1")["SCBF, unbounded"].ours == 100.0
     assert judge(ARTEFACTS["table-4.1"], outcome_of("table-4.1"), Sample()).verdict in (
-        Verdict.ELSEWHERE,
+        Verdict.ALTERNATIVE,
         Verdict.NOT,
     )
 
@@ -261,12 +265,13 @@ def test_the_fitted_setting_is_told_as_such() -> None:
     """Where it is named, and in a note."""
     outcome = outcome_of("table-4.1")
     assert any(
-        "fitted by us, 4 printed numbers by 5 quantities" in name for name in outcome.elsewhere
+        "fitted by us, 4 printed numbers by 5 quantities" in name
+        for name in outcome.alternative_settings
     )
     assert any("fitted 4 numbers by 5 quantities, tau = 5.8 s" in note for note in outcome.notes)
     assert any(
         "fitted to Table 4.1, not to this figure" in name
-        for name in outcome_of("figure-4.1").elsewhere
+        for name in outcome_of("figure-4.1").alternative_settings
     )
 
 
@@ -274,7 +279,7 @@ def test_effort_over_time_depends_on_what_the_print_leaves_open() -> None:
     """SRCBF's is the lower one most of the time, and the higher one with the settings that were
     fitted to the table."""
     outcome = outcome_of("figure-4.1")
-    by_print, fitted = outcome.elsewhere.values()
+    by_print, fitted = outcome.alternative_settings.values()
     assert [found.claims[0].holds for found in (outcome, by_print, fitted)] == [False, False, True]
 
 
@@ -284,16 +289,19 @@ def test_printed_zeroing_form() -> None:
     problem = dubins_runs.dubins_problem(0.1, "inward")
     barrier: Barrier = problem.barriers[0]
     printed, corrected = (
-        kind((2.0, 3.0)).constraint(problem.model, barrier)
-        for kind in (dubins_runs.PrintedSZCBF, SZCBF)
+        condition.constraint(problem.model, barrier)
+        for condition in (
+            PrintedCondition(partial(dubins_runs.printed_szcbf, (2.0, 3.0))),
+            SZCBF((2.0, 3.0)),
+        )
     )
     h = barrier.expression
     missing = 3 * (generator(problem.model, h) + 2 * h - h)
     assert (corrected.offset - printed.offset - missing).expand().simplify() == 0
     assert printed.coefficient[0].equals(corrected.coefficient[0])
-    as_printed = {number.name: number for number in outcome_of("figure-4.2").as_printed}
+    printed_formula = {number.name: number for number in outcome_of("figure-4.2").printed_formula}
     for name in dubins_runs.ALPHAS:
-        assert as_printed[f"{name}, sigma = 0"].ours == 0.0
+        assert printed_formula[f"{name}, sigma = 0"].ours == 0.0
         assert ours("figure-4.2")[f"{name}, sigma = 0"].ours > 50.0
 
 
@@ -301,7 +309,8 @@ def test_starts_without_condition_are_the_main_setting() -> None:
     """Nothing of the numbers is from starts with A h > 0, from which no path without noise leaves."""
     assert ours("figure-4.2")["SCBF, sigma = 0"].ours < 90.0
     assert any(
-        name.startswith("starts with A h > 0") for name in outcome_of("figure-4.2").elsewhere
+        name.startswith("starts with A h > 0")
+        for name in outcome_of("figure-4.2").alternative_settings
     )
     assert {"SCBF, sigma = 0.25", "SCBF, sigma = 0.3"} <= ours("figure-4.2").keys()
 

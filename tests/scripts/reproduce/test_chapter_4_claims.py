@@ -9,17 +9,18 @@ import pytest
 
 from safe_envs.scripts.reproduce.chapter_4 import (
     cruise,
-    cruise_effort,
     dubins_noise,
     dubins_points,
     dubins_runs,
+    effort_claims,
     martingale,
+    reciprocal_inputs,
 )
-from safe_envs.scripts.reproduce.chapter_4.cruise_effort import Run
-from safe_envs.scripts.reproduce.chapter_4.paired_episodes import Exits
+from safe_envs.scripts.reproduce.chapter_4.effort_claims import EffortRecord
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
+from safe_envs.scripts.reproduce.framework.episodes import Violations
 
-H = martingale.DISTANCES
+H = reciprocal_inputs.DISTANCES
 X = 1.0 - H
 LAWS = {"RCBF": H**3 - X, "SRCBF": H**3 - X - 0.25 / H}
 
@@ -41,7 +42,7 @@ def held(claims: list[Claim]) -> list[bool]:
 )
 def test_inputs_at_the_edge(asked: dict[str, np.ndarray], expected: list[bool]) -> None:
     """A wrong gamma, a wrong sign or a change of the two is seen."""
-    assert held(martingale.claims_on_inputs(asked)) == expected
+    assert held(reciprocal_inputs.claims_on_inputs(asked)) == expected
 
 
 def test_certainty_is_lost_only_if_the_intervals_are_apart() -> None:
@@ -97,9 +98,9 @@ def test_table(counts: tuple[int, ...], expected: list[bool], words: str) -> Non
     assert words in claims[2].evidence
 
 
-def run_of(effort: np.ndarray, barrier: float | np.ndarray = 1.0) -> Run:
+def run_of(effort: np.ndarray, barrier: float | np.ndarray = 1.0) -> EffortRecord:
     """A run in which the filter always acts."""
-    return Run(effort, effort, np.broadcast_to(barrier, effort.shape))
+    return EffortRecord(effort, effort, np.broadcast_to(barrier, effort.shape))
 
 
 def test_effort_over_time() -> None:
@@ -109,59 +110,59 @@ def test_effort_over_time() -> None:
     ended = ones.copy()
     ended[1:] = np.nan
     larger, smaller = (
-        cruise_effort.share_of_time(run_of(a), run_of(b)) for a, b in ((peaks, ones), (ones, peaks))
+        effort_claims.share_of_time(run_of(a), run_of(b)) for a, b in ((peaks, ones), (ones, peaks))
     )
     assert larger == pytest.approx([0.2] * 3)
     assert smaller == pytest.approx([0.8] * 3)
-    assert cruise_effort.share_of_time(run_of(peaks), run_of(ended)) == pytest.approx([1.0] * 3)
-    assert cruise_effort.share_of_time(run_of(ones), run_of(ones)) == pytest.approx([0.0] * 3)
-    assert not cruise_effort.claim_on_time(larger, smaller).holds
-    assert cruise_effort.claim_on_time(smaller, larger).holds
-    assert not cruise_effort.claim_on_time(larger, larger).holds
+    assert effort_claims.share_of_time(run_of(peaks), run_of(ended)) == pytest.approx([1.0] * 3)
+    assert effort_claims.share_of_time(run_of(ones), run_of(ones)) == pytest.approx([0.0] * 3)
+    assert not effort_claims.claim_on_time(larger, smaller).holds
+    assert effort_claims.claim_on_time(smaller, larger).holds
+    assert not effort_claims.claim_on_time(larger, larger).holds
     total = {"SRCBF": run_of(peaks), "SCBF": run_of(ones)}
-    assert cruise_effort.claim_on_total(total).holds
-    assert not cruise_effort.claim_on_total({"SRCBF": total["SCBF"], "SCBF": total["SRCBF"]}).holds
+    assert effort_claims.claim_on_total(total).holds
+    assert not effort_claims.claim_on_total({"SRCBF": total["SCBF"], "SCBF": total["SRCBF"]}).holds
 
 
 def test_effort_at_the_edge() -> None:
     """A force that grows like 1/h has no bound, a constant one has."""
-    grows, stays = 1.0 / cruise_effort.DISTANCES, np.full_like(cruise_effort.DISTANCES, 200.0)
-    assert [cruise_effort.claim_on_edge(force).holds for force in (grows, stays)] == [True, False]
-    assert [cruise_effort.claim_on_bounded(force).holds for force in (grows, stays)] == [
+    grows, stays = 1.0 / effort_claims.DISTANCES, np.full_like(effort_claims.DISTANCES, 200.0)
+    assert [effort_claims.claim_on_edge(force).holds for force in (grows, stays)] == [True, False]
+    assert [effort_claims.claim_on_bounded(force).holds for force in (grows, stays)] == [
         False,
         True,
     ]
-    assert cruise_effort.claim_on_edge(grows).printed
-    assert not cruise_effort.claim_on_bounded(stays).printed
+    assert effort_claims.claim_on_edge(grows).printed
+    assert not effort_claims.claim_on_bounded(stays).printed
 
 
 def test_peaks_and_growth_are_checks_of_ours() -> None:
     """Both may fail, and a filter that never acts needs no force."""
     low, high = np.array([1.0, 1.0, 9.0]), np.array([2.0, 2.0, 2.0])
-    assert cruise_effort.claim_on_peaks(high, low).holds
-    assert not cruise_effort.claim_on_peaks(low, high).holds
+    assert effort_claims.claim_on_peaks(high, low).holds
+    assert not effort_claims.claim_on_peaks(low, high).holds
     barrier = np.array([[0.1], [2.0]])
     claims = [
-        cruise_effort.claim_on_growth(run_of(np.array(effort), barrier))
+        effort_claims.claim_on_growth(run_of(np.array(effort), barrier))
         for effort in ([[5.0], [1.0]], [[1.0], [5.0]])
     ]
     assert held(claims) == [True, False]
-    never = cruise_effort.claim_on_growth(run_of(np.full((2, 1), np.nan), barrier))
+    never = effort_claims.claim_on_growth(run_of(np.full((2, 1), np.nan), barrier))
     assert not never.holds
     assert "never below" in never.evidence
-    assert not any(claim.printed for claim in (*claims, cruise_effort.claim_on_peaks(high, low)))
+    assert not any(claim.printed for claim in (*claims, effort_claims.claim_on_peaks(high, low)))
 
 
 def test_median_peak_is_between_order_statistics() -> None:
     """For 50 episodes the 18th and the 33rd hold the median with 95 %."""
-    number = cruise_effort.median_peak("SRCBF", np.arange(50.0, 0.0, -1.0) ** 2)
+    number = effort_claims.median_peak("SRCBF", np.arange(50.0, 0.0, -1.0) ** 2)
     assert (number.low, number.ours, number.high) == (18.0, 25.5, 33.0)
 
 
-def runs_of(scbf: int, one: int, half: int, of: int = 200) -> dict[str, Exits]:
+def runs_of(scbf: int, one: int, half: int, of: int = 200) -> dict[str, Violations]:
     """Runs with so many safe episodes."""
     return {
-        name: Exits(np.where(first(count, of), 1000, 1), 0.1)
+        name: Violations(np.where(first(count, of), 1000, 1), 0.1)
         for name, count in zip(dubins_runs.FILTERS, (scbf, one, half), strict=True)
     }
 
@@ -220,7 +221,7 @@ def test_points(by_start: list[tuple[int, int, int]], holds: bool) -> None:
 def test_horizon_counts() -> None:
     """An exit after the horizon is none: with control periods of .05 s instant 101 is past 5 s,
     instant 100 is not."""
-    late, soon = Exits(np.full(50, 101), 0.0), Exits(np.full(50, 100), 0.0)
+    late, soon = Violations(np.full(50, 101), 0.0), Violations(np.full(50, 100), 0.0)
     claim = dubins_points.claim_on_points(
         [{"SCBF": late, "SZCBF(1, 1)": soon, "SZCBF(.5, .5)": soon}], 5.0
     )
@@ -232,7 +233,10 @@ def test_horizon_counts() -> None:
 
 def test_turning_time() -> None:
     """The first instant from which on the first row stays ahead."""
-    run, other = Exits(np.array([2, 2, 300, 300]), 0.0), Exits(np.array([1, 50, 50, 300]), 0.0)
+    run, other = (
+        Violations(np.array([2, 2, 300, 300]), 0.0),
+        Violations(np.array([1, 50, 50, 300]), 0.0),
+    )
     assert dubins_runs.turning_time(run, other) == pytest.approx(2.5)
     assert dubins_runs.turning_time(other, run) is None
 
@@ -257,17 +261,19 @@ def test_product_is_contradicted_where_the_rate_is_below_it() -> None:
     assert "in 10.0 % of the steps" in note
 
 
-def test_what_holds_elsewhere_is_named() -> None:
+def test_alternative_settings_that_hold_are_named() -> None:
     """Both kinds of settings, or that there is none."""
     worse, better = ({0.0: runs_of(*counts)} for counts in ((100, 150, 150), (150, 100, 100)))
-    found = dubins_runs.elsewhere_of({"all starts": worse}, better, dubins_noise.claim_on_noises)
+    found = dubins_runs.alternatives_of({"all starts": worse}, better, dubins_noise.claim_on_noises)
     assert list(found) == [
-        *(f"{dubins_runs.AS_PRINTED}, T = {t} s" for t in (5, 3, 10)),
+        *(f"{dubins_runs.BY_PRINTED_FORM}, T = {t} s" for t in (5, 3, 10)),
         "all starts, T = 3 s",
         "all starts, T = 10 s",
     ]
     note = dubins_runs.holds_note(found)
-    assert note.index(dubins_runs.AS_PRINTED) < note.index("It does not with: all starts, T = 3 s")
+    assert note.index(dubins_runs.BY_PRINTED_FORM) < note.index(
+        "It does not with: all starts, T = 3 s"
+    )
     assert "none of the other settings" in dubins_runs.holds_note(
         {"all starts, T = 3 s": found["all starts, T = 3 s"]}
     )

@@ -14,8 +14,13 @@ from safe_envs.scripts.reproduce.chapter_5 import (
     paired_rates,
     pendulum,
 )
-from safe_envs.scripts.reproduce.chapter_5.paired_rates import Runs
 from safe_envs.scripts.reproduce.framework.artefact import Sample
+from safe_envs.scripts.reproduce.framework.paired import (
+    MeasuredFilter,
+    difference,
+    safer,
+    with_interval,
+)
 from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
 
 
@@ -26,8 +31,8 @@ def made(*safe, episodes=1000):
     safe, trials = int(np.sum(flags)), len(flags) * episodes
     low, high = rate_interval(round(safe / len(flags)), episodes)
     counts = {"safe": safe, "episodes": trials, "violations": trials - safe}
-    rate = {"safety_rate": safe / trials, "ci_low": low, "ci_high": high}
-    return Runs(SimpleNamespace(**counts, **rate), flags)
+    row = SimpleNamespace(**counts, safety_rate=safe / trials, ci_low=low, ci_high=high)
+    return MeasuredFilter(row, [float(np.mean(each)) for each in flags], flags, episodes)
 
 
 def test_a_root_mean_square_has_the_interval_of_its_mean_square():
@@ -91,7 +96,7 @@ def test_the_print_itself_is_reproduced_in_the_pendulum_table():
 
 
 def test_the_page_says_what_the_other_setting_would_have_given():
-    assert pendulum.in_other_setting(pendulum_outcome()).endswith("in A: all as printed")
+    assert pendulum.in_other_setting(pendulum_outcome()).endswith("in A: all as in the thesis")
     said = pendulum.in_other_setting(pendulum_outcome(ddscbf=870, cbf=40))
     assert "DDSCBF: 91 % printed, 87 % here" in said
     assert "CBF: 0 % printed, 4 % here" in said
@@ -105,18 +110,21 @@ def test_what_the_print_could_resolve():
 
 
 def test_differences_are_of_pairs_and_of_identifications():
+    def apart(first, second):
+        return difference("", first.flags, second.flags)
+
     half = np.arange(1000) < 500
-    assert str(paired_rates.difference(made(600), made(500))) == "+10.0 points [8.1, 11.9]"
+    assert with_interval(apart(made(600), made(500)), " points") == "+10.0 points [8.1, 11.9]"
     # As many one way as the other: the difference is none, though no episode ends alike.
-    none = paired_rates.difference(made(half), made(~half))
-    assert (none.mean, none.low < -5.0, none.high > 5.0) == (0.0, True, True)
-    apart = paired_rates.difference(made(500, 600, 700), made(500))
-    assert apart.mean == pytest.approx(10.0)
-    assert apart.low < -10.0  # identifications differ by more than their mean does from none
-    assert not paired_rates.safer("", made(500, 600, 700), made(500), printed=True).holds
-    assert paired_rates.safer("", made(600), made(500), printed=True).holds
-    assert not paired_rates.safer("", made(500), made(600), printed=True).holds
-    assert not paired_rates.safer("", made(503), made(500), printed=True).holds
+    none = apart(made(half), made(~half))
+    assert (none.ours, none.low < -5.0, none.high > 5.0) == (0.0, True, True)
+    repeated = apart(made(500, 600, 700), made(500))
+    assert repeated.ours == pytest.approx(10.0)
+    assert repeated.low < -10.0  # identifications differ by more than their mean does from none
+    assert not safer("", made(500, 600, 700), made(500)).holds
+    assert safer("", made(600), made(500)).holds
+    assert not safer("", made(500), made(600)).holds
+    assert not safer("", made(503), made(500)).holds
 
 
 def test_closeness_needs_the_whole_interval_within_the_limit():
@@ -145,18 +153,18 @@ def test_claims_about_the_cubic_table_can_fail_and_are_ours(ddscbf, holds):
     assert not any(claim.printed for claim in found)
 
 
-def test_the_side_of_no_filter_is_computed():
-    low, high = cubic.beside_no_filter({0.1: {"none": made(700)}, 0.15: {"none": made(500)}})
+def test_the_side_of_the_unfiltered_rate_is_computed():
+    low, high = cubic.compare_with_no_filter({0.1: {"none": made(700)}, 0.15: {"none": made(500)}})
     assert "77.3 % of the CBF is above [67.1, 72.8]" in low
     assert "57.5 % of the CBF is above" in high
-    low, high = cubic.beside_no_filter({0.1: {"none": made(770)}, 0.15: {"none": made(650)}})
+    low, high = cubic.compare_with_no_filter({0.1: {"none": made(770)}, 0.15: {"none": made(650)}})
     assert "is within [74.3, 79.5]" in low
     assert "is below [62.0, 67.9]" in high
 
 
 def path(*safe):
     states = np.zeros((2, len(safe), 2))
-    return cubic_paths.Path(
+    return cubic_paths.PlaneTrajectories(
         made(5), states, np.array([[0.1] * len(safe), [0.1 if each else -0.1 for each in safe]])
     )
 

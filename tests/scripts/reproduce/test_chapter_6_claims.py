@@ -10,23 +10,26 @@ from scipy.stats import norm, t
 
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.scripts.reproduce.chapter_6 import (
-    bayesian_cruise,
-    bayesian_cubic,
+    car_drift,
+    car_rates,
     cubic_drift,
+    cubic_rates,
     identifications,
     learned_controllers,
     learning_times,
+    noise_posterior,
     worst_case,
 )
-from safe_envs.scripts.reproduce.chapter_6.learned_controllers import Learned
+from safe_envs.scripts.reproduce.chapter_6.learned_controllers import LearnedController
 from safe_envs.scripts.reproduce.framework.artefact import Number
+from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter
 
 DRAWS = norm.ppf((np.arange(10_000) + 0.5) / 10_000)
 """Of a standard normal posterior."""
 
 
 def learned(*difference, rates=(0.8, 0.9)):
-    return Learned(list(rates), 1000, difference)
+    return LearnedController(rates, 1000, Number("", *difference))
 
 
 def test_one_more_of_many_is_in_its_interval_with_95_percent():
@@ -50,7 +53,7 @@ def test_a_positive_quantity_is_predicted_by_its_logarithm():
 
 
 def test_an_interval_of_draws_holds_95_percent_of_them():
-    found = identifications.credible("sigma", DRAWS, "")
+    found = noise_posterior.credible("sigma", DRAWS, "")
     assert (found.low, found.high) == (
         pytest.approx(-1.96, abs=1e-3),
         pytest.approx(1.96, abs=1e-3),
@@ -63,7 +66,7 @@ def test_an_interval_of_draws_holds_95_percent_of_them():
 )
 def test_posteriors_are_around_the_truth_together_in_95_percent(true, holds):
     # Each of the two with 97.5 %, that is 2.24 standard deviations.
-    claim = identifications.gathered([DRAWS, DRAWS], true)
+    claim = noise_posterior.gathered([DRAWS, DRAWS], true)
     assert claim.holds is holds
     assert "97.5 %" in claim.evidence
 
@@ -92,7 +95,7 @@ def test_a_printed_fall_is_possible_or_not():
     claim = cubic_drift.falls_as_printed("f_2", squares(5e-2, 8e-3, 6e-4), (5e-2, 8e-3, 6e-4))
     assert claim.holds
     assert "83-fold" in claim.sentence
-    assert "from K = 30 to 100 13.3-fold in print" in claim.evidence
+    assert "from K = 30 to 100 13.3-fold in the thesis" in claim.evidence
 
 
 @pytest.mark.parametrize(
@@ -107,7 +110,7 @@ def test_a_printed_fall_is_possible_or_not():
     ],
     ids=["wide", "near", "low", "high", "one is far", "print"],
 )
-def test_similar_is_what_the_interval_says_in_points_of_the_print(differences, holds):
+def test_similar_is_decided_by_the_interval_in_printed_points(differences, holds):
     claim = learned_controllers.similar(
         {str(i): learned(*each) for i, each in enumerate(differences)}
     )
@@ -169,7 +172,8 @@ def test_the_worst_case_is_for_ever_or_not():
 )
 def test_both_printed_rates_are_looked_for_at_one_horizon(second, said):
     def row(safe):
-        return {"episodes": 1000, "curve": {"time": [0.0, 0.5, 1.0], "safe": list(safe)}}
+        curve = {"time": [0.0, 0.5, 1.0], "safe": list(safe)}
+        return MeasuredFilter({"episodes": 1000, "curve": curve}, [], [], 1000)
 
     text = worst_case.at_one_horizon(row((1000, 905, 850)), row(second), (91, 55))
     assert said in text
@@ -177,13 +181,13 @@ def test_both_printed_rates_are_looked_for_at_one_horizon(second, said):
 
 
 def test_an_estimate_is_validated_by_what_its_posterior_leaves_open():
-    assert bayesian_cruise.validated(Number("a", 0.9, 0.8, 1.1)).holds
-    assert not bayesian_cruise.validated(Number("a", 1.2, 1.05, 1.35)).holds
+    assert car_drift.validated(Number("a", 0.9, 0.8, 1.1)).holds
+    assert not car_drift.validated(Number("a", 1.2, 1.05, 1.35)).holds
 
 
 def test_near_is_a_check_of_ours():
-    assert bayesian_cruise.near("f", np.array([0.01, 0.011, 0.012])).holds
-    far = bayesian_cruise.near("f", np.array([0.05, 0.08, 0.1]))
+    assert car_drift.near("f", np.array([0.01, 0.011, 0.012])).holds
+    far = car_drift.near("f", np.array([0.05, 0.08, 0.1]))
     assert not far.holds
     assert not far.printed
 
@@ -195,16 +199,16 @@ def test_identifying_is_sooner_or_not_and_ten_times_is_ours(ratio, holds):
     claims = learning_times.sooner(ratio)
     assert [claim.holds for claim in claims] == holds
     assert [claim.printed for claim in claims] == [True, False]
-    assert "1200 times in print" in claims[0].evidence
+    assert "1200 times in the thesis" in claims[0].evidence
 
 
 def test_the_limit_of_similar_is_the_largest_printed_difference():
     pairs = [
         *zip(
-            bayesian_cubic.PRINTED_RATES["SCBF"],
-            bayesian_cubic.PRINTED_RATES["Bayesian SCBF"],
+            cubic_rates.PRINTED["SCBF"],
+            cubic_rates.PRINTED["Bayesian SCBF"],
             strict=True,
         )
     ]
-    pairs.append((bayesian_cruise.PRINTED["SCBF"], bayesian_cruise.PRINTED["Bayesian SCBF"]))
+    pairs.append((car_rates.PRINTED["SCBF"], car_rates.PRINTED["Bayesian SCBF"]))
     assert max(abs(a - b) for a, b in pairs) == learned_controllers.SIMILAR

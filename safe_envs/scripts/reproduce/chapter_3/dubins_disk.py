@@ -11,49 +11,50 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
+from safe_envs import SafetyProblem
+from safe_envs.agents import load_problem
+from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
-    CORRECTED,
-    Run,
-    learning,
-    parameters,
+    CHAPTER,
+    Trajectory,
     residuals,
     runs,
     seeds,
+    setting_values,
     thinned,
 )
 from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.drawing import SHADED
 from safe_envs.wrappers import HOCBF
 from safe_envs.wrappers.learning.residual import ResidualModel
 
-DISK = "DubinsDisk-v0"
-RATES = (0.5, 1.0, 5.0)  # p_1 = p_2, 1/s
-PRINTED_START, VALID_START = (0.9, 0.1, 0.0), (0.0, 0.1, 0.0)  # m, m, rad
-SHOWN = 400  # control instants in the picture
-WIDE, NARROW = (-20.0, 20.0), (-math.pi, math.pi)  # turn rate, rad/s
+_SETTINGS = CHAPTER.settings["disk"]
+DISK, RATES = _SETTINGS["env"], _SETTINGS["rates"]
+PRINTED_START, VALID_START = _SETTINGS["start"], _SETTINGS["valid_start"]
+WIDE, NARROW = (-_SETTINGS["turn_rate"], _SETTINGS["turn_rate"]), (-math.pi, math.pi)  # rad/s
+_SAFE_RUNS = CHAPTER.printed("figure-3.1")["safe_runs"]
+_SHOWN = 400  # control instants in the picture
 SAFE_COUNT = f"safe trajectories of {len(RATES)}, in the worst learning"
 _NOMINAL = [f"hocbf:p={p},{p}" for p in RATES]
 _LEARNED = [f"learned-{text}" for text in _NOMINAL]
 _NO_MARGIN = [f"{text}:eps=0" for text in _LEARNED]
 
-Learnings = Sequence[Sequence[Run]]  # one run for each gain, for each learning
+Learnings = Sequence[Sequence[Trajectory]]  # one run for each gain, for each learning
 
 
 def disk(sample: Sample) -> SafetyProblem:
-    """The problem, as long as the sample lets it be."""
+    """Return the problem, as long as the sample lets it be."""
     world = load_problem(DISK)
     return world.configured(horizon=world.dt * sample.work(world.steps))
 
 
 def compute_disk(sample: Sample) -> Outcome:
-    """Trajectories of the disk for each gain, from both starts."""
+    """Compute the trajectories of the disk for each gain, from both starts."""
     world, models = disk(sample), residuals(DISK, sample)
     at = {start: world.configured(start=start, box=WIDE) for start in (PRINTED_START, VALID_START)}
     found = {start: trajectories(problem, models) for start, problem in at.items()}
-    believed = runs(at[VALID_START], _NOMINAL, policy="zero")
+    nominal = runs(at[VALID_START], _NOMINAL, policy="zero")
     exact = {
         start: runs(problem, _NOMINAL, policy="zero", knowledge="plant")
         for start, problem in at.items()
@@ -64,11 +65,11 @@ def compute_disk(sample: Sample) -> Outcome:
     )
     by_print = trajectories(at[PRINTED_START], estimates, _NO_MARGIN)
     return Outcome(
-        numbers=disk_numbers(found[PRINTED_START], printed=len(RATES)),
-        claims=[all_safe(found[PRINTED_START]), theory_holds(found[VALID_START], believed)],
-        elsewhere=_elsewhere(at, models, found[VALID_START]),
-        as_printed=disk_numbers(by_print),
-        data=_pictures(found[PRINTED_START][0], by_print[0], found[VALID_START][0], believed),
+        numbers=disk_numbers(found[PRINTED_START], printed=_SAFE_RUNS),
+        claims=[all_safe(found[PRINTED_START]), theory_holds(found[VALID_START], nominal)],
+        alternative_settings=_alternatives(at, models, found[VALID_START]),
+        printed_formula=disk_numbers(by_print),
+        data=_pictures(found[PRINTED_START][0], by_print[0], found[VALID_START][0], nominal),
         notes=[
             *(outside(world, start) for start in at),
             *(
@@ -83,15 +84,21 @@ def compute_disk(sample: Sample) -> Outcome:
 
 def trajectories(
     problem: SafetyProblem, models: Sequence[ResidualModel], filters: Sequence[str] = _LEARNED
-) -> list[list[Run]]:
-    """A run for each gain with each learning, the nominal control being 0."""
+) -> list[list[Trajectory]]:
+    """Return a run for each gain with each learning, the nominal control being 0.
+
+    Args:
+        problem: with a fixed start.
+        models: learned ones.
+        filters: text for each gain.
+    """
     return [runs(problem, filters, model, "zero") for model in models]
 
 
-def _elsewhere(
+def _alternatives(
     at: dict[tuple[float, ...], SafetyProblem], models: Sequence[ResidualModel], valid: Learnings
 ) -> dict[str, Outcome]:
-    """What comes out with another start, with another box of the input, and without a margin."""
+    """Return the outcomes with another start, other input bounds, and without a margin."""
     narrow = {
         start: trajectories(problem.configured(box=NARROW), models) for start, problem in at.items()
     }
@@ -102,14 +109,20 @@ def _elsewhere(
         "without the margin of Eq. (3.20)": trajectories(at[PRINTED_START], models, _NO_MARGIN),
     }
     return {
-        name: Outcome(disk_numbers(each, printed=len(RATES)), [all_safe(each)])
+        name: Outcome(disk_numbers(each, printed=_SAFE_RUNS), [all_safe(each)])
         for name, each in found.items()
     }
 
 
 def disk_numbers(found: Learnings, printed: float | None = None) -> list[Number]:
-    """How many are safe, a fact without an interval, which is all of them only if it is so in every
-    learning; and the smallest h."""
+    """Return how many runs are safe in the worst learning, and the smallest h of each gain.
+
+    The first is a fact without an interval.
+
+    Args:
+        found: runs of each learning.
+        printed: number of safe runs in the thesis.
+    """
     each = zip(RATES, zip(*map(_smallest, found), strict=True), strict=True)
     return [
         Number(SAFE_COUNT, float(min(_counts(found))), printed=printed),
@@ -118,7 +131,7 @@ def disk_numbers(found: Learnings, printed: float | None = None) -> list[Number]
 
 
 def all_safe(found: Learnings) -> Claim:
-    """The text about the figure."""
+    """Return the claim of the text about the figure."""
     return Claim(
         "All trajectories stay safe under the learned derivatives",
         min(worst(found)) > 0,
@@ -127,24 +140,29 @@ def all_safe(found: Learnings) -> Claim:
     )
 
 
-def theory_holds(found: Learnings, believed: Sequence[Run]) -> Claim:
-    """What the theory has to say, where it says something."""
+def theory_holds(found: Learnings, nominal: Sequence[Trajectory]) -> Claim:
+    """Return the claim of the theory, where it applies.
+
+    Args:
+        found: runs of each learning.
+        nominal: runs with nominal derivatives.
+    """
     return Claim(
         f"From {VALID_START}, a start that the theory covers, all stay safe under the learned"
         " derivatives, none under the nominal",
-        min(worst(found)) > 0 > max(_smallest(believed)),
+        min(worst(found)) > 0 > max(_smallest(nominal)),
         f"smallest h over the learnings: {_by_rate(worst(found))}; nominal:"
-        f" {_by_rate(_smallest(believed))}",
+        f" {_by_rate(_smallest(nominal))}",
         printed=False,
     )
 
 
 def worst(found: Learnings) -> list[float]:
-    """The smallest h of each gain over all learnings."""
+    """Return the smallest h of each gain over all learnings."""
     return [min(each) for each in zip(*map(_smallest, found), strict=True)]
 
 
-def _smallest(each: Sequence[Run]) -> list[float]:
+def _smallest(each: Sequence[Trajectory]) -> list[float]:
     return [run.smallest for run in each]
 
 
@@ -160,20 +178,23 @@ def _by_printed_differences(shares: Sequence[float], found: Learnings) -> str:
     return (
         f"the differences of Eq. (3.28) give at most {max(shares):.2g} of the input's gain (median"
         f" over states), so that the filter turns about {1 / max(shares):.2g} times as much as the"
-        f" condition asks for: without a margin, as printed, {min(_counts(found))} of {len(RATES)}"
+        f" condition asks for: without a margin, as in the thesis, {min(_counts(found))} of {len(RATES)}"
         f" runs from {PRINTED_START} are safe in the worst learning"
     )
 
 
 def _pictures(
-    printed: Sequence[Run], by_print: Sequence[Run], valid: Sequence[Run], believed: Sequence[Run]
+    printed: Sequence[Trajectory],
+    by_print: Sequence[Trajectory],
+    valid: Sequence[Trajectory],
+    nominal: Sequence[Trajectory],
 ) -> dict[str, Any]:
-    """The curves of the three panels."""
+    """Return the curves of the three panels."""
     shown = (
         (0, "learned", printed),
         (1, "learned", by_print),
         (2, "learned", valid),
-        (2, "nominal", believed),
+        (2, "nominal", nominal),
     )
     return {
         "curves": [
@@ -181,8 +202,8 @@ def _pictures(
                 "panel": panel,
                 "kind": kind,
                 "p": p,
-                "x": thinned(run.states[:SHOWN, 0]),
-                "y": thinned(run.states[:SHOWN, 1]),
+                "x": thinned(run.states[:_SHOWN, 0]),
+                "y": thinned(run.states[:_SHOWN, 1]),
             }
             for panel, kind, found in shown
             for p, run in zip(RATES, found, strict=True)
@@ -195,7 +216,13 @@ def _pictures(
 def chain_at(
     problem: SafetyProblem, p: float, start: Sequence[float]
 ) -> tuple[float, float, float]:
-    """h, b_1 and b_2 without the input at a state, for the plant and p_1 = p_2 = p."""
+    """Return h, b_1 and b_2 without the input at a state of the plant.
+
+    Args:
+        problem: of the disk.
+        p: the rates p_1 = p_2, in 1/s.
+        start: the state.
+    """
     constraint = HOCBF((p, p)).constraint(problem.plant, problem.barriers[0])
     values = dict(zip(problem.plant.states, map(sp.Float, start), strict=True))
     h, b_1, b_2 = (
@@ -205,7 +232,12 @@ def chain_at(
 
 
 def outside(problem: SafetyProblem, start: Sequence[float]) -> str:
-    """Whether a start is in C_2 for each gain."""
+    """Return whether a start is in C_2 for each gain, in words.
+
+    Args:
+        problem: of the disk.
+        start: a state.
+    """
     values = [chain_at(problem, p, start)[1] for p in RATES]
     where = (
         "outside C_2 for every gain"
@@ -218,10 +250,15 @@ def outside(problem: SafetyProblem, start: Sequence[float]) -> str:
 
 
 def crossing(problem: SafetyProblem, p: float, start: Sequence[float]) -> tuple[float, float]:
-    """When h passes 0 and how deep it gets while the exact condition binds.
+    """Return when h passes 0, in s, and its minimum while the exact condition binds.
 
-    Then b_1 = b_1(0) exp(-p t) and h = (h(0) + b_1(0) t) exp(-p t), of which the least is at t =
-    h(0)/-b_1(0) + 1/p.
+    Then b_1 = b_1(0) exp(-p t) and h = (h(0) + b_1(0) t) exp(-p t), with its minimum
+    at t = h(0)/-b_1(0) + 1/p.
+
+    Args:
+        problem: of the disk.
+        p: the rates p_1 = p_2, in 1/s.
+        start: a state.
     """
     h, b_1, _ = chain_at(problem, p, start)
     time = -h / b_1
@@ -229,7 +266,7 @@ def crossing(problem: SafetyProblem, p: float, start: Sequence[float]) -> tuple[
 
 
 def binding(problem: SafetyProblem) -> str:
-    """What exact derivatives and the control 0 make of the printed start."""
+    """Return what exact derivatives and the control 0 do from the start of the thesis, in words."""
     rows = [chain_at(problem, p, PRINTED_START)[2] for p in RATES]
     times, depths = zip(*[crossing(problem, p, PRINTED_START) for p in RATES], strict=True)
     return (
@@ -242,40 +279,22 @@ def binding(problem: SafetyProblem) -> str:
 
 
 def draw_disk(figure: Figure, outcome: Outcome) -> None:
-    """Panels for the printed start, with our estimates and with the printed ones, and for a valid
-    start."""
+    """Draw panels for the start of the thesis, by our estimates and the printed ones, and a valid one."""
     colors = dict(zip(RATES, COLORS, strict=False))
-    names = ("our estimates", "estimates as printed", "our estimates")
+    names = ("our estimates", "printed estimates", "our estimates")
     panels = figure.subplots(1, len(names), sharey=True)
     for panel, (axes, name, start) in enumerate(
         zip(panels, names, outcome.data["starts"], strict=True)
     ):
         axes.set(aspect="equal", xlim=(-1.65, 1.65), ylim=(-1.65, 1.65), xlabel="x (m)")
-        axes.axvspan(-1.65, 1.65, color=UNSAFE, alpha=0.35, linewidth=0, zorder=0)
-        axes.add_patch(
-            Circle(
-                (0, 0),
-                outcome.data["radius"],
-                facecolor="white",
-                edgecolor="black",
-                linewidth=1.2,
-                zorder=0.5,
-            )
-        )
+        axes.axvspan(-1.65, 1.65, **SHADED)
+        edge: dict[str, Any] = {"facecolor": "white", "edgecolor": "black", "linewidth": 1.2}
+        axes.add_patch(Circle((0, 0), outcome.data["radius"], zorder=0.5, **edge))
         for curve in (curve for curve in outcome.data["curves"] if curve["panel"] == panel):
-            learned = curve["kind"] == "learned"
-            style: dict[str, Any] = (
-                {"linewidth": 1.3}
-                if learned
-                else {"linewidth": 0.8, "linestyle": (0, (4, 2)), "alpha": 0.8}
-            )
-            axes.plot(
-                curve["x"],
-                curve["y"],
-                color=colors[curve["p"]],
-                zorder=2 if learned else 1.5,
-                **style,
-            )
+            learned: dict[str, Any] = {"linewidth": 1.3, "zorder": 2}
+            nominal = {"linewidth": 0.8, "linestyle": (0, (4, 2)), "alpha": 0.8, "zorder": 1.5}
+            style = learned if curve["kind"] == "learned" else nominal
+            axes.plot(curve["x"], curve["y"], color=colors[curve["p"]], **style)
         axes.plot(*start[:2], "*", color="black", markersize=9, zorder=3)
         axes.text(-1.6, -1.6, "unsafe", color=QUIET, va="bottom")
         axes.set_title(f"({'abc'[panel]}) start ({start[0]:g}, {start[1]:g})\n{name}")
@@ -284,61 +303,19 @@ def draw_disk(figure: Figure, outcome: Outcome) -> None:
         Line2D([], [], color=colors[p], linewidth=1.8, label=f"$p_1 = p_2 = {p:g}$ 1/s")
         for p in RATES
     ]
-    add_legend(
-        figure,
-        [*handles, Line2D([], [], color=QUIET, linewidth=0.8, linestyle="--", label="nominal")],
-    )
+    nominal = Line2D([], [], color=QUIET, linewidth=0.8, linestyle="--", label="nominal")
+    add_legend(figure, [*handles, nominal])
 
 
-def setting(sample: Sample) -> tuple[str, ...]:
-    """How it is simulated."""
+def _values(sample: Sample) -> dict[str, Any]:
     world = disk(sample)
-    speeds = [parameters(system)["v"] for system in (world.plant, world.model)]
-    return (
-        (
-            f"{DISK}: plant {speeds[0]:g} m/s, model {speeds[1]:g} m/s, dt {world.dt:g} s,"
-            f" {world.horizon:g} s; p_1 = p_2 = {', '.join(f'{p:g}' for p in RATES)} 1/s; start"
-            f" {PRINTED_START}, and {VALID_START} beside it"
-        ),
-        learning(sample),
-        "safe: h > 0 at every control instant",
-        f"the picture shows the first learning, up to {min(SHOWN * world.dt, world.horizon):g} s",
-    )
+    return {
+        **setting_values(world, sample),
+        "gains": ", ".join(f"{p:g}" for p in RATES),
+        "shown": min(_SHOWN * world.dt, world.horizon),
+    }
 
 
-FIGURE = Artefact(
-    name="figure-3.1",
-    title="Dubins vehicle in the unit disk under learned derivatives of the HOCBF",
-    compute=compute_disk,
-    draw=draw_disk,
-    setting=setting,
-    chosen=(
-        "nominal control 0",
-        f"|omega| <= {WIDE[1]:g} rad/s, and |omega| <= pi rad/s beside it",
-        "layers of 100 and 30 nodes, which the print gives for the quadrotor",
-        (
-            "for Eq. (3.28) as printed: differences over the control period, the backward one"
-            " driven straight on, no margin"
-        ),
-    ),
-    corrections=(
-        (
-            f"Sec. 3.5.1: the start {PRINTED_START} is outside C_2 for all three gains, where no"
-            f" safety follows; {VALID_START} is shown too"
-        ),
-        (
-            "Sec. 3.5.1: the relative degree is not 2 where the heading is radial; the row is"
-            " infeasible there unless b_2 >= 0"
-        ),
-        (
-            "Sec. 3.5.1: a network with 3 inputs; here 4, x, y, cos(theta) and sin(theta), for"
-            " theta leaves the range that was learned as the vehicle turns on"
-        ),
-        *CORRECTED,
-    ),
-    argument=(
-        "With exact derivatives, too, a run from the printed start leaves the set: see the closed"
-        " form in the notes."
-    ),
-    size=(7.0, 3.2),
+ARTEFACTS: tuple[Artefact, ...] = (
+    CHAPTER.artefact("figure-3.1", compute_disk, _values, draw_disk, (7.0, 3.2)),
 )

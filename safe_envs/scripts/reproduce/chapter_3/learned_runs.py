@@ -1,66 +1,40 @@
-"""What the figures of chapter 3 share: models whose derivatives are learned some times, and single
-trajectories under filters."""
+"""What the figures of chapter 3 share: models with learned derivatives, and single trajectories."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.evaluate import evaluate
-from safe_envs.agents.evaluation.repeats import pooled
-from safe_envs.agents.evaluation.rows import EvaluationRow
-from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs import ControlAffineSDE, SafetyProblem
+from safe_envs.agents import evaluate, load_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS
 from safe_envs.scripts.reproduce.framework.artefact import Number, Sample
+from safe_envs.scripts.reproduce.framework.paired import measure
+from safe_envs.scripts.reproduce.framework.thesis_data import chapter
 from safe_envs.wrappers.learning.residual import ResidualModel, learn_residual
 
-LEARNINGS, QUICK_LEARNINGS = 3, 2  # repetitions of the learning, from other seeds
-STATES, LEAST_STATES = (
-    2000,
-    400,
-)  # to learn from; with fewer than 127 the held-out errors have no 95 % quantile
-EPOCHS, LEAST_EPOCHS = 500, 80  # with fewer the margin is so wide that no input meets the row
-LABEL_STEP = 1e-3  # of the differences that are learned from, s
-EPISODES = 1000  # from starts around the printed one
-
-CORRECTED = (
-    (
-        "Eq. (3.28), Alg. 1: the central second difference over control periods gives half of the"
-        f" input's gain; here forward differences over steps of {LABEL_STEP:g} s under one held"
-        " input"
-    ),
-    (
-        "Sec. 3.4.1, Alg. 1: states along trajectories; here drawn uniformly where it is safe,"
-        " which covers the region evenly"
-    ),
-    (
-        "Eq. (3.26) forgets the margin of Eq. (3.20), and the box of the input; both are here, the"
-        " margin with an error of its own for each residual, and |u| in place of its largest value"
-    ),
-    (
-        "Sec. 3.4.2: the loss lacks its square, and the update has the wrong sign; here Adam,"
-        " stopped by the loss at states kept apart"
-    ),
-)
+CHAPTER = chapter(3)
+LEARNING = CHAPTER.settings["learning"]
+_QUICK_LEARNINGS = 2
+_LEAST_STATES = 400  # with fewer than 127 the held-out errors have no 95 % quantile
+_LEAST_EPOCHS = 80  # with fewer the margin is so wide that no input meets the constraint
+_MOST_POINTS = 400
 
 LEARNED_COLOR, TRUE_COLOR, PRINTED_COLOR, NOMINAL_COLOR = COLORS[:4]
-_MOST_POINTS = 400
 
 
 @dataclass(frozen=True)
-class Run:
+class Trajectory:
     """One trajectory.
 
     Attributes:
-        states: (K, n), one for each control instant.
-        h: smallest barrier value there, (K,).
+        states: at each control instant, shape (K, n).
+        h: smallest barrier value there, shape (K,).
     """
 
     states: np.ndarray
@@ -73,51 +47,79 @@ class Run:
 
     @property
     def steps(self) -> int:
-        """Control periods."""
+        """The number of control periods."""
         return len(self.h) - 1
 
     @property
     def lengths(self) -> np.ndarray:
-        """Distance covered in each control period, in m."""
+        """Distance covered in each control period in m, shape (K - 1,)."""
         return np.hypot(*np.diff(self.states[:, :2], axis=0).T)
 
+    def over_time(self, dt: float, **column: np.ndarray) -> dict[str, list[float]]:
+        """Return the instants in s for a control period in s, with a column, both thinned."""
+        columns = {"time": dt * np.arange(len(self.h)), **column}
+        return {name: thinned(values) for name, values in columns.items()}
 
-def settings(sample: Sample) -> tuple[int, int]:
-    """States to learn from, and epochs."""
-    return max(LEAST_STATES, sample.work(STATES)), max(LEAST_EPOCHS, sample.work(EPOCHS))
+
+Trajectories = Mapping[str, Sequence[Trajectory]]
+"""By what the filter knows: one for each learning, one each without learning."""
+
+
+def learning_sizes(sample: Sample) -> tuple[int, int]:
+    """Return the number of states to learn from, and of epochs."""
+    return (
+        max(_LEAST_STATES, sample.work(LEARNING["states"])),
+        max(_LEAST_EPOCHS, sample.work(LEARNING["epochs"])),
+    )
 
 
 def seeds(sample: Sample) -> list[int]:
-    """One for each repetition of the learning."""
-    return (
-        np.random.SeedSequence(sample.seed)
-        .generate_state(QUICK_LEARNINGS if sample.quick else LEARNINGS)
-        .tolist()
-    )
+    """Return a seed for each repetition of the learning."""
+    count = _QUICK_LEARNINGS if sample.quick else LEARNING["repetitions"]
+    return np.random.SeedSequence(sample.seed).generate_state(count).tolist()
 
 
-def learning(sample: Sample) -> str:
-    """How it is learned."""
-    states, epochs = settings(sample)
-    return (
-        f"{len(seeds(sample))} learnings from {states} states each, network 100-30 ReLU, Adam, up"
-        f" to {epochs} epochs, margin of the held-out errors at the 95 % level"
-    )
+def setting_values(problem: SafetyProblem, sample: Sample) -> dict[str, Any]:
+    """Return what the lines of a setting name.
+
+    Args:
+        problem: that is simulated.
+        sample: how much.
+    """
+    states, epochs = learning_sizes(sample)
+    return {
+        "plant": parameters(problem.plant),
+        "model": parameters(problem.model),
+        "dt": problem.dt,
+        "horizon": problem.horizon,
+        "learnings": len(seeds(sample)),
+        "states": states,
+        "epochs": epochs,
+        "episodes": sample.size(LEARNING["episodes"]),
+    }
 
 
 def parameters(system: ControlAffineSDE) -> dict[str, float]:
-    """Parameters of a system by their names."""
+    """Return the parameters of a system by name."""
     return {symbol.name: value for symbol, value in system.parameters.items()}
 
 
 @lru_cache(maxsize=8)
 def residuals(env_id: str, sample: Sample, **model: float) -> tuple[ResidualModel, ...]:
-    """What is learned of a problem, anew for each repetition; remembered, for two figures show the
-    same."""
+    """Return what is learned of a problem, once for each repetition.
+
+    The results are cached, for two figures show the same.
+
+    Args:
+        env_id: of the problem.
+        sample: how much is learned.
+        model: parameters of the model.
+    """
     problem = load_problem(env_id, {"model": model or None})
-    states, epochs = settings(sample)
+    states, epochs = learning_sizes(sample)
+    label_dt = LEARNING["label_step"]
     return tuple(
-        learn_residual(problem, states=states, label_dt=LABEL_STEP, epochs=epochs, seed=seed)
+        learn_residual(problem, states=states, label_dt=label_dt, epochs=epochs, seed=seed)
         for seed in seeds(sample)
     )
 
@@ -128,53 +130,89 @@ def runs(
     model: ResidualModel | None = None,
     policy: str = "nominal",
     knowledge: str = "model",
-) -> list[Run]:
-    """The trajectory from a problem's fixed start under each filter."""
+) -> list[Trajectory]:
+    """Return the trajectory from a problem's fixed start under each filter.
+
+    Args:
+        problem: with a fixed start.
+        filters: texts of the filters.
+        model: of the learned filters, if any.
+        policy: name of the policy.
+        knowledge: what the filters know, "model" or "plant".
+    """
     learned = () if model is None else (model,)
+    size = {"episodes": 1, "num_envs": 1, "bounds": False, "record": True}
     found = evaluate(
-        problem,
-        policy,
-        filters,
-        episodes=1,
-        num_envs=1,
-        knowledge=knowledge,
-        bounds=False,
-        learned=learned,
-        record=True,
+        problem, policy, filters, knowledge=knowledge, learned=learned, **size
     ).trajectories
     return [cut(found[name].states[:, 0], found[name].barrier[:, 0]) for name in filters]
 
 
-def cut(states: np.ndarray, h: np.ndarray) -> Run:
-    """The part of a recorded trajectory up to its end."""
+def cut(states: np.ndarray, h: np.ndarray) -> Trajectory:
+    """Return the part of a recorded trajectory up to its end.
+
+    Args:
+        states: shape (K, n).
+        h: shape (K,), NaN after the end.
+    """
     present = np.isfinite(h)
-    return Run(states[present], h[present])
+    return Trajectory(states[present], h[present])
+
+
+def trajectories(
+    problem: SafetyProblem, gains: str, models: Sequence[ResidualModel]
+) -> dict[str, list[Trajectory]]:
+    """Return trajectories with learned, nominal and true derivatives, and without a filter.
+
+    Args:
+        problem: with a fixed start.
+        gains: rates of the HOCBF, as text.
+        models: learned ones.
+    """
+    exact = f"hocbf:p={gains}"
+    nominal, none = runs(problem, [exact, "none"])
+    return {
+        "learned": [runs(problem, [f"learned-{exact}"], model)[0] for model in models],
+        "nominal": [nominal],
+        "true": runs(problem, [exact], knowledge="plant"),
+        "none": [none],
+    }
+
+
+def smallest_numbers(found: Trajectories, unit: str = "") -> list[Number]:
+    """Return the smallest h of all trajectories; unit: of h."""
+    learned = [run.smallest for run in found["learned"]]
+    return [
+        Number.mean("smallest h, learned", learned, unit),
+        *(
+            Number(f"smallest h, {kind}", found[kind][0].smallest, unit=unit)
+            for kind in ("nominal", "true", "none")
+        ),
+    ]
 
 
 def rates_around(
     problem: SafetyProblem, sample: Sample, models: Sequence[ResidualModel], gains: str
 ) -> list[Number]:
-    """Safety rates from starts around the printed one, the learned one's interval over learnings
-    too."""
-    world, size = problem.configured(start="spread"), sample.size(EPISODES)
+    """Return safety rates from starts around that of the thesis.
 
-    def row(name: str, **rest: Any) -> EvaluationRow:
-        return evaluate(
-            world, "nominal", [name], episodes=size, seed=sample.seed, bounds=False, **rest
-        ).rows[0]
-
-    nominal, true = row(f"hocbf:p={gains}"), row(f"hocbf:p={gains}", knowledge="plant")
-    learned = pooled([row(f"learned-hocbf:p={gains}", learned=(model,)) for model in models], 0.95)
-    rate, low, high = (100 * v for v in (learned.safety_rate, learned.ci_low, learned.ci_high))
-    return [
-        Number("safe around the start, learned", rate, low, high, unit="%"),
-        Number.rate("safe around the start, nominal", nominal.safe, nominal.episodes),
-        Number.rate("safe around the start, true", true.safe, true.episodes),
-    ]
+    Args:
+        problem: with the starts "spread".
+        sample: how much is simulated.
+        models: learned ones; the interval of their rate is over them, too.
+        gains: rates of the HOCBF, as text.
+    """
+    world, exact = problem.configured(start="spread"), f"hocbf:p={gains}"
+    size = sample.size(LEARNING["episodes"]), sample.seed
+    found = {
+        "learned": measure(world, f"learned-{exact}", *size, models),
+        "nominal": measure(world, exact, *size),
+        "true": measure(world, exact, *size, knowledge="plant"),
+    }
+    return [each.number(f"safe around the start, {kind}") for kind, each in found.items()]
 
 
 def thinned(values: np.ndarray) -> list[float]:
-    """At most 400 of the values, evenly spaced."""
-    return (
-        np.asarray(values, dtype=float)[:: math.ceil(len(values) / _MOST_POINTS)].round(5).tolist()
-    )
+    """Return at most 400 of the values, evenly spaced."""
+    some = np.asarray(values, dtype=float)[:: math.ceil(len(values) / _MOST_POINTS)]
+    return some.round(5).tolist()

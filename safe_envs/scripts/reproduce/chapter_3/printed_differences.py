@@ -8,7 +8,7 @@ from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import derivatives, lie_derivative_f, lie_derivative_g
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.reproduce.chapter_3.learned_runs import settings
+from safe_envs.scripts.reproduce.chapter_3.learned_runs import learning_sizes
 from safe_envs.scripts.reproduce.framework.artefact import Sample
 from safe_envs.wrappers.learning.base import Record
 from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
@@ -27,7 +27,7 @@ def printed_residuals(
 
     Source: thesis Eq. (3.28), with Eq. (3.24).
     """
-    count, epochs = settings(sample)
+    count, epochs = learning_sizes(sample)
     before = draw_states(problem, count, np.random.default_rng(seed))
     x = _stepped(problem, before, 0.0)
     first, second = problem.exploration.inputs[0][0], problem.exploration.inputs[-1][0]

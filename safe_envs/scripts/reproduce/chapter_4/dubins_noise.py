@@ -1,5 +1,4 @@
-"""Thesis Sec. 4.3.2: safety of SCBF and SZCBF for a Dubins vehicle against its noise (Figure 4.2),
-and that section's artefacts."""
+"""Thesis Sec. 4.3.2: safety of SCBF and SZCBF against the noise (Figure 4.2)."""
 
 from __future__ import annotations
 
@@ -9,49 +8,38 @@ import numpy as np
 
 from safe_envs.agents.evaluation.statistics import rate_band
 from safe_envs.scripts.reproduce.chapter_4.dubins_pictures import draw_noises
-from safe_envs.scripts.reproduce.chapter_4.dubins_points import FIGURE_POINTS
 from safe_envs.scripts.reproduce.chapter_4.dubins_runs import (
     ALPHAS,
-    CHOSEN,
-    CORRECTIONS,
+    CHAPTER,
     FILTERS,
     HORIZON,
     HORIZONS,
     PRINTED_FORM,
     SCBF_ONLY,
-    SETTING,
+    SETTINGS,
     STARTS,
     STEP,
-    Runs,
+    ByFilter,
     ahead_of,
+    alternatives_of,
     bands_of,
     counts,
-    elsewhere_of,
     holds_note,
     scbf_of,
     simulate,
     step_of,
     turning_time,
 )
-from safe_envs.scripts.reproduce.chapter_4.paired_episodes import (
-    Exits,
-    is_above,
-    is_below,
-    with_interval,
-)
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.episodes import Violations
+from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, with_interval
 
-NOISES = (0.0, 0.05, 0.1, 0.15, 0.2)
-"""sigma_1 = sigma_2 of the numbers, in m/sqrt(s)."""
-BETWEEN = (0.025, 0.075, 0.125, 0.175)
-"""Further ones of the curves."""
-BEYOND = (0.25, 0.3)
-"""Further ones of the SCBF alone."""
-EPISODES = 1000
+NOISES, BEYOND, EPISODES = (SETTINGS[name] for name in ("noises", "beyond", "episodes"))
+BETWEEN = (0.025, 0.075, 0.125, 0.175)  # further noise levels of the curves, in m/sqrt(s)
 
 
 def compute_noises(sample: Sample) -> Outcome:
-    """Figure 4.2: safety against noise, from random starts."""
+    """Compute the safety against noise, from random starts."""
     episodes, seed = sample.size(EPISODES), sample.seed
     levels = sorted((*NOISES, *(() if sample.quick else BETWEEN)))
     runs = {
@@ -65,12 +53,12 @@ def compute_noises(sample: Sample) -> Outcome:
     }
     beyond = {level: simulate(SCBF_ONLY, level, "uniform", episodes, seed) for level in BEYOND}
     named = {STARTS[start]: _at(runs[start], NOISES) for start in STARTS}
-    elsewhere = elsewhere_of(named, printed, claim_on_noises)
+    alternatives = alternatives_of(named, printed, claim_on_noises)
     return Outcome(
         numbers=[*_rates(main, NOISES), *_rates(beyond, BEYOND), *_differences(main)],
         claims=[claim_on_noises(named[STARTS["uniform"]], HORIZON)],
-        elsewhere=elsewhere,
-        as_printed=[
+        alternative_settings=alternatives,
+        printed_formula=[
             number for number in _rates(printed, NOISES) if not number.name.startswith("SCBF")
         ],
         data={
@@ -91,15 +79,15 @@ def compute_noises(sample: Sample) -> Outcome:
                 STARTS[s]: {n: _curve(runs[s][max(NOISES)][n]) for n in FILTERS} for s in STARTS
             },
         },
-        notes=[holds_note(elsewhere), _beyond_note(), *_turns(runs), *_infeasible(main)],
+        notes=[holds_note(alternatives), _beyond_note(), *_turns(runs), *_infeasible(main)],
     )
 
 
-def _at(runs: Mapping[float, Runs], levels: Sequence[float]) -> dict[float, Runs]:
+def _at(runs: Mapping[float, ByFilter], levels: Sequence[float]) -> dict[float, ByFilter]:
     return {level: runs[level] for level in levels}
 
 
-def _rates(runs: Mapping[float, Runs], levels: Sequence[float]) -> list[Number]:
+def _rates(runs: Mapping[float, ByFilter], levels: Sequence[float]) -> list[Number]:
     return [
         run.rate(f"{name}, sigma = {level:g}", step_of(HORIZON))
         for level in levels
@@ -107,7 +95,7 @@ def _rates(runs: Mapping[float, Runs], levels: Sequence[float]) -> list[Number]:
     ]
 
 
-def _differences(runs: Mapping[float, Runs]) -> list[Number]:
+def _differences(runs: Mapping[float, ByFilter]) -> list[Number]:
     return [
         ahead_of(rival, runs[level], HORIZON, f", sigma = {level:g}")
         for rival in ALPHAS
@@ -115,8 +103,8 @@ def _differences(runs: Mapping[float, Runs]) -> list[Number]:
     ]
 
 
-def claim_on_noises(runs: Mapping[float, Runs], horizon: float) -> Claim:
-    """Against all rates of the SZCBF, since the print names none, by paired intervals.
+def claim_on_noises(runs: Mapping[float, ByFilter], horizon: float) -> Claim:
+    """Return the claim against all rates of the SZCBF, as the thesis names none, by paired intervals.
 
     Args:
         runs: of SCBF and the SZCBFs at each noise level.
@@ -145,12 +133,12 @@ def claim_on_noises(runs: Mapping[float, Runs], horizon: float) -> Claim:
     )
 
 
-def _never_fail(names: Sequence[str], runs: Runs, horizon: float) -> bool:
+def _never_fail(names: Sequence[str], runs: ByFilter, horizon: float) -> bool:
     return all(runs[name].safe(step_of(horizon)).all() for name in names)
 
 
 def _against(rival: str, gaps: Mapping[float, Number], perfect: int) -> str:
-    """The differences, and how many of them are beyond chance."""
+    """Return the differences, and how many of them are beyond chance, in words."""
     above, below = (sum(map(beyond, gaps.values())) for beyond in (is_above, is_below))
     each = ", ".join(f"{with_interval(gap)} at {level:g}" for level, gap in gaps.items())
     both = f", both without a failure at {perfect}" if perfect else ""
@@ -167,8 +155,8 @@ def _beyond_note() -> str:
     )
 
 
-def _turns(runs: Mapping[str, Mapping[float, Runs]]) -> list[str]:
-    """From when on SCBF is the safer one."""
+def _turns(runs: Mapping[str, Mapping[float, ByFilter]]) -> list[str]:
+    """Return from when on SCBF is the safer one, in words."""
     most = max(NOISES)
     return [
         f"sigma = {most:g}, {STARTS[s]}: more episodes are safe with SCBF than with {rival} "
@@ -182,17 +170,17 @@ def _as_text(time: float | None) -> str:
     return f"not up to {max(HORIZONS):g} s" if time is None else f"from {time:.2f} s on"
 
 
-def _infeasible(runs: Mapping[float, Runs]) -> list[str]:
+def _infeasible(runs: Mapping[float, ByFilter]) -> list[str]:
     shares = ", ".join(
         f"{name} {100 * run.infeasible:.2g} %" for name, run in runs[max(NOISES)].items()
     )
     return [
-        f"steps in which no turn rate in the box meets the condition, sigma = {max(NOISES):g},"
+        f"steps in which no turn rate in its bounds meets the condition, sigma = {max(NOISES):g},"
         f" {STARTS['uniform']}: {shares}"
     ]
 
 
-def _curve(run: Exits) -> dict[str, list[float]]:
+def _curve(run: Violations) -> dict[str, list[float]]:
     safe, episodes = counts(run), len(run.instant)
     low, high = rate_band(safe, episodes)
     time = STEP * np.arange(len(safe))
@@ -205,18 +193,7 @@ def _curve(run: Exits) -> dict[str, list[float]]:
 
 
 ARTEFACTS: tuple[Artefact, ...] = (
-    Artefact(
-        name="figure-4.2",
-        title="Safety of SCBF and SZCBF against the noise",
-        compute=compute_noises,
-        setting=lambda sample: (
-            *SETTING,
-            f"random starts at each noise level, an episode from each: {sample.size(EPISODES)}",
-        ),
-        chosen=CHOSEN,
-        corrections=CORRECTIONS,
-        draw=draw_noises,
-        size=(7.0, 4.2),
+    CHAPTER.artefact(
+        "figure-4.2", compute_noises, lambda sample: {"count": sample.size(EPISODES)}, draw_noises
     ),
-    FIGURE_POINTS,
 )

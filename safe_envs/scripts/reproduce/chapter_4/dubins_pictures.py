@@ -1,4 +1,4 @@
-"""Figures 4.2 and 4.3: how safe SCBF and SZCBF keep a Dubins vehicle with noise in a disk."""
+"""Figures 4.2 and 4.3: the safety of a Dubins vehicle with noise in a disk."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from matplotlib.patches import Circle
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_4.dubins_runs import ALPHAS, FILTERS, RADIUS
 from safe_envs.scripts.reproduce.framework.artefact import Outcome
+from safe_envs.scripts.reproduce.framework.drawing import draw_interval
 
 _COLOR = dict(zip(FILTERS, COLORS, strict=False))
 _LABEL = {
@@ -22,69 +23,42 @@ _LABEL = {
 
 
 def draw_noises(figure: Figure, outcome: Outcome) -> None:
-    """Left: safety against noise. Right: over time at the largest noise. Full lines: all starts;
-    dashed: those with A h > 0."""
+    """Draw safety against noise, and over time at the largest noise.
+
+    Full lines are of all starts, dashed ones of those with A h > 0.
+    """
     left, right = figure.subplots(1, 2, sharey=True)
-    data = outcome.data
+    data, dots = outcome.data, {"marker": "o", "markersize": 3}
     for (kind, rates), dashes in zip(data["rates"].items(), ("-", "--"), strict=True):
         for name, bands in rates.items():
-            label = _LABEL[name] if dashes == "-" else None
-            _draw_band(
-                left,
-                data["noises"],
-                np.array(bands).T,
-                dashes,
-                color=_COLOR[name],
-                label=label,
-                marker="o",
-                markersize=3,
-            )
+            color, label = _COLOR[name], _LABEL[name] if dashes == "-" else None
+            ends = np.array(bands).T
+            draw_interval(left, data["noises"], ends, color, 0.15, dashes, label=label, **dots)
             curve = data["curves"][kind][name]
-            _draw_band(
-                right,
-                curve["time"],
-                [curve[key] for key in ("low", "rate", "high")],
-                dashes,
-                color=_COLOR[name],
-            )
+            ends = [curve[key] for key in ("low", "rate", "high")]
+            draw_interval(right, curve["time"], ends, color, 0.15, dashes)
         left.plot([], [], dashes, color="black", label=kind)
-    _draw_band(
-        left,
-        data["beyond"],
-        np.array(data["further"]).T,
-        "-",
-        color=_COLOR["SCBF"],
-        marker="o",
-        markersize=3,
-    )
+    further = np.array(data["further"]).T
+    draw_interval(left, data["beyond"], further, _COLOR["SCBF"], 0.15, **dots)
+    cross: dict[str, Any] = {"marker": "x", "markersize": 4}
     for name, rates in data["printed"].items():
-        left.plot(data["levels"], rates, ":", color=_COLOR[name], marker="x", markersize=4)
-    left.plot(
-        [], [], ":", color="black", marker="x", markersize=4, label="printed $h_2$, all starts"
-    )
+        left.plot(data["levels"], rates, ":", color=_COLOR[name], **cross)
+    left.plot([], [], ":", color="black", label="printed $h_2$, all starts", **cross)
     for horizon in data["horizons"]:
         right.axvline(horizon, color=UNSAFE, linewidth=0.8, zorder=0)
-    title = f"(a) T = {data['horizon']:g} s"
     left.set(
         xlabel=r"noise $\sigma_1 = \sigma_2$ (m/$\sqrt{\mathrm{s}}$)",
         ylabel="safe (%)",
         ylim=(-3, 103),
-        title=title,
+        title=f"(a) T = {data['horizon']:g} s",
     )
     title = rf"(b) $\sigma$ = {max(data['levels']):g} m/$\sqrt{{\mathrm{{s}}}}$"
     right.set(xlabel="horizon T (s)", xlim=(0, max(data["horizons"])), title=title)
     add_legend(figure, left.get_legend_handles_labels()[0])
 
 
-def _draw_band(axes: Axes, along: Any, band: Any, dashes: str, **line: Any) -> None:
-    low, rate, high = band
-    axes.fill_between(along, low, high, color=line["color"], alpha=0.15, linewidth=0)
-    axes.plot(along, rate, dashes, **line)
-
-
 def draw_points(figure: Figure, outcome: Outcome) -> None:
-    """Left: safety from each start, filled at the short horizon, hollow at the long one. Right: the
-    starts."""
+    """Draw safety from each start, filled at the short horizon and hollow at the long one, and the starts."""
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
     data = outcome.data
     index = np.arange(1, len(data["starts"]) + 1)
@@ -102,38 +76,20 @@ def draw_points(figure: Figure, outcome: Outcome) -> None:
                 **style,
             )
     product = np.array(data["product"])
-    left.plot(
-        index[product > 0],
-        100 * product[product > 0],
-        "_",
-        color="black",
-        markersize=14,
-        label="product of Thm. 4.2.10",
-    )
+    black: dict[str, Any] = {"color": "black", "label": "product of Thm. 4.2.10"}
+    left.plot(index[product > 0], 100 * product[product > 0], "_", markersize=14, **black)
     for horizon, face in ((short, "black"), (long, "white")):
-        left.plot(
-            [],
-            [],
-            "o",
-            color="black",
-            markerfacecolor=face,
-            markersize=4.5,
-            label=f"T = {horizon:g} s",
-        )
+        black = {"color": "black", "label": f"T = {horizon:g} s", "markerfacecolor": face}
+        left.plot([], [], "o", markersize=4.5, **black)
     left.set(xlabel="start", ylabel="safe (%)", xticks=index, ylim=(-3, 103), title="(a)")
     _draw_starts(right, np.array(data["starts"]))
     handles, labels = left.get_legend_handles_labels()
-    add_legend(
-        figure,
-        [
-            handles[labels.index(label)]
-            for label in sorted(labels, key=lambda label: label not in _LABEL.values())
-        ],
-    )
+    ordered = sorted(labels, key=lambda label: label not in _LABEL.values())
+    add_legend(figure, [handles[labels.index(label)] for label in ordered])
 
 
 def _draw_starts(axes: Axes, starts: np.ndarray) -> None:
-    """The disk with the starts and their headings, each number behind its arrow."""
+    """Draw the disk with the starts and their headings, each number behind its arrow."""
     axes.set_facecolor(to_rgba(UNSAFE, 0.35))
     axes.add_patch(Circle((0, 0), RADIUS, facecolor="white", edgecolor="black", linewidth=1.2))
     x, y = starts[:, :2].T
@@ -141,12 +97,5 @@ def _draw_starts(axes: Axes, starts: np.ndarray) -> None:
     axes.quiver(x, y, along, up, color=QUIET, scale=9, width=0.009)
     for i, place in enumerate(zip(x - 0.28 * along, y - 0.28 * up, strict=True), 1):
         axes.text(*place, str(i), ha="center", va="center", fontsize=8)
-    edge = 1.12 * RADIUS
-    axes.set(
-        xlabel="x (m)",
-        ylabel="y (m)",
-        xlim=(-edge, edge),
-        ylim=(-edge, edge),
-        aspect="equal",
-        title="(b)",
-    )
+    limits = (-1.12 * RADIUS, 1.12 * RADIUS)
+    axes.set(xlabel="x (m)", ylabel="y (m)", xlim=limits, ylim=limits, aspect="equal", title="(b)")

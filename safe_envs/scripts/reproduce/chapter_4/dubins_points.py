@@ -1,5 +1,4 @@
-"""Thesis Sec. 4.3.2: safety of SCBF and SZCBF for a Dubins vehicle with noise, from ten random
-starts (Figure 4.3)."""
+"""Thesis Sec. 4.3.2: safety of SCBF and SZCBF from ten random starts (Figure 4.3)."""
 
 from __future__ import annotations
 
@@ -8,44 +7,41 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.scripts.reproduce.chapter_4.dubins_pictures import draw_points
 from safe_envs.scripts.reproduce.chapter_4.dubins_runs import (
     ALPHAS,
-    CHOSEN,
-    CORRECTIONS,
+    CHAPTER,
     FILTERS,
     HORIZON,
     HORIZONS,
     PRINTED_FORM,
     RADIUS,
-    SETTING,
+    SETTINGS,
     STARTS,
-    Runs,
+    ByFilter,
     ahead_of,
+    alternatives_of,
     bands_of,
     dubins_problem,
-    elsewhere_of,
     holds_note,
     random_starts,
     scbf_of,
     simulate,
     step_of,
 )
-from safe_envs.scripts.reproduce.chapter_4.paired_episodes import Exits, is_above, with_interval
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.episodes import Violations, episode_seed
+from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, with_interval
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.bounds import theorem_4_2_10_printed, union_bound
 from safe_envs.wrappers.verification.formulas import Formulas
 
-POINTS = 10
-EPISODES_OF_POINT = 500
-NOISE = 0.2
-"""sigma_1 = sigma_2, in m/sqrt(s)."""
+POINTS, NOISE = SETTINGS["points"], SETTINGS["noise"]
+EPISODES_OF_POINT = SETTINGS["episodes_of_point"]
 
 
 def compute_points(sample: Sample) -> Outcome:
-    """Figure 4.3: safety from ten random starts, many episodes each."""
+    """Compute the safety from ten random starts, with many episodes each."""
     episodes = sample.size(EPISODES_OF_POINT)
     seeds = [episode_seed(sample.seed, i) for i in range(POINTS)]
     starts = {
@@ -54,7 +50,7 @@ def compute_points(sample: Sample) -> Outcome:
         if kind == "uniform" or not sample.quick
     }
 
-    def from_each(kind: str, filters: Mapping[str, Any]) -> list[dict[str, Exits]]:
+    def from_each(kind: str, filters: Mapping[str, Any]) -> list[dict[str, Violations]]:
         return [
             simulate(filters, NOISE, x.tolist(), episodes, seed)
             for x, seed in zip(starts[kind], seeds, strict=True)
@@ -66,7 +62,7 @@ def compute_points(sample: Sample) -> Outcome:
         found | scbf_of(of_start)
         for found, of_start in zip(from_each("uniform", PRINTED_FORM), main, strict=True)
     ]
-    elsewhere = elsewhere_of(runs, printed, claim_on_points)
+    alternatives = alternatives_of(runs, printed, claim_on_points)
     together, step = pooled(main), step_of(HORIZON)
     return Outcome(
         numbers=[
@@ -79,8 +75,8 @@ def compute_points(sample: Sample) -> Outcome:
             ),
         ],
         claims=[claim_on_points(main, HORIZON)],
-        elsewhere=elsewhere,
-        as_printed=[
+        alternative_settings=alternatives,
+        printed_formula=[
             run.rate(f"{name}, all ten starts", step)
             for name, run in pooled(printed).items()
             if name in ALPHAS
@@ -95,8 +91,8 @@ def compute_points(sample: Sample) -> Outcome:
             "product": printed_and_union_bound(starts["uniform"])[0].tolist(),
         },
         notes=[
-            holds_note(elsewhere),
-            *_drawn_anew(main),
+            holds_note(alternatives),
+            *_over_other_starts(main),
             *(
                 bound_note(
                     STARTS[k], [r["SCBF"] for r in runs[STARTS[k]]], *printed_and_union_bound(x)
@@ -107,11 +103,11 @@ def compute_points(sample: Sample) -> Outcome:
     )
 
 
-def pooled(runs: Sequence[Runs]) -> dict[str, Exits]:
-    """All episodes of all starts, with the average share of infeasible steps."""
+def pooled(runs: Sequence[ByFilter]) -> dict[str, Violations]:
+    """Return all episodes of all starts, with the average share of infeasible steps."""
     names = runs[0].keys()
     return {
-        n: Exits(
+        n: Violations(
             np.concatenate([r[n].instant for r in runs]),
             float(np.mean([r[n].infeasible for r in runs])),
         )
@@ -119,8 +115,8 @@ def pooled(runs: Sequence[Runs]) -> dict[str, Exits]:
     }
 
 
-def claim_on_points(runs: Sequence[Runs], horizon: float) -> Claim:
-    """Over all starts together, against all rates of the SZCBF.
+def claim_on_points(runs: Sequence[ByFilter], horizon: float) -> Claim:
+    """Return the claim over all starts together, against all rates of the SZCBF.
 
     Args:
         runs: of SCBF and the SZCBFs from each start.
@@ -142,23 +138,25 @@ def claim_on_points(runs: Sequence[Runs], horizon: float) -> Claim:
     )
 
 
-def _drawn_anew(runs: Sequence[Runs]) -> list[str]:
-    """What ten starts say of others."""
+def _over_other_starts(runs: Sequence[ByFilter]) -> list[str]:
+    """Return what ten starts say of others, in words."""
     notes = []
     for rival in ALPHAS:
         gap = Number.mean(
             "", [ahead_of(rival, run, HORIZON).ours for run in runs], "points", -100.0, 100.0
         )
         notes.append(
-            f"the print's starts are not given; over random starts anew SCBF - {rival} is"
+            f"the thesis does not give its starts; over other random starts SCBF - {rival} is"
             f" {with_interval(gap)} points on average"
         )
     return notes
 
 
 def printed_and_union_bound(starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Thm. 4.2.10's product and the union bound for ever, at each start, shape (2, starts): 0 where
-    A h <= 0."""
+    """Return the product of Thm. 4.2.10 and the union bound for ever at each start, shape (starts,).
+
+    Both are 0 where A h <= 0.
+    """
     formulas = Formulas(dubins_problem(NOISE, "uniform"), [SCBF()], "model")
     speed = next(
         value for symbol, value in formulas.system.parameters.items() if symbol.name == "v"
@@ -172,9 +170,12 @@ def printed_and_union_bound(starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     )
 
 
-def bound_note(name: str, runs: Sequence[Exits], product: np.ndarray, union: np.ndarray) -> str:
-    """How the bounds compare with what is simulated; only a start with A h > 0 has one that is
-    positive.
+def bound_note(
+    name: str, runs: Sequence[Violations], product: np.ndarray, union: np.ndarray
+) -> str:
+    """Return how the bounds compare with the simulation, in words.
+
+    Only a start with A h > 0 has one that is positive.
 
     Args:
         name: of the starts.
@@ -184,7 +185,7 @@ def bound_note(name: str, runs: Sequence[Exits], product: np.ndarray, union: np.
     """
     inside = np.flatnonzero(product > 0.0)
     last = [run.rate("", step_of(max(HORIZONS))) for run in runs]
-    below = sum((last[i].high or 0.0) < 100 * product[i] for i in inside)
+    below = sum(is_below(last[i], 100 * product[i]) for i in inside)
     share = 100 * np.mean([run.infeasible for run in runs])
     return (
         f"{name}: A h > 0, as Thm. 4.2.10 presumes, holds at {len(inside)} of {len(runs)}. Its"
@@ -195,19 +196,12 @@ def bound_note(name: str, runs: Sequence[Exits], product: np.ndarray, union: np.
     )
 
 
-FIGURE_POINTS = Artefact(
-    name="figure-4.3",
-    title="Safety of SCBF and SZCBF from ten random starts",
-    compute=compute_points,
-    setting=lambda sample: (
-        *SETTING,
-        (
-            f"sigma = {NOISE:g} m/sqrt(s), {POINTS} random starts, episodes from each:"
-            f" {sample.size(EPISODES_OF_POINT)}"
-        ),
+ARTEFACTS: tuple[Artefact, ...] = (
+    CHAPTER.artefact(
+        "figure-4.3",
+        compute_points,
+        lambda sample: {"count": sample.size(EPISODES_OF_POINT)},
+        draw_points,
+        (7.0, 4.0),
     ),
-    chosen=CHOSEN,
-    corrections=CORRECTIONS,
-    draw=draw_points,
-    size=(7.0, 4.0),
 )

@@ -1,5 +1,4 @@
-"""The cubic system under unknown noise (thesis Sec. 5.4.2): what is learned of it, and its safety
-rates."""
+"""The cubic system under unknown noise (thesis Sec. 5.4.2)."""
 
 from __future__ import annotations
 
@@ -9,48 +8,35 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.agents import load_problem
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.registry import load_problem
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
-    FIT_ERRATA,
-    draw_learning,
+from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     identifications,
-    learning_outcome,
-    learning_setting,
-    lessons,
+    learning_values,
     models,
+    repeated,
 )
+from safe_envs.scripts.reproduce.chapter_5.noise_terms import draw_learning, learning_outcome
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
+    CHAPTER,
     EPISODES,
     NO_RATE,
-    Runs,
     close,
-    gap,
+    explain_gap,
     measured,
-    safer,
 )
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, is_above, is_below, safer
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.feasibility import verify
 from safe_envs.wrappers.verification.guarantee import promise
 
-ENV = "safe_envs/CubicSDE-v0"
-LEVELS = (0.1, 0.15)
-"""k of sigma = k x_2, in 1/sqrt(s)."""
-PRINTED = {"SCBF": (86.8, 84.3), "DDSCBF": (85.2, 83.0), "CBF": (77.3, 57.5)}
-"""Of Table 5.2, in %, at these levels."""
-ALPHA = 2.0
-"""Class-K rate of the CBF, in 1/s."""
+SETTINGS = CHAPTER.settings["cubic"]
+ENV, LEVELS, ALPHA, FIXED = (SETTINGS[name] for name in ("env", "levels", "alpha", "fixed_start"))
+PRINTED = CHAPTER.printed("table-5.2")
 CBF, WITHOUT = f"cbf:alpha={ALPHA}", f"cbf:alpha={NO_RATE}"
-ALPHAS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+_ALPHAS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
 """Rates among which the printed fall of the CBF is looked for, in 1/s."""
-FIXED = (-0.25, -1.0)
-"""A single start, with h = .25."""
-START = "near the edge: uniform where 0 < h < .5 in [-3, 1] x [-2, 2]"
-TASK = "nominal: CLF V = x_1^2 + x_2^2, decay 1 1/s, weights 1; abs(u) <= 10 1/s; dt = 10 ms"
-STATES = (
-    "the equations are of d[x_1, x_2], not of the differential of their derivatives (Sec. 5.4.2)"
-)
 
 _FILTERS = {
     "SCBF": "scbf",
@@ -59,21 +45,17 @@ _FILTERS = {
     "CBF with alpha = 0": WITHOUT,
     "no filter": "none",
 }
-Levels = Mapping[float, dict[str, Runs]]
-"""Runs by filter at each level."""
+Levels = Mapping[float, Mapping[str, MeasuredFilter]]
+"""By filter at each level."""
 
 
-def _table(sample: Sample) -> Outcome:
-    learned = {k: lessons(ENV, k, sample) for k in LEVELS}
+def compute_table(sample: Sample) -> Outcome:
+    """Compute Table 5.2, also from a single start."""
+    learned = {k: repeated(ENV, k, sample) for k in LEVELS}
+    filters = ["none", CBF, WITHOUT, "scbf"]
     near, single = (
         {
-            k: measured(
-                ENV,
-                {"noise": k, **start},
-                ["none", CBF, WITHOUT, "scbf"],
-                models(learned[k]),
-                sample,
-            )
+            k: measured(ENV, {"noise": k, **start}, filters, models(learned[k]), sample)
             for k in LEVELS
         }
         for start in ({}, {"start": list(FIXED)})
@@ -84,20 +66,20 @@ def _table(sample: Sample) -> Outcome:
     return Outcome(
         numbers=numbers(near, _FILTERS),
         claims=claims(near),
-        elsewhere={
+        alternative_settings={
             f"a single start {FIXED} with h = .25": Outcome(
                 numbers(single, _FILTERS), claims(single)
             )
         },
-        as_printed=numbers(literal, {"DDSCBF": "ddscbf"}),
+        printed_formula=numbers(literal, {"DDSCBF": "ddscbf"}),
         data={
             f"k = {k:g}": {name: near[k][text].curve for name, text in _FILTERS.items()}
             for k in LEVELS
         },
         notes=[
-            *(gap(near[k], CBF, f"at k = {k:g}") for k in LEVELS),
+            *(explain_gap(near[k], CBF, f"at k = {k:g}") for k in LEVELS),
             _falls(sample),
-            *beside_no_filter(near),
+            *compare_with_no_filter(near),
             (
                 "from a single start the rate falls from the lower to the higher noise by"
                 f" {_fall(single, CBF):.1f} points with the CBF, by {_fall(single, 'scbf'):.1f}"
@@ -109,7 +91,12 @@ def _table(sample: Sample) -> Outcome:
 
 
 def numbers(found: Levels, filters: Mapping[str, str]) -> list[Number]:
-    """The rates of filters at each level, beside the printed ones."""
+    """Return the rates of filters at each level, with the printed ones.
+
+    Args:
+        found: all rates.
+        filters: texts by name.
+    """
     return [
         found[k][text].number(f"{name}, k = {k:g}", PRINTED[name][i] if name in PRINTED else None)
         for i, k in enumerate(LEVELS)
@@ -118,8 +105,10 @@ def numbers(found: Levels, filters: Mapping[str, str]) -> list[Number]:
 
 
 def claims(found: Levels) -> list[Claim]:
-    """Checks of ours: the text of the thesis says nothing about the table, and its orders are in
-    the numbers."""
+    """Return checks of ours.
+
+    The text of the thesis says nothing about the table, and its orders are in the numbers.
+    """
     return [
         *(
             close(found[k], PRINTED["SCBF"][i], PRINTED["DDSCBF"][i], f" at k = {k:g}")
@@ -138,15 +127,14 @@ def claims(found: Levels) -> list[Claim]:
 
 
 def _fall(found: Levels, name: str) -> float:
-    """By how many points a rate falls from the first level to the second."""
+    """Return by how many points a rate falls from the first level to the second."""
     before, after = (found[k][name].rate for k in LEVELS)
     return before - after
 
 
 def _falls(sample: Sample) -> str:
-    """How far the CBF falls from one level to the other, for several class-K rates and every
-    horizon."""
-    tried = ALPHAS[:1] if sample.quick else ALPHAS
+    """Return how far the CBF falls between the levels, over class-K rates and horizons, in words."""
+    tried = _ALPHAS[:1] if sample.quick else _ALPHAS
     swept = [
         measured(ENV, {"noise": k}, [f"cbf:alpha={a}" for a in tried], [], sample) for k in LEVELS
     ]
@@ -161,22 +149,23 @@ def _falls(sample: Sample) -> str:
     )
 
 
-def beside_no_filter(found: Levels) -> list[str]:
-    """On which side of the rate without any filter the printed rates of the CBF are."""
+def compare_with_no_filter(found: Levels) -> list[str]:
+    """Return on which side of the unfiltered rate the printed rates of the CBF are, in words."""
     said = []
     for k, printed in zip(LEVELS, PRINTED["CBF"], strict=True):
-        bare = found[k]["none"].number("")
-        low, high = (bare.ours if end is None else end for end in (bare.low, bare.high))
-        side = "below" if printed < low else "above" if printed > high else "within"
+        free = found[k]["none"].number("")
+        side = (
+            "below" if is_above(free, printed) else "above" if is_below(free, printed) else "within"
+        )
         said.append(
-            f"at k = {k:g} the printed {printed:g} % of the CBF is {side} [{low:.1f}, {high:.1f}],"
-            " the interval without any filter"
+            f"at k = {k:g} the printed {printed:g} % of the CBF is {side} [{free.low:.1f},"
+            f" {free.high:.1f}], the interval without any filter"
         )
     return said
 
 
 def _no_bound(sample: Sample) -> list[str]:
-    """Why h/sup h says nothing here."""
+    """Return why h/sup h says nothing here, in words."""
     problem = load_problem(ENV)
     condition = SCBF().constraint(problem.model, problem.barriers[0])
     read = compile_function(
@@ -196,66 +185,30 @@ def _no_bound(sample: Sample) -> list[str]:
     return [
         *notes,
         (
-            f"{reason}; no input in the box meets the condition on"
+            f"{reason}; no input in its bounds meets the condition on"
             f" {100 * found.safe.infeasible:.0f} % of C within the workspace"
         ),
     ]
 
 
 def printed_term(x_2: Any) -> Any:
-    """The last term of the printed A h, -sigma(x_2)^2, at the first level."""
+    """Return the last term of the printed A h, -sigma(x_2)^2, at the first level."""
     return -((LEVELS[0] * x_2) ** 2)
 
 
-def _table_setting(sample: Sample) -> tuple[str, ...]:
-    episodes = (
-        f"{sample.size(EPISODES)} episodes, the same for all filters; DDSCBF over"
-        f" {identifications(sample)} identifications"
-    )
-    return f"{START}; no violation at any control instant up to 2 s", f"{TASK}; {episodes}"
+def _table_values(sample: Sample) -> dict[str, Any]:
+    return {"count": sample.size(EPISODES), "identifications": identifications(sample)}
 
+
+_SIGMA = f"sigma = {LEVELS[0]:g} x_2"
 
 ARTEFACTS: tuple[Artefact, ...] = (
-    Artefact(
-        name="figure-5.2",
-        title="Learned noise part of the generator, cubic system",
-        compute=partial(
-            learning_outcome,
-            ENV,
-            LEVELS[0],
-            1,
-            f"-sigma(x_2)^2 at sigma = {LEVELS[0]:g} x_2",
-            printed_term,
-        ),
-        setting=partial(
-            learning_setting, where="C within [-1, 1]^2", noise=f"sigma = {LEVELS[0]:g} x_2"
-        ),
-        chosen=(
-            (
-                "the region [-1, 1]^2; tanh, Adam 1e-3, batches of 32, standardised inputs and"
-                " targets; 70 % of the states train"
-            ),
-        ),
-        corrections=(*FIT_ERRATA, STATES),
-        draw=draw_learning,
-        size=(7.5, 3.8),
+    CHAPTER.artefact(
+        "figure-5.2",
+        partial(learning_outcome, ENV, LEVELS[0], 1, f"-sigma(x_2)^2 at {_SIGMA}", printed_term),
+        partial(learning_values, region="C within [-1, 1]^2", law=_SIGMA),
+        draw_learning,
+        (7.5, 3.8),
     ),
-    Artefact(
-        name="table-5.2",
-        title="Safety rates of SCBF, DDSCBF and CBF, cubic system",
-        compute=_table,
-        setting=_table_setting,
-        chosen=(
-            "starts, horizon, task and box: see the setting",
-            f"CBF with alpha(h) = {ALPHA:g} h 1/s, and with alpha = 0 beside it",
-        ),
-        corrections=(
-            (
-                "Eq. (5.17), (5.18): the estimator without its bias and with far less noise, see"
-                " Figure 5.2"
-            ),
-            "Sec. 5.4.2 calls C compact: it is unbounded, and so is h",
-            STATES,
-        ),
-    ),
+    CHAPTER.artefact("table-5.2", compute_table, _table_values),
 )

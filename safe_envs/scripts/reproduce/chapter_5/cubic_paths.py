@@ -11,21 +11,17 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents import evaluate, load_problem
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.registry import load_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
-from safe_envs.scripts.reproduce.chapter_5.cubic import ALPHA, CBF, ENV, LEVELS, START, STATES, TASK
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import lessons
-from safe_envs.scripts.reproduce.chapter_5.paired_rates import EPISODES, Runs, measured, safer
+from safe_envs.scripts.reproduce.chapter_5.cubic import CBF, ENV, LEVELS, SETTINGS
+from safe_envs.scripts.reproduce.chapter_5.noise_identification import repeated
+from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER, EPISODES, measured
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, safer
 
-HORIZON = 4.0
-"""In s."""
-WIDE = [-1e3, 1e3]
-"""A box that the system without noise never meets, in 1/s."""
-SHOWN, STRIDE = 12, 2
-"""Trajectories in a picture, and which of their instants."""
+HORIZON, WIDE = SETTINGS["horizon"], SETTINGS["wide"]
+SHOWN, STRIDE = 12, 2  # trajectories in a picture, and which of their instants
 
 _KINDS = {"a": ("none", 0.0), "b": (CBF, 0.0), "c": (CBF, LEVELS[0]), "d": ("ddscbf", LEVELS[0])}
 _WANTED = {"a": False, "b": True, "c": False, "d": True}
@@ -36,7 +32,7 @@ _SOUGHT = (
 
 
 @dataclass(frozen=True)
-class Path:
+class PlaneTrajectories:
     """Trajectories under one filter, the same starts for all.
 
     Attributes:
@@ -45,48 +41,49 @@ class Path:
         barrier: h, shape (steps + 1, the same).
     """
 
-    runs: Runs
+    runs: MeasuredFilter
     states: np.ndarray
     barrier: np.ndarray
 
     @property
     def safe(self) -> np.ndarray:
-        """Which of these episodes have no violation."""
+        """Return which of these episodes have no violation, shape (at most 32,)."""
         return np.nanmin(self.barrier, axis=0) > 0.0
 
 
 @lru_cache(maxsize=2)
-def paths(sample: Sample) -> dict[str, Path]:
-    """Trajectories of all four pictures."""
-    model = lessons(ENV, LEVELS[0], sample)[0].learned["martingale"]
+def paths(sample: Sample) -> dict[str, PlaneTrajectories]:
+    """Return the trajectories of all four pictures."""
+    model = repeated(ENV, LEVELS[0], sample)[0].learned["martingale"]
     found = {}
     for key, (name, noise) in _KINDS.items():
-        learned = [model] if name == "ddscbf" else []
-        how: dict[str, Any] = {
-            "episodes": sample.size(EPISODES),
-            "seed": sample.seed,
-            "bounds": False,
-            "record": True,
-        }
+        options = {"noise": noise, "horizon": HORIZON}
         run = evaluate(
             ENV,
             filters=[name],
-            options={"noise": noise, "horizon": HORIZON},
-            learned=learned,
-            **how,
+            options=options,
+            learned=[model] if name == "ddscbf" else [],
+            episodes=sample.size(EPISODES),
+            seed=sample.seed,
+            bounds=False,
+            record=True,
         )
-        recorded = run.trajectories[name]
-        found[key] = Path(
-            Runs(run.rows[0], [each.safe for each in run.episodes[name]]),
+        recorded, row = run.trajectories[name], run.rows[0]
+        found[key] = PlaneTrajectories(
+            MeasuredFilter(
+                row, [row.safety_rate], [each.safe for each in run.episodes[name]], row.episodes
+            ),
             recorded.states,
             recorded.barrier[:, : recorded.states.shape[1]],
         )
     return found
 
 
-def alike(found: Mapping[str, Path]) -> np.ndarray:
-    """Episodes that end as those of the thesis' text in all pictures; the CLF alone is to be
-    unsafe, or the CBF changes nothing."""
+def alike(found: Mapping[str, PlaneTrajectories]) -> np.ndarray:
+    """Return the episodes that end as in the text of the thesis in all pictures.
+
+    The CLF alone is to be unsafe, or the CBF changes nothing.
+    """
     return np.flatnonzero(
         np.all([found[key].safe == safe for key, safe in _WANTED.items()], axis=0)
     )
@@ -102,7 +99,7 @@ def _picture(key: str, name: str, sample: Sample) -> Outcome:
     return Outcome(
         numbers=[path.runs.number(_rate_name(name))],
         claims=[_CLAIMS[key](found)],
-        elsewhere=(
+        alternative_settings=(
             {f"abs(u) <= {WIDE[1]:g} 1/s in place of 10 1/s": _unbounded(name, sample)}
             if key == "b"
             else {}
@@ -126,13 +123,13 @@ def _rate_name(name: str) -> str:
 
 
 def _unbounded(name: str, sample: Sample) -> Outcome:
-    """The CBF without noise, with more input than it ever takes."""
+    """Return the outcome of the CBF without noise, with more input than it ever takes."""
     runs = measured(ENV, {"noise": 0.0, "horizon": HORIZON, "box": WIDE}, [CBF], [], sample)[CBF]
     return Outcome([runs.number(_rate_name(name))], [kept(runs)])
 
 
-def short_of_input(runs: Runs) -> str:
-    """How often the box is too small for the CBF."""
+def short_of_input(runs: MeasuredFilter) -> str:
+    """Return how often the input bounds are too narrow for the CBF, in words."""
     return (
         "no input within 10 1/s meets the condition of the CBF at"
         f" {runs.row.infeasible_rate:.2%} of the steps up to a first violation"
@@ -140,7 +137,11 @@ def short_of_input(runs: Runs) -> str:
 
 
 def towards_origin(states: np.ndarray) -> Claim:
-    """Whether all trajectories, shape (steps + 1, B, 2), end nearer to the origin than they begin."""
+    """Return the claim that all trajectories end nearer to the origin than they begin.
+
+    Args:
+        states: shape (steps + 1, B, 2), NaN after an end.
+    """
     last = np.isfinite(states).all(axis=2).sum(axis=0) - 1
     ends = states[last, np.arange(states.shape[1])]
     left = np.linalg.norm(ends, axis=1) / np.linalg.norm(states[0], axis=1)
@@ -156,8 +157,8 @@ def towards_origin(states: np.ndarray) -> Claim:
     )
 
 
-def kept(runs: Runs) -> Claim:
-    """Whether a CBF without noise keeps all episodes safe."""
+def kept(runs: MeasuredFilter) -> Claim:
+    """Return the claim that a CBF without noise keeps all episodes safe."""
     row = runs.row
     return Claim(
         "the CBF guarantees safe trajectories without noise",
@@ -166,26 +167,32 @@ def kept(runs: Runs) -> Claim:
     )
 
 
-def lost(quiet: Runs, noisy: Runs) -> Claim:
-    """Whether the CBF is less safe with noise than without."""
-    return safer(
-        "the noise makes trajectories unsafe with the CBF that are safe without it",
-        quiet,
-        noisy,
-        printed=True,
-    )
+def lost(quiet: MeasuredFilter, noisy: MeasuredFilter) -> Claim:
+    """Return the claim that the CBF is less safe with noise than without.
+
+    Args:
+        quiet: without noise.
+        noisy: with it.
+    """
+    sentence = "the noise makes trajectories unsafe with the CBF that are safe without it"
+    return safer(sentence, quiet, noisy)
 
 
-def recovered(ddscbf: Runs, cbf: Runs) -> Claim:
-    """Whether DDSCBF is safer than the CBF under noise."""
+def recovered(ddscbf: MeasuredFilter, cbf: MeasuredFilter) -> Claim:
+    """Return the claim that DDSCBF is safer than the CBF under noise.
+
+    Args:
+        ddscbf: under noise.
+        cbf: on the same episodes.
+    """
     sentence = (
         "under noise DDSCBF keeps trajectories safe that are unsafe with the CBF, more than the"
         " other way round"
     )
-    return safer(sentence, ddscbf, cbf, printed=True)
+    return safer(sentence, ddscbf, cbf)
 
 
-_CLAIMS: dict[str, Callable[[Mapping[str, Path]], Claim]] = {
+_CLAIMS: dict[str, Callable[[Mapping[str, PlaneTrajectories]], Claim]] = {
     "a": lambda found: towards_origin(found["a"].states),
     "b": lambda found: kept(found["b"].runs),
     "c": lambda found: lost(found["b"].runs, found["c"].runs),
@@ -194,22 +201,16 @@ _CLAIMS: dict[str, Callable[[Mapping[str, Path]], Claim]] = {
 
 
 def draw_paths(figure: Figure, outcome: Outcome) -> None:
-    """Trajectories in the plane, one of them bold, with the unsafe region."""
+    """Draw trajectories in the plane, one of them bold, with the unsafe region."""
     problem = load_problem(ENV)
     axes = figure.subplots()
     lines = [np.array(line) for line in outcome.data["paths"]]
+    thin: dict[str, Any] = {"color": COLORS[4], "linewidth": 0.8, "alpha": 0.8}
     for line in reversed(lines[1:]):
-        axes.plot(
-            line[:, 0], line[:, 1], color=COLORS[4], linewidth=0.8, alpha=0.8, label="other starts"
-        )
+        axes.plot(*line.T, label="other starts", **thin)
         axes.plot(*line[0], "o", color=COLORS[4], markersize=2.5)
-    axes.plot(
-        lines[0][:, 0],
-        lines[0][:, 1],
-        color=COLORS[0],
-        linewidth=2.2,
-        label="the same start in all pictures",
-    )
+    label = "the same start in all pictures"
+    axes.plot(*lines[0].T, color=COLORS[0], linewidth=2.2, label=label)
     axes.plot(*lines[0][0], "o", color="black", markersize=4, zorder=3)
     axes.plot(0.0, 0.0, "+", color="black", markersize=9, markeredgewidth=1.5)
     low, high = (-3.2, -2.3), (2.2, 2.3)
@@ -220,29 +221,16 @@ def draw_paths(figure: Figure, outcome: Outcome) -> None:
     axes.contourf(*grid, h, levels=[-np.inf, 0.0], colors=[UNSAFE], alpha=0.35, zorder=0)
     axes.contour(*grid, h, levels=[0.0], colors="black", linewidths=1.2, zorder=1)
     axes.text(0.98, 0.03, "unsafe", transform=axes.transAxes, ha="right", color=QUIET)
-    axes.set(
-        xlim=(low[0], high[0]),
-        ylim=(low[1], high[1]),
-        xlabel="$x_1$",
-        ylabel="$x_2$",
-        title=outcome.data["name"],
-        aspect="equal",
-    )
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+    axes.set(xlabel="$x_1$", ylabel="$x_2$", title=outcome.data["name"])
     handles, labels = axes.get_legend_handles_labels()
     kinds = dict(zip(labels, handles, strict=True))
     add_legend(figure, [*reversed(kinds.values()), Patch(color=UNSAFE, alpha=0.35, label="h < 0")])
 
 
-def _setting(sample: Sample) -> tuple[str, ...]:
+def _values(sample: Sample) -> dict[str, Any]:
     episodes = sample.size(EPISODES)
-    return (
-        (
-            f"{min(SHOWN, episodes)} trajectories up to {HORIZON:g} s; rates over {episodes}"
-            " episodes; DDSCBF of one identification"
-        ),
-        START,
-        TASK,
-    )
+    return {"shown": min(SHOWN, episodes), "count": episodes}
 
 
 _PICTURES = (
@@ -253,19 +241,8 @@ _PICTURES = (
 )
 
 ARTEFACTS: tuple[Artefact, ...] = tuple(
-    Artefact(
-        name=f"figure-5.3{key}",
-        title=f"Trajectories of the cubic system: {name}",
-        compute=partial(_picture, key, name),
-        setting=_setting,
-        chosen=(
-            "start, horizon, task and box: see the setting",
-            f"CBF with alpha(h) = {ALPHA:g} h 1/s",
-            "which start is drawn bold: see the notes",
-        ),
-        corrections=(STATES,),
-        draw=draw_paths,
-        size=(7.0, 5.2),
+    CHAPTER.artefact(
+        f"figure-5.3{key}", partial(_picture, key, name), _values, draw_paths, (7.0, 5.2)
     )
     for key, name in _PICTURES
 )

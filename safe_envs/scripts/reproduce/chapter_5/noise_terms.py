@@ -1,146 +1,69 @@
-"""What the noise adds to the generator of a barrier, learned by Algorithm 2 of the thesis (Figures
-5.1, 5.2)."""
+"""Figures 5.1 and 5.2: the learned noise part of the generator of a barrier, and its errors."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import sympy as sp
 from matplotlib.figure import Figure
 
+from safe_envs import SafetyProblem
+from safe_envs.agents import load_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient, ito_correction
-from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legend
-from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Outcome, Sample
-from safe_envs.wrappers.learning.data.collection import collect, draw_states
-from safe_envs.wrappers.learning.estimators import Estimator, ito_part, rates
-from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
-
-POINTS, REPETITIONS = 200, 50_000
-"""Of Algorithm 2: start states, and one-step transitions from each."""
-VALIDATION = 400
-"""States at which the errors of an identification are measured."""
-CLOSE = 0.1
-"""Largest rms error of a learned term, as part of the term: a limit of ours."""
-
-FIT_ERRATA = (
-    (
-        "Eq. (5.17), (5.18): the change of h is taken from where the known drift leads, less its"
-        " linear part in the noise"
-    ),
-    "Eq. (5.17): j = 1..n in place of 0..n",
+from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
+    REPETITIONS,
+    VALIDATION,
+    Identification,
+    models,
+    repeated,
 )
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.paired import is_below
+from safe_envs.wrappers.learning.data.collection import draw_states
+from safe_envs.wrappers.learning.generator import GeneratorModel
+
+_CLOSE = 0.1  # largest rms error of a learned term, as part of the term: a limit of ours
 
 _LABELS = "rms error of the training data"
 _NETWORK = "rms error of the network"
 
 
 @dataclass(frozen=True)
-class Lesson:
-    """What an identification learned: models by estimator, and of a whole lesson the labels at the
-    states x of its data."""
-
-    seed: int
-    learned: dict[str, GeneratorModel]
-    x: np.ndarray
-    labels: dict[str, np.ndarray]
-
-
-@dataclass(frozen=True)
 class _Errors:
-    """How far the networks of several identifications are from the true term, each at states of its
-    own, shape (K, P)."""
+    """The networks of several identifications and the true term, each at P states of its own.
+
+    Attributes:
+        truth: shape (K, P).
+        estimates: the same.
+    """
 
     truth: np.ndarray
     estimates: np.ndarray
 
     @property
     def each(self) -> list[float]:
-        """Rms error of each network, in 1/s."""
+        """Return the rms error of each network, in 1/s."""
         return [_rms(row) for row in self.estimates - self.truth]
 
     @property
     def number(self) -> Number:
-        """Their mean. The states at which one network is looked at are not independent of each
-        other: only networks are."""
+        """Return their mean over networks.
+
+        The states at which one network is evaluated are not independent: only networks are.
+        """
         return Number.mean(_NETWORK, self.each, "1/s", least=0.0)
-
-
-@lru_cache(maxsize=16)
-def lesson(
-    env_id: str, noise: float, points: int, repetitions: int, seed: int, whole: bool
-) -> Lesson:
-    """Follow Algorithm 2 at one noise level, by the repaired and by the printed estimator; `whole`
-    adds all labels."""
-    problem = load_problem(env_id, {"noise": noise})
-    data = collect(problem, points, repetitions, [[0.0]], seed=seed)
-    estimators: tuple[Estimator, ...] = ("martingale", "printed")
-    learned = {
-        name: learn_generator(problem, data=data, estimator=name, seed=seed) for name in estimators
-    }
-    if not whole:
-        return Lesson(seed, learned, data.x, {})
-    h, plant = problem.barriers[0].expression, problem.plant
-    value, slopes = (
-        compile_function(plant.states, tuple(plant.numeric(e) for e in part), "arrays")
-        for part in ([h], gradient(plant, h))
-    )
-    rate = rates(problem.model, data)
-    labels = {
-        e: ito_part(data, rate, lambda x: value(*x)[0], lambda x: slopes(*x), e).values
-        for e in get_args(Estimator)
-    }
-    return Lesson(seed, learned, data.x, labels)
-
-
-def identifications(sample: Sample) -> int:
-    """How often is learned; at least twice, since intervals are over it."""
-    return 2 if sample.quick else 3
-
-
-def lessons(env_id: str, noise: float, sample: Sample) -> list[Lesson]:
-    """Several identifications, the first of them whole."""
-    children = (
-        np.random.SeedSequence(sample.seed, spawn_key=(r, 0)).generate_state(1)[0]
-        for r in range(1, identifications(sample))
-    )
-    seeds = [sample.seed, *map(int, children)]
-    return [
-        lesson(env_id, noise, sample.work(POINTS), sample.work(REPETITIONS), seed, r == 0)
-        for r, seed in enumerate(seeds)
-    ]
-
-
-def models(learned: Sequence[Lesson], estimator: Estimator = "martingale") -> list[GeneratorModel]:
-    """What was learned by an estimator."""
-    return [each.learned[estimator] for each in learned]
-
-
-def learning_setting(sample: Sample, where: str, noise: str) -> tuple[str, ...]:
-    """How a term is learned, and its error measured."""
-    return (
-        (
-            f"{sample.work(POINTS)} states uniform in {where}, {sample.work(REPETITIONS)} Euler"
-            f" steps of 10 ms from each, u = 0, {noise}"
-        ),
-        (
-            f"network 100-30, 500 epochs at most; {identifications(sample)} identifications, each"
-            f" with data of its own; the error of each at {VALIDATION} other states"
-        ),
-    )
 
 
 def learning_outcome(
     env_id: str, noise: float, state: int, said: str, formula: Callable[[Any], Any], sample: Sample
 ) -> Outcome:
-    """How near the learned term is to the true one, which depends on one state alone.
+    """Return how near the learned term is to the true one, which depends on one state alone.
 
     Args:
         env_id: of the system.
@@ -150,7 +73,7 @@ def learning_outcome(
         formula: the same as a function of the state.
         sample: how much is simulated.
     """
-    problem, learned = load_problem(env_id, {"noise": noise}), lessons(env_id, noise, sample)
+    problem, learned = load_problem(env_id, {"noise": noise}), repeated(env_id, noise, sample)
     first = learned[0]
     x = [draw_states(problem, VALIDATION, np.random.default_rng(each.seed)) for each in learned]
     repaired, printed = (
@@ -175,20 +98,22 @@ def learning_outcome(
             learnable(repaired.each, repaired.truth),
             near(repaired.each, repaired.truth),
         ],
-        as_printed=[printed.number, root_mean_square(_LABELS, missed["printed"])],
+        printed_formula=[printed.number, root_mean_square(_LABELS, missed["printed"])],
         data={
             "state": f"${sp.latex(problem.plant.states[state])}${unit}",
             "grid": grid.tolist(),
             "term": term(grid)[0].tolist(),
             "points": first.x[:, state].tolist(),
             "validation": x[0][:, state].tolist(),
-            "repaired": {
-                "labels": first.labels["martingale"].tolist(),
-                "network": repaired.estimates[0].tolist(),
-            },
-            "printed": {
-                "labels": first.labels["printed"].tolist(),
-                "network": printed.estimates[0].tolist(),
+            **{
+                name: {
+                    "labels": first.labels[estimator].tolist(),
+                    "network": errors.estimates[0].tolist(),
+                }
+                for name, estimator, errors in (
+                    ("repaired", "martingale", repaired),
+                    ("printed", "printed", printed),
+                )
             },
         },
         notes=_why_printed_fails(problem, first, missed["printed"], sample.work(REPETITIONS)),
@@ -206,8 +131,13 @@ def _errors(
 
 
 def as_derived(said: str, term: np.ndarray, printed: np.ndarray) -> Claim:
-    """Whether the printed formula of the term is that which follows from the system and h, at some
-    states."""
+    """Return the claim that the printed term follows from the system and h.
+
+    Args:
+        said: the term, in words.
+        term: derived, at some states.
+        printed: by the printed formula, there.
+    """
     largest = float(np.abs(term - printed).max())
     return Claim(
         f"the analytic term is {said}",
@@ -217,11 +147,17 @@ def as_derived(said: str, term: np.ndarray, printed: np.ndarray) -> Claim:
 
 
 def learnable(errors: Sequence[float], truth: np.ndarray) -> Claim:
-    """Whether networks are nearer to the term than the best constant: then they learned something
-    of its shape."""
+    """Return the claim that networks are nearer to the term than the best constant.
+
+    Then they learned something of its shape.
+
+    Args:
+        errors: rms error of each, in 1/s.
+        truth: the term at the validation states.
+    """
     constant = float(np.std(truth))
     found = Number.mean("", errors, least=0.0)
-    holds = found.high is not None and found.high < constant
+    holds = is_below(found, constant)
     evidence = (
         f"rms error of the network {found.ours:.2g} 1/s [{found.low:.2g}, {found.high:.2g}], of the"
         f" best constant {constant:.2g} 1/s"
@@ -232,16 +168,21 @@ def learnable(errors: Sequence[float], truth: np.ndarray) -> Claim:
 
 
 def near(errors: Sequence[float], truth: np.ndarray) -> Claim:
-    """Whether networks are near to the term, by a limit of ours."""
+    """Return the claim that networks are near to the term, by a limit of ours.
+
+    Args:
+        errors: rms error of each, in 1/s.
+        truth: the term at the validation states.
+    """
     share = float(np.mean(errors)) / _rms(truth)
-    sentence = f"the rms error of the network is below {CLOSE:.0%} of the term's rms"
-    return Claim(sentence, share < CLOSE, f"it is {share:.1%} of it", printed=False)
+    sentence = f"the rms error of the network is below {_CLOSE:.0%} of the term's rms"
+    return Claim(sentence, share < _CLOSE, f"it is {share:.1%} of it", printed=False)
 
 
 def _why_printed_fails(
-    problem: SafetyProblem, first: Lesson, missed: np.ndarray, repetitions: int
+    problem: SafetyProblem, first: Identification, missed: np.ndarray, repetitions: int
 ) -> list[str]:
-    """The printed estimator's error, its bias in closed form, and its noise."""
+    """Return the printed estimator's error, its bias in closed form, and its noise, in words."""
     plant, h = problem.plant, problem.barriers[0].expression
     bias = (
         (plant.drift.T * gradient(plant, h).jacobian(plant.states) * plant.drift)[0, 0]
@@ -276,7 +217,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def root_mean_square(name: str, values: np.ndarray) -> Number:
-    """Of independent values in 1/s, with the normal interval of their mean square."""
+    """Return that of independent values in 1/s, with the normal interval of their mean square."""
     square = np.square(values)
     mean, half = float(square.mean()), 1.96 * float(square.std(ddof=1)) / math.sqrt(len(square))
     return Number(
@@ -285,41 +226,20 @@ def root_mean_square(name: str, values: np.ndarray) -> Number:
 
 
 def draw_learning(figure: Figure, outcome: Outcome) -> None:
-    """The learned term over the state that it depends on: by the repaired estimator, and by the
-    printed one."""
+    """Draw the learned term over its state, by the repaired and by the printed estimator."""
     data = outcome.data
     panels = list(figure.subplots(1, 2))
     for axes, key in zip(panels, ("repaired", "printed"), strict=True):
-        axes.plot(
-            data["grid"],
-            data["term"],
-            color=COLORS[3],
-            linewidth=5.0,
-            alpha=0.7,
-            label="analytic term",
-        )
-        axes.plot(
-            data["points"],
-            data[key]["labels"],
-            ".",
-            color="black",
-            markersize=5,
-            label="training data",
-        )
-        axes.plot(
-            data["validation"],
-            data[key]["network"],
-            ".",
-            color=COLORS[0],
-            markersize=2.2,
-            label="network, other states",
-        )
+        wide: dict[str, Any] = {"color": COLORS[3], "linewidth": 5.0, "alpha": 0.7}
+        labels, network = data[key]["labels"], data[key]["network"]
+        axes.plot(data["grid"], data["term"], label="analytic term", **wide)
+        axes.plot(data["points"], labels, "k.", markersize=5, label="training data")
+        dots: dict[str, Any] = {"color": COLORS[0], "markersize": 2.2}
+        axes.plot(data["validation"], network, ".", label="network, other states", **dots)
         axes.axhline(0.0, color=QUIET, linewidth=0.6, zorder=0)
         axes.ticklabel_format(axis="y", style="sci", scilimits=(-2, 2))
         axes.set_xlabel(data["state"])
     low, high = (float(np.ptp(axes.get_ylim())) for axes in panels)
     panels[0].set(title="(a) repaired estimator", ylabel="noise part of the generator of h (1/s)")
-    panels[1].set_title(
-        f"(b) estimator as printed\n(other scale: {high / low:.3g} times that of (a))"
-    )
+    panels[1].set_title(f"(b) printed estimator\n(other scale: {high / low:.3g} times that of (a))")
     add_legend(figure, panels[0].get_legend_handles_labels()[0])

@@ -1,71 +1,26 @@
-"""Safety rates of several filters on the same episodes, and what pairs of them tell (chapter 5)."""
+"""Rates of the filters of chapter 5 on the same episodes, and what pairs of them tell."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from safe_envs.agents.evaluation.comparison import compare_all
-from safe_envs.agents.evaluation.evaluate import evaluate
-from safe_envs.agents.evaluation.repeats import pooled
-from safe_envs.agents.evaluation.rows import EpisodeSummary
-from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Sample
+from safe_envs.scripts.reproduce.framework.paired import (
+    PRINTED_EPISODES,
+    MeasuredFilter,
+    difference,
+    measure,
+    with_interval,
+)
+from safe_envs.scripts.reproduce.framework.thesis_data import chapter
 from safe_envs.wrappers.learning.generator import GeneratorModel
 
-EPISODES = 1000
-"""Of each rate in Tables 5.1 and 5.2."""
+CHAPTER = chapter(5)
+EPISODES = CHAPTER.settings["learning"]["episodes"]
 NO_RATE = 1e-12
 """Rate of a CBF without its class-K term, in 1/s: the derivative of h must not be negative then."""
-
-
-@dataclass(frozen=True)
-class Runs:
-    """Episodes under one filter.
-
-    Attributes:
-        row: of `evaluate`, over all identifications.
-        flags: which episodes were safe, with each identification.
-    """
-
-    row: EpisodeSummary
-    flags: Sequence[np.ndarray]
-
-    @property
-    def rate(self) -> float:
-        """In %."""
-        return 100 * self.row.safety_rate
-
-    @property
-    def curve(self) -> dict[str, list[float]]:
-        """Rate in % over time in s."""
-        return {
-            "time": self.row.curve.time,
-            "rate": [100 * rate for rate in self.row.curve.rate],
-        }
-
-    def number(self, name: str, printed: float | None = None) -> Number:
-        """The rate, beside a printed one of 1000 runs."""
-        low, high = (100 * v for v in (self.row.ci_low, self.row.ci_high))
-        return Number(
-            name, self.rate, low, high, printed, None if printed is None else EPISODES, "%"
-        )
-
-
-@dataclass(frozen=True)
-class Difference:
-    """Of two rates on the same episodes, in points, with its 95 % interval over identifications and
-    episodes."""
-
-    mean: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{self.mean:+.1f} points [{self.low:.1f}, {self.high:.1f}]"
 
 
 def measured(
@@ -74,69 +29,70 @@ def measured(
     filters: Sequence[str],
     models: Sequence[GeneratorModel],
     sample: Sample,
-) -> dict[str, Runs]:
-    """Run filters that learn nothing, and the learned one, "ddscbf", with each of several models."""
-    how: dict[str, Any] = {
-        "options": options,
-        "episodes": sample.size(EPISODES),
-        "seed": sample.seed,
-        "bounds": False,
-    }
-    found = {name: [evaluate(env_id, filters=[name], **how)] for name in filters}
-    if models:
-        found["ddscbf"] = [
-            evaluate(env_id, filters=["ddscbf"], learned=[model], **how) for model in models
-        ]
+) -> dict[str, MeasuredFilter]:
+    """Return the rates of filters that learn nothing, and of "ddscbf" with several models.
+
+    Args:
+        env_id: what to simulate.
+        options: arguments of the environment.
+        filters: texts of those that learn nothing.
+        models: of "ddscbf"; without any it is left out.
+        sample: how much is simulated.
+    """
+    used = {**dict.fromkeys(filters, ()), **({"ddscbf": models} if models else {})}
+    size = sample.size(EPISODES), sample.seed
     return {
-        name: Runs(
-            pooled([run.rows[0] for run in each], 0.95),
-            [found.safe for run in each for found in run.episodes[name]],
-        )
-        for name, each in found.items()
+        text: measure(env_id, text, *size, each, options=options) for text, each in used.items()
     }
 
 
-def difference(first: Runs, second: Runs) -> Difference:
-    """The first rate less the second one, on the same episodes."""
-    (found,) = compare_all({"second": second.flags, "first": first.flags}, 0.95)
-    return Difference(*(100 * v for v in (found.difference, found.ci_low, found.ci_high)))
-
-
-def safer(sentence: str, first: Runs, second: Runs, *, printed: bool) -> Claim:
-    """Whether the first rate is above the second one by more than chance."""
-    apart = difference(first, second)
-    return Claim(
-        sentence, apart.low > 0.0, f"{first.rate:.1f} % less {second.rate:.1f} %: {apart}", printed
-    )
+def apart(first: MeasuredFilter, second: MeasuredFilter) -> str:
+    """Return the first rate less the second one on the same episodes, in words."""
+    return with_interval(difference("", first.flags, second.flags), " points")
 
 
 def resolution(first: float, second: float) -> float:
-    """What separate samples of the printed size can tell apart with 95 %, in points, by the two
-    rates in %."""
-    return 196 * math.sqrt(sum(p / 100 * (1 - p / 100) for p in (first, second)) / EPISODES)
+    """Return what separate samples of the printed size can tell apart with 95 %, in points.
+
+    Args:
+        first: one rate, in per cent.
+        second: the other.
+    """
+    variances = (p / 100 * (1 - p / 100) for p in (first, second))
+    return 196 * math.sqrt(sum(variances) / PRINTED_EPISODES)
 
 
-def close(runs: dict[str, Runs], scbf: float, ddscbf: float, where: str = "") -> Claim:
-    """Whether learning costs less than the print could have told apart, by the two printed rates in
-    %: a check of ours."""
-    limit, apart = resolution(scbf, ddscbf), difference(runs["ddscbf"], runs["scbf"])
-    evidence = (
-        f"DDSCBF - SCBF = {apart}, over identifications and episodes; limit {limit:.1f} points,"
-        f" what two samples of {EPISODES} tell apart"
-    )
+def close(runs: Mapping[str, MeasuredFilter], scbf: float, ddscbf: float, where: str = "") -> Claim:
+    """Return our claim that learning costs less than the thesis could have told apart.
+
+    Args:
+        runs: with "scbf" and "ddscbf".
+        scbf: printed rate, in per cent.
+        ddscbf: printed rate, in per cent.
+        where: end of the sentence.
+    """
+    limit = resolution(scbf, ddscbf)
+    gap = difference("", runs["ddscbf"].flags, runs["scbf"].flags)
     return Claim(
         f"DDSCBF is as safe as SCBF{where}",
-        -limit <= apart.low and apart.high <= limit,
-        evidence,
+        gap.low is not None and gap.high is not None and -limit <= gap.low and gap.high <= limit,
+        f"DDSCBF - SCBF = {with_interval(gap, ' points')}, over identifications and episodes; limit"
+        f" {limit:.1f} points, what two samples of {PRINTED_EPISODES} tell apart",
         printed=False,
     )
 
 
-def gap(runs: dict[str, Runs], cbf: str, where: str) -> str:
-    """Where the gap between SCBF and CBF comes from."""
+def explain_gap(runs: Mapping[str, MeasuredFilter], cbf: str, where: str) -> str:
+    """Return where the gap between SCBF and CBF comes from, in words.
+
+    Args:
+        runs: with "scbf", the CBF, and the CBF without its class-K term.
+        cbf: text of the CBF.
+        where: beginning of the sentence.
+    """
     without = runs[f"cbf:alpha={NO_RATE}"]
     return (
-        f"{where}, SCBF - CBF is {difference(runs['scbf'], runs[cbf])}: the class-K term (CBF with"
-        f" alpha = 0 less CBF) makes {difference(without, runs[cbf])} of it, and the noise part"
-        f" (SCBF less CBF with alpha = 0) {difference(runs['scbf'], without)}"
+        f"{where}, SCBF - CBF is {apart(runs['scbf'], runs[cbf])}: the class-K term (CBF with"
+        f" alpha = 0 less CBF) makes {apart(without, runs[cbf])} of it, and the noise part"
+        f" (SCBF less CBF with alpha = 0) {apart(runs['scbf'], without)}"
     )

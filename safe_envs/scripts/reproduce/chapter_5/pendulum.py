@@ -9,53 +9,46 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs.agents import load_problem
 from safe_envs.agents.evaluation.bound_check import starts_of
 from safe_envs.agents.evaluation.contradiction import by_rate
-from safe_envs.registry import load_problem
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
-    FIT_ERRATA,
-    Lesson,
-    draw_learning,
+from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
+    Identification,
     identifications,
-    learning_outcome,
-    learning_setting,
-    lessons,
+    learning_values,
     models,
+    repeated,
 )
+from safe_envs.scripts.reproduce.chapter_5.noise_terms import draw_learning, learning_outcome
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
+    CHAPTER,
     EPISODES,
     NO_RATE,
-    Runs,
     close,
-    gap,
+    explain_gap,
     measured,
-    safer,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, safer
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
 from safe_envs.wrappers import DDSCBF, SCBF, SafetyFilter
 from safe_envs.wrappers.verification.feasibility import verify
 from safe_envs.wrappers.verification.guarantee import promise
 
-ENV = "safe_envs/Pendulum-v0"
-NOISE = 0.1
-"""sigma, in 1/sqrt(s)."""
-PRINTED = {"SCBF": 92.0, "DDSCBF": 91.0, "CBF": 0.0}
-"""Of Table 5.1, in %."""
-THRESHOLD = 90.0
-"""The rate of DDSCBF is above it by the thesis' text, in %."""
-UNBOUNDED = [-1e4, 1e4]
-"""A box that is never met, in N m."""
+_SETTINGS = CHAPTER.settings["pendulum"]
+ENV, NOISE, THRESHOLD = (_SETTINGS[name] for name in ("env", "noise", "threshold"))
+PRINTED = CHAPTER.printed("table-5.1")
 WITHOUT = f"cbf:alpha={NO_RATE}"
+_UNBOUNDED = [-1e4, 1e4]  # input bounds that are never met, N m
 
 
 @dataclass(frozen=True)
-class Setting:
-    """What the print leaves open.
+class PendulumSetting:
+    """What the thesis leaves open.
 
     Attributes:
         name: a letter.
-        start: of the env.
+        start: of the environment.
         horizon: in s.
         alpha: class-K rate of the CBF, in 1/s.
         longest: up to which horizon the printed rates are looked for, in s.
@@ -69,15 +62,15 @@ class Setting:
 
     @property
     def cbf(self) -> str:
-        """The CBF as text."""
+        """Return the text of the CBF."""
         return f"cbf:alpha={self.alpha}"
 
     def options(self, sample: Sample) -> dict[str, Any]:
-        """Arguments of the env: a quick sample ends after 5 s at the latest."""
+        """Return the environment's arguments: a quick sample ends after 5 s at the latest."""
         return {"start": self.start, "horizon": sample.work(round(2 * self.horizon)) / 2}
 
-    def told(self, sample: Sample) -> str:
-        """In words."""
+    def describe(self, sample: Sample) -> str:
+        """Return it in words."""
         where = {"near-origin": "from (.1 rad, .1 rad/s)", "uniform": "uniform in C"}[self.start]
         return (
             f"{self.name}: {where}, {self.options(sample)['horizon']:g} s, CBF with alpha(h) ="
@@ -85,12 +78,14 @@ class Setting:
         )
 
 
-A = Setting("A", "uniform", 2.0, 5.0, 5.0)
-B = Setting("B", "near-origin", 20.0, 1.0, 40.0)
+A, B = (
+    PendulumSetting(name, *values) for name, values in CHAPTER.settings["pendulum_settings"].items()
+)
 
 
-def _table(sample: Sample) -> Outcome:
-    learned = lessons(ENV, NOISE, sample)
+def compute_table(sample: Sample) -> Outcome:
+    """Compute Table 5.1 in both settings."""
+    learned = repeated(ENV, NOISE, sample)
     found = {
         each: measured(
             ENV, each.options(sample), [each.cbf, WITHOUT, "scbf"], models(learned), sample
@@ -104,13 +99,13 @@ def _table(sample: Sample) -> Outcome:
     return Outcome(
         numbers=main.numbers,
         claims=main.claims,
-        elsewhere={A.told(sample): other},
-        as_printed=[literal.number("DDSCBF", PRINTED["DDSCBF"])],
+        alternative_settings={A.describe(sample): other},
+        printed_formula=[literal.number("DDSCBF", PRINTED["DDSCBF"])],
         data={each.name: {text: run.curve for text, run in found[each].items()} for each in (B, A)},
         notes=[
             in_other_setting(other),
-            gap(runs, B.cbf, "in B"),
-            gap(others, A.cbf, "in A"),
+            explain_gap(runs, B.cbf, "in B"),
+            explain_gap(others, A.cbf, "in A"),
             _by_printed_estimator(learned, sample),
             _sampled(sample),
             *([] if sample.quick else [_horizons(each, sample) for each in (B, A)]),
@@ -119,15 +114,17 @@ def _table(sample: Sample) -> Outcome:
     )
 
 
-def _quiet(setting: Setting, sample: Sample) -> Runs:
-    """The CBF on the same episodes without noise."""
+def _quiet(setting: PendulumSetting, sample: Sample) -> MeasuredFilter:
+    """Return the rate of the CBF on the same episodes without noise."""
     return measured(ENV, {**setting.options(sample), "noise": 0.0}, [setting.cbf], [], sample)[
         setting.cbf
     ]
 
 
-def outcome_of(setting: Setting, runs: dict[str, Runs], quiet: Runs) -> Outcome:
-    """Numbers and claims in a setting.
+def outcome_of(
+    setting: PendulumSetting, runs: dict[str, MeasuredFilter], quiet: MeasuredFilter
+) -> Outcome:
+    """Return numbers and claims in a setting.
 
     Args:
         setting: which.
@@ -157,7 +154,6 @@ def outcome_of(setting: Setting, runs: dict[str, Runs], quiet: Runs) -> Outcome:
             "the noise makes trajectories unsafe with the CBF that are safe without it",
             quiet,
             cbf,
-            printed=True,
         ),
         Claim(above, ddscbf.rate > THRESHOLD, f"{ddscbf.rate:.1f} % [{low:.1f}, {high:.1f}]"),
         close(runs, PRINTED["SCBF"], PRINTED["DDSCBF"]),
@@ -166,7 +162,7 @@ def outcome_of(setting: Setting, runs: dict[str, Runs], quiet: Runs) -> Outcome:
 
 
 def in_other_setting(other: Outcome) -> str:
-    """What would be said of the print, had the other setting been taken as the main one."""
+    """Return the verdict's reasons had the other setting been the main one, in words."""
     apart = [text for number in other.numbers if (text := disagreement(number))]
     failed = [
         f"it does not hold that {claim.sentence}"
@@ -174,14 +170,14 @@ def in_other_setting(other: Outcome) -> str:
         if claim.printed and not claim.holds
     ]
     return (
-        "A and B had both been computed before B was taken for the main one; in A:"
-        f" {'; '.join([*apart, *failed]) or 'all as printed'}"
+        "A and B had both been computed before B was taken as the main setting; in A:"
+        f" {'; '.join([*apart, *failed]) or 'all as in the thesis'}"
     )
 
 
-def _by_printed_estimator(learned: list[Lesson], sample: Sample) -> str:
+def _by_printed_estimator(learned: list[Identification], sample: Sample) -> str:
     printed = models(learned, "printed")
-    options = ({**A.options(sample), **box} for box in ({}, {"box": UNBOUNDED}))
+    options = ({**A.options(sample), **box} for box in ({}, {"box": _UNBOUNDED}))
     boxed, free = (measured(ENV, each, [], printed, sample)["ddscbf"].rate for each in options)
     return (
         f"DDSCBF by the printed estimator in A: {boxed:.1f} % safe with a torque within 5 N m,"
@@ -191,53 +187,45 @@ def _by_printed_estimator(learned: list[Lesson], sample: Sample) -> str:
 
 
 def _sampled(sample: Sample) -> str:
-    """What the CBF of A loses to the control period alone."""
+    """Return what the CBF of A loses to the control period alone, in words."""
     ahead = f"{A.cbf}:sampling_margin=first-order"
     said = []
     for where, noise in (("without noise", 0.0), ("with it", NOISE)):
         found = measured(ENV, {**A.options(sample), "noise": noise}, [A.cbf, ahead], [], sample)
-        bare, least = found[A.cbf], found[A.cbf].row.min_h_median
+        plain = found[A.cbf]
         said.append(
-            f"{where} {bare.rate:.1f} % (median of the least h {least:.1g}), with a margin for it"
+            f"{where} {plain.rate:.1f} % (median of the minimum h {plain.row.min_h_median:.1g}),"
+            " with a margin for it"
             f" {found[ahead].rate:.1f} %"
         )
     return f"the CBF is held for 10 ms; safe in A: {'; '.join(said)}"
 
 
-def _horizons(setting: Setting, sample: Sample) -> str:
-    """Up to which horizons the printed rates of SCBF and CBF come out."""
+def _horizons(setting: PendulumSetting, sample: Sample) -> str:
+    """Return up to which horizons the printed rates of SCBF and CBF are reproduced, in words."""
     found = measured(
         ENV, {"start": setting.start, "horizon": setting.longest}, [setting.cbf, "scbf"], [], sample
     )
     agreeing = []
     for name, text in (("SCBF", "scbf"), ("CBF", setting.cbf)):
-        row = found[text].row
-        numbers = [
-            Number.rate("", safe, row.episodes, PRINTED[name], EPISODES) for safe in row.curve.safe
-        ]
-        agreeing.append(
-            {t for t, n in zip(row.curve.time, numbers, strict=True) if disagreement(n) is None}
-        )
+        numbers = found[text].at_each_horizon(PRINTED[name])
+        times = found[text].curve["time"]
+        agreeing.append({t for t, n in zip(times, numbers, strict=True) if disagreement(n) is None})
     both, tried = sorted(agreeing[0] & agreeing[1]), len(found["scbf"].row.curve.time)
     said = f"{len(both)} of {tried} horizons up to {setting.longest:g} s" + (
         f", from {both[0]:.3g} to {both[-1]:.3g} s" if both else ""
     )
-    return f"{setting.name}: the printed rates of SCBF and of CBF both come out at {said}"
+    return f"{setting.name}: the printed rates of SCBF and of CBF both are reproduced at {said}"
 
 
-def _bounds(first: Lesson, scbf: Runs, sample: Sample) -> list[str]:
-    """What Prop. 4.2.8 gives, and what Prop. 5.2.2 asks for at the origin."""
+def _bounds(first: Identification, scbf: MeasuredFilter, sample: Sample) -> list[str]:
+    """Return what Prop. 4.2.8 gives, and what Prop. 5.2.2 asks for at the origin, in words."""
     problem, model = load_problem(ENV, B.options(sample)), first.learned["martingale"]
     margin = next(iter(model.record.errors.values()))
-    slack = float(
-        np.max(
-            SafetyFilter.for_problem(problem, DDSCBF(model, margin=margin))
-            .filter([0.0, 0.0], [0.0])
-            .slack
-        )
-    )
+    answer = SafetyFilter.for_problem(problem, DDSCBF(model, margin=margin))
+    slack = float(np.max(answer.filter([0.0, 0.0], [0.0]).slack))
     met = (
-        f"misses the condition by {slack:.2g} 1/s, so that h/sup h does not apply to DDSCBF"
+        f"violates the condition by {slack:.2g} 1/s, so that h/sup h does not apply to DDSCBF"
         if slack > 0.0
         else "meets the condition"
     )
@@ -260,55 +248,25 @@ def _bounds(first: Lesson, scbf: Runs, sample: Sample) -> list[str]:
 
 
 def printed_term(theta: Any) -> Any:
-    """Eq. (5.19) at sigma = .1."""
+    """Return Eq. (5.19) at sigma = .1, for theta in rad."""
     return -math.sqrt(3) * (0.1 * theta) ** 2
 
 
-def _table_setting(sample: Sample) -> tuple[str, ...]:
-    return (
-        f"{B.told(sample)}; no violation at any control instant, dt = 10 ms",
-        (
-            f"{sample.size(EPISODES)} episodes, the same for all filters, with no nominal torque;"
-            f" DDSCBF over {identifications(sample)} identifications"
-        ),
-    )
+def _table_values(sample: Sample) -> dict[str, Any]:
+    return {
+        "main": B.describe(sample),
+        "count": sample.size(EPISODES),
+        "identifications": identifications(sample),
+    }
 
 
 ARTEFACTS: tuple[Artefact, ...] = (
-    Artefact(
-        name="figure-5.1",
-        title="Learned noise part of the generator, pendulum",
-        compute=partial(learning_outcome, ENV, NOISE, 0, "-sqrt(3) (.1 theta)^2", printed_term),
-        setting=partial(learning_setting, where="C", noise=f"sigma = {NOISE:g} theta"),
-        chosen=(
-            (
-                "tanh, Adam 1e-3, batches of 32, standardised inputs and targets; 70 % of the"
-                " states train"
-            ),
-        ),
-        corrections=(*FIT_ERRATA, "Eq. (5.19): the trace is malformed, its value is right"),
-        draw=draw_learning,
-        size=(7.5, 3.8),
+    CHAPTER.artefact(
+        "figure-5.1",
+        partial(learning_outcome, ENV, NOISE, 0, "-sqrt(3) (.1 theta)^2", printed_term),
+        partial(learning_values, region="C", law=f"sigma = {NOISE:g} theta"),
+        draw_learning,
+        (7.5, 3.8),
     ),
-    Artefact(
-        name="table-5.1",
-        title="Safety rates of SCBF, DDSCBF and CBF, pendulum",
-        compute=_table,
-        setting=_table_setting,
-        chosen=(
-            "mass 1 kg, torque within 5 N m",
-            (
-                "start, horizon and the rate of the CBF: both A and B were computed before B was"
-                " taken for the main one; A is beside it"
-            ),
-            "CBF with alpha = 0 beside the others",
-        ),
-        corrections=(
-            (
-                "Eq. (5.17), (5.18): the estimator without its bias and with far less noise, see"
-                " Figure 5.1"
-            ),
-            "Prop. 5.2.2: no margin, which cannot be met where h is largest",
-        ),
-    ),
+    CHAPTER.artefact("table-5.1", compute_table, _table_values),
 )

@@ -1,17 +1,16 @@
-"""The measured rates of Table 6.2 beside the worst case h/c, and at one horizon for both starts."""
+"""The measured rates of Table 6.2 against the worst case h/c, and at one horizon for both starts."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from safe_envs.agents.evaluation.rows import EpisodeSummary
-from safe_envs.scripts.reproduce.chapter_6.learned_controllers import PRINTED_EPISODES
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
+from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
 
 
 def above_worst(horizon: float, each: Mapping[str, tuple[Sequence[Number], float]]) -> Claim:
-    """That measured rates are above the worst case, by the lower ends of their intervals.
+    """Return the claim that measured rates are above the worst case, by the ends of their intervals.
 
     Args:
         horizon: up to which they were measured, in s.
@@ -32,7 +31,7 @@ def above_worst(horizon: float, each: Mapping[str, tuple[Sequence[Number], float
 
 
 def worst_for_ever(seconds: float, each: Mapping[str, tuple[Number, float]]) -> Claim:
-    """That no rate falls below the worst case in a long time, by the upper ends of the intervals.
+    """Return the claim that no rate falls below the worst case in a long time.
 
     Args:
         seconds: how long.
@@ -48,20 +47,16 @@ def worst_for_ever(seconds: float, each: Mapping[str, tuple[Number, float]]) -> 
     )
 
 
-def at_one_horizon(
-    first: EpisodeSummary, second: EpisodeSummary, printed: tuple[float, float]
-) -> str:
-    """Whether the rates from two starts are the printed ones at the same horizon, in words.
+def at_one_horizon(first: MeasuredFilter, second: MeasuredFilter, printed: Sequence[float]) -> str:
+    """Return whether the rates from two starts are the printed ones at one horizon, in words.
 
     Args:
         first: what was measured from the first start, with its curve of rates over the horizon.
         second: the same from the second one.
         printed: of both, in per cent.
     """
-    times, curves = (
-        first.curve.time,
-        [_rates(row, at) for row, at in zip((first, second), printed, strict=True)],
-    )
+    times = first.row.curve.time
+    curves = [each.at_each_horizon(p) for each, p in zip((first, second), printed, strict=True)]
     both = [
         time for time, *pair in zip(times, *curves, strict=True) if not any(map(disagreement, pair))
     ]
@@ -75,12 +70,6 @@ def at_one_horizon(
         f"At none of {len(times)} instants up to T = {times[-1]:g} s has the SCBF both printed"
         f" rates: from the first start it is nearest to {printed[0]:g} % at T = {times[k]:.2f} s,"
         f" with {curves[0][k].ours:.1f} %, and has {curves[1][k].ours:.1f} % from the second one"
-        f" then, {printed[1]:g} % in print. At longer horizons it has no more than"
+        f" then, {printed[1]:g} % in the thesis. At longer horizons it has no more than"
         f" {curves[0][-1].ours:.1f} % from the first start."
     )
-
-
-def _rates(row: EpisodeSummary, printed: float) -> list[Number]:
-    return [
-        Number.rate("", safe, row.episodes, printed, PRINTED_EPISODES) for safe in row.curve.safe
-    ]

@@ -1,5 +1,4 @@
-"""What a table or figure of the thesis is here: what is printed, how ours is computed and drawn,
-and what came out."""
+"""A table or figure of the thesis: printed numbers, how ours is computed and drawn, and its outcome."""
 
 from __future__ import annotations
 
@@ -34,18 +33,25 @@ class Sample:
             require_whole("episodes", self.episodes, 1)
 
     def size(self, full: int) -> int:
-        """Episodes, or other repetitions that make the answer more certain, where the full work has
-        so many."""
+        """Return the number of episodes, or of other repetitions that narrow the intervals.
+
+        Args:
+            full: their number in the full work.
+        """
         return self.episodes or self.work(full)
 
     def work(self, full: int) -> int:
-        """Points, epochs or other work that is the same for any number of episodes."""
+        """Return an amount of work that does not depend on the number of episodes, such as epochs.
+
+        Args:
+            full: in the full work.
+        """
         return max(full // 20, min(full, 10)) if self.quick else full
 
 
 @dataclass(frozen=True)
 class Number:
-    """A number of ours, beside the printed one if there is one.
+    """A number of ours, with the printed one if there is one.
 
     Attributes:
         name: what it is of, unique in its artefact.
@@ -74,7 +80,7 @@ class Number:
         printed: float | None = None,
         printed_trials: int | None = None,
     ) -> Number:
-        """A safety rate in per cent, with its interval.
+        """Return a safety rate in per cent, with its interval.
 
         Args:
             name: see the class.
@@ -95,8 +101,7 @@ class Number:
         least: float = -math.inf,
         most: float = math.inf,
     ) -> Number:
-        """The mean of a quantity over independent repetitions, such as learnings, starts or
-        episodes, with Student's interval.
+        """Return the mean over independent repetitions, such as episodes, with Student's interval.
 
         Args:
             name: see the class.
@@ -132,31 +137,31 @@ class Claim:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out. JSON-able.
+    """The outcome of an artefact, as JSON-able data.
 
     Attributes:
         numbers: of the artefact.
         claims: of its figure and of the text about it.
-        elsewhere: the same numbers and claims with other settings, by a name that says which.
-        as_printed: the same numbers by the printed formula, where that is wrong.
+        alternative_settings: the same numbers and claims with other settings, by a name that says which.
+        printed_formula: the same numbers by the printed formula, where that is wrong.
         data: what the picture shows, lists by name.
         notes: what else a reader should know, computed where it holds numbers.
     """
 
     numbers: list[Number] = field(default_factory=list)
     claims: list[Claim] = field(default_factory=list)
-    elsewhere: dict[str, Outcome] = field(default_factory=dict)
-    as_printed: list[Number] = field(default_factory=list)
+    alternative_settings: dict[str, Outcome] = field(default_factory=dict)
+    printed_formula: list[Number] = field(default_factory=list)
     data: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
     def document(self) -> dict[str, Any]:
-        """As JSON holds it."""
+        """Return all of it as JSON-able data."""
         return asdict(self)
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> Outcome:
-        """Read what `document` wrote.
+        """Return the outcome that `document` wrote.
 
         Raises:
             AttributeError, ArithmeticError, LookupError, TypeError, ValueError: it is of another
@@ -168,15 +173,18 @@ class Outcome:
         return cls(
             [_typed(Number, row) for row in document["numbers"]],
             [_typed(Claim, row) for row in document["claims"]],
-            {name: cls.from_document(other) for name, other in document["elsewhere"].items()},
-            [_typed(Number, row) for row in document["as_printed"]],
+            {
+                name: cls.from_document(other)
+                for name, other in document["alternative_settings"].items()
+            },
+            [_typed(Number, row) for row in document["printed_formula"]],
             data,
             notes,
         )
 
 
 def _typed(kind: type, row: dict[str, Any]) -> Any:
-    """A number or claim of an object of JSON, whose entries have the types of its attributes."""
+    """Return the number or claim of a JSON object whose entries have the types of its attributes."""
     hints = get_type_hints(kind)
     for name, value in row.items():
         # JSON does not tell 1.0 from 1.
@@ -198,9 +206,9 @@ class Artefact:
         title: what it shows, in our words.
         compute: does the work, with the project's public API only.
         setting: how, by what is simulated.
-        chosen: what the print leaves open, and what we take.
-        corrections: errors of the print that are not in ours, with the thesis' equation.
-        argument: why the print cannot be reproduced, for a verdict that says so.
+        assumptions: what the thesis leaves open, and what we take.
+        errata: errors of the thesis that are not in ours, with the equation.
+        argument: why it cannot be reproduced, for a verdict that says so.
         draw: fills an empty figure from the outcome; None for a table.
         size: of the figure, in inches.
     """
@@ -209,8 +217,8 @@ class Artefact:
     title: str
     compute: Callable[[Sample], Outcome]
     setting: Callable[[Sample], tuple[str, ...]]
-    chosen: tuple[str, ...] = ()
-    corrections: tuple[str, ...] = ()
+    assumptions: tuple[str, ...] = ()
+    errata: tuple[str, ...] = ()
     argument: str = ""
     draw: Callable[[Figure, Outcome], None] | None = None
     size: tuple[float, float] = (7.0, 4.2)

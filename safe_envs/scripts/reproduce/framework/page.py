@@ -33,23 +33,25 @@ class _Entry:
 
     @property
     def settings(self) -> list[tuple[str, Sequence[Number]]]:
-        """The tables of numbers, with their headings."""
+        """Return the tables of numbers, with their headings."""
         tables = [
             ("", self.outcome.numbers),
             *(
                 (f"Other setting: {name}", found.numbers)
-                for name, found in self.outcome.elsewhere.items()
+                for name, found in self.outcome.alternative_settings.items()
             ),
         ]
-        tables.append(("By the printed formula", self.outcome.as_printed))
+        tables.append(("By the printed formula", self.outcome.printed_formula))
         return [(heading, numbers) for heading, numbers in tables if numbers]
 
     @property
     def checks(self) -> list[tuple[str, list[Claim]]]:
-        """Claims of the thesis and checks of ours, with their headings; those of another setting by
-        its name."""
+        """Return claims of the thesis and checks of ours, with their headings.
+
+        Those of another setting carry its name.
+        """
         claims = [*self.outcome.claims]
-        for name, found in self.outcome.elsewhere.items():
+        for name, found in self.outcome.alternative_settings.items():
             claims += [
                 replace(claim, sentence=f"{claim.sentence} (other setting: {name})")
                 for claim in found.claims
@@ -96,7 +98,7 @@ def _is_html(name: str | None) -> bool:
 
 
 def _picture(folder: Path, artefact: Artefact) -> str:
-    """The picture as text for a page without other files."""
+    """Return the picture as text, for a page without other files."""
     if artefact.draw is None:
         return ""
     light, path = io.BytesIO(), folder / f"{artefact.name}.png"
@@ -132,7 +134,7 @@ def _printed(number: Number) -> str:
 
 
 def _cell(text: str) -> str:
-    """As a cell of a Markdown table."""
+    """Return a text as a cell of a Markdown table."""
     return text.replace("|", "\\|")
 
 

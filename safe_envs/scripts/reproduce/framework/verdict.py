@@ -1,4 +1,4 @@
-"""Whether the print comes out, decided from the numbers by stated rules."""
+"""Whether an artefact is reproduced, decided from the numbers by stated rules."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from safe_envs.scripts.reproduce.framework.artefact import Artefact, Number, Out
 
 
 class Verdict(StrEnum):
-    """What is said of an artefact; no others."""
+    """The verdicts on an artefact; there are no others."""
 
     REPRODUCED = "reproduced"
     ORDERING = "ordering reproduced"
-    ELSEWHERE = "reachable only with other settings"
+    ALTERNATIVE = "reachable only with other settings"
     NOT = "not reproducible"
     WRONG_FORMULA = "printed formula is wrong"
     NONE = "no verdict, for a quick run"
@@ -27,23 +27,23 @@ RULES = {
     Verdict.REPRODUCED: (
         "every claim of the thesis holds, every printed number agrees, and no order of printed"
         " numbers is turned. A rate agrees if the 95 % interval of its difference to the printed"
-        " one, at the printed sample size, holds 0, and ours is at most twice as wide as that of"
-        " the print; another number, if the printed one is inside our 95 % interval. An order"
+        " one, at the printed sample size, holds 0, and ours is at most twice as wide as the"
+        " thesis'; another number, if the printed one is inside our 95 % interval. An order"
         " counts if the printed sample sizes can tell the two numbers apart at 95 %"
     ),
     Verdict.ORDERING: (
         "some number does not agree, but every claim holds, and no order of printed numbers is"
         " turned"
     ),
-    Verdict.ELSEWHERE: (
+    Verdict.ALTERNATIVE: (
         "neither of the above, but with the settings that are named every printed number agrees, no"
         " order is turned, and the claims that are looked at there hold, among them all that do not"
         " hold otherwise"
     ),
-    Verdict.NOT: "none of the above; the argument stands beside it, if one is known",
+    Verdict.NOT: "none of the above; the argument is given, if one is known",
     Verdict.WRONG_FORMULA: (
-        "said besides: a number by the printed formula is outside our interval by the corrected"
-        " one. It gives the print where its numbers agree with the printed ones"
+        "said in addition: a number by the printed formula is outside our interval by the corrected"
+        " one. It gives the thesis' numbers where these agree with them"
     ),
     Verdict.NONE: "a twentieth of the work shows that it works, and not what comes out",
 }
@@ -60,29 +60,37 @@ class Judgement:
     Attributes:
         verdict: the main one.
         wrong_formula: whether the printed formula gives something else than the corrected one.
-        gives_print: whether the numbers by the printed formula agree with the printed ones.
-        reasons: what the verdict rests on.
+        matches_thesis: whether the numbers by the printed formula agree with the printed ones.
+        reasons: of the verdict.
     """
 
     verdict: Verdict
     wrong_formula: bool = False
-    gives_print: bool = False
+    matches_thesis: bool = False
     reasons: tuple[str, ...] = ()
 
     @property
     def text(self) -> str:
-        """The verdict in words."""
-        besides = f"; {Verdict.WRONG_FORMULA}" if self.wrong_formula else ""
-        return f"{self.verdict}{besides}{', and gives the print' if besides and self.gives_print else ''}"
+        """Return the verdict in words."""
+        if not self.wrong_formula:
+            return self.verdict.value
+        matches = ", and gives the thesis' numbers" if self.matches_thesis else ""
+        return f"{self.verdict}; {Verdict.WRONG_FORMULA}{matches}"
 
     @property
     def mood(self) -> str:
-        """How good that is: "good", "middle" or "bad"."""
+        """Return how good that is: "good", "middle" or "bad"."""
         return {Verdict.REPRODUCED: "good", Verdict.NOT: "bad"}.get(self.verdict, "middle")
 
 
 def judge(artefact: Artefact, outcome: Outcome, sample: Sample) -> Judgement:
-    """Apply `RULES` to what came out of a sample."""
+    """Return the verdict by `RULES`.
+
+    Args:
+        artefact: that was computed.
+        outcome: of it.
+        sample: how much was simulated.
+    """
     if sample.quick:
         return Judgement(Verdict.NONE)
     apart = [text for number in outcome.numbers if (text := disagreement(number))]
@@ -95,7 +103,11 @@ def judge(artefact: Artefact, outcome: Outcome, sample: Sample) -> Judgement:
         *(f"{first.name} is not above {second.name}" for first, second in turned),
     ]
     other = next(
-        (name for name, found in outcome.elsewhere.items() if _reached(found, outcome, failed)),
+        (
+            name
+            for name, found in outcome.alternative_settings.items()
+            if _reached(found, outcome, failed)
+        ),
         None,
     )
     if not reasons and _says_something(outcome):
@@ -103,15 +115,18 @@ def judge(artefact: Artefact, outcome: Outcome, sample: Sample) -> Judgement:
     elif orders and not turned and not failed:
         verdict = Verdict.ORDERING
     elif other is not None:
-        verdict, reasons = Verdict.ELSEWHERE, [*reasons, f"agrees with the other setting: {other}"]
+        verdict, reasons = (
+            Verdict.ALTERNATIVE,
+            [*reasons, f"agrees with the other setting: {other}"],
+        )
     else:
         verdict, reasons = (
             Verdict.NOT,
             [*reasons, *([artefact.argument] if artefact.argument else [])],
         )
-    wrong = [number for number in outcome.as_printed if not _same(number, outcome.numbers)]
+    wrong = [number for number in outcome.printed_formula if not _same(number, outcome.numbers)]
     reasons += [f"by the printed formula {n.name} is {n.ours:.3g}{_unit(n)}" for n in wrong]
-    return Judgement(verdict, bool(wrong), _gives_print(outcome), tuple(reasons))
+    return Judgement(verdict, bool(wrong), _matches_thesis(outcome), tuple(reasons))
 
 
 def _says_something(outcome: Outcome) -> bool:
@@ -121,8 +136,7 @@ def _says_something(outcome: Outcome) -> bool:
 
 
 def disagreement(number: Number) -> str | None:
-    """Why a printed number and ours may not be the same; None where they may be, or none is
-    printed."""
+    """Return why a printed number and ours differ; None where they may agree or none is printed."""
     if number.printed is None:
         return None
     text = (
@@ -143,8 +157,10 @@ def disagreement(number: Number) -> str | None:
 
 
 def printed_orders(numbers: Sequence[Number]) -> list[tuple[Number, Number]]:
-    """Pairs of printed numbers of one unit, the larger first, that the printed sample sizes can
-    tell apart."""
+    """Return pairs of printed numbers of one unit that the printed sample sizes can tell apart.
+
+    The larger number comes first.
+    """
     return [(a, b) for a, b in permutations(numbers, 2) if a.unit == b.unit and _is_above(a, b)]
 
 
@@ -163,7 +179,7 @@ def _turned(orders: Sequence[tuple[Number, Number]]) -> list[tuple[Number, Numbe
 
 
 def _reached(found: Outcome, outcome: Outcome, failed: Sequence[str]) -> bool:
-    """Whether another setting gives all that is printed, and what does not hold otherwise."""
+    """Return whether another setting gives all that is printed, and what does not hold otherwise."""
     claims = {claim.sentence: claim.holds for claim in found.claims if claim.printed}
     names = {number.name for number in found.numbers if number.printed is not None}
     return (
@@ -175,16 +191,19 @@ def _reached(found: Outcome, outcome: Outcome, failed: Sequence[str]) -> bool:
     )
 
 
-def _gives_print(outcome: Outcome) -> bool:
-    """Whether numbers by the printed formula agree with the printed ones, where there are both."""
+def _matches_thesis(outcome: Outcome) -> bool:
+    """Return whether numbers by the printed formula agree with the printed ones."""
     printed = {number.name: number for number in outcome.numbers}
-    both = [n if n.printed is not None else _beside(n, printed[n.name]) for n in outcome.as_printed]
+    both = [
+        n if n.printed is not None else _compared(n, printed[n.name])
+        for n in outcome.printed_formula
+    ]
     both = [number for number in both if number.printed is not None]
     return bool(both) and not any(map(disagreement, both))
 
 
-def _beside(number: Number, other: Number) -> Number:
-    """A number with what is printed of another one."""
+def _compared(number: Number, other: Number) -> Number:
+    """Return a number with the printed value of another one."""
     return replace(number, printed=other.printed, printed_trials=other.printed_trials)
 
 
@@ -195,7 +214,7 @@ def _same(printed_form: Number, numbers: Sequence[Number]) -> bool:
 
 
 def _ends(number: Number) -> tuple[float, float]:
-    """Of our interval; the number itself where it has none."""
+    """Return the ends of our interval; the number itself where it has none."""
     return (
         (number.ours, number.ours)
         if number.low is None or number.high is None
@@ -211,7 +230,7 @@ def _printed_ends(rate: float, trials: int) -> tuple[float, float]:
 def _difference(
     first: tuple[float, float, float], second: tuple[float, float, float]
 ) -> tuple[float, float]:
-    """The interval of the difference of two independent quantities, each with its interval.
+    """Return the interval of the difference of two independent quantities, each with its own.
 
     Source: R. G. Newcombe, Interval estimation for the difference between independent proportions,
         Statistics in Medicine 17 (1998) 873-890, method 10.

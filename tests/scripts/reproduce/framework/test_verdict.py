@@ -99,41 +99,66 @@ def test_orders_are_those_that_the_printed_samples_can_tell_apart():
         # Equal ones are turned, too.
         (Outcome(rates(75, 75)), Verdict.NOT),
         (
-            Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60))}),
-            Verdict.ELSEWHERE,
+            Outcome(rates(20, 40), alternative_settings={"more noise": Outcome(rates(88, 60))}),
+            Verdict.ALTERNATIVE,
         ),
-        (Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 20))}), Verdict.NOT),
-        (Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(75, 75))}), Verdict.NOT),
-        (Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60)[:1])}), Verdict.NOT),
         (
-            Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60), [SAID_NOT])}),
+            Outcome(rates(20, 40), alternative_settings={"more noise": Outcome(rates(88, 20))}),
             Verdict.NOT,
         ),
         (
-            Outcome(rates(20, 40), [SAID_NOT], elsewhere={"more noise": Outcome(rates(88, 60))}),
+            Outcome(rates(20, 40), alternative_settings={"more noise": Outcome(rates(75, 75))}),
+            Verdict.NOT,
+        ),
+        (
+            Outcome(rates(20, 40), alternative_settings={"more noise": Outcome(rates(88, 60)[:1])}),
             Verdict.NOT,
         ),
         (
             Outcome(
-                rates(20, 40), [SAID_NOT], elsewhere={"more noise": Outcome(rates(88, 60), [SAID])}
-            ),
-            Verdict.ELSEWHERE,
-        ),
-        (
-            Outcome(rates(20, 40), elsewhere={"more noise": Outcome(rates(88, 60), [CHECK_FAILS])}),
-            Verdict.ELSEWHERE,
-        ),
-        (
-            Outcome(
-                rates(20, 40), elsewhere={"more noise": Outcome([Number("nothing printed", 1.0)])}
+                rates(20, 40),
+                alternative_settings={"more noise": Outcome(rates(88, 60), [SAID_NOT])},
             ),
             Verdict.NOT,
         ),
-        (Outcome(claims=[SAID_NOT], elsewhere={"more noise": claims(SAID)}), Verdict.ELSEWHERE),
+        (
+            Outcome(
+                rates(20, 40),
+                [SAID_NOT],
+                alternative_settings={"more noise": Outcome(rates(88, 60))},
+            ),
+            Verdict.NOT,
+        ),
+        (
+            Outcome(
+                rates(20, 40),
+                [SAID_NOT],
+                alternative_settings={"more noise": Outcome(rates(88, 60), [SAID])},
+            ),
+            Verdict.ALTERNATIVE,
+        ),
+        (
+            Outcome(
+                rates(20, 40),
+                alternative_settings={"more noise": Outcome(rates(88, 60), [CHECK_FAILS])},
+            ),
+            Verdict.ALTERNATIVE,
+        ),
+        (
+            Outcome(
+                rates(20, 40),
+                alternative_settings={"more noise": Outcome([Number("nothing printed", 1.0)])},
+            ),
+            Verdict.NOT,
+        ),
+        (
+            Outcome(claims=[SAID_NOT], alternative_settings={"more noise": claims(SAID)}),
+            Verdict.ALTERNATIVE,
+        ),
         (
             Outcome(
                 claims=[SAID_NOT],
-                elsewhere={"more noise": claims(replace(SAID, sentence="another"))},
+                alternative_settings={"more noise": claims(replace(SAID, sentence="another"))},
             ),
             Verdict.NOT,
         ),
@@ -148,7 +173,7 @@ def test_the_verdict_follows_from_the_numbers(outcome, verdict):
     assert judgement.verdict == verdict
     assert verdict in RULES
     assert ("agrees with the other setting: more noise" in judgement.reasons) is (
-        verdict == Verdict.ELSEWHERE
+        verdict == Verdict.ALTERNATIVE
     )
     assert (TABLE.argument in judgement.reasons) is (verdict == Verdict.NOT)
     assert judge(TABLE, outcome, Sample(quick=True)).verdict == Verdict.NONE
@@ -160,29 +185,31 @@ def test_orders_that_are_turned_are_named():
 
 def test_a_printed_formula_is_wrong_if_it_gives_another_number():
     ours = [*rates(88, 60), Number("exact", 2.0)]
-    for as_printed, wrong in (
+    for printed_formula, wrong in (
         (ours[0], False),
         (Number.rate("high", 10, 100), True),
         (Number.rate("high", 100, 100), True),
         (Number("exact", 3.0), True),
         (Number("exact", 2.0), False),
     ):
-        judgement = judge(TABLE, Outcome(ours, as_printed=[as_printed]), SAMPLE)
+        judgement = judge(TABLE, Outcome(ours, printed_formula=[printed_formula]), SAMPLE)
         assert judgement.wrong_formula is wrong
         assert judgement.text == "reproduced; printed formula is wrong" if wrong else "reproduced"
 
 
 def test_a_wrong_formula_that_gives_the_print_is_said_to():
     text = judge(
-        TABLE, Outcome(rates(40, 20), as_printed=[Number("high", 90.0, unit="%")]), SAMPLE
+        TABLE, Outcome(rates(40, 20), printed_formula=[Number("high", 90.0, unit="%")]), SAMPLE
     ).text
-    assert text == "ordering reproduced; printed formula is wrong, and gives the print"
+    assert text == "ordering reproduced; printed formula is wrong, and gives the thesis' numbers"
     own = Number("high", 35.0, printed=35.0, unit="%")
     assert judge(
-        TABLE, Outcome([Number("high", 27.0, unit="%"), rates(40, 20)[1]], as_printed=[own]), SAMPLE
-    ).gives_print
+        TABLE,
+        Outcome([Number("high", 27.0, unit="%"), rates(40, 20)[1]], printed_formula=[own]),
+        SAMPLE,
+    ).matches_thesis
     # What is outside the printed number's interval gives something else again.
     text = judge(
-        TABLE, Outcome(rates(40, 20), as_printed=[Number("high", 10.0, unit="%")]), SAMPLE
+        TABLE, Outcome(rates(40, 20), printed_formula=[Number("high", 10.0, unit="%")]), SAMPLE
     ).text
     assert text == "ordering reproduced; printed formula is wrong"

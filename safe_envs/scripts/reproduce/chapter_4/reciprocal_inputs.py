@@ -1,0 +1,93 @@
+"""Thesis Sec. 4.2.2: the inputs that reciprocal conditions allow towards the edge of the safe set."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from safe_envs.agents import load_problem
+from safe_envs.scripts.figures.evaluation_figure import COLORS
+from safe_envs.scripts.reproduce.framework.artefact import Claim
+from safe_envs.scripts.reproduce.framework.thesis_data import chapter
+from safe_envs.wrappers import SafetyFilter, parse_conditions
+
+CHAPTER = chapter(4)
+SETTINGS = CHAPTER.settings["scalar"]
+SCALAR = "safe_envs/Scalar-v0"
+GAMMA, NOISE = SETTINGS["gamma"], SETTINGS["noise"]
+UNBOUNDED = 1e12  # an input bound so wide that it never counts, 1/s
+DISTANCES = np.logspace(0, -6, 61)  # h at which the conditions are asked for the largest input
+_ROUNDING = 1e-6  # relative difference up to which two inputs are the same
+
+
+def largest_inputs(text: str, noise: float) -> np.ndarray:
+    """Return the largest u that a condition allows at each of `DISTANCES`.
+
+    It is the filter's answer to a far larger one.
+
+    Args:
+        text: of the condition.
+        noise: sigma of the scalar system, in 1/sqrt(s).
+    """
+    problem = load_problem(SCALAR, {"noise": noise, "box": [-UNBOUNDED, UNBOUNDED]})
+    answer = SafetyFilter.for_problem(problem, parse_conditions(text, problem))
+    state = (1.0 - DISTANCES)[:, None]
+    return answer.filter(state, np.full_like(state, UNBOUNDED)).action[:, 0]
+
+
+def claims_on_inputs(allowed: Mapping[str, np.ndarray]) -> list[Claim]:
+    """Return the claims of the printed inequalities, and of their limits at the edge.
+
+    Args:
+        allowed: the largest input that each condition allows at each of `DISTANCES`.
+    """
+    h, x = DISTANCES, 1.0 - DISTANCES
+    printed = {"RCBF": h**3 - x, "SRCBF": h**3 - x - NOISE**2 / h}
+    largest = max(
+        float(np.max(np.abs(allowed[name] - law) / np.maximum(np.abs(law), 1.0)))
+        for name, law in printed.items()
+    )
+    return [
+        Claim(
+            "both inequalities on u are right",
+            largest < _ROUNDING,
+            f"largest relative difference {largest:.1e}",
+        ),
+        _claim_on_edge(
+            "without noise the RCBF asks for bounded control at the edge",
+            allowed["RCBF"],
+            bounded=True,
+        ),
+        _claim_on_edge(
+            "under noise the SRCBF asks for unbounded control at the edge",
+            allowed["SRCBF"],
+            bounded=False,
+        ),
+    ]
+
+
+def _claim_on_edge(sentence: str, allowed: np.ndarray, bounded: bool) -> Claim:
+    """Return the claim by the power of h, to the nearest integer, with which the effort goes.
+
+    It is 0 where the effort is bounded, and less where it is not.
+    """
+    near, effort = np.log(DISTANCES[-20:]), np.log(np.abs(allowed[-20:]))
+    power = float(np.polyfit(near, effort, 1)[0])
+    evidence = (
+        f"it allows u = {allowed[-1]:.6g} at h = {DISTANCES[-1]:g}; |u| goes like"
+        f" h^{round(power, 3) + 0.0:.3f} there"
+    )
+    return Claim(sentence, (round(power) >= 0) == bounded, evidence)
+
+
+def draw_inputs(axes: Axes, data: dict[str, Any]) -> None:
+    """Draw the effort that each condition asks for, over h."""
+    near = np.array(data["h"]) < 0.5
+    h, what = np.array(data["h"])[near], ("no noise", rf"$\sigma$ = {NOISE:g}")
+    for (name, values), color, noise in zip(data["asked"].items(), COLORS[:2], what, strict=True):
+        axes.plot(h, -np.array(values)[near], color=color, linewidth=2, label=f"{name}, {noise}")
+    labels = {"xlabel": "h = 1 - x, edge at the left", "ylabel": "minimum effort -u (1/s)"}
+    axes.set(xscale="log", yscale="log", title="(a)", **labels)
