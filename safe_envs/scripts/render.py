@@ -13,7 +13,7 @@ import typer
 
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.figures.film import require_film, steps_a_frame, write_film
-from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options import evaluation_options, text_options
 from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
@@ -55,27 +55,11 @@ def render(
             ),
         ),
     ] = None,
-    policy: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME|FOLDER|FILE",
-            help=(
-                "nominal, clf, zero, random, a folder of `safe-envs train`, or with --trust a .zip"
-                " of Stable-Baselines3."
-            ),
-        ),
-    ] = "nominal",
+    policy: evaluation_options.Policy = "nominal",
     trust: text_options.Trust = False,
     seed: text_options.Seed = 0,
     knowledge: text_options.Knowledge = "model",
-    learned: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--learned",
-            metavar="FILE",
-            help="What `safe-envs identify` wrote, for the learned filters. Repeatable.",
-        ),
-    ] = None,
+    learned: evaluation_options.Learned = None,
     json_file: Json = None,
 ) -> None:
     """Draw an episode: the scene to scale, the safe set, the trail, and what the filter does to the
