@@ -18,7 +18,6 @@ from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:
-    from safe_envs.agents.policies.base import Policy
     from safe_envs.problem.problem import SafetyProblem
     from safe_envs.wrappers import Condition
 
@@ -146,7 +145,7 @@ class Run:
         name: of the filter, "none" without.
         conditions: of the filter, none for the bare env.
         problem: what is simulated.
-        actor: the policy; each run has its own.
+        actor: the policy, anything with Stable-Baselines3's `predict`; each run has its own.
         seed: of the start and of the noise.
         knowledge: of the filter.
     """
@@ -156,11 +155,12 @@ class Run:
         name: str,
         conditions: Sequence[Condition],
         problem: SafetyProblem,
-        actor: Policy,
+        actor: Any,
         seed: int,
         knowledge: str,
     ) -> None:
         from safe_envs import SafeEnv
+        from safe_envs.agents.policies.base import Policy
         from safe_envs.wrappers import SafetyFilterWrapper
 
         self.name, self._actor = name, actor
@@ -170,7 +170,8 @@ class Run:
         )
         if self._world.viewer is not None:
             self._world.viewer.caption = f"filter {name}" if conditions else "no filter"
-        actor.begin(range(1), seed)
+        if isinstance(actor, Policy):
+            actor.begin(range(1), seed)
         self._observation, self._info = self._env.reset(seed=seed)
         self._state: Any = None
         self._dt, self._steps = problem.dt, 0
