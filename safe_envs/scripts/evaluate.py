@@ -38,8 +38,7 @@ def evaluate(
     episodes_out: of.EpisodesOut = None,
     plot: of.Plot = None,
 ) -> None:
-    """Print the safety rate of a policy under each filter with its interval, and compare the
-    filters pair by pair.
+    """Print the safety rate of a policy under each filter, and compare the filters in pairs.
 
     An episode is safe if every barrier is positive at every control instant, or with --monitoring
     continuous between them too. After an episode's first violation its interventions, infeasible

@@ -1,5 +1,4 @@
-"""`safe-envs render`: an episode as a video, an animation or a still, under one filter or several
-side by side."""
+"""`safe-envs render`: an episode as a video, an animation or a still, under some filters."""
 
 from __future__ import annotations
 
@@ -61,11 +60,10 @@ def render(
     learned: evaluation_options.Learned = None,
     json_file: Json = None,
 ) -> None:
-    """Draw an episode: the scene to scale, the safe set, the trail, and what the filter does to the
-    policy's actions.
+    """Draw an episode: the scene to scale, the safe set, the trail, and the filtered actions.
 
-    The episode is that of an env which is reset with the seed. Filters that rest on something
-    learned learn it first, unless --learned gives it.
+    The episode is that of an env which is reset with the seed. Learned filters are
+    learned first, unless --learned gives the model.
     """
     from safe_envs.registry import load_problem
 
@@ -120,8 +118,9 @@ def render(
 
 
 def split_filters(text: str) -> list[str]:
-    """The filters of --compare, each once: a comma divides two of them where the name of a filter
-    follows it.
+    """Return the filters of --compare, each once.
+
+    A comma divides two of them where the name of a filter follows it.
 
     Raises:
         ConfigurationError: one has no text.
@@ -143,7 +142,7 @@ class Run:
 
     Args:
         name: of the filter, "none" without.
-        conditions: of the filter, none for the bare env.
+        conditions: of the filter, none for the unfiltered env.
         problem: what is simulated.
         actor: the policy, anything with Stable-Baselines3's `predict`; each run has its own.
         seed: of the start and of the noise.
@@ -193,7 +192,7 @@ class Run:
             self._violated_at = self._steps * self._dt
 
     def frame(self) -> np.ndarray:
-        """A picture of where the episode is."""
+        """Return a picture of where the episode is."""
         return self._world.render()
 
     def summary(self) -> str:
@@ -205,12 +204,12 @@ class Run:
             else ""
         )
         return (
-            f"{self.name}: {safe}, least h {self._info['h_min']:.3g}{share},"
+            f"{self.name}: {safe}, minimum h {self._info['h_min']:.3g}{share},"
             f" {self._steps * self._dt:.2f} s"
         )
 
     def document(self) -> dict[str, Any]:
-        """The same, JSON-able."""
+        """Return the same as JSON-able data."""
         return {
             "filter": self.name,
             "violated_at": self._violated_at,
@@ -230,7 +229,7 @@ def make_runs(
     knowledge: str,
     learned: Sequence[Path],
 ) -> list[Run]:
-    """An episode for each filter, all with the same seed, at its start.
+    """Return an episode for each filter, all with the same seed, at its start.
 
     Raises:
         ConfigurationError: a filter or the policy is unknown or does not fit the problem.
@@ -260,8 +259,7 @@ def make_runs(
 def frames_of(
     runs: Sequence[Run], every: int, steps: int, tell: Callable[[float], None] | None
 ) -> Iterator[np.ndarray]:
-    """Pictures of the episodes side by side: at the start, after every so many steps, and at the
-    end.
+    """Yield pictures of the episodes side by side: first, after some steps each, and last.
 
     An episode that ended before the others stays as it was.
 
@@ -269,21 +267,21 @@ def frames_of(
         runs: the episodes.
         every: control periods from one picture to the next.
         steps: most control periods.
-        tell: told the part that is done.
+        tell: called with the part that is done.
     """
-    yield _beside(runs)
+    yield _side_by_side(runs)
     k = 0
     while not all(each.ended for each in runs):
         for each in runs:
             each.step()
         k += 1
         if k % every == 0 or all(each.ended for each in runs):
-            yield _beside(runs)
+            yield _side_by_side(runs)
         if tell:
             tell(k / steps)
 
 
-def _beside(runs: Sequence[Run]) -> np.ndarray:
+def _side_by_side(runs: Sequence[Run]) -> np.ndarray:
     return np.concatenate([each.frame() for each in runs], axis=1)
 
 

@@ -167,7 +167,7 @@ class WorkParts:
         self._progress, self._parts, self._begun = progress, parts, 0
 
     def part(self, whole: float = 1.0) -> Progress | None:
-        """Return the progress of the next part, which is called with how much of `whole` is done."""
+        """Return the progress of the next part, to be called with how much of `whole` is done."""
         before, self._begun = self._begun, self._begun + 1
         report = self._progress
         return (
@@ -176,7 +176,7 @@ class WorkParts:
 
 
 def _checked(name: str, problem: SafetyProblem) -> str | None:
-    """Return the text of a filter with all its parameters; None where it has to be learned first."""
+    """Return the text of a filter with all parameters; None where it has to be learned first."""
     if name == UNFILTERED:
         return UNFILTERED
     if UNFILTERED in name.split("+"):

@@ -18,7 +18,7 @@ from safe_envs.scripts.reports.evaluation_report import heading, print_evaluatio
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
 from safe_envs.wrappers import LEARNED
 
-NO_BOUND = "no bound for what rests on something learned"
+NO_BOUND = "no bound for learned filters"
 LEARNING = LearningSummary([], 1, 20, [], [], [], {}, [], [], rates=[0.9])
 OFTEN = replace(LEARNING, repeats=3, rates=[0.9, 0.5, 0.8])
 POSTERIOR_BOUND = PosteriorGuarantee(0.4, "", delta=0.1, shortfall=0.0, bias=0.0, supremum=1.0)
