@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
-from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.errors import ConfigurationError, nearest
+from safe_envs.rate_text import percent, percent_in
 from safe_envs.scripts.options import text_options
 from safe_envs.scripts.options.console import Json, stdout, write_result
 

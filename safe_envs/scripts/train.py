@@ -12,9 +12,9 @@ import typer
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.errors import ConfigurationError, shortened
 from safe_envs.number_text import real
+from safe_envs.rate_text import percent_in
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env

@@ -14,8 +14,8 @@ from rich.table import Table
 from rich.text import Text
 
 from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
-from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.rate_text import percent, percent_in
 from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.wrappers import spec_of
 from safe_envs.wrappers.verification.feasibility import SMALL, BarrierFindings, Part, Verification
