@@ -1,5 +1,4 @@
-"""Who acts, and how well: policies with Stable-Baselines3's `predict`, and the evaluation of
-filters.
+"""Policies with Stable-Baselines3's `predict`, and the evaluation of policies and filters.
 
 Nothing here imports torch or Stable-Baselines3 before an agent is trained, or a policy of that
 library is loaded.
@@ -7,8 +6,9 @@ library is loaded.
 
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate
+from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate, run_evaluation
 from safe_envs.agents.evaluation.refinement import Refinement, refine
+from safe_envs.agents.evaluation.spec import EvaluationSpec, RunSettings
 from safe_envs.agents.evaluation.statistics import (
     mcnemar_p,
     paired_difference_interval,
@@ -25,10 +25,12 @@ __all__ = [
     "POLICIES",
     "CLFController",
     "Evaluation",
+    "EvaluationSpec",
     "NominalController",
     "Policy",
     "RandomPolicy",
     "Refinement",
+    "RunSettings",
     "ZeroController",
     "evaluate",
     "make_policy",
@@ -38,6 +40,7 @@ __all__ = [
     "paired_difference_interval",
     "rate_interval",
     "refine",
+    "run_evaluation",
     "wilson_interval",
 ]
 

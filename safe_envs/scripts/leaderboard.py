@@ -9,6 +9,10 @@ from typing import Annotated
 import typer
 
 from safe_envs import ENV_IDS
+from safe_envs.atomic_io import write_json
+from safe_envs.bounded_reading import read_json
+from safe_envs.errors import ConfigurationError, shown
+from safe_envs.rate_text import percent_in
 from safe_envs.scripts.options import completion
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (

@@ -1,6 +1,4 @@
-"""`safe-envs render`: an episode as a video, an animation or a still, under one filter or several
-side by side.
-"""
+"""`safe-envs render`: an episode as a video, an animation or a still, under some filters."""
 
 from __future__ import annotations
 
@@ -14,13 +12,11 @@ import typer
 
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.figures.film import require_film, steps_a_frame, write_film
-from safe_envs.scripts.options import text_options
-from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
+from safe_envs.scripts.options import evaluation_options, text_options
+from safe_envs.scripts.options.console import Json, progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:
-    from safe_envs.agents.policies.base import Policy
     from safe_envs.problem.problem import SafetyProblem
     from safe_envs.wrappers import Condition
 
@@ -57,34 +53,17 @@ def render(
             ),
         ),
     ] = None,
-    policy: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME|FOLDER|FILE",
-            help=(
-                "nominal, clf, zero, random, a folder of `safe-envs train`, or with --trust a .zip"
-                " of Stable-Baselines3."
-            ),
-        ),
-    ] = "nominal",
+    policy: evaluation_options.Policy = "nominal",
     trust: text_options.Trust = False,
     seed: text_options.Seed = 0,
     knowledge: text_options.Knowledge = "model",
-    learned: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "--learned",
-            metavar="FILE",
-            help="What `safe-envs identify` wrote, for the learned filters. Repeatable.",
-        ),
-    ] = None,
+    learned: evaluation_options.Learned = None,
     json_file: Json = None,
 ) -> None:
-    """Draw an episode: the scene to scale, the safe set, the trail, and what the filter does to the
-    policy's actions.
+    """Draw an episode: the scene to scale, the safe set, the trail, and the filtered actions.
 
-    The episode is that of an env which is reset with the seed. Filters that rest on something
-    learned learn it first, unless --learned gives it.
+    The episode is that of an env which is reset with the seed. Learned filters are
+    learned first, unless --learned gives the model.
     """
     from safe_envs.registry import make_problem
 
@@ -139,17 +118,17 @@ def render(
 
 
 def split_filters(text: str) -> list[str]:
-    """The filters of --compare, each once: a comma divides two of them where the name of a filter
-    follows it.
+    """Return the filters of --compare, each once.
+
+    A comma divides two of them where the name of a filter follows it.
 
     Raises:
         ConfigurationError: one has no text.
     """
     from safe_envs.agents.evaluation.spec import UNFILTERED
-    from safe_envs.wrappers import CONDITIONS, LEARNED
+    from safe_envs.wrappers import head_pattern
 
-    names = "|".join(sorted((UNFILTERED, *CONDITIONS, *LEARNED), key=len, reverse=True))
-    found = [part.strip() for part in re.split(rf",(?=\s*(?:{names})\s*(?:[:+,]|$))", text)]
+    found = [part.strip() for part in re.split(rf",(?=\s*{head_pattern(UNFILTERED)})", text)]
     if not all(found):
         raise ConfigurationError(
             f"--compare {shown(text)} names no filter at one place; give names with commas between:"
@@ -163,9 +142,9 @@ class Run:
 
     Args:
         name: of the filter, "none" without.
-        conditions: of the filter, none for the bare env.
+        conditions: of the filter, none for the unfiltered env.
         problem: what is simulated.
-        actor: the policy; each run has its own.
+        actor: the policy, anything with Stable-Baselines3's `predict`; each run has its own.
         seed: of the start and of the noise.
         knowledge: of the filter.
     """
@@ -175,11 +154,12 @@ class Run:
         name: str,
         conditions: Sequence[Condition],
         problem: SafetyProblem,
-        actor: Policy,
+        actor: Any,
         seed: int,
         knowledge: str,
     ) -> None:
         from safe_envs import SafeEnv
+        from safe_envs.agents.policies.base import Policy
         from safe_envs.wrappers import SafetyFilterWrapper
 
         self.name, self._actor = name, actor
@@ -189,7 +169,8 @@ class Run:
         )
         if self._world.viewer is not None:
             self._world.viewer.caption = f"filter {name}" if conditions else "no filter"
-        actor.begin(range(1), seed)
+        if isinstance(actor, Policy):
+            actor.begin(range(1), seed)
         self._observation, self._info = self._env.reset(seed=seed)
         self._state: Any = None
         self._dt, self._steps = problem.dt, 0
@@ -211,7 +192,7 @@ class Run:
             self._violated_at = self._steps * self._dt
 
     def frame(self) -> np.ndarray:
-        """A picture of where the episode is."""
+        """Return a picture of where the episode is."""
         return self._world.render()
 
     def summary(self) -> str:
@@ -223,12 +204,12 @@ class Run:
             else ""
         )
         return (
-            f"{self.name}: {safe}, least h {self._info['h_min']:.3g}{share},"
+            f"{self.name}: {safe}, minimum h {self._info['h_min']:.3g}{share},"
             f" {self._steps * self._dt:.2f} s"
         )
 
     def document(self) -> dict[str, Any]:
-        """The same, JSON-able."""
+        """Return the same as JSON-able data."""
         return {
             "filter": self.name,
             "violated_at": self._violated_at,
@@ -248,55 +229,37 @@ def make_runs(
     knowledge: str,
     learned: Sequence[Path],
 ) -> list[Run]:
-    """An episode for each filter, all with the same seed, at its start.
+    """Return an episode for each filter, all with the same seed, at its start.
 
     Raises:
         ConfigurationError: a filter or the policy is unknown or does not fit the problem.
         RelativeDegreeError: a filter does not suit a barrier.
     """
-    from safe_envs.agents.evaluation.identification import Learning
-    from safe_envs.agents.evaluation.spec import UNFILTERED
+    from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+    from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
     from safe_envs.agents.policies.registry import make_policy
-    from safe_envs.errors import nearest, require_whole
-    from safe_envs.wrappers import require_known, require_readable
+    from safe_envs.wrappers import require_known
 
-    require_whole("seed", seed, 0)
-    if knowledge not in ("model", "plant"):
-        raise ConfigurationError(
-            f"knowledge = {shown(knowledge)}; {nearest(knowledge, ('model', 'plant'))}"
-        )
-    known = (UNFILTERED, *CONDITIONS, *LEARNED)
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.
-        for word in re.split("[:+]", name)[0].split(","):
-            if word.strip() not in known:
-                raise ConfigurationError(
-                    f"unknown filter {shown(word.strip())}; {nearest(word.strip(), known)}"
-                )
-        if name != UNFILTERED:
-            require_readable(name, problem)
-    actors = [make_policy(policy, problem, trust) for _ in names]
-    learning = Learning(problem, names, learned, 1, seed)
-    for method, repeat in learning.missing():
-        learning.learn(method, repeat, None)
+        words = [word.strip() for word in re.split("[:+]", name)[0].split(",")]
+        for word in words[:-1] and [word for word in words if word != UNFILTERED]:
+            require_known(word, UNFILTERED)
+    spec = EvaluationSpec(
+        problem, policy, names, learned=learned, trust=trust, seed=seed, knowledge=knowledge
+    )
+    resolved = ResolvedEvaluation(spec)
+    resolved.learn(lambda: None)
     return [
-        Run(
-            name,
-            () if name == UNFILTERED else learning.conditions(name, 0),
-            problem,
-            actor,
-            seed,
-            knowledge,
-        )
-        for name, actor in zip(names, actors, strict=True)
+        Run(name, conditions, problem, make_policy(policy, problem, trust), seed, knowledge)
+        for name, (conditions, *_) in resolved.filters.items()
     ]
 
 
 def frames_of(
     runs: Sequence[Run], every: int, steps: int, tell: Callable[[float], None] | None
 ) -> Iterator[np.ndarray]:
-    """Pictures of the episodes side by side: at the start, after every so many steps, and at the
-    end.
+    """Yield pictures of the episodes side by side: first, after some steps each, and last.
 
     An episode that ended before the others stays as it was.
 
@@ -304,21 +267,21 @@ def frames_of(
         runs: the episodes.
         every: control periods from one picture to the next.
         steps: most control periods.
-        tell: told the part that is done.
+        tell: called with the part that is done.
     """
-    yield _beside(runs)
+    yield _side_by_side(runs)
     k = 0
     while not all(each.ended for each in runs):
         for each in runs:
             each.step()
         k += 1
         if k % every == 0 or all(each.ended for each in runs):
-            yield _beside(runs)
+            yield _side_by_side(runs)
         if tell:
             tell(k / steps)
 
 
-def _beside(runs: Sequence[Run]) -> np.ndarray:
+def _side_by_side(runs: Sequence[Run]) -> np.ndarray:
     return np.concatenate([each.frame() for each in runs], axis=1)
 
 

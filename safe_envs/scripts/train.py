@@ -10,7 +10,9 @@ from typing import Annotated
 
 import typer
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shortened
+from safe_envs.number_text import real
+from safe_envs.rate_text import percent_in
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result

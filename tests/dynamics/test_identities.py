@@ -102,7 +102,7 @@ def test_noise_in_a_part_of_the_workspace_reaches_a_barrier():
     # 0).
     expected = [0.2, 0.5 * (0.4 - math.sqrt(2 * 0.1))]
     np.testing.assert_allclose(
-        bridge.lowest(states, ends, ends, np.ones((2, 1)))[:, 0], expected, rtol=1e-12
+        bridge.sample_minimum(states, ends, ends, np.ones((2, 1)))[:, 0], expected, rtol=1e-12
     )
 
 

@@ -132,7 +132,7 @@ def test_animations_run_in_real_time(tmp_path, seconds):
 def straightforward(
     env_id: str, seed: int, filter_name: str | None = None, knowledge: str = "model", **options
 ):
-    """What an env of the seed does under the random policy: the least h, and where and when it
+    """What an env of the seed does under the random policy: the minimum h, and where and when it
     ended and was unsafe first."""
     problem = problem_of(env_id, **options)
     env = (

@@ -1,6 +1,4 @@
-"""What a simulation says to the bounds of conditions: the measured safety over several horizons,
-and what it contradicts.
-"""
+"""The measured safety over several horizons, and the bounds that it contradicts."""
 
 from __future__ import annotations
 
@@ -81,8 +79,9 @@ class Measurement:
 def judged(
     bounds: Sequence[Bound], measurements: Sequence[Measurement], verification: Verification
 ) -> tuple[list[Bound], list[Measurement]]:
-    """Bounds and measurements without the values of what was estimated and is contradicted; see
-    `safe_envs.agents.evaluation.contradiction`.
+    """Withhold the values of what was estimated and is contradicted.
+
+    See `safe_envs.agents.evaluation.contradiction`.
 
     Args:
         bounds: at the start.
@@ -119,8 +118,9 @@ def measure(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> list[Measurement]:
-    """Simulate a policy under the conditions, from the problem's start and from where the printed
-    bound is largest.
+    """Simulate a policy under the conditions, and compare its safety with the bounds.
+
+    The starts are the problem's, and the one where the printed bound is largest.
 
     The horizons are the problem's times 1, 2, 5, ..., up to 20 or, if there is noise and a bound
     that is for ever, 500, as far as the simulation stays short. A bound is contradicted where the
@@ -133,7 +133,7 @@ def measure(
         policy: as for `evaluate`.
         episodes: for each start.
         seed: of all randomness.
-        progress: told the part of the work that is done, from 0 to 1.
+        progress: called with the part of the work that is done, from 0 to 1.
 
     Raises:
         ConfigurationError: as `evaluate`.
@@ -150,13 +150,13 @@ def measure(
         )
     found = []
     for i, (name, world) in enumerate(worlds):
-        told = None if progress is None else _part_of(progress, i / len(worlds), 1.0 / len(worlds))
-        found.append(_measure(verification, name, world, policy, episodes, seed, told))
+        part = None if progress is None else _part_of(progress, i / len(worlds), 1.0 / len(worlds))
+        found.append(_measure(verification, name, world, policy, episodes, seed, part))
     return _all_compared(found)
 
 
 def starts_of(problem: SafetyProblem, seed: int = 0) -> np.ndarray:
-    """The starts that bounds are averaged over, shape (B, n): one if they are all the same."""
+    """Return the starts that bounds are averaged over, shape (B, n); one if all are the same."""
     return draw_starts(problem, STARTS if problem.starts[problem.start].uniforms else 1, seed)
 
 
@@ -211,8 +211,9 @@ def _measure(
 
 
 def _runs(world: SafetyProblem, lasting: bool, episodes: int) -> list[list[int]]:
-    """Of which horizons to measure, in units of the problem's: a lasting bound under noise may take
-    long to fail.
+    """Return which horizons to measure, in units of the problem's.
+
+    A lasting bound under noise may take long to fail.
 
     The long ones get a run of their own, since the instants at which a run is read are spread over
     the whole of it.
@@ -246,8 +247,7 @@ def _all_compared(found: list[Measurement]) -> list[Measurement]:
 
 
 def _compared(measurement: Measurement, horizon: Horizon, comparisons: int) -> Horizon:
-    """Name the bounds above the interval; above the rate itself, where that is exact because
-    nothing is random.
+    """Name the bounds above the interval, or above the rate where nothing is random.
 
     A mean over starts may lie above the mean over all starts by a few of its standard errors.
     """
@@ -265,8 +265,9 @@ def _compared(measurement: Measurement, horizon: Horizon, comparisons: int) -> H
 
 
 def _upper_end(successes: int, trials: int, error: float) -> float:
-    """Clopper and Pearson's one-sided upper end, which is below the probability of success in at
-    most that part of all cases.
+    """Return Clopper and Pearson's one-sided upper end.
+
+    It is below the probability of success in at most the part `error` of all cases.
 
     Wilson's is below more often where the probability is near 1, as that of safety is.
     """

@@ -12,13 +12,13 @@ from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 
 MONITORING = ("discrete", "continuous")
-"""When h is looked at: at control instants, or between them too."""
+"""Where h is checked: at control instants, or between them too."""
 
 _CHUNK = 256
 
 
 def require_monitoring(monitoring: str) -> None:
-    """Check a word for when h is looked at.
+    """Check a word for where h is checked.
 
     Raises:
         ConfigurationError: it is none of `MONITORING`.
@@ -75,10 +75,10 @@ class BrownianBridge:
         return len(self.reached)
 
     def barriers(self, x: Components) -> np.ndarray:
-        """The barriers at states, given component by component, shape (B, k)."""
+        """Return the barriers at states, given component by component, shape (B, k)."""
         return stacked(self._h(*x), len(x[0]))
 
-    def lowest(
+    def sample_minimum(
         self, x: Components, before: np.ndarray, after: np.ndarray, draws: np.ndarray
     ) -> np.ndarray:
         """Draw the smallest value of each barrier during a control period, its ends included.
@@ -101,22 +101,22 @@ class BrownianBridge:
 
 
 def smallest(barriers: np.ndarray) -> np.ndarray:
-    """The smallest of the barriers of each episode: shape (B,) for (B, k)."""
+    """Return the smallest of the barriers of each episode: shape (B,) for (B, k)."""
     return barriers[:, 0] if barriers.shape[1] == 1 else barriers.min(axis=1)
 
 
 def bridge_notes(problem: SafetyProblem) -> list[str]:
-    """What has to be known to read numbers of continuous monitoring."""
+    """Return notes on how to read numbers of continuous monitoring."""
     reached = BrownianBridge(problem).reached
-    missed = [
+    smooth = [
         barrier.name
         for barrier, reaches in zip(problem.barriers, reached, strict=True)
         if not reaches
     ]
     notes = []
-    if missed:
+    if smooth:
         notes.append(
-            f"continuous monitoring changes nothing for {', '.join(missed)}, which no noise reaches"
+            f"continuous monitoring changes nothing for {', '.join(smooth)}, which no noise reaches"
             " directly: there only a smaller dt does anything."
         )
     if sum(reached) > 1:
@@ -127,8 +127,9 @@ def bridge_notes(problem: SafetyProblem) -> list[str]:
 
 
 class Exponentials:
-    """Standard exponentials of episodes side by side, a stream for each: what an episode gets does
-    not depend on its neighbours.
+    """Standard exponentials of episodes side by side, a stream for each.
+
+    The draws of an episode do not depend on its neighbours.
 
     Args:
         seed: of the evaluation.
@@ -146,7 +147,7 @@ class Exponentials:
         self._position = _CHUNK
 
     def next(self) -> np.ndarray:
-        """The draws of the next control period, shape (rows, width)."""
+        """Return the draws of the next control period, shape (rows, width)."""
         if self._position == _CHUNK:
             for generator, drawn in zip(self._generators, self._drawn, strict=True):
                 generator.standard_exponential(out=drawn)

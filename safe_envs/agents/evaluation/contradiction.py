@@ -1,9 +1,8 @@
-"""What the episodes of a command say against a bound that it estimates: the one place that decides
-what is withheld.
+"""The one place that decides which estimated bounds the episodes contradict.
 
 A bound is withheld, and the reason said, where the episodes themselves show that it, or a number it
-rests on, is wrong: a start or a visited state has a b_j above the supremum c_j that was found, the
-filter missed a condition by more than the shortfall m that was found, or the interval of the
+uses, is wrong: a start or a visited state has a b_j above the supremum c_j that was found, the
+filter violated a condition by more than the shortfall m that was found, or the interval of the
 measured rate lies below the bound. See
 `safe_envs.wrappers.verification.chain_guarantee.ChainGuarantee.contradiction` for the first two.
 """
@@ -25,21 +24,21 @@ ADVICE = "bounds are of continuous time: try a smaller dt, or --refine"
 
 
 def by_states(bound: EstimatedBound | PosteriorBound, visited: Sequence[VisitedStates]) -> str:
-    """What the states of episodes say against the numbers that a bound rests on; "" if nothing.
+    """Return how the states of episodes contradict the numbers of a bound; "" if they do not.
 
     Args:
         bound: that was estimated.
         visited: states of the episodes.
     """
     found = (
-        bound.contradiction(each.deepest, each.missed, each.actions, each.slack) for each in visited
+        bound.contradiction(each.deepest, each.violating, each.actions, each.slack)
+        for each in visited
     )
     return next(filter(None, found), "")
 
 
 def by_rate(bound: float | None, ci_high: float) -> str:
-    """What the interval of a measured rate says against a bound: that it ends below it; "" if it
-    does not.
+    """Return how the interval of a measured rate contradicts a bound; "" if it does not.
 
     Args:
         bound: on the probability of being safe, None for none.

@@ -49,8 +49,7 @@ class EpisodeBatch:
         reward: np.ndarray,
         info: Info,
     ) -> None:
-        """Count a step with its smallest h; it counts for the filter only if the episode was safe
-        up to its beginning.
+        """Count a step; for the filter only if the episode was safe up to its beginning.
 
         Args:
             h: smallest barrier value of the step.

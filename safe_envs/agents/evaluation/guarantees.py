@@ -1,6 +1,4 @@
-"""The bounds of a filter, averaged over the starts of the episodes, as far as the episodes do not
-contradict them.
-"""
+"""The bounds of a filter, averaged over starts, unless the episodes contradict them."""
 
 from __future__ import annotations
 
@@ -33,11 +31,11 @@ class GuaranteeAverager:
     `safe_envs.wrappers.verification.posterior_guarantee`.
 
     For relative degree r >= 2 a condition keeps the intersection of the sets C_j = {b_j >= 0}, j <
-    r, and from a start in C but outside of it, it promises nothing. How many starts are there is
+    r, and from a start in C but outside of it, it guarantees nothing. The share of such starts is
     counted too.
 
     Args:
-        conditions: one for each barrier; none of the bare env.
+        conditions: one for each barrier; none for the unfiltered env.
         problem: whose barriers they keep.
         knowledge: of the filter, "model" or "plant".
         why_not: why not to look for a bound at all, if so.
@@ -68,7 +66,7 @@ class GuaranteeAverager:
             self._found = guarantee_of(problem, conditions, knowledge)
             self._why_none = self._found.note
         except SafeEnvsError as error:
-            # The bound looks at the whole safe set, where the episodes may never be.
+            # The search covers the whole safe set, where the episodes may never be.
             self._why_none = str(error)
 
     def add(self, starts: np.ndarray) -> None:
@@ -123,8 +121,9 @@ class GuaranteeAverager:
 def _outside_of(
     conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str
 ) -> Callable[[np.ndarray], np.ndarray] | None:
-    """Tells of states (B, n) which of them are in C, and outside the sets C_j that conditions keep;
-    None where these are not known.
+    """Return a function that finds the states in C but outside the sets C_j of conditions.
+
+    It maps states (B, n) to booleans (B,); None where the sets are not known.
     """
     corrected = any(c.corrects_model for c in conditions)
     known = problem.plant if knowledge == "plant" and not corrected else problem.model

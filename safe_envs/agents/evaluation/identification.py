@@ -120,13 +120,8 @@ class Learning:
 
 
 def _methods(name: str) -> list[str]:
-    """Return the methods of the learned conditions in a filter's text that name no file."""
-    parts = [part.split(":") for part in name.split("+")]
-    return [
-        LEARNED[key].method
-        for key, *settings in parts
-        if key in LEARNED and not any(s.startswith("file=") for s in settings)
-    ]
+    """Return the methods of the models that a filter needs without naming their files."""
+    return [method for method, file in learned_parts(name) if file is None]
 
 
 def _filter_of(method: str) -> str:
@@ -134,10 +129,8 @@ def _filter_of(method: str) -> str:
 
 
 def learned_of(conditions: Sequence[Condition]) -> list[LearnedModel]:
-    """Return the learned models of conditions, each once."""
-    return list(
-        {id(c.learned): c.learned for c in conditions if isinstance(c, LearnedCondition)}.values()
-    )
+    """Return the learned models that conditions need, each once."""
+    return list({id(m): m for c in conditions for m in c.learned_models}.values())
 
 
 def seconds_of(identifications: Sequence[Sequence[Condition]]) -> float | None:

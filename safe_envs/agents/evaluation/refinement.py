@@ -37,7 +37,7 @@ class RefinementRow:
         change_low: lower end of the interval of the change.
         change_high: upper end.
         verdict: see `refine`.
-        withheld: what the rates say against a bound, which is withheld then.
+        withheld: how the rates contradict a bound, which is withheld then.
     """
 
     filter: str
@@ -85,8 +85,7 @@ def refine(
     record: bool = False,
     **arguments: Any,
 ) -> Refinement:
-    """Evaluate with the control period dt of a problem, with dt/2 and with dt/4: has the safety
-    rate converged?
+    """Evaluate with the control periods dt, dt/2 and dt/4: has the safety rate converged?
 
     Learned filters are learned once, with the period dt.
 
@@ -104,7 +103,7 @@ def refine(
     Args:
         problem: as for `evaluate`.
         policy: as for `evaluate`.
-        progress: told the part of the work of all three that is done, from 0 to 1.
+        progress: called with the part of the work of all three that is done, from 0 to 1.
         record: keep trajectories of the first evaluation for pictures.
         **arguments: the others of `evaluate`.
 
@@ -147,9 +146,7 @@ def _judged(row: EvaluationRow, finer: Sequence[Evaluation]) -> EvaluationRow:
 
 
 def _share(progress: Progress | None, i: int) -> Progress | None:
-    """From the done part of the i-th evaluation to that of all: an evaluation has as much work as
-    it has steps.
-    """
+    """Return the progress of the i-th evaluation, whose work is that of its steps."""
     if progress is None:
         return None
     before, all_steps = sum(DIVISORS[:i]), sum(DIVISORS)
@@ -182,7 +179,7 @@ def _row(name: str, evaluations: tuple[Evaluation, ...]) -> RefinementRow:
 
 
 def verdict(low: float, high: float) -> str:
-    """What the interval (low, high) of the change of a rate says: see `refine`."""
+    """Return what the interval (low, high) of the change of a rate means: see `refine`."""
     if max(-low, high) <= TOLERANCE:
         return "converged"
     return "not resolved" if low <= 0.0 <= high else "still changing"

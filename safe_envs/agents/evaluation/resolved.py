@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -11,20 +10,23 @@ import numpy as np
 
 from safe_envs.agents.evaluation.identification import Learning
 from safe_envs.agents.evaluation.rollout import Env, Progress
-from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec, Filter, conditions_in
+from safe_envs.agents.evaluation.spec import (
+    UNFILTERED,
+    EvaluationSpec,
+    conditions_in,
+    filter_text,
+)
 from safe_envs.agents.evaluation.targets import make_target
 from safe_envs.agents.policies.custom import policy_name
 from safe_envs.agents.policies.registry import policy_files
 from safe_envs.bounded_reading import read_bytes
-from safe_envs.errors import ConfigurationError, nearest, shown
-from safe_envs.plugins import CONDITIONS as CONDITION_PLUGINS
-from safe_envs.plugins import plugin_names
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import (
-    CONDITIONS,
-    LEARNED,
     Condition,
+    learned_parts,
     parse_conditions,
+    require_known,
     require_readable,
     spec_of,
 )
@@ -66,7 +68,7 @@ class ResolvedEvaluation:
             else self.target.adapt_policy(given)
         )
         asked = (UNFILTERED, self.target.filter) if spec.filters is None else spec.filters
-        filters = {_name_of(each): each for each in asked}
+        filters = {filter_text(each): each for each in asked}
         self.names = list(filters)
         self._given = {
             name: self._fitted(conditions_in(each))
@@ -165,7 +167,7 @@ class WorkParts:
         self._progress, self._parts, self._begun = progress, parts, 0
 
     def part(self, whole: float = 1.0) -> Progress | None:
-        """Return the progress of the next part, which is called with how much of `whole` is done."""
+        """Return the progress of the next part, to be called with how much of `whole` is done."""
         before, self._begun = self._begun, self._begun + 1
         report = self._progress
         return (
@@ -173,17 +175,8 @@ class WorkParts:
         )
 
 
-def _name_of(given: Filter) -> str:
-    return given if isinstance(given, str) else spec_of(conditions_in(given))
-
-
-def filter_names() -> tuple[str, ...]:
-    """Return the names of all filters, "none" and those of other packages included."""
-    return (UNFILTERED, *CONDITIONS, *LEARNED, *plugin_names(CONDITION_PLUGINS))
-
-
 def _checked(name: str, problem: SafetyProblem) -> str | None:
-    """Return the text of a filter with all its parameters; None where it has to be learned first."""
+    """Return the text of a filter with all parameters; None where it has to be learned first."""
     if name == UNFILTERED:
         return UNFILTERED
     if UNFILTERED in name.split("+"):
@@ -191,11 +184,8 @@ def _checked(name: str, problem: SafetyProblem) -> str | None:
             f"filter {shown(name)}: {UNFILTERED!r} is the unfiltered env, no condition; give it"
             " alone or leave it out"
         )
-    head, known = re.split("[:+]", name)[0], filter_names()
-    # What has a dot is the place of a condition of one's own.
-    if head not in known and "." not in head:
-        raise ConfigurationError(f"unknown filter {shown(name)}; {nearest(name, known)}")
-    if any(re.split(":", part)[0] in LEARNED for part in name.split("+")):
+    require_known(name, UNFILTERED)
+    if learned_parts(name):
         require_readable(name, problem)
         return None
     return spec_of(parse_conditions(name, problem))

@@ -109,7 +109,7 @@ class _MinimumWatch:
 
     def minimum(self, x: Components, barriers: np.ndarray) -> np.ndarray:
         """Return the minimum h of the period that led to the states x, shape (B,)."""
-        found = self._bridge.lowest(self._x, self._barriers, barriers, self._draws.next())
+        found = self._bridge.sample_minimum(self._x, self._barriers, barriers, self._draws.next())
         self._x, self._barriers = x, barriers
         return smallest(found)
 

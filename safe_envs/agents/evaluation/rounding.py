@@ -1,6 +1,4 @@
-"""How exactly a barrier is known at a state in floating point: whether an episode violates, or only
-touches h = 0.
-"""
+"""Whether an episode violates, or only touches h = 0 to rounding."""
 
 from __future__ import annotations
 
@@ -22,14 +20,17 @@ _NEARLY = 1e-6
 
 
 def may_touch(lowest: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """Which episodes are worth a look at by `touches`, which compiles formulas, by their smallest
-    and their largest h, shape (B,).
+    """Select the episodes for `touches`, which compiles formulas.
+
+    Args:
+        lowest: minimum h of each episode, shape (B,).
+        largest: maximum h of each, shape (B,).
     """
     return lowest >= -_NEARLY * largest
 
 
 def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Which of the smallest h <= 0 of episodes cannot be told from 0 in floating point, shape (B,).
+    """Return which of the minima h <= 0 are 0 to floating-point precision, shape (B,).
 
     That is so where |h| is at most 64 units of rounding of its terms and of what rounded states
     make of it.
@@ -51,8 +52,9 @@ def touches(problem: SafetyProblem, lowest: np.ndarray, x: np.ndarray) -> np.nda
 
 @lru_cache(maxsize=64)
 def _parts(states: tuple[sp.Symbol, ...], barriers: tuple[sp.Expr, ...]) -> tuple[Any, list[int]]:
-    """The compiled terms of each barrier, and each state times its slope; and where those of a
-    barrier end, after a 0.
+    """Compile the terms of each barrier, and each state times its slope.
+
+    The list has a 0, and where the terms of each barrier end.
     """
     parts = [
         [*sp.Add.make_args(h), *(s * slope for s in states if not _jumps(slope := sp.diff(h, s)))]

@@ -1,4 +1,4 @@
-"""What an evaluation says of each episode, and of each filter in a row."""
+"""Results of episodes, and rows with the statistics of filters."""
 
 from __future__ import annotations
 
@@ -94,8 +94,8 @@ class PosteriorGuarantee:
     Attributes:
         probability: the bound; None where there is none.
         note: why there is none, or why it is weak.
-        delta: probability that the identification misses the system; None, as those below, where
-            no bound was looked for.
+        delta: probability that the identification does not contain the system; None, as those
+            below, where no bound was looked for.
         supremum: c.
         shortfall: m, in 1/s.
         bias: e of the steps, in 1/s.
@@ -117,10 +117,10 @@ class PosteriorGuarantee:
 
 @dataclass(frozen=True, kw_only=True)
 class BoundSummary:
-    """The bounds of a filter, averaged over the starts, as far as the episodes do not contradict it.
+    """The bounds of a filter, averaged over starts, unless the episodes contradict them.
 
     Attributes:
-        withheld: what the episodes say against a bound, which is withheld then.
+        withheld: how the episodes contradict a bound, which is withheld then.
         outside_rate: share of the starts in the safe set outside the sets C_j, which no bound
             covers; None without a filter, and where the sets are not known.
         estimated_bound: on the probability of being safe; None where there is none.
@@ -166,7 +166,7 @@ class LearningSummary:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationRow(BoundSummary, EpisodeSummary):
-    """Everything an evaluation says of one filter.
+    """All that an evaluation finds for one filter.
 
     Attributes:
         filter: its name, "none" without one.

@@ -12,7 +12,7 @@ from safe_envs.agents.evaluation.brownian_bridge import require_monitoring
 from safe_envs.agents.evaluation.statistics import require_confidence
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import CONDITIONS, Condition, FilterSpec, spec_of
+from safe_envs.wrappers import Condition, FilterSpec, spec_of
 from safe_envs.wrappers.learning import LearnedModel
 
 UNFILTERED = "none"
@@ -165,21 +165,8 @@ class RunSettings:
 
 
 def filter_text(given: Filter) -> str:
-    """Return the text of a filter, which is a text, a condition, or one for each barrier.
-
-    Raises:
-        ConfigurationError: It is a condition that `parse_conditions` cannot make from text.
-    """
-    if isinstance(given, str):
-        return given
-    conditions = conditions_in(given)
-    for condition in conditions:
-        if CONDITIONS.get(condition.name) is not type(condition):
-            raise ConfigurationError(
-                f"the condition {type(condition).__name__} has no text here; write it in a file and"
-                " give FILE.py:NAME"
-            )
-    return spec_of(conditions)
+    """Return the text of a filter, which is a text, a condition, or one for each barrier."""
+    return given if isinstance(given, str) else spec_of(conditions_in(given))
 
 
 def conditions_in(given: Condition | Sequence[Condition]) -> tuple[Condition, ...]:

@@ -44,8 +44,7 @@ def wilson_interval(
 
 
 def rate_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's interval, or Clopper and Pearson's exact one where all or none of the trials
-    succeeded.
+    """Return Wilson's interval, or Clopper and Pearson's where all or no trials succeeded.
 
     Arguments and errors as for `wilson_interval`.
     """
@@ -66,8 +65,7 @@ def rate_band(
 def paired_difference_interval(
     both: float, only_first: float, only_second: float, neither: float, confidence: float = 0.95
 ) -> tuple[float, float]:
-    """Newcombe's interval for the difference p1 - p2 of the rates of two outcomes of the same
-    trials.
+    """Return Newcombe's interval for the difference p1 - p2 of two rates of the same trials.
 
     The Wilson intervals of the two rates, squared and added with the outcomes' phi correlation,
     which is corrected for continuity where it is positive, and 0 where it is not defined.
@@ -114,8 +112,9 @@ def repeated_interval(
     confidence: float,
     bounds: tuple[float, float],
 ) -> tuple[float, float]:
-    """Interval for the mean of a quantity over everything that was drawn once for all its trials,
-    such as an identification.
+    """Return an interval for the mean of a quantity over draws that all trials share.
+
+    Such a draw is an identification.
 
     All draws see the same trials, so that these do not average out: the distances from the mean to
     the ends of the interval over trials and those of Student's interval over draws are added as
@@ -150,13 +149,12 @@ def repeated_interval(
 def log_normal_interval(
     estimates: Sequence[float] | np.ndarray, confidence: float = 0.95
 ) -> tuple[float, float]:
-    """Interval for the mean of positive estimates whose logarithms are nearly normal, as those of
-    splitting are.
+    """Return an interval for the mean of positive estimates with nearly normal logarithms.
 
     Cox's interval for the mean of a log-normal variable, exp(+- t sqrt(s^2/R + s^4/(2 (R - 1))))
     with s the deviation of the R logarithms and t the quantile of Student's distribution, laid
     around the mean of the estimates, which is unbiased whatever their distribution. Student's
-    interval of the estimates themselves misses to one side: the largest of them are the rarest.
+    interval of the estimates themselves errs to one side: the largest of them are the rarest.
 
     Args:
         estimates: independent ones, at least two, all above 0.
@@ -230,7 +228,7 @@ def _counts(successes: float, trials: float) -> np.ndarray:
 
 
 class RunningSum:
-    """Sum of values in the order given: the same to the last bit, in whatever portions they come."""
+    """Sum of values in the order given, the same to the last bit in any portions."""
 
     def __init__(self) -> None:
         self.total = 0.0
@@ -286,7 +284,7 @@ def safety_curve(first_violation: np.ndarray, steps: int, dt: float, confidence:
 
 
 def curve_instants(steps: int) -> np.ndarray:
-    """Return the control instants of a curve, evenly spaced from 0, and the last one: at most 201."""
+    """Return the control instants of a curve, evenly spaced with both ends: at most 201."""
     return np.append(np.arange(0, steps, -(-steps // _MOST_INTERVALS)), steps)
 
 

@@ -1,6 +1,4 @@
-"""Those states of episodes that say something against a bound, or of a violation: kept while the
-episodes run.
-"""
+"""The states of episodes that may contradict a bound, or that violate."""
 
 from __future__ import annotations
 
@@ -17,18 +15,18 @@ _KEPT = 64
 
 @dataclass(frozen=True)
 class VisitedStates:
-    """The states of episodes where most was missed, and where h was largest.
+    """The states of episodes where a filter violated its conditions most, and where h was largest.
 
     Attributes:
-        missed: states before a first violation where the filter missed its conditions by most, one
-            an episode, shape (E, n).
+        violating: states before a first violation of h where the filter violated its conditions
+            most, one an episode, shape (E, n).
         actions: what was executed there, shape (E, m).
-        slack: by how much the worst row was missed there, shape (E,), the largest first.
+        slack: violation of the worst condition there, shape (E,), the largest first.
         deepest: states where the smallest h was largest, one an episode, shape (D, n).
         depth: h there, shape (D,), the largest first.
     """
 
-    missed: np.ndarray
+    violating: np.ndarray
     actions: np.ndarray
     slack: np.ndarray
     deepest: np.ndarray
@@ -41,12 +39,12 @@ class VisitedStates:
         return cls(np.empty((0, n)), np.empty((0, m)), np.empty(0), np.empty((0, n)), np.empty(0))
 
     def joined(self, other: VisitedStates) -> VisitedStates:
-        """The most extreme states of both."""
+        """Return the most extreme states of both."""
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        missed, actions, slack, deepest, depth = (np.concatenate(pair) for pair in pairs)
+        violating, actions, slack, deepest, depth = (np.concatenate(pair) for pair in pairs)
         worst, highest = _first(slack), _first(depth)
         return VisitedStates(
-            missed[worst], actions[worst], slack[worst], deepest[highest], depth[highest]
+            violating[worst], actions[worst], slack[worst], deepest[highest], depth[highest]
         )
 
 
@@ -56,13 +54,13 @@ def _first(values: np.ndarray) -> np.ndarray:
 
 
 class StateWatch:
-    """Keeps the extreme states of each episode of a wave."""
+    """Keeps the extreme states of each episode of a batch."""
 
     def __init__(self, x: Components, h: np.ndarray, inputs: int) -> None:
         self._deepest = np.stack(x)
         self.depth = h.copy()
         """Largest value of the smallest barrier in each episode up to a violation, shape (B,)."""
-        self._missed, self._slack = np.zeros_like(self._deepest), np.zeros(len(h))
+        self._violating, self._slack = np.zeros_like(self._deepest), np.zeros(len(h))
         self._actions = np.zeros((inputs, len(h)))
         self.lowest = np.stack(x)
         """States (n, B) where an episode that violates has its smallest h."""
@@ -75,7 +73,7 @@ class StateWatch:
         Args:
             before: state before the step.
             u: what was executed.
-            slack: by how much the worst row was missed, shape (B,); None without a filter.
+            slack: violation of the worst condition, shape (B,); None without a filter.
             counts: the episodes without a violation so far.
         """
         if slack is None or not slack.any():
@@ -84,7 +82,7 @@ class StateWatch:
         if not worse.any():
             return
         np.copyto(self._slack, slack, where=worse)
-        _keep(self._missed, before, worse)
+        _keep(self._violating, before, worse)
         _keep(self._actions, u, worse)
 
     def reached(
@@ -107,12 +105,12 @@ class StateWatch:
             _keep(self.lowest, x, lower)
 
     def visited(self, count: int) -> VisitedStates:
-        """What was seen in the first `count` episodes."""
+        """Return the extreme states of the first `count` episodes."""
         slack, depth = self._slack[:count], self.depth[:count]
         worst = _first(slack)
         worst, highest = worst[slack[worst] > 0.0], _first(depth)
         return VisitedStates(
-            self._missed.T[worst],
+            self._violating.T[worst],
             self._actions.T[worst],
             slack[worst],
             self._deepest.T[highest],

@@ -15,16 +15,15 @@ from safe_envs.wrappers.filter_qp import FilterQP, FilterQPSolver, UndefinedCons
 
 
 class CLFController(Policy):
-    """Solves min w_u |u|^2 + w_d d^2 subject to AV + rate V <= d and the box, exactly, at every
-    observation.
+    """Minimizes w_u |u|^2 + w_d d^2 subject to AV + rate V <= d and the input bounds, exactly.
 
-    It is the joint program of `safe_envs.wrappers.SafetyFilter` without barriers: put a filter with
+    It is the joint QP of `safe_envs.wrappers.SafetyFilter` without barriers: put a filter with
     `objective="clf"` over `ZeroController` for the one with them. With a single input there is no
     difference between that and a filter over this controller, since the cost is convex; with
     several there is, since the nearest action is not the cheapest one.
 
     Args:
-        problem: whose model, box and features are taken.
+        problem: whose model, input bounds and features are taken.
         clf: the goal; that of the problem by default.
 
     Raises:

@@ -29,7 +29,7 @@ class BlockPolicy(Policy):
 
     @abstractmethod
     def act(self, block: np.ndarray) -> np.ndarray:
-        """The actions (BLOCK, m) at a block of observations, float32 of shape (BLOCK, k)."""
+        """Return the actions (BLOCK, m) at observations (BLOCK, k) in float32."""
 
     def begin(self, episodes: range, seed: int) -> None:
         """Remember in which row of its block the first episode belongs; see `Policy.begin`."""

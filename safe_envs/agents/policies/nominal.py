@@ -1,4 +1,4 @@
-"""Policies that need no training: the problem's nominal controller, no action, and random actions."""
+"""Policies that need no training: nominal controller, no action, random actions."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ _CHUNK = 128
 
 
 class NominalController(Policy):
-    """The problem's nominal controller: it sees the observation and the model's parameters, never
-    the plant.
+    """The problem's nominal controller.
+
+    It sees the observation and the model's parameters, never the plant.
 
     Args:
-        problem: whose `nominal` laws, box and features are taken.
+        problem: whose `nominal` laws, input bounds and features are taken.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -73,10 +74,10 @@ class NominalController(Policy):
 
 
 class ZeroController(Policy):
-    """The physical input 0, or the point of the box nearest to it.
+    """The physical input 0, or the point within the input bounds nearest to it.
 
     Args:
-        problem: whose box is taken.
+        problem: whose input bounds are taken.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:

@@ -101,7 +101,7 @@ def policy_files(name: str) -> list[Path]:
 
 
 def absolute_policy(name: str) -> str:
-    """Return the name of a policy with the whole path of its file, so that it holds in any folder."""
+    """Return the name of a policy with the whole path of its file, valid in any folder."""
     if _is_place(name):
         return resolved(name)
     return os.path.realpath(name) if policy_files(name) and os.path.exists(name) else name

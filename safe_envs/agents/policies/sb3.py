@@ -18,7 +18,7 @@ from safe_envs.errors import ConfigurationError, shortened
 
 _MOST_BYTES = 100_000_000
 _STATISTICS = ("normalization.pkl", "vecnormalize.pkl", "*/vecnormalize.pkl")
-"""Where a VecNormalize lies beside a .zip: that of `safe-envs train`, one of RL Zoo, and the place
+"""Where the VecNormalize of a .zip lies: that of `safe-envs train`, one of RL Zoo, and the place
 where RL Zoo itself puts it."""
 
 
@@ -27,7 +27,7 @@ class SB3Policy(BlockPolicy):
 
     Only the policy is built, not the algorithm around it, so that there is no need to know which
     one saved it. The file does not say for which inputs its actions stand: that is left to the
-    problem's box.
+    problem's input bounds.
 
     Args:
         path: of the file. Loading it runs code that it contains: trust its source.
@@ -36,7 +36,7 @@ class SB3Policy(BlockPolicy):
 
     Raises:
         ConfigurationError: the file is no archive of Stable-Baselines3, or its spaces are not those
-            of the env; or beside it lies the VecNormalize of its training, whose observations are
+            of the env; or the VecNormalize of its training lies next to it, whose observations are
             not the env's.
     """
 
@@ -53,8 +53,9 @@ class SB3Policy(BlockPolicy):
 
 
 def require_archive(path: Path) -> None:
-    """Raise ConfigurationError unless a file looks like a whole policy of Stable-Baselines3;
-    nothing in it is run.
+    """Raise ConfigurationError unless a file looks like a policy of Stable-Baselines3.
+
+    Nothing in it is run.
     """
     if not _is_archive(path):
         raise ConfigurationError(

@@ -18,7 +18,7 @@ _ACTIVATIONS = {
 
 
 def actor_of(network: Any) -> tuple[list[np.ndarray], list[np.ndarray], str]:
-    """The layers that give the deterministic action, before it is squashed or clipped.
+    """Return the layers of the deterministic action, before it is squashed or clipped.
 
     With gSDE the noise alone is of another kind: the deterministic action of PPO and A2C is the
     same. SAC bounds it by another layer then, and is refused.
@@ -57,7 +57,7 @@ def actor_of(network: Any) -> tuple[list[np.ndarray], list[np.ndarray], str]:
 
 
 def _modules(network: Any) -> tuple[Any, list[Any]]:
-    """The features extractor, and layers and activations by turns."""
+    """Return the features extractor, and layers and activations by turns."""
     from stable_baselines3.common.policies import ActorCriticPolicy
     from stable_baselines3.sac.policies import SACPolicy
     from stable_baselines3.td3.policies import TD3Policy

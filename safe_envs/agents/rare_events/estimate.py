@@ -20,7 +20,7 @@ from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.rare_events.importance_sampling import (
-    Drifting,
+    ImportanceSampling,
     TiltedNoiseEnv,
     optimal_tilt,
 )
@@ -83,8 +83,9 @@ def estimate_rare(
     monitoring: str = "discrete",
     progress: Progress | None = None,
 ) -> RareEvaluation:
-    """Estimate the probability of a violation under each filter by splitting on h; see
-    `safe_envs.agents.rare_events.splitting.Splitting`.
+    """Estimate the probability of a violation under each filter, by splitting on h.
+
+    See `safe_envs.agents.rare_events.splitting.Splitting`.
 
     The violating paths of splitting predict the error of importance sampling by a drift, see
     `safe_envs.agents.rare_events.importance_sampling.optimal_tilt`. If that is less than half of
@@ -169,7 +170,7 @@ def _why_frozen(world: SafetyProblem, policy: Any) -> str:
         return ""
     return (
         "nothing is random after the start, so that copies of an episode go on like it; plain"
-        " episodes say all that there is"
+        " episodes find all that there is"
     )
 
 
@@ -218,7 +219,9 @@ class _Estimator:
         split = Estimate.of(by, found.estimates, spec.confidence)
         if not found.levels.any():
             split = replace(split, method="plain episodes", ci_low=low, ci_high=high)
-        drift, drift_steps = self._by_drift(Drifting(*how), found, split.relative_error, last_part)
+        drift, drift_steps = self._by_drift(
+            ImportanceSampling(*how), found, split.relative_error, last_part
+        )
         best, check, doubt = verdict(split, drift, plain)
         p, error = best.probability, best.relative_error
         needed = (1.0 - p) / (p * error**2) if error else None
@@ -234,7 +237,11 @@ class _Estimator:
         )
 
     def _by_drift(
-        self, drifting: Drifting, found: Repetitions, to_beat: float, progress: Progress | None
+        self,
+        drifting: ImportanceSampling,
+        found: Repetitions,
+        to_beat: float,
+        progress: Progress | None,
     ) -> tuple[Estimate | None, int]:
         """Return the estimate by importance sampling, and the control periods that it took.
 

@@ -1,6 +1,4 @@
-"""Probabilities of rare violations, by importance sampling: noise that drifts towards smaller h,
-and weights that undo it.
-"""
+"""Importance sampling of rare violations: noise that drifts towards smaller h, and weights."""
 
 from __future__ import annotations
 
@@ -27,8 +25,9 @@ _STRONGEST = 64.0
 
 
 class TiltedNoiseEnv(SafeVectorEnv):
-    """`SafeVectorEnv` with dW - c e dt in place of dW, where e = sigma' grad h/|sigma' grad h| is
-    the way on which h rises fastest.
+    """`SafeVectorEnv` with dW - c e dt in place of dW.
+
+    Here e = sigma' grad h/|sigma' grad h| is the direction in which h rises fastest.
 
     Of several barriers the smallest counts. Where no noise reaches it, e = 0. The e of a control
     period is that of its beginning.
@@ -39,7 +38,7 @@ class TiltedNoiseEnv(SafeVectorEnv):
 
     Attributes:
         girsanov_integrals: of each episode the integrals of e'dW, where W is what drives the
-            system, and of e'e dt; shape (num_envs, 2). They say the density of the noise so far
+            system, and of e'e dt; shape (num_envs, 2). They give the density of the noise so far
             over that with a drift: see `log_ratio`.
     """
 
@@ -63,10 +62,10 @@ class TiltedNoiseEnv(SafeVectorEnv):
         self._shape = (len(rows), len(live), len(lengths))
         self._lengths = lengths
         self.girsanov_integrals = np.zeros((len(lengths), 2))
-        self._noise = _DriftingStreams(self, self._simulation.integrator.channels)
+        self._noise = _TiltedStreams(self, self._simulation.integrator.channels)
 
-    def way(self) -> np.ndarray:
-        """The vector e of the coming period, shape (channels of the noise, num_envs)."""
+    def tilt_direction(self) -> np.ndarray:
+        """Return the direction e of the coming period, shape (noise channels, num_envs)."""
         slopes = stacked(self._slopes(*self.components), self.num_envs).T.reshape(self._shape)
         if len(slopes) == 1:
             steepest = slopes[0]
@@ -76,17 +75,18 @@ class TiltedNoiseEnv(SafeVectorEnv):
         steepness = np.sqrt((steepest * steepest).sum(axis=0))
         return np.where(steepness > 0.0, steepest / np.where(steepness > 0.0, steepness, 1.0), 0.0)
 
-    def drifted(self, draws: np.ndarray) -> np.ndarray:
-        """The draws of a period with the drift in them, substep by substep; notes how far they
-        climb.
+    def tilted(self, draws: np.ndarray) -> np.ndarray:
+        """Return the draws of a period with the drift in them, substep by substep.
+
+        Adds to `girsanov_integrals`.
         """
         if not draws.size:
             return draws
         root = math.sqrt(self.problem.dt / self.problem.substeps)
-        way = np.tile(self.way(), (self.problem.substeps, 1))
-        moved = draws - self._lengths * root * way
-        self.girsanov_integrals[:, 0] += root * (way * moved).sum(axis=0)
-        self.girsanov_integrals[:, 1] += root**2 * (way * way).sum(axis=0)
+        direction = np.tile(self.tilt_direction(), (self.problem.substeps, 1))
+        moved = draws - self._lengths * root * direction
+        self.girsanov_integrals[:, 0] += root * (direction * moved).sum(axis=0)
+        self.girsanov_integrals[:, 1] += root**2 * (direction * direction).sum(axis=0)
         return moved
 
     def snapshot(self) -> dict[str, np.ndarray]:
@@ -105,7 +105,7 @@ class TiltedNoiseEnv(SafeVectorEnv):
         self.girsanov_integrals[envs] = 0.0
 
 
-class _DriftingStreams(NoiseStreams):
+class _TiltedStreams(NoiseStreams):
     """The draws of an env with its drift."""
 
     def __init__(self, env: TiltedNoiseEnv, channels: int) -> None:
@@ -114,14 +114,15 @@ class _DriftingStreams(NoiseStreams):
 
     def next(self, rngs: Sequence[np.random.Generator], stepping: np.ndarray | None) -> np.ndarray:
         """See `NoiseStreams.next`."""
-        # A state that overflows is found by the env, which says so better than a warning.
+        # A state that overflows is found by the env, whose message is better than a warning.
         with np.errstate(all="ignore"):
-            return self._env.drifted(super().next(rngs, stepping))
+            return self._env.tilted(super().next(rngs, stepping))
 
 
 def log_ratio(girsanov_integrals: np.ndarray, lengths: Any) -> np.ndarray:
-    """Logarithm of the density of episodes' noise as it is over that with a drift, by Girsanov: c
-    int e'dW + c^2/2 int e'e dt.
+    """Return the log density of episodes' noise as it is over that with a drift.
+
+    By Girsanov it is c int e'dW + c^2/2 int e'e dt.
 
     Args:
         girsanov_integrals: of the episodes, as in `TiltedNoiseEnv`, shape (..., 2).
@@ -133,8 +134,9 @@ def log_ratio(girsanov_integrals: np.ndarray, lengths: Any) -> np.ndarray:
 def optimal_tilt(
     girsanov_integrals: np.ndarray, shares: np.ndarray, horizon: float
 ) -> tuple[float, float]:
-    """The drift whose weights differ least, judged by episodes that end in a violation, however
-    these were found.
+    """Return the drift whose weights differ least, judged by episodes that violate.
+
+    It does not matter how these were found.
 
     With the weight w of an episode the second moment under the drift is E[w; violation] without it.
     So episodes that the drift would hardly ever show, since they violate on another way, count with
@@ -146,8 +148,8 @@ def optimal_tilt(
         horizon: of an episode, in s.
 
     Returns:
-        The length c in 1/sqrt(s), and the deviation of what one episode with it says, relative to
-        the probability.
+        The length c in 1/sqrt(s), and the deviation of the estimate of one episode with it,
+        relative to the probability.
 
     Source: S. Asmussen and P. Glynn, Stochastic Simulation, Springer 2007, Ch. V and VI.
     """
@@ -167,12 +169,12 @@ def optimal_tilt(
     return float(found.x), math.sqrt(max(math.exp(min(found.fun, 700.0)) - 1.0, 0.0))
 
 
-MakeDrifting = Callable[[np.ndarray], Env]
+MakeTiltedEnv = Callable[[np.ndarray], Env]
 """A filtered `TiltedNoiseEnv` with drifts of given lengths."""
 
 
 @dataclass(frozen=True)
-class Drifting:
+class ImportanceSampling:
     """How to estimate the probability that h comes down to 0, from episodes that are pushed there.
 
     Attributes:
@@ -180,13 +182,13 @@ class Drifting:
         policy: anything with Stable-Baselines3's `predict`, without memory.
         seed: of all randomness.
         num_envs: the most episodes side by side.
-        bridge: looks at h between control instants too. Between given ends a bridge does not depend
-            on a drift.
+        bridge: gives the minimum h between control instants too. Between given ends a bridge
+            does not depend on a drift.
 
     Source: S. Asmussen and P. Glynn, Stochastic Simulation, Springer 2007, Ch. V and VI.
     """
 
-    make: MakeDrifting
+    make: MakeTiltedEnv
     policy: Any
     seed: int
     num_envs: int
@@ -201,7 +203,7 @@ class Drifting:
             length: of the drift, in 1/sqrt(s).
             episodes: of a repetition.
             repetitions: R.
-            progress: told the part that is done.
+            progress: called with the part that is done.
 
         Returns:
             Unbiased estimates, shape (R,), and the control periods that were simulated.
@@ -217,8 +219,9 @@ class Drifting:
         return weights.reshape(repetitions, episodes).mean(axis=1), steps
 
     def _weights(self, lengths: np.ndarray, spawn_key: tuple[int, ...]) -> tuple[np.ndarray, int]:
-        """Density ratio of each episode's noise up to its violation, 0 without one; and the control
-        periods.
+        """Return each episode's density ratio up to its violation, and the control periods.
+
+        The ratio is 0 without a violation.
         """
         seed = np.random.SeedSequence(self.seed, spawn_key=spawn_key)
         env = self.make(lengths)
@@ -240,7 +243,7 @@ class Drifting:
                 after = info["barrier"]
                 lowest = after
                 if self.bridge is not None:
-                    lowest = self.bridge.lowest(
+                    lowest = self.bridge.sample_minimum(
                         x, before, after, generator.standard_exponential(after.shape)
                     )
                 hit = alive & (smallest(lowest) <= 0.0)

@@ -1,6 +1,4 @@
-"""Episodes that can be taken up again at each instant at which their score was better than ever
-before.
-"""
+"""Episodes that can be resumed at each instant at which their score was a record."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ import numpy as np
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, smallest
 from safe_envs.agents.evaluation.rollout import Env
 from safe_envs.agents.policies.base import Policy
-from safe_envs.agents.rare_events.importance_sampling import MakeDrifting
+from safe_envs.agents.rare_events.importance_sampling import MakeTiltedEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
 
@@ -20,8 +18,9 @@ _FEWEST_ENVS = 64
 
 
 class Records:
-    """The instants at which each path was nearer to a violation than ever before, in arrays that
-    grow as they fill.
+    """The instants at which each path was nearer to a violation than ever before.
+
+    Arrays grow as they fill.
 
     Args:
         paths: how many.
@@ -63,15 +62,13 @@ class Records:
         self._count[paths] += 1
 
     def first_below(self, levels: np.ndarray, paths: np.ndarray) -> tuple[np.ndarray, ...]:
-        """The first records of paths below levels, one for each, in the order of the arguments of
-        `add`.
-        """
+        """Return the first records of paths below levels, as the arguments of `add`."""
         # Records fall along the first axis, and what was not filled is lower than all.
         rows = (self._height[:, paths] >= levels).sum(axis=0)
         return tuple(kept[rows, paths] for kept in self._kept)
 
     def last(self, paths: np.ndarray) -> tuple[np.ndarray, ...]:
-        """The last records of paths, in the order of the arguments of `add`."""
+        """Return the last records of paths, in the order of the arguments of `add`."""
         return tuple(kept[self._count[paths] - 1, paths] for kept in self._kept)
 
     def _grow(self) -> None:
@@ -102,7 +99,7 @@ class Particles:
         powers: p of each path.
         seed: of all randomness.
         num_envs: the most episodes side by side.
-        bridge: looks at h between control instants too.
+        bridge: gives the minimum h between control instants too.
 
     Attributes:
         lowest: smallest height of each path, shape (paths,).
@@ -114,7 +111,7 @@ class Particles:
 
     def __init__(
         self,
-        make: MakeDrifting,
+        make: MakeTiltedEnv,
         policy: Any,
         powers: np.ndarray,
         seed: np.random.SeedSequence,
@@ -164,15 +161,14 @@ class Particles:
         self.kept_length = float(kept.mean()) if kept.size else None
 
     def h_at_lowest(self, paths: np.ndarray) -> np.ndarray:
-        """The h of paths where their heights were smallest, of several barriers relative to the
-        starts; shape as given.
+        """Return h of paths where their heights were smallest, shape as given.
+
+        Of several barriers it is relative to the starts.
         """
         return self.lowest[paths] / self._weights[self._records.last(paths)[1], self._kind[paths]]
 
     def girsanov_integrals(self, paths: np.ndarray) -> np.ndarray:
-        """`TiltedNoiseEnv.girsanov_integrals` of paths where their heights were smallest, shape (B,
-        2).
-        """
+        """Return `girsanov_integrals` of paths where their heights were smallest, shape (B, 2)."""
         return self._records.last(paths)[5]
 
     def branch(self, paths: np.ndarray, parents: np.ndarray, levels: np.ndarray) -> None:
@@ -211,8 +207,9 @@ class Particles:
     def _play(
         self, env: Env, paths: np.ndarray, observation: np.ndarray, entries: tuple[np.ndarray, ...]
     ) -> np.ndarray:
-        """Simulate paths, in the first rows of an env, from entries of `Records.add` until they end
-        or violate; return when.
+        """Simulate paths in the first rows of an env until they end or violate; return when.
+
+        They begin with entries of `Records.add`.
         """
         world: Any = readable(env)
         count, records, kind = len(paths), self._records, self._kind[paths]
@@ -264,12 +261,12 @@ class Particles:
     def _lowest(self, x: Any, before: np.ndarray | None, after: np.ndarray) -> np.ndarray:
         if self._bridge is None or before is None:
             return after
-        return self._bridge.lowest(
+        return self._bridge.sample_minimum(
             x, before, after, self._generator.standard_exponential(after.shape)
         )
 
     def _env(self, count: int) -> Env:
-        """An env with at least so many episodes side by side, seeded when it is first used."""
+        """Return an env with at least so many episodes side by side, seeded at its first use."""
         size = self._largest
         while size // 2 >= max(count, _FEWEST_ENVS):
             size //= 2

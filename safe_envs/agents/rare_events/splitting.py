@@ -10,7 +10,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.jobs import blas_threads
-from safe_envs.agents.rare_events.importance_sampling import MakeDrifting
+from safe_envs.agents.rare_events.importance_sampling import MakeTiltedEnv
 from safe_envs.agents.rare_events.particles import Particles
 
 KILLED = 0.75
@@ -83,7 +83,7 @@ class Splitting:
         policy: anything with Stable-Baselines3's `predict`, without memory.
         seed: of all randomness.
         num_envs: the most episodes side by side.
-        bridge: looks at h between control instants too.
+        bridge: gives the minimum h between control instants too.
         killed: share at a level, at least, between 0 and 1.
 
     Source: C.-E. Brehier, M. Gazeau, L. Goudenege, T. Lelievre, M. Rousset, Unbiasedness of some
@@ -91,7 +91,7 @@ class Splitting:
         (2016) 3559-3601.
     """
 
-    make: MakeDrifting
+    make: MakeTiltedEnv
     policy: Any
     seed: int
     num_envs: int
@@ -101,12 +101,13 @@ class Splitting:
     def choose(
         self, particles: int, progress: Callable[[float], None] | None = None
     ) -> tuple[float, int]:
-        """Find the power whose estimates differ less, in a few small repetitions with each; 0 if
-        violations are frequent.
+        """Find the power whose estimates differ less, in a few small repetitions with each.
+
+        It is 0 if violations are frequent.
 
         Args:
             particles: of the estimation that is to come.
-            progress: told the part that is done.
+            progress: called with the part that is done.
 
         Returns:
             One of `POWERS`, and the control periods that were simulated.
@@ -132,7 +133,7 @@ class Splitting:
             power: of the score.
             particles: N.
             repetitions: R.
-            progress: told the part of the way from the first level to 0.
+            progress: called with the part of the way from the first level to 0.
 
         Raises:
             ConfigurationError: the policy has a memory.
@@ -156,8 +157,9 @@ class Splitting:
 
 
 def _spread(estimates: np.ndarray) -> tuple[int, float]:
-    """How much estimates differ: first by how many there are none, then by the deviation of the
-    logarithms of the others.
+    """Return how much estimates differ.
+
+    First counts how many there are none, then the deviation of the logarithms of the others.
     """
     found = estimates[estimates > 0.0]
     return len(estimates) - len(found), float(np.std(np.log(found))) if len(found) else 0.0
@@ -204,8 +206,9 @@ class _Run:
                 self.paths.branch(killed, parents, levels)
 
     def violating(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the paths that violate, their `girsanov_integrals`, and the part of the estimated
-        probability for which each stands.
+        """Return the `girsanov_integrals` of the paths that violate, and their shares.
+
+        The share is the part of the estimated probability for which each stands.
         """
         violate = self.paths.lowest.reshape(len(self.estimates), self._particles) <= 0.0
         each = self.estimates / (np.maximum(violate.sum(axis=1), 1) * len(self.estimates))
@@ -214,8 +217,9 @@ class _Run:
         )
 
     def _next_level(self, r: int) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Whom to kill, whom to continue in their place and from which level; None if the
-        repetition is at its end.
+        """Return which paths to kill, which to continue in their place, and from which level.
+
+        None if the repetition is at its end.
         """
         own = np.arange(r * self._particles, (r + 1) * self._particles)
         lowest = self.paths.lowest[own]

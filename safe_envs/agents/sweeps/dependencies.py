@@ -15,11 +15,8 @@ from safe_envs.wrappers import files_of, with_absolute_paths
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of a cell with paths that mean the same in every process."""
-    found = {
-        **settings,
-        "filter": _FILE.sub(lambda match: os.path.realpath(match.group()), settings["filter"]),
-    }
+    """The settings of a cell with paths that mean the same in every process."""
+    found = {**settings, "filter": with_absolute_paths(settings["filter"])}
     found["policy"] = absolute_policy(settings["policy"])
     if "system" in settings:
         file, _, name = settings["system"].rpartition(":")

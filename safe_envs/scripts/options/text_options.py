@@ -34,6 +34,7 @@ def require_outputs(
     plot: Path | None,
     *,
     out: Path | None = None,
+    episodes_out: Path | None = None,
     inputs: Iterable[tuple[str, Path]] = (),
 ) -> None:
     """Check, before any work, that --out, --json and --plot can be written, each to a file of its
@@ -43,13 +44,19 @@ def require_outputs(
         json: of --json, if given.
         plot: of --plot, if given.
         out: of --out, where a command has it.
+        episodes_out: of --episodes-out, where a command has it.
         inputs: options and the files that they read, which are not to be overwritten.
 
     Raises:
         ConfigurationError: one cannot.
     """
     taken = {os.path.realpath(path): f"{option} {path}" for option, path in inputs}
-    for option, path in (("--out", out), ("--json", json), ("--plot", plot)):
+    for option, path in (
+        ("--out", out),
+        ("--json", json),
+        ("--episodes-out", episodes_out),
+        ("--plot", plot),
+    ):
         if path is None or (option == "--json" and path == STDOUT):
             continue
         require_writable(path)
@@ -59,6 +66,10 @@ def require_outputs(
                 f"{option} {path} would overwrite the file of {taken[place]}; name another file"
             )
         taken[place] = f"{option} {path}"
+    if episodes_out is not None:
+        from safe_envs.agents.evaluation.episodes_file import require_parquet
+
+        require_parquet()
     if plot is not None:
         _require_format(plot)
 

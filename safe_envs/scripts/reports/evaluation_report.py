@@ -7,13 +7,12 @@ from rich.text import Text
 
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
 from safe_envs.agents.evaluation.comparison import Comparison
-from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.refinement import TOLERANCE, Refinement
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.options.console import say
+from safe_envs.rate_text import percent, percent_in
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
 from safe_envs.scripts.reports.tables import make_table, print_whole
 
@@ -43,7 +42,7 @@ _VERDICTS = {
 
 
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:
-    """Print a heading, a row for each filter, comparisons, and what has to be known to read them."""
+    """Print a heading, a row for each filter, comparisons, and notes on how to read them."""
     interval = _interval(evaluation)
     say(console, heading(evaluation))
     learned = learned_columns(evaluation.rows)
@@ -110,7 +109,7 @@ def heading(evaluation: Evaluation) -> Text:
         f" {config['seed']}",
         style="not bold",
     )
-    goal = ", joint program with the goal" if config["objective"] == "clf" else ""
+    goal = ", joint QP with the goal" if config["objective"] == "clf" else ""
     watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
     title.append(
         f"\n{_told(evaluation)}{watched}; filters know the {config['knowledge']}{goal}",
@@ -187,20 +186,20 @@ def _notes(evaluation: Evaluation) -> list[str]:
     if evaluation.is_deterministic:
         notes.append(
             "nothing is random here (no noise, a fixed start, a deterministic policy), so that all"
-            " episodes are one and the same: the interval says nothing."
+            " episodes are one and the same: the interval has no meaning."
         )
     return notes
 
 
 def _of_bound(row: EvaluationRow) -> list[str]:
-    """Why a row has no bound, or is promised nothing from some of its starts."""
+    """Return why a row has no bound, or none from some of its starts."""
     name, notes = row.filter, []
     if name != UNFILTERED and row.estimated_bound is None and row.learning is None:
         notes.append(f"no bound for {name}: {row.bound_note}")
     if row.outside_rate:
         notes.append(
             f"{100 * row.outside_rate:.3g} % of the starts lie outside the sets C_j = {{b_j >="
-            f" 0}}, j >= 1, that {name} keeps: nothing is promised from there"
+            f" 0}}, j >= 1, that {name} keeps: no bound holds from there"
         )
     return notes
 

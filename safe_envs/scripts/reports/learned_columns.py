@@ -1,16 +1,14 @@
-"""What the table of an evaluation says of learning: its time, the worst identification, bounds over
-posteriors, and notes.
-"""
+"""Columns and notes of an evaluation's table on learned models and posterior bounds."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import FilterTiming
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.dynamics.lie import lie_derivative_g, vanishes
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.rate_text import percent
 
 Cell = Callable[[EvaluationRow, FilterTiming], str]
 """From a row, and what was timed of it, to a text."""
@@ -19,7 +17,7 @@ _NONE = "-"
 
 
 def learned_columns(rows: Sequence[EvaluationRow]) -> dict[str, Cell]:
-    """The columns that the rows need, by title; none where nothing was learned."""
+    """Return the columns that the rows need, by title; none where nothing was learned."""
     columns: dict[str, Cell] = {}
     repeats = _repeats(rows)
     if repeats:
@@ -32,7 +30,7 @@ def learned_columns(rows: Sequence[EvaluationRow]) -> dict[str, Cell]:
 
 
 def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list[str]:
-    """What has to be known of what was learned of a problem, and of bounds over posteriors."""
+    """Return notes on what was learned of a problem, and on bounds over posteriors."""
     repeats = _repeats(rows)
     if not repeats:
         return []
@@ -42,7 +40,7 @@ def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list
         if untried
         else ""
     )
-    notes = [f"no bound for what rests on something learned{hint}."]
+    notes = [f"no bound for learned filters{hint}."]
     if repeats > 1:
         notes.append(
             f"the intervals take the rates of the {repeats} identifications for nearly normal: bad"
@@ -67,20 +65,21 @@ def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list
             notes.append(
                 f"bound of {name} over the posterior: (1 - delta)(h_0 - (m + e) T)/c,"
                 f" estimated, with probability delta = {bound.delta:.3g} that the identification"
-                f" misses the system, shortfall m = {bound.shortfall:.3g}, bias of the steps e ="
+                f" does not contain the system, shortfall m = {bound.shortfall:.3g}, bias of the steps e ="
                 f" {bound.bias:.3g}, c = {bound.supremum:.3g}."
             )
     return notes
 
 
 def _repeats(rows: Sequence[EvaluationRow]) -> int:
-    """The number of identifications of what was learned; 0 where nothing was."""
+    """Return the number of identifications of what was learned; 0 where nothing was."""
     return max((row.learning.repeats for row in rows if row.learning), default=0)
 
 
 def _may_have_a_bound(problem: SafetyProblem) -> bool:
-    """Whether a problem has one barrier, of relative degree 1: for others there is no robust
-    condition, on which such a bound rests.
+    """Return whether a problem has one barrier, of relative degree 1.
+
+    Others have no robust condition, which such a bound needs.
     """
     if len(problem.barriers) != 1:
         return False

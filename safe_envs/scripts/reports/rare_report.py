@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
-
+from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
-from safe_envs.agents.rare_events.estimate import RareEvaluation, estimate_rare
+from safe_envs.agents.rare_events.estimate import RareEvaluation
 from safe_envs.agents.rare_events.rows import RareRow
-from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.options.console import progress_bar, say, stdout, write_result
 from safe_envs.scripts.reports.evaluation_report import describe_system, early_end, unsafe_starts
 from safe_envs.scripts.reports.tables import make_table, print_whole
 
@@ -26,34 +21,6 @@ _COLUMNS = (
     "violations in\nplain episodes",
     "steps/s",
 )
-
-
-def run_rare(
-    json: Path | None, refused: Mapping[str, Any], env: Any, policy: str, **arguments: Any
-) -> None:
-    """Estimate, print the answer and write it.
-
-    Args:
-        json: of --json, if given.
-        refused: options that splitting knows nothing of, and what was given for them.
-        env: id or problem.
-        policy: as for `estimate_rare`.
-        **arguments: of `estimate_rare`; None for its default.
-
-    Raises:
-        ConfigurationError: one of the refused options was given, or as `estimate_rare`.
-    """
-    given = [name for name, value in refused.items() if value]
-    if given:
-        raise ConfigurationError(
-            f"--rare does not go with {', '.join(given)}; leave one of them out"
-        )
-    with progress_bar("Splitting") as tell:
-        answer = estimate_rare(
-            env, policy, progress=tell, **{k: v for k, v in arguments.items() if v is not None}
-        )
-    print_rare(stdout(), answer)
-    write_result(json, answer.document)
 
 
 def print_rare(console: Console, answer: RareEvaluation) -> None:

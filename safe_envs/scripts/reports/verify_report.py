@@ -12,9 +12,8 @@ from rich.markup import escape
 from rich.text import Text
 
 from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
-from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.scripts.options.console import say
+from safe_envs.rate_text import percent, percent_in
 from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.scripts.reports.tables import make_table
 from safe_envs.wrappers import spec_of

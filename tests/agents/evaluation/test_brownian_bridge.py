@@ -26,7 +26,7 @@ def test_minimum_has_the_law_of_a_brownian_bridge(before, after):
     dt, sigma, count = 0.05, 1.5, 20_000
     bridge = BrownianBridge(brownian(dt, 1.0, 0.0, sigma))
     first, last = (np.full((count, 1), value) for value in (before, after))
-    lowest = bridge.lowest(
+    lowest = bridge.sample_minimum(
         (np.zeros(count),), first, last, np.random.default_rng(0).standard_exponential((count, 1))
     )
 
@@ -59,7 +59,7 @@ def test_variance_is_that_of_the_beginning_of_the_period():
         + after
         - np.sqrt((after - before) ** 2 + 2 * np.array(rate)[:, None] * problem.dt * draws)
     )
-    assert bridge.lowest(x, before, after, draws) == pytest.approx(wanted)
+    assert bridge.sample_minimum(x, before, after, draws) == pytest.approx(wanted)
     assert bridge.barriers(x)[:, 0] == pytest.approx([float(h.subs(point)) for point in points])
 
 
@@ -108,7 +108,8 @@ def test_control_and_noise_are_those_of_discrete_monitoring():
             == continuous.trajectories[name].barrier.tobytes()
         )
         # Whoever violates at an instant violates.
-        assert continuous.flags[name][0].table(discrete.flags[name][0])[1] == 0
+        late, early = (each.episodes[name][0].safe for each in (continuous, discrete))
+        assert not (late & ~early).any()
     assert (discrete.config["monitoring"], continuous.config["monitoring"]) == (
         "discrete",
         "continuous",
@@ -166,9 +167,9 @@ def test_several_barriers_have_bridges_of_their_own():
     assert row.ci_low < 1 - 2 * first_passage(1.0, 0.0, 0.5, 1.0) < row.ci_high
 
 
-def test_unknown_word_and_env_of_somebody_else_are_refused():
+def test_unknown_word_and_third_party_env_are_refused():
     with pytest.raises(ConfigurationError, match="did you mean 'continuous'"):
         evaluate("Scalar-v0", monitoring="continous")
     place = f"{Path(__file__).parents[3] / 'examples' / 'pendulum_v1.py'}:spec"
-    with pytest.raises(ConfigurationError, match="not known"):
+    with pytest.raises(ConfigurationError, match="unknown"):
         evaluate("Pendulum-v1", filter_spec=place, monitoring="continuous", episodes=2)

@@ -51,7 +51,7 @@ def test_batches_of_any_size_keep_the_same(seed, size, missing):
     missed = np.where(safe[:-1], slack, 0.0)
     most = np.sort(missed.max(axis=0))[::-1]
     np.testing.assert_array_equal(found.slack, most[most > 0][:64])
-    for state, action, size_of in zip(found.missed, found.actions, found.slack, strict=True):
+    for state, action, size_of in zip(found.violating, found.actions, found.slack, strict=True):
         k, i = np.argwhere(missed == size_of)[0]
         np.testing.assert_array_equal(state, x[k, :, i])
         assert action == x[k, 0, i] - x[k, 1, i]

@@ -15,7 +15,7 @@ from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.agents.rare_events.importance_sampling import (
-    Drifting,
+    ImportanceSampling,
     TiltedNoiseEnv,
     log_ratio,
     optimal_tilt,
@@ -35,7 +35,7 @@ def both(problem, bridge=None):
         4096,
         bridge,
     )
-    return Splitting(*how), Drifting(*how)
+    return Splitting(*how), ImportanceSampling(*how)
 
 
 def test_exact_for_several_barriers_and_substeps():

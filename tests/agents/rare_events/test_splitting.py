@@ -18,7 +18,7 @@ from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.rare_events import splitting
 from safe_envs.agents.rare_events.estimate import estimate_rare
-from safe_envs.agents.rare_events.importance_sampling import Drifting, TiltedNoiseEnv
+from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling, TiltedNoiseEnv
 from safe_envs.agents.rare_events.splitting import Splitting
 from safe_envs.problem.barrier import Barrier
 from safe_envs.scripts.reproduce.chapter_4.martingale import attaining_problem
@@ -133,7 +133,7 @@ def test_pilots_and_estimates_have_noise_of_their_own():
     how = (lambda lengths: Noting(problem, lengths), ZeroController(problem), 0, 64)
     Splitting(*how).choose(50)
     Splitting(*how).estimate(0.0, 50, 10)
-    Drifting(*how).estimate(3.0, 50, 2)
+    ImportanceSampling(*how).estimate(3.0, 50, 2)
     assert len(seeds) == 4
     assert len(set.union(*seeds)) == sum(len(each) for each in seeds)
 

@@ -69,13 +69,10 @@ def test_starts_from_which_nothing_is_promised_are_told(evaluated):
     # b_1 = v, and v is even in [-3, 1].
     assert 0.5 < scbf["outside_rate"] < 0.95
     told = (
-        "lie outside the sets C_j = {b_j >= 0}, j >= 1, that scbf keeps: nothing is promised from"
-        " there"
+        "lie outside the sets C_j = {b_j >= 0}, j >= 1, that scbf keeps: no bound holds from there"
     )
     assert f"Note: {100 * scbf['outside_rate']:.3g} % of the starts {told}\n" in out
-    assert (
-        "nothing is promised" not in evaluated("falling", "--filter", "scbf", "--start", "1,1")[1]
-    )
+    assert "no bound holds" not in evaluated("falling", "--filter", "scbf", "--start", "1,1")[1]
 
 
 def printed(answer):

@@ -12,13 +12,13 @@ from rich.console import Console
 
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.rows import LearningSummary, PosteriorGuarantee
-from safe_envs.registry import make_problem
-from safe_envs.scripts.evaluate import LEARNED_PARAMETERS
+from safe_envs.registry import load_problem
+from safe_envs.scripts.options.evaluation_options import LEARNED_PARAMETERS
 from safe_envs.scripts.reports.evaluation_report import heading, print_evaluation
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
 from safe_envs.wrappers import LEARNED
 
-NO_BOUND = "no bound for what rests on something learned"
+NO_BOUND = "no bound for learned filters"
 LEARNING = LearningSummary([], 1, 20, [], [], [], {}, [], [], rates=[0.9])
 OFTEN = replace(LEARNING, repeats=3, rates=[0.9, 0.5, 0.8])
 POSTERIOR_BOUND = PosteriorGuarantee(0.4, "", delta=0.1, shortfall=0.0, bias=0.0, supremum=1.0)

@@ -66,7 +66,12 @@ def printed_run(problem: SafetyProblem, knowledge: str) -> Trajectory:
         problem: with a fixed start.
         knowledge: "model" for the mass of the model, "plant" for the true one.
     """
-    return runs(problem, [PrintedCondition(printed_hocbf)], knowledge=knowledge)[0]
+    condition = PrintedCondition(printed_hocbf)
+    found = list(periods(problem, condition, "nominal", range(1), 0, knowledge))
+    start = problem.starts[problem.start].state
+    states = np.array([start, *(period.states[0] for period in found)], dtype=float)
+    h = [found[0].before[0], *(period.after[0] for period in found)]
+    return Trajectory(states, np.array(h))
 
 
 def compute(sample: Sample) -> Outcome:

@@ -113,7 +113,6 @@ def compute(sample: Sample) -> Outcome:
         [safe_up_to(s, t, step) for s in STARTS] for t, step in ((math.inf, 0.0), (HORIZON, STEP))
     ]
     curves = [each.row.curve for each in attained]
-    note = partial(CHAPTER.note, "example-4.2.2", horizon=HORIZON)
     calm_rate = measure(SCALAR, "rcbf", 1, 0, options=calm).rate
     return Outcome(
         numbers=[

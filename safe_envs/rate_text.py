@@ -9,12 +9,12 @@ _MOST_DIGITS = 9
 
 
 def percent(rate: float | None) -> str:
-    """A rate in per cent; "-" for None."""
+    """Return a rate in per cent as text; "-" for None."""
     return "-" if rate is None else f"{_percents(rate)[0]} %"
 
 
 def percent_in(rate: float, low: float, high: float) -> str:
-    """A rate with its interval, in per cent."""
+    """Return a rate with its interval, in per cent, as text."""
     rate_text, low_text, high_text = _percents(rate, low, high)
     return f"{rate_text} % [{low_text}, {high_text}]"
 
@@ -25,7 +25,7 @@ def rate_of(row: Mapping[str, Any]) -> str:
 
 
 def _percents(*rates: float) -> list[str]:
-    """With one digit, or as many more as it takes to tell each from 0 and from 1 that is neither."""
+    """Return percentages with one digit, or as many as tell each from 0 and from 1."""
     # What rounding has left of 0 and 1 is the same.
     open_ended = [rate for rate in rates if 1e-12 < rate < 1.0 - 1e-12]
     digits = next(

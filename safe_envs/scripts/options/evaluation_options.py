@@ -1,0 +1,132 @@
+"""Options of commands that evaluate or show filters and policies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from safe_envs.scripts.options import completion, text_options
+
+LEARNED_PARAMETERS = (
+    "learned-hocbf:p=..:level=.95:eps=.. (quantile of the held-out errors that is the margin, or"
+    " the margin itself), ddscbf:margin=0, bayesian-scbf:confidence=P or"
+    " bayesian-scbf:simultaneous=P (robust at each state by itself, or at all at once), and with"
+    " each file=FILE, as by --learned, and sampling_margin=M"
+)
+
+Filters = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--filter",
+        metavar="NAME",
+        autocompletion=completion.filters,
+        help=(
+            "none, cbf, ecbf, hocbf, rcbf, srcbf, szcbf, scbf, and learned ones: learned-hocbf,"
+            " ddscbf, bayesian-scbf; with "
+            "parameters: hocbf:p=2,8; one for each barrier: hocbf:p=2,8+cbf:alpha=1; a condition of"
+            " your own: FILE.py:NAME. Repeatable. By default none and the env's own. "
+            f"Parameters of learned ones: {LEARNED_PARAMETERS}."
+        ),
+    ),
+]
+Policy = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME|FOLDER|FILE",
+        autocompletion=completion.policies,
+        help=(
+            "nominal, clf, zero, random, a policy of your own as FILE.py:NAME, a folder of"
+            " `safe-envs train`, or with --trust a .zip of Stable-Baselines3."
+        ),
+    ),
+]
+FilterSpecPlace = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE.py:NAME",
+        help=(
+            "For the ENV_ID of a third-party env, like Pendulum-v1: a FilterSpec that says how"
+            " filters see it. Runs the file."
+        ),
+    ),
+]
+Objective = Annotated[
+    str,
+    typer.Option(
+        metavar="nearest|clf",
+        help="Of the filters: the action nearest to the policy's, or the joint QP with the goal.",
+    ),
+]
+Learned = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--learned",
+        metavar="FILE",
+        help="What `safe-envs identify` wrote, for the learned filters. Repeatable.",
+    ),
+]
+Episodes = Annotated[int | None, typer.Option(help="Episodes for each filter. [1000]")]
+Repeats = Annotated[
+    int,
+    typer.Option(
+        help="How often to learn, with new seeds: intervals are over identifications too."
+    ),
+]
+Confidence = Annotated[
+    float, typer.Option(metavar="C", help="Of all intervals, above 0 and below 1.")
+]
+Refine = Annotated[
+    bool,
+    typer.Option(
+        "--refine", help="Repeat with dt/2 and dt/4, and say whether the safety rate has converged."
+    ),
+]
+Monitoring = Annotated[
+    str,
+    typer.Option(
+        metavar="discrete|continuous",
+        help="Check h at control instants only, or by Brownian bridges between them too.",
+    ),
+]
+Rare = Annotated[
+    bool,
+    typer.Option(
+        "--rare",
+        help="Estimate P(violation) where it is too small for plain episodes, by splitting on h.",
+    ),
+]
+Particles = Annotated[
+    int | None,
+    typer.Option(help="With --rare, in place of --episodes: episodes of a repetition. [250]"),
+]
+Repetitions = Annotated[
+    int | None, typer.Option(help="With --rare: independent ones, which give the interval. [20]")
+]
+NumEnvs = Annotated[
+    int | None,
+    typer.Option(help="Episodes side by side; it changes the speed, not the answer. [1024]"),
+]
+Jobs = Annotated[int, typer.Option(help="Processes; they change the speed, not the answer.")]
+JsonOut = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help=(
+            "Write configuration, versions, rows, comparisons and timing; - for stdout, and"
+            " nothing else there."
+        ),
+    ),
+]
+EpisodesOut = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.parquet", help="Write what became of each episode; needs pyarrow."),
+]
+Plot = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help=f"Draw h and the safety rate over time, and trajectories: {text_options.FORMATS}",
+    ),
+]

@@ -1,0 +1,95 @@
+"""The result of an evaluation as text, columns, data frames and files."""
+
+from __future__ import annotations
+
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from safe_envs import ConfigurationError
+from safe_envs.agents import evaluate
+from safe_envs.agents.evaluation import episodes_file
+from safe_envs.agents.evaluation.episodes_file import write_episodes
+
+
+@pytest.fixture(scope="module")
+def found():
+    return measured()
+
+
+def measured(**how):
+    options = {"horizon": 1.0, "noise": 0.8}
+    given = {"options": options, "episodes": 40, "bounds": False, **how}
+    return evaluate("Scalar-v0", "random", ["none", "cbf:alpha=2"], record=how == {}, **given)
+
+
+def test_text_is_a_table(found):
+    heading, titles, *rows = str(found).splitlines()
+    assert heading.startswith(found.title)
+    assert titles.startswith("filter")
+    assert "safe [95 % interval]" in titles
+    assert [line.split()[0] for line in rows] == ["none", "cbf:alpha=2"]
+    assert len({len(line) for line in (titles, *rows)}) == 1
+
+
+def test_results_of_episodes_are_those_of_the_rows(found):
+    columns = found.episode_columns()
+    for row in found.rows:
+        here = columns["filter"] == row.filter
+        each = {name: values[here] for name, values in columns.items()}
+        assert each["episode"].tolist() == list(range(40))
+        assert 0 < row.safe == each["safe"].sum() < 40
+        assert row.return_mean == pytest.approx(each["return"].mean())
+        assert row.effort_mean == pytest.approx(np.nanmean(each["effort"]))
+        assert row.min_h_median == np.median(each["min_h"])
+        h = found.trajectories[row.filter].barrier
+        np.testing.assert_array_equal(each["length"], np.isfinite(h).sum(axis=0) - 1)
+        np.testing.assert_allclose(each["min_h"], np.nanmin(h, axis=0))
+        unsafe = ~each["safe"]
+        first = (h <= 0).argmax(axis=0)[unsafe] * found.problem.dt
+        np.testing.assert_allclose(each["first_violation"][unsafe], first)
+        assert np.isnan(each["first_violation"][each["safe"]]).all()
+        counted = np.where(unsafe, (h <= 0).argmax(axis=0), each["length"])
+        share = each["interventions"].sum() / counted.sum()
+        assert row.intervention_rate == pytest.approx(share)
+
+
+@pytest.mark.slow
+def test_the_file_is_the_same_for_every_num_envs_and_jobs(found, tmp_path):
+    contents = set()
+    for i, how in enumerate(({}, {"num_envs": 7}, {"jobs": 2})):
+        write_episodes(tmp_path / f"{i}.parquet", measured(**how))
+        contents.add((tmp_path / f"{i}.parquet").read_bytes())
+    assert len(contents) == 1
+    table = pq.read_table(tmp_path / "0.parquet")
+    columns = found.episode_columns()
+    assert table.column_names == list(columns)
+    assert table["return"].to_pylist() == columns["return"].tolist()
+    assert table["first_violation"].null_count == columns["safe"].sum()
+
+
+def test_without_pyarrow_or_pandas_errors_say_what_to_install(found, monkeypatch, tmp_path):
+    monkeypatch.setattr(episodes_file, "find_spec", lambda _: None)
+    with pytest.raises(ConfigurationError, match=r"pip install \"safe-envs\[sweep\]\""):
+        write_episodes(tmp_path / "out.parquet", found)
+    assert not (tmp_path / "out.parquet").exists()
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ConfigurationError, match="pip install pandas"):
+        found.to_dataframe()
+
+
+def test_data_frames_have_a_row_for_each_filter_or_episode(found, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=lambda data: data))
+    rows = found.to_dataframe()
+    assert [row["safety_rate"] for row in rows] == [row.safety_rate for row in found.rows]
+    assert not {"curve", "learning"} & set(rows[0])
+    assert len(found.to_dataframe(episodes=True)["return"]) == 80
+
+
+def test_rows_are_found_by_name(found):
+    assert found.row("none") is found.rows[0]
+    with pytest.raises(KeyError):
+        found.row("scbf")
