@@ -13,7 +13,8 @@ from typing import Any
 from safe_envs.agents.policies.registry import absolute_policy, policy_files
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 
-_FILE = re.compile("(?<=file=)[^:+]+")
+_FILE = re.compile(r"(?<=file=)[^:+]+|(?<![^+])[^:+]+\.py(?=:)")
+"""A file in the text of a filter: of what was learned, or of a condition of one's own."""
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
