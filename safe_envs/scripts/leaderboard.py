@@ -18,7 +18,6 @@ from safe_envs.scripts.options.console import (
     stdout,
     write_result,
 )
-from safe_envs.scripts.reports.leaderboard_report import leaderboard_markdown, leaderboard_table
 
 
 def leaderboard(
@@ -70,6 +69,7 @@ def leaderboard(
     from safe_envs.agents.jobs.fingerprint import package_versions
     from safe_envs.agents.training.leaderboard import LeaderboardOptions, leaderboard_rows
     from safe_envs.registry import full_id
+    from safe_envs.scripts.reports.leaderboard_report import leaderboard_markdown, leaderboard_table
 
     require_result(json_file)
     ids = list(dict.fromkeys(full_id(env_id) for env_id in env_ids or ENV_IDS))

@@ -10,7 +10,6 @@ import typer
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.scripts.options import text_options
 from safe_envs.scripts.options.console import Json, say, stdout, write_result
-from safe_envs.scripts.reports.sweep_cells import print_cells, report_document
 
 _PICTURE = "report.png"
 _SHOWN = 10
@@ -60,6 +59,7 @@ def sweep_report(
     """
     from safe_envs.agents.sweeps.store import read, read_index
     from safe_envs.scripts.figures.sweep_figure import Layout, draw
+    from safe_envs.scripts.reports.sweep_cells import print_cells, report_document
 
     path = plot or folder / _PICTURE
     index, rows = read_index(folder), read(folder).to_pylist()
