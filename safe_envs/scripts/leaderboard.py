@@ -80,10 +80,8 @@ def leaderboard(
         say(stdout(), leaderboard_markdown(rows))
     else:
         stdout().print(leaderboard_table(rows))
-    write_result(
-        json_file,
-        lambda: {"settings": asdict(options), "versions": package_versions(), "rows": rows},
-    )
+    document = {"settings": asdict(options), "versions": package_versions()}
+    write_result(json_file, lambda: {**document, "rows": [asdict(row) for row in rows]})
 
 
 if __name__ == "__main__":
