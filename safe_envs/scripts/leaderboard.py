@@ -23,7 +23,6 @@ from safe_envs.scripts.options.console import (
     stdout,
     write_result,
 )
-from safe_envs.scripts.reports.leaderboard_report import leaderboard_markdown, leaderboard_table
 
 
 def leaderboard(
@@ -75,6 +74,7 @@ def leaderboard(
     from safe_envs.agents.jobs.fingerprint import package_versions
     from safe_envs.agents.training.leaderboard import LeaderboardOptions, leaderboard_rows
     from safe_envs.registry import full_id
+    from safe_envs.scripts.reports.leaderboard_report import leaderboard_markdown, leaderboard_table
 
     require_result(json_file)
     ids = list(dict.fromkeys(full_id(env_id) for env_id in env_ids or ENV_IDS))
@@ -85,10 +85,8 @@ def leaderboard(
         say(stdout(), leaderboard_markdown(rows))
     else:
         stdout().print(leaderboard_table(rows))
-    write_result(
-        json_file,
-        lambda: {"settings": asdict(options), "versions": package_versions(), "rows": rows},
-    )
+    document = {"settings": asdict(options), "versions": package_versions()}
+    write_result(json_file, lambda: {**document, "rows": [asdict(row) for row in rows]})
 
 
 if __name__ == "__main__":

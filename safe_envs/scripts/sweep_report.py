@@ -12,7 +12,6 @@ from safe_envs.rate_text import percent, percent_in
 from safe_envs.scripts.options import text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, say, stdout, write_result
-from safe_envs.scripts.reports.sweep_cells import print_cells, report_document
 
 _PICTURE = "report.png"
 _SHOWN = 10
@@ -62,6 +61,7 @@ def sweep_report(
     """
     from safe_envs.agents.sweeps.store import read, read_index
     from safe_envs.scripts.figures.sweep_figure import Layout, draw
+    from safe_envs.scripts.reports.sweep_cells import print_cells, report_document
 
     path = plot or folder / _PICTURE
     index, rows = read_index(folder), read(folder).to_pylist()

@@ -18,7 +18,6 @@ from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 from safe_envs.scripts.options.hyperparameter_options import read_hyperparameters
-from safe_envs.scripts.reports.training_report import print_evaluations
 
 
 @with_env
@@ -113,6 +112,7 @@ def train(
     """
     from safe_envs.agents.policies.base import DESCRIPTION
     from safe_envs.agents.training.config import Training
+    from safe_envs.scripts.reports.training_report import print_evaluations
 
     text_options.require_outputs(
         json_file, None, inputs=text_options.inputs_of(env.system, filters=filters or ())

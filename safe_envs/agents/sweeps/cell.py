@@ -8,7 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents.evaluation.evaluate import run_evaluation
+from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.jobs.fingerprint import (
     file_checksum,
     json_checksum,
@@ -67,6 +68,21 @@ class Cell:
                 options.setdefault(group, {})[parameter] = value
         return options
 
+    @property
+    def spec(self) -> EvaluationSpec:
+        """What to evaluate.
+
+        Raises:
+            ConfigurationError: a value is out of range.
+        """
+        return EvaluationSpec(
+            self.env_id,
+            filters=(self.settings["filter"],),
+            options=self.options,
+            trust=self.trust,
+            **{name: self.settings[name] for name in EVALUATION_DEFAULTS},
+        )
+
     def compute(self) -> dict[str, Any]:
         """Return the "row" and the "config" of the evaluation, in any process of this project.
 
@@ -76,14 +92,7 @@ class Cell:
             SafeEnvsError: the evaluation fails.
         """
         self._require_same_code()
-        arguments = {name: self.settings[name] for name in EVALUATION_DEFAULTS}
-        found = evaluate(
-            self.env_id,
-            filters=[self.settings["filter"]],
-            trust=self.trust,
-            options=self.options,
-            **arguments,
-        )
+        found = run_evaluation(self.spec)
         return {"row": found.rows[0].as_dict(), "config": found.config}
 
     def _require_same_code(self) -> None:

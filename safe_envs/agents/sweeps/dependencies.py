@@ -11,7 +11,9 @@ from typing import Any
 
 from safe_envs.agents.policies.registry import absolute_policy, policy_files
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
-from safe_envs.wrappers import files_of, with_absolute_paths
+
+_FILE = re.compile(r"(?<=file=)[^:+]+|(?<![^+])[^:+]+\.py(?=:)")
+"""A file in the text of a filter: of what was learned, or of a condition of one's own."""
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:

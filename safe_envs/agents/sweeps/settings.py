@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import fields
+from typing import Any, get_type_hints
 
-from safe_envs.agents.evaluation.spec import UNFILTERED
+from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import real
 from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS
@@ -16,19 +17,18 @@ from safe_envs.registry import full_id
 ENV_OPTIONS = ("system", *(name for name in OPTION_NAMES if name not in PARAMETER_GROUPS))
 """Settings that are arguments of `gym.make`."""
 
+_OTHERWISE = ("problem", "filters", "options", "filter_spec", "learned", "trust")
+"""Fields of an evaluation that a sweep states in another way, or not at all."""
+
 EVALUATION_DEFAULTS: dict[str, Any] = {
-    "policy": "nominal",
-    "knowledge": "model",
-    "objective": "nearest",
-    "seed": 0,
-    "episodes": 1000,
-    "bounds": False,
-}
-"""Settings that are arguments of `evaluate`, with the values of a cell that leaves them out."""
+    field.name: field.default for field in fields(EvaluationSpec) if field.name not in _OTHERWISE
+} | {"bounds": False}
+"""Settings that are fields of an `EvaluationSpec`, with the values of a cell without them."""
 
 _SECTIONS = ("fixed", "grid", "cells")
+_KINDS = get_type_hints(EvaluationSpec) | {"substeps": int, "policy": str}
+_WORDS = ("env", "system", "filter", *(name for name in EVALUATION_DEFAULTS if _KINDS[name] is str))
 _NAMES = ("env", "filter", *ENV_OPTIONS, *EVALUATION_DEFAULTS)
-_WORDS = ("env", "system", "filter", "policy", "knowledge", "objective")
 _GROUPS = tuple(f"{group}.NAME" for group in PARAMETER_GROUPS)
 
 Settings = dict[str, Any]
@@ -155,13 +155,13 @@ def _value(name: str, value: Any, what: str) -> Any:
     """Return a value of the kind that its setting takes, in one form where there are several."""
     if name in _WORDS:
         return _word(name, value, what)
-    if name == "bounds":
+    if _KINDS.get(name) is bool:
         if not isinstance(value, bool):
             raise ConfigurationError(
-                f"{what}: bounds = {shortened(text_of(value))}; give true or false"
+                f"{what}: {name} = {shortened(text_of(value))}; give true or false"
             )
         return value
-    if name in ("seed", "episodes", "substeps"):
+    if _KINDS.get(name) is int:
         require_whole(f"{what}: {name}", value, 0 if name == "seed" else 1)
         return value
     if isinstance(value, list):

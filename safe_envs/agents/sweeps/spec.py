@@ -9,19 +9,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import file_checksum
-from safe_envs.agents.policies.registry import make_policy
 from safe_envs.agents.sweeps.cell import Cell, versions
 from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_imported
 from safe_envs.agents.sweeps.document import document_in
 from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_of
-from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
-from safe_envs.registry import make_problem
-from safe_envs.wrappers import SafetyFilter, learned_parts, require_readable
+from safe_envs.errors import ConfigurationError, SafeEnvsError
+from safe_envs.wrappers import LEARNED, SafetyFilter
 
 _NO_PART = ("seed", "episodes", "bounds")
-"""Settings that change neither the problem nor the filter nor the policy."""
+"""Settings that need no check other than that of their kind."""
 
 _TOGETHER = {"filter": ("env", "system", "knowledge", "objective"), "policy": ("env", "system")}
 """Settings with which another one has to be compatible."""
@@ -170,17 +169,8 @@ def _check(sweep: Sweep, what: str) -> None:
 
 
 def _check_cell(cell: Cell, derive: bool) -> None:
-    settings = cell.settings
-    for name, allowed in (("knowledge", ("model", "plant")), ("objective", ("nearest", "clf"))):
-        if settings[name] not in allowed:
-            raise ConfigurationError(
-                f"{name} = {shown(settings[name])}; {nearest(settings[name], allowed)}"
-            )
-    problem = make_problem(cell.env_id, **cell.options)
-    if settings["filter"] != UNFILTERED:
-        require_readable(settings["filter"], problem)
-        if derive and not learned_parts(settings["filter"]):
-            SafetyFilter.for_problem(
-                problem, settings["filter"], settings["knowledge"], settings["objective"]
-            )
-    make_policy(settings["policy"], problem, cell.trust)
+    found = ResolvedEvaluation(cell.spec)
+    (name,) = found.names
+    needs_learning = any(part.split(":")[0] in LEARNED for part in name.split("+"))
+    if derive and name != UNFILTERED and not needs_learning:
+        SafetyFilter.for_problem(found.problem, name, cell.spec.knowledge, cell.spec.objective)

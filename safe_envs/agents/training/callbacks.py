@@ -138,11 +138,6 @@ class ProgressLog(KVWriter):
         """Do nothing: each line is written at once."""
 
 
-def read_progress(path: Path) -> list[Mapping[str, Any]]:
-    """Return the lines of a `ProgressLog`."""
-    return [line for _, line in _lines(path)]
-
-
 def _copy(path: Path, to: Path, until: int) -> None:
     """Copy the lines of a log up to a step."""
     with to.open("w") as stream:

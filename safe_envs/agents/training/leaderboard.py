@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.spec import UNFILTERED
@@ -17,11 +17,42 @@ from safe_envs.registry import make_problem
 from safe_envs.systems import ENV_IDS
 
 _QUICK: dict[str, Any] = {"n_timesteps": 4096, "eval_freq": 4096, "eval_episodes": 50}
-_NAMES = ("env_id", "policy", "filter")
-_STATISTICS = ("safety_rate", "ci_low", "ci_high", "return_mean", "intervention_rate")
+_STATISTICS = ("filter", "safety_rate", "ci_low", "ci_high", "return_mean", "intervention_rate")
 
-Row = dict[str, Any]
-"""Names of the env, the policy and the filter; statistics; and the seconds of the training."""
+
+@dataclass(frozen=True)
+class LeaderboardRow:
+    """The evaluation of a policy with a filter.
+
+    Attributes:
+        env_id: full id.
+        policy: its name in the leaderboard.
+        filter: text of the filter, or "none".
+        safety_rate: share of the episodes without a violation.
+        ci_low: lower end of its 95 % interval.
+        ci_high: upper end.
+        return_mean: mean return of an episode.
+        intervention_rate: share of the steps at which the filter changed the action.
+        trained_in: processor time of the training in seconds; None without one.
+
+    Raises:
+        TypeError: an attribute is of another type.
+    """
+
+    env_id: str
+    policy: str
+    filter: str
+    safety_rate: float
+    ci_low: float
+    ci_high: float
+    return_mean: float
+    intervention_rate: float
+    trained_in: float | None
+
+    def __post_init__(self) -> None:
+        for name, kind in get_type_hints(type(self)).items():
+            if not isinstance(getattr(self, name), kind):
+                raise TypeError(f"{name} is {getattr(self, name)!r}")
 
 
 @dataclass(frozen=True)
@@ -49,7 +80,7 @@ def leaderboard_rows(
     options: LeaderboardOptions,
     out: Path,
     progress: Callable[[float], None],
-) -> list[Row]:
+) -> list[LeaderboardRow]:
     """Return five rows for each env, computed unless a previous run has kept them.
 
     Args:
@@ -71,7 +102,11 @@ def leaderboard_rows(
                 env_id, options, out, lambda part, k=k: progress((k + part) / count)
             )
             rows = list(of_env)
-            store.keep(_key(env_id), _configuration(env_id, options), {"rows": rows})
+            store.keep(
+                _key(env_id),
+                _configuration(env_id, options),
+                {"rows": [asdict(row) for row in rows]},
+            )
         found += rows
         progress((k + 1) / count)
     return found
@@ -85,24 +120,19 @@ def _configuration(env_id: str, options: LeaderboardOptions) -> dict[str, Any]:
     return {"env_id": env_id, "options": asdict(options), "versions": package_versions()}
 
 
-def _kept(store: ResultStore, env_id: str, options: LeaderboardOptions) -> list[Row] | None:
+def _kept(
+    store: ResultStore, env_id: str, options: LeaderboardOptions
+) -> list[LeaderboardRow] | None:
     document = store.read(_key(env_id), _configuration(env_id, options))
     if document is None:
         return None
     with reading(store.path(_key(env_id))):
-        for row in document["rows"]:
-            numbers = [*(row[name] for name in _STATISTICS), row["trained_in"] or 0.0]
-            texts = [row[name] for name in _NAMES]
-            if not all(isinstance(n, int | float) for n in numbers) or not all(
-                isinstance(text, str) for text in texts
-            ):
-                raise TypeError("a row has entries of other types")
-    return document["rows"]
+        return [LeaderboardRow(**row) for row in document["rows"]]
 
 
 def _rows_of_env(
     env_id: str, options: LeaderboardOptions, out: Path, progress: Callable[[float], None]
-) -> Iterator[Row]:
+) -> Iterator[LeaderboardRow]:
     """Yield the rows of the nominal controller, and of agents without and with the filter."""
     default, algo = make_problem(env_id).filter, options.algo
     yield from _evaluated(env_id, "nominal", "nominal", [UNFILTERED, default], options)
@@ -137,7 +167,7 @@ def _evaluated(
     filters: Sequence[str],
     options: LeaderboardOptions,
     seconds: float | None = None,
-) -> Iterator[Row]:
+) -> Iterator[LeaderboardRow]:
     found = evaluate(
         env_id,
         policy,
@@ -148,5 +178,5 @@ def _evaluated(
         bounds=False,
     )
     for row in found.rows:
-        statistics = {name: getattr(row, name) for name in ("filter", *_STATISTICS)}
-        yield {"env_id": env_id, "policy": name, **statistics, "trained_in": seconds}
+        statistics = {key: getattr(row, key) for key in _STATISTICS}
+        yield LeaderboardRow(env_id, name, **statistics, trained_in=seconds)

@@ -23,7 +23,7 @@ def test_a_file_that_changed_or_went_is_an_error(tmp_path: Path, monkeypatch: py
     file.write_bytes(b"1")
     monkeypatch.setattr(
         cell,
-        "evaluate",
+        "run_evaluation",
         lambda *_, **__: Evaluated([SimpleNamespace(as_dict=lambda: {"safe": 1})], {}),
     )
     (one,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
@@ -49,7 +49,7 @@ def test_threads_of_a_worker_compute_one_cell_at_a_time(monkeypatch: pytest.Monk
         both.wait(0.3)
         return Evaluated([{}], {})
 
-    monkeypatch.setattr(cell, "evaluate", evaluate)
+    monkeypatch.setattr(cell, "run_evaluation", evaluate)
     (one,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
     with ThreadPoolExecutor(2) as threads:
         errors = [outcome.error for outcome in threads.map(outcome_of, [one, one])]
@@ -64,7 +64,7 @@ def test_a_cell_has_one_thread(monkeypatch: pytest.MonkeyPatch):
         seen.extend(pool["num_threads"] for pool in threadpool_info())
         raise RuntimeError("seen")
 
-    monkeypatch.setattr(cell, "evaluate", evaluate)
+    monkeypatch.setattr(cell, "run_evaluation", evaluate)
     (one,) = sweep_of({"fixed": {"env": "Scalar-v0", "filter": "none"}}).cells
     with threadpool_limits(2):
         assert "seen" in str(outcome_of(one).error)

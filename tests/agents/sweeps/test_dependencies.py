@@ -76,3 +76,10 @@ def test_a_cell_is_known_by_what_its_system_imports(folder: Path):
     assert sweep_of(document).cells[0].key != cell.key
     assert "another content in" in str(outcome_of(cell).error)
     assert "end.py" in str(outcome_of(cell).error)
+
+
+def test_a_condition_of_ones_own_is_a_file_of_the_cell(tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = absolute({"filter": "scbf+mine.py:Eager:gain=2", "policy": "nominal"})
+    assert settings["filter"] == f"scbf+{tmp_path / 'mine.py'}:Eager:gain=2"
+    assert list(read_by(settings)) == [tmp_path / "mine.py"]

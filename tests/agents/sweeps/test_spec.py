@@ -2,13 +2,14 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from datetime import date
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from safe_envs.agents.evaluation.spec import EvaluationSpec
 from safe_envs.agents.jobs.job import outcome_of
 from safe_envs.agents.sweeps.cell import Cell
 from safe_envs.agents.sweeps.spec import describe, read_sweep, sweep_of
@@ -205,6 +206,21 @@ def test_an_error_of_any_kind_is_the_outcome_of_its_cell():
     outcome = outcome_of(Cell({"env": "Scalar-v0"}))
     assert outcome.result is None
     assert re.fullmatch(
-        r"KeyError: 'policy' \(at sweeps/cell\.py:\d+ in .*, from .*:\d+ in outcome_of\)",
+        r"KeyError: 'filter' \(at sweeps/cell\.py:\d+ in .*, from .*:\d+ in outcome_of\)",
         str(outcome.error),
     )
+
+
+def test_every_field_of_an_evaluation_is_a_setting():
+    settings = {"env": "Scalar-v0", "filter": "none", "monitoring": "continuous", "confidence": 0.9}
+    (cell,) = sweep_of({"fixed": settings}).cells
+    assert (cell.spec.monitoring, cell.spec.confidence) == ("continuous", 0.9)
+    names = {field.name for field in fields(EvaluationSpec)}
+    assert names - set(cell.settings) == {
+        "problem",
+        "filters",
+        "options",
+        "filter_spec",
+        "learned",
+        "trust",
+    }
