@@ -23,7 +23,6 @@ from safe_envs.dynamics.codegen import compile_function
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, UNSAFE
 from safe_envs.wrappers import HOCBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.guarantee import promise
 
 _GRID = 241
 _EPISODES = 1000
@@ -185,7 +184,9 @@ def _promise() -> Figure:
             label=f"{row['filter']}: measured, {_EPISODES} episodes, with its 95 % band",
         )
     times = np.linspace(0.0, problem.horizon, 41)
-    at_times = zip(*[promise(verification, starts, t) for t in times.tolist()], strict=True)
+    at_times = zip(
+        *[verification.guarantee.applicable_bounds(starts, t) for t in times.tolist()], strict=True
+    )
     for bounds, color in zip(at_times, (QUIET, COLORS[1]), strict=True):
         label = f"{bounds[-1].name.split(',')[0]}: {bounds[-1].status}"
         axes.plot(

@@ -110,7 +110,7 @@ def train(
     cost and smallest h, and violations, interventions and infeasible steps in the training so far.
     The folder is what `safe-envs evaluate --policy DIR` reads.
     """
-    from safe_envs.agents.policies.registry import DESCRIPTION
+    from safe_envs.agents.policies.registry import POLICY_FILE
     from safe_envs.agents.training.config import Training
     from safe_envs.agents.training.trainer import train as train_agent
 
@@ -138,7 +138,7 @@ def train(
         threads=threads,
     )
     # The policy itself is written at the very end.
-    finished = resume and os.path.exists(out / DESCRIPTION)
+    finished = resume and os.path.exists(out / POLICY_FILE)
     with progress_bar("Training") as tell:
         try:
             train_agent(training, out, resume=resume, tensorboard=tensorboard, tell=tell)

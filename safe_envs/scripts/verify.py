@@ -77,7 +77,6 @@ def verify(
     from safe_envs.scripts.reports.verify_report import document, print_report
     from safe_envs.wrappers import parse_conditions
     from safe_envs.wrappers.verification.feasibility import verify as find
-    from safe_envs.wrappers.verification.guarantee import promise
 
     require_whole("episodes", episodes, 1)
     text_options.require_outputs(
@@ -93,7 +92,7 @@ def verify(
         problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed
     )
     starts = starts_of(problem, seed)
-    bounds = promise(found, starts, problem.duration)
+    bounds = found.guarantee.applicable_bounds(starts, problem.duration)
     measurements = []
     if simulate:
         with progress_bar("Simulating") as tell:

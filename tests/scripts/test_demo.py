@@ -16,9 +16,7 @@ def test_demo_prints_two_tables_and_leaves_a_policy_and_two_pictures(tmp_path, c
     demo.demo(folder, episodes=10)
     out = capsys.readouterr().out
     assert sorted(p.name for p in folder.iterdir()) == ["nominal.png", "ppo", "ppo.png"]
-    assert {"model.zip", "policy.json", "policy.safetensors"} <= {
-        p.name for p in (folder / "ppo").iterdir()
-    }
+    assert {"model.zip", "policy.npz"} <= {p.name for p in (folder / "ppo").iterdir()}
     for path in folder.iterdir():
         assert str(path) in out
         assert path.is_dir() or path.stat().st_size > 5000

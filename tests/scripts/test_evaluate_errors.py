@@ -45,7 +45,7 @@ USER_ERRORS = (
     ([DUBINS, "--policy", __file__, "--trust"], ["not a policy that Stable-Baselines3 saved"]),
     (
         [DUBINS, "--policy", "."],
-        ["policy.safetensors cannot be read: No such file", "`safe-envs train`"],
+        ["policy.npz does not exist", "`safe-envs train`"],
     ),
     ([DUBINS, "--plant", "vv=1"], ["unknown parameter 'vv'", "did you mean 'v'"]),
     ([DUBINS, "--plant", "v=fast"], ["--plant 'v=fast'", "not a number"]),
@@ -100,8 +100,8 @@ USER_ERRORS = (
         ["would overwrite the file of --policy ppo.zip"],
     ),
     (
-        [DUBINS, "--json", "policy.json", "--policy", "."],
-        ["would overwrite the file of --policy policy.json"],
+        [DUBINS, "--json", "policy.npz", "--policy", "."],
+        ["would overwrite the file of --policy policy.npz"],
     ),
     ([DUBINS, "--plot", "nowhere/out.png"], ["cannot write nowhere/out.png"]),
     ([DUBINS, "--plot", "out.pong"], ["unknown format 'pong'", "did you mean 'png'"]),

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from safe_envs.wrappers.learning.models.files import load
 from tests.scripts.conftest import strictly
 from tests.scripts.own_system import SYSTEM
 
@@ -171,8 +172,7 @@ def test_a_system_without_a_workspace_is_trained_and_gone_on_with(safe_envs_comm
     status, out, err = safe_envs_command(*arguments, "--eval-freq", 128)
     assert (status, err) == (0, "")
     assert "finished already" not in out
-    assert strictly("run/policy.json")["problem"]["observation"] == {
-        "shape": [2],
+    assert load(Path("run/policy.npz")).details["observation"] == {
         "low": ["-inf", "-inf"],
         "high": ["inf", "inf"],
     }
@@ -181,7 +181,7 @@ def test_a_system_without_a_workspace_is_trained_and_gone_on_with(safe_envs_comm
     # A policy of other observations is refused as ever.
     status, _, err = safe_envs_command("evaluate", "--system", "own.py:bounded", *evaluated)
     assert status == 2
-    assert "was trained for another problem, with observation" in err
+    assert "was trained for another problem: its observation" in err
     status, out, _ = safe_envs_command(*arguments, "--eval-freq", 128, "--resume")
     assert status == 0
     assert out.startswith("The training in run was finished already")

@@ -123,7 +123,7 @@ def test_json_holds_all_of_it(verify, tmp_path):
         [1000.0],
     )
     assert [bound["status"] for bound in document["bounds"]] == ["hypothesis fails", "estimated"]
-    assert len(document["safe"]["worst"]) == 3
+    assert len(document["safe_set"]["worst"]) == 3
     measured, _ = document["measurements"]
     assert [h["time"] for h in measured["horizons"]] == [1.0, 2.0, 5.0, 10.0, 20.0]
     assert list(measured) == ["start", "state", "episodes", "repeats", "horizons"]

@@ -7,7 +7,7 @@ import pytest
 
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.learning.generator import GeneratorModel, LearnedGenerator, learn_generator
-from safe_envs.wrappers.learning.models.files import Signature
+from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.residual import LearnedResidual, ResidualModel
 from tests.conftest import problem_of
 from tests.wrappers.learned import NO_RECORD, some_network

@@ -14,9 +14,8 @@ from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate
 from safe_envs.agents.evaluation.visited_states import Seen
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import spec_of
-from safe_envs.wrappers.verification.estimated_bound import from_survey
 from safe_envs.wrappers.verification.feasibility import Verification
-from safe_envs.wrappers.verification.guarantee import Bound, best_start, promise
+from safe_envs.wrappers.verification.results import Bound
 from safe_envs.wrappers.verification.safe_set import draw_starts
 
 Progress = Callable[[float], None]
@@ -88,9 +87,7 @@ def judged(
         measurements: of the same conditions.
         verification: on which the bounds rest.
     """
-    of_all = by_states(
-        from_survey(verification.survey), [seen for m in measurements for seen in m.seen]
-    )
+    of_all = by_states(verification.guarantee, [seen for m in measurements for seen in m.seen])
     of_each: dict[str, str] = {}
     for m in measurements:
         for h in m.horizons:
@@ -138,7 +135,7 @@ def measure(
         ConfigurationError: as `evaluate`.
     """
     problem = verification.formulas.problem
-    best = best_start(verification, seed)
+    best = verification.guarantee.best_start(seed)
     worlds = [(f"the start {problem.start!r}", problem)]
     if best is not None:
         worlds.append(
@@ -175,7 +172,8 @@ def _measure(
 ) -> Measurement:
     formulas, starts = verification.formulas, starts_of(world, seed)
     lasting = formulas.noisy and any(
-        b.forever and b.value for b in promise(verification, starts, world.duration)
+        b.forever and b.value
+        for b in verification.guarantee.applicable_bounds(starts, world.duration)
     )
     runs = _runs(world, lasting, episodes)
     horizons: list[Horizon] = []
@@ -230,7 +228,9 @@ def _horizon(
     curve = answer.rows[0]["curve"]
     i = int(np.searchsorted(curve["time"], horizon * (1.0 + 1e-9), side="right")) - 1
     time = curve["time"][i]
-    bounds = tuple(b for b in promise(verification, starts, time) if b.value is not None)
+    bounds = tuple(
+        b for b in verification.guarantee.applicable_bounds(starts, time) if b.value is not None
+    )
     return Horizon(
         time, curve["safe"][i], curve["rate"][i], curve["ci_low"][i], curve["ci_high"][i], bounds
     )

@@ -16,9 +16,10 @@ from safe_envs.agents.evaluation.visited_states import Seen
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import BayesianSCBF, Condition, LearnedCondition
-from safe_envs.wrappers.verification.estimated_bound import EstimatedBound, estimated_bound
-from safe_envs.wrappers.verification.posterior_bound import PosteriorBound, posterior_bound
+from safe_envs.wrappers import BayesianSCBF, Condition
+from safe_envs.wrappers.verification.guarantee import guarantee_of
+from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
+from safe_envs.wrappers.verification.results import Guarantee
 
 _SIZES = ("delta", "supremum", "shortfall", "bias")
 """What a bound over a posterior is made of."""
@@ -28,7 +29,7 @@ class GuaranteeAverager:
     """The estimated bound on P(safe up to the horizon) of conditions, averaged over the starts.
 
     For conditions that are robust over a posterior it is a bound of its own; see
-    `safe_envs.wrappers.verification.posterior_bound`.
+    `safe_envs.wrappers.verification.posterior_guarantee`.
 
     For relative degree r >= 2 a condition keeps the intersection of the sets C_j = {b_j >= 0}, j <
     r, and from a start in C but outside of it, it promises nothing. How many starts are there is
@@ -52,7 +53,7 @@ class GuaranteeAverager:
         self._of_posterior = any(
             isinstance(c, BayesianSCBF) and c.simultaneous is not None for c in conditions
         )
-        self._found: EstimatedBound | PosteriorBound | None = None
+        self._found: Guarantee | None = None
         self._why_none: str | None = why_not if conditions else "there is no filter"
         self._total, self._count = RunningSum(), 0
         self._outside = _outside_of(conditions, problem, knowledge)
@@ -65,17 +66,8 @@ class GuaranteeAverager:
         self, conditions: Sequence[Condition], problem: SafetyProblem, knowledge: str
     ) -> None:
         try:
-            if self._of_posterior:
-                self._found = posterior_bound(problem, conditions)
-                self._why_none = None
-            elif any(isinstance(c, LearnedCondition) for c in conditions):
-                self._why_none = (
-                    "it rests on something learned; for bayesian-scbf:simultaneous=P a bound is"
-                    " estimated over the posterior"
-                )
-            else:
-                self._found = estimated_bound(problem, conditions, knowledge)
-                self._why_none = self._found.note
+            self._found = guarantee_of(problem, conditions, knowledge)
+            self._why_none = self._found.note
         except SafeEnvsError as error:
             # The bound looks at the whole safe set, where the episodes may never be.
             self._why_none = str(error)
@@ -105,7 +97,7 @@ class GuaranteeAverager:
         bound, note = self._mean()
         row: Row = {"withheld": None, "outside_rate": share(self._lost, self._starts)}
         if self._of_posterior:
-            found = self._found if isinstance(self._found, PosteriorBound) else None
+            found = self._found if isinstance(self._found, PosteriorGuarantee) else None
             sizes = {} if found is None else {name: getattr(found, name) for name in _SIZES}
             row |= {
                 "estimated_bound": None,

@@ -13,7 +13,7 @@ import numpy as np
 from safe_envs.agents.evaluation.identification import Learning
 from safe_envs.agents.evaluation.rollout import Env, Progress
 from safe_envs.agents.evaluation.targets import world_of
-from safe_envs.agents.policies.registry import policy_files
+from safe_envs.agents.policies.registry import policy_file
 from safe_envs.agents.rare_events.importance_sampling import TiltedNoiseEnv
 from safe_envs.bounded_reading import read_bytes
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shown
@@ -196,7 +196,7 @@ def _describe(problem: SafetyProblem) -> dict[str, Any]:
 def _describe_policy(policy: Any) -> dict[str, Any]:
     if not isinstance(policy, str):
         return {"name": type(policy).__name__}
-    files = policy_files(policy)
-    if not files:
+    file = policy_file(policy)
+    if file is None:
         return {"name": policy}
-    return {"name": policy, "sha256": hashlib.sha256(read_bytes(files[0])).hexdigest()}
+    return {"name": policy, "sha256": hashlib.sha256(read_bytes(file)).hexdigest()}

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.agents.evaluation.rollout import Env
-from safe_envs.agents.policies.registry import POLICIES, Policy, make_policy, policy_files
+from safe_envs.agents.policies.registry import POLICIES, Policy, is_data, make_policy, policy_file
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.envs.simulation import center_and_half_width
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -152,7 +152,7 @@ class ExternalTarget:
             return _OfModel(
                 make_policy(name, self.problem), self.spec, self.problem, self._spaces[1]
             )
-        if len(policy_files(name)) > 1:
+        if is_data(policy_file(name)):
             raise ConfigurationError(
                 f"{name} holds a policy for envs of this project; give a .zip of Stable-Baselines3"
                 f" for {self.env_id}"

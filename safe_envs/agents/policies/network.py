@@ -1,60 +1,31 @@
-"""Trained policies as data, numbers and JSON in a folder, so that nobody needs to run a stranger's
-pickle."""
+"""Trained policies as data: a network in a file that holds numbers and JSON, and no pickle."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_tensors
-from safetensors.numpy import save as save_tensors
 
 from safe_envs.agents.policies.fixed_batch import BlockPolicy
-from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS, policy_files
+from safe_envs.agents.policies.registry import POLICY_FILE, policy_file
 from safe_envs.agents.policies.sb3 import require_spaces
-from safe_envs.atomic_io import write_atomically
-from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers.learning.models import files
+from safe_envs.wrappers.learning.models.network import Network
+from safe_envs.wrappers.learning.models.signature import Signature
 
-_FORMAT = 2
-_PACKAGES = ("safe-envs", "numpy", "stable-baselines3", "torch", "safetensors")
+KIND = "policy"
+"""Kind of a file that holds a policy."""
 
-_ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "identity": lambda x: x,
-    "tanh": np.tanh,
-    "relu": lambda x: np.maximum(x, 0.0),
-    "leaky_relu": lambda x: np.where(x < 0.0, 0.01 * x, x),
-    "elu": lambda x: np.where(x < 0.0, np.expm1(np.minimum(x, 0.0)), x),
-    "silu": lambda x: 0.5 * x * (1.0 + np.tanh(0.5 * x)),
-}
-_OUTPUTS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "tanh": np.tanh,
-    "clip": lambda x: np.clip(x, -1.0, 1.0),
-}
+_WRITER = "safe-envs train"
 
-# What json and safetensors raise on damaged files, and Python on JSON of another shape.
-_DAMAGED = (
-    ArithmeticError,
-    AttributeError,
-    LookupError,
-    RecursionError,
-    SafetensorError,
-    TypeError,
-    ValueError,
-)
-
-_MOST_BYTES = 100_000_000
-"""Of the numbers of a policy; they are in memory a few times."""
+_OUTPUTS = {"tanh": np.tanh, "clip": lambda x: np.clip(x, -1.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -63,7 +34,7 @@ class Normalization:
 
     Attributes:
         mean: k numbers, subtracted.
-        var: k numbers; their roots divide then.
+        var: k numbers, by whose roots is divided then.
         clip: bound of the result.
         epsilon: added to `var`.
 
@@ -90,7 +61,7 @@ class Normalization:
 
     @classmethod
     def of(cls, wrapper: Any) -> Normalization | None:
-        """What a VecNormalize does by now; None if that is nothing."""
+        """Return what a VecNormalize does now; None if that is nothing."""
         if wrapper is None or not wrapper.norm_obs:
             return None
         moments = wrapper.obs_rms
@@ -108,7 +79,7 @@ class Normalization:
         return cls(mean, var, float(data["clip"]), float(data["epsilon"]))
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
-        """Normalise (B, k)."""
+        """Normalise observations (B, k)."""
         return np.clip(
             (observations - np.array(self.mean)) / np.sqrt(np.array(self.var) + self.epsilon),
             -self.clip,
@@ -123,51 +94,34 @@ class NetworkPolicy(BlockPolicy):
     machine then.
 
     Args:
-        weights: of each layer, (outputs, inputs) of the layer.
-        biases: of each layer, (outputs,).
-        activation: after every layer but the last, by its name in `policy.json`.
-        output: after the last one, "tanh" or "clip".
-        normalization: before the first one, if any.
-        boxes: physical boxes of the training and of the env, each (m, 2), where they differ.
+        network: from observations to actions before `output`.
+        output: function after the last layer, "tanh" or "clip".
+        normalization: before the first layer, if any.
+        boxes: input bounds of the training and of the env, each (m, 2), where they differ.
 
     Raises:
-        ConfigurationError: an activation is unknown, or a number is not finite.
+        ConfigurationError: the output is unknown.
     """
 
     def __init__(
         self,
-        weights: Sequence[np.ndarray],
-        biases: Sequence[np.ndarray],
-        activation: str,
+        network: Network,
         output: str,
         normalization: Normalization | None = None,
         boxes: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        super().__init__(weights[0].shape[1])
-        for what, name, allowed in (
-            ("activation", activation, _ACTIVATIONS),
-            ("output", output, _OUTPUTS),
-        ):
-            if name not in allowed:
-                raise ConfigurationError(f"{what} = {shown(name)}; {nearest(str(name), allowed)}")
-        _require_finite([*weights, *biases])
-        self._layers = [
-            (np.ascontiguousarray(w.T, dtype=float), b.astype(float))
-            for w, b in zip(weights, biases, strict=True)
-        ]
-        self._activation, self._output = _ACTIVATIONS[activation], _OUTPUTS[output]
-        self._normalization = normalization
-        self._boxes = boxes
+        super().__init__(len(network.input_mean))
+        if output not in _OUTPUTS:
+            raise ConfigurationError(f"output = {shown(output)}; {nearest(str(output), _OUTPUTS)}")
+        self._network, self._output = network, _OUTPUTS[output]
+        self._normalization, self._boxes = normalization, boxes
 
     def act(self, block: np.ndarray) -> np.ndarray:
-        """Evaluate the layers; see `BlockPolicy.act`."""
+        """Evaluate the network; see `BlockPolicy.act`."""
         x = block.astype(float)
         if self._normalization is not None:
             x = self._normalization(x)
-        for weights, bias in self._layers[:-1]:
-            x = self._activation(x @ weights + bias)
-        weights, bias = self._layers[-1]
-        actions = self._output(x @ weights + bias)
+        actions = self._output(self._network.outputs(x))
         if self._boxes is not None:
             actions = _in_another_box(actions, *self._boxes)
         return actions.astype(np.float32)
@@ -176,8 +130,7 @@ class NetworkPolicy(BlockPolicy):
 def save_policy(
     model: Any, folder: str | Path, problem: SafetyProblem, normalization: Any = None
 ) -> None:
-    """Write the deterministic actor of a model of Stable-Baselines3 as `policy.safetensors` and
-    `policy.json`.
+    """Write the deterministic actor of a model of Stable-Baselines3 as `policy.npz`.
 
     Args:
         model: PPO, A2C, SAC, TD3 or DDPG with MlpPolicy.
@@ -199,85 +152,82 @@ def save_policy(
         action_box(problem),
     )
     weights, biases, activation = actor_of(model.policy)
-    _require_finite([*weights, *biases])
+    if not all(np.isfinite(a).all() for a in (*weights, *biases)):
+        raise ConfigurationError(
+            "the weights of the policy are not all finite: its training diverged; train with a"
+            " smaller learning rate"
+        )
+    network = Network.unscaled(weights, biases, activation)
     scaling = Normalization.of(
         model.get_vec_normalize_env() if normalization is None else normalization
     )
-    description = {
-        "format": _FORMAT,
+    details = {
         "algorithm": type(model).__name__,
-        "layers": [weights[0].shape[1], *(len(w) for w in weights)],
         "activation": activation,
         "output": "tanh" if model.policy.squash_output else "clip",
         "normalization": None if scaling is None else asdict(scaling),
-        "problem": _identity(problem),
-        "dt": problem.dt,
+        **_spaces(problem),
         "box": _box(problem).tolist(),
-        "versions": {package: version(package) for package in _PACKAGES},
     }
-    arrays = {**_numbered("weight", weights), **_numbered("bias", biases)}
-    # The numbers name their description, so that their checksum is one of the whole policy.
-    content = save_tensors(arrays, metadata={"description": _checksum(description)})
-    text = json.dumps(
-        {**description, "sha256": hashlib.sha256(content).hexdigest()}, indent=2, allow_nan=False
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigurationError(
+            f"the folder {folder} cannot be made: {error.strerror}; give another one"
+        ) from error
+    files.save(
+        folder / POLICY_FILE, KIND, Signature.of(problem), details, network.to_arrays("actor")
     )
-    _write(Path(folder), {TENSORS: content, DESCRIPTION: f"{text}\n".encode()})
 
 
-def load_policy(folder: str | Path, problem: SafetyProblem) -> NetworkPolicy:
+def load_policy(path: str | Path, problem: SafetyProblem) -> NetworkPolicy:
     """Read what `save_policy` wrote; no code is run.
 
-    An action stands for an input in physical units. In an env with another box than that of the
-    training the policy gives the same inputs, and where that box does not hold one, the nearest one
-    that it holds.
+    An action stands for an input in physical units. In an env with other input bounds than those
+    of the training the policy gives the same inputs, and where these bounds do not hold one, the
+    nearest one that they hold. Parameters of plant and model, dt and the horizon may differ too.
 
     Args:
-        folder: or one of the two files in it.
+        path: of the file, or of its folder.
         problem: in which the policy is to act.
 
     Raises:
         ConfigurationError: there is no such policy, it is damaged, altered or of an unknown format,
             or belongs to another problem.
     """
-    files = policy_files(str(folder))
-    if len(files) < 2:
+    file = policy_file(str(path)) or Path(path)
+    if not file.exists() and (file.parent / "config.json").exists():
         raise ConfigurationError(
-            f"{shortened(folder)} is no folder; name one with {TENSORS} and {DESCRIPTION}, as"
-            " `safe-envs train` writes them"
+            f"the training in {file.parent} is not finished: go on with it by `{_WRITER}`"
+            f" ... --resume, or give the best policy so far, {file.parent / 'best'}, which is"
+            " there after the first evaluation"
         )
-    content, text = _read(files[0], _MOST_BYTES), _read(files[1], MOST_BYTES_OF_TEXT)
+    content = files.load(file, _WRITER)
+    if content.kind != KIND:
+        raise ConfigurationError(f"{shortened(file)} holds {content.kind}, and no policy")
     try:
-        description = json.loads(text)
-        _require_format(files[1], description)
-        _require_untouched(files, content, description)
-        _require_problem(files[1].parent, description["problem"], problem)
-        return _policy(load_tensors(content), description, problem)
-    except _DAMAGED as error:
-        if isinstance(error, ConfigurationError):
-            raise
+        _require_problem(file, content, problem)
+        return _policy(content, problem)
+    except ConfigurationError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise ConfigurationError(
-            f"the policy in {files[0].parent} cannot be read ({type(error).__name__}:"
-            f" {shortened(error)}); it is damaged or altered: copy it again"
+            f"the policy in {shortened(file)} is incomplete or altered ({type(error).__name__}:"
+            f" {shortened(error)}); train or copy it again"
         ) from error
 
 
-def _policy(
-    arrays: Mapping[str, np.ndarray], description: Mapping[str, Any], problem: SafetyProblem
-) -> NetworkPolicy:
-    sizes, scaling = description["layers"], description["normalization"]
-    depth, ends = len(sizes) - 1, [len(problem.features), len(problem.inputs)]
-    shapes = {f"weight_{k}": (sizes[k + 1], sizes[k]) for k in range(depth)} | {
-        f"bias_{k}": (sizes[k + 1],) for k in range(depth)
-    }
-    fits = [sizes[0], sizes[-1]] == ends and {name: a.shape for name, a in arrays.items()} == shapes
-    if not fits or any(a.dtype != np.float32 for a in arrays.values()):
-        raise ValueError("the tensors are not those of the layers")
+def _policy(content: files.Content, problem: SafetyProblem) -> NetworkPolicy:
+    details, scaling = content.details, content.details["normalization"]
+    network = Network.from_arrays(content.arrays, "actor", details["activation"])
+    ends = (len(network.input_mean), len(network.output_mean))
+    if ends != (len(problem.features), len(problem.inputs)):
+        raise ValueError("the network is not one from observations to actions")
     normalization = None if scaling is None else Normalization.from_json(scaling)
-    if normalization is not None and {len(normalization.mean), len(normalization.var)} != {
-        sizes[0]
-    }:
+    if normalization is not None and {len(normalization.mean), len(normalization.var)} != {ends[0]}:
         raise ValueError("the normalisation is not that of the observations")
-    trained, given = np.array(description["box"], dtype=float), _box(problem)
+    trained, given = np.array(details["box"], dtype=float), _box(problem)
     if (
         trained.shape != given.shape
         or not np.isfinite(trained).all()
@@ -285,123 +235,43 @@ def _policy(
     ):
         raise ValueError("the box is not one of the inputs")
     boxes = None if np.array_equal(trained, given) else (trained, given)
-    weights, biases = ([arrays[f"{name}_{k}"] for k in range(depth)] for name in ("weight", "bias"))
-    return NetworkPolicy(
-        weights, biases, description["activation"], description["output"], normalization, boxes
-    )
-
-
-def _numbered(name: str, arrays: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
-    return {f"{name}_{k}": np.ascontiguousarray(a) for k, a in enumerate(arrays)}
-
-
-def _require_finite(arrays: Sequence[np.ndarray]) -> None:
-    if not all(np.isfinite(a).all() for a in arrays):
-        raise ConfigurationError(
-            "the weights of the policy are not all finite: its training diverged; train with a"
-            " smaller learning rate"
-        )
+    return NetworkPolicy(network, details["output"], normalization, boxes)
 
 
 def _box(problem: SafetyProblem) -> np.ndarray:
-    """The physical box of a problem's inputs, (m, 2)."""
+    """Return the physical bounds of a problem's inputs, (m, 2)."""
     return np.array(problem.box, dtype=float)
 
 
 def _in_another_box(actions: np.ndarray, trained: np.ndarray, given: np.ndarray) -> np.ndarray:
-    """Actions (B, m) that stand for the same inputs in the given box as others in the trained one,
-    or for the nearest ones."""
+    """Return actions (B, m) that stand for the same or the nearest inputs in other input bounds."""
     (center, half), (new_center, new_half) = (
         (box.mean(axis=1), 0.5 * np.ptp(box, axis=1)) for box in (trained, given)
     )
     return np.clip((center + half * actions - new_center) / new_half, -1.0, 1.0)
 
 
-def _identity(problem: SafetyProblem) -> dict[str, Any]:
-    """What must be the same where a policy is used: dt and parameters may differ, to see what comes
-    of that, and the box."""
+def _spaces(problem: SafetyProblem) -> dict[str, Any]:
+    """Describe the observations that a policy takes, which its signature does not know."""
     box = observation_box(problem)
+    # Strict JSON knows no infinity, which an unbounded state has.
+    low, high = (
+        [end if math.isfinite(end) else str(end) for end in ends.tolist()]
+        for ends in (box.low, box.high)
+    )
     return {
-        "system": problem.name,
-        "states": [s.symbol.name for s in problem.states],
         "features": [f.name for f in problem.features],
-        "inputs": [i.symbol.name for i in problem.inputs],
-        "observation": {
-            "shape": list(box.shape),
-            "low": _strict(box.low),
-            "high": _strict(box.high),
-        },
+        "observation": {"low": low, "high": high},
     }
 
 
-def _strict(bounds: np.ndarray) -> list[float | str]:
-    """Bounds as strict JSON has them: it knows no infinity, which an unbounded state has, and gets
-    a text for it."""
-    return [bound if math.isfinite(bound) else str(bound) for bound in bounds.tolist()]
-
-
-def _require_problem(folder: Path, trained: Mapping[str, Any], problem: SafetyProblem) -> None:
-    for name, wanted in _identity(problem).items():
-        if trained[name] != wanted:
-            raise ConfigurationError(
-                f"the policy in {folder} was trained for another problem, with {name}"
-                f" {trained[name]}; that of {problem.name} is {wanted}. Use the env and the"
-                " arguments that it was trained with, or train for this one"
-            )
-
-
-def _require_format(path: Path, description: Mapping[str, Any]) -> None:
-    if description["format"] != _FORMAT:
+def _require_problem(path: Path, content: files.Content, problem: SafetyProblem) -> None:
+    difference = content.signature.difference(problem)
+    for name, wanted in _spaces(problem).items():
+        if not difference and content.details[name] != wanted:
+            difference = f"its {name}: {content.details[name]}, that of {problem.name}: {wanted}"
+    if difference:
         raise ConfigurationError(
-            f"{path} has the format {shown(description['format'])}; this version reads {_FORMAT}:"
-            " use the one that wrote it, or train again"
+            f"the policy in {path} was trained for another problem: {shortened(difference)}. Use the"
+            " env and the arguments that it was trained with, or train for this one"
         )
-
-
-def _require_untouched(
-    files: Sequence[Path], content: bytes, description: Mapping[str, Any]
-) -> None:
-    if hashlib.sha256(content).hexdigest() != description["sha256"]:
-        raise ConfigurationError(
-            f"{files[0]} was altered or truncated, or belongs to another {DESCRIPTION}; train or"
-            " copy both again"
-        )
-    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-    if header["__metadata__"]["description"] != _checksum(
-        {k: v for k, v in description.items() if k != "sha256"}
-    ):
-        raise ConfigurationError(
-            f"{files[1]} was altered: its content does not match its checksum; train or copy it"
-            " again"
-        )
-
-
-def _checksum(description: Mapping[str, Any]) -> str:
-    return hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
-
-
-def _read(path: Path, most: int) -> bytes:
-    try:
-        return read_bytes(path, most)
-    except OSError as error:
-        if isinstance(error, FileNotFoundError) and (path.parent / "config.json").exists():
-            raise ConfigurationError(
-                f"the training in {path.parent} is not finished: go on with it by `safe-envs train"
-                f" ... --resume`, or give the best policy so far, {path.parent / 'best'}, which is"
-                " there after the first evaluation"
-            ) from error
-        raise ConfigurationError(
-            f"{path} cannot be read: {error.strerror}; give a folder with {TENSORS} and"
-            f" {DESCRIPTION}, as `safe-envs train` writes it"
-        ) from error
-
-
-def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(
-            f"the folder {folder} cannot be made: {error.strerror}; give another one"
-        ) from error
-    for name, content in contents.items():
-        write_atomically(folder / name, lambda part, content=content: part.write_bytes(content))

@@ -17,13 +17,8 @@ from safe_envs.problem.problem import SafetyProblem
 POLICIES = ("nominal", "clf", "zero", "random")
 """Names that `make_policy` knows besides paths."""
 
-TENSORS = "policy.safetensors"
-"""Name of the file with the numbers of a policy that was saved as data; see
-`safe_envs.agents.policies.network`."""
-
-DESCRIPTION = "policy.json"
-"""Name of the file beside it that says what the numbers are."""
-
+POLICY_FILE = "policy.npz"
+"""Name of a policy that was saved as data; see `safe_envs.agents.policies.network`."""
 
 Spaces = tuple[gym.Space[Any], gym.Space[Any]]
 """Of observations and of actions."""
@@ -78,8 +73,8 @@ def make_policy(
 
     Args:
         name: one of `POLICIES`; the folder where `safe-envs train` or
-            `safe_envs.agents.policies.network.save_policy` put a policy, or one of the two files of
-            the policy in it; or the path of a .zip of Stable-Baselines3.
+            `safe_envs.agents.policies.network.save_policy` put a policy, or the path of its .npz;
+            or the path of a .zip of Stable-Baselines3.
         problem: which the policy is to act in.
         trust: load a .zip too, which runs code that it contains.
         spaces: of observations and actions, which a .zip is to fit; by default those of the
@@ -100,19 +95,17 @@ def make_policy(
     }
     if name in named:
         return named[name](problem)
-    files = policy_files(name)
-    if len(files) > 1:
+    file = policy_file(name)
+    if is_data(file):
         from safe_envs.agents.policies.network import load_policy
 
         return load_policy(name, problem)
-    if not os.path.isfile(files[0]):
+    if file is None or not os.path.isfile(file):
         raise ConfigurationError(
             f"unknown policy {shown(name)}; {nearest(name, POLICIES)}, a folder of `safe-envs"
             " train`, or the path of a Stable-Baselines3 .zip: there is no such file"
         )
-    return _make_of_archive(
-        files[0], spaces or (observation_box(problem), action_box(problem)), trust
-    )
+    return _make_of_archive(file, spaces or (observation_box(problem), action_box(problem)), trust)
 
 
 def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
@@ -122,20 +115,21 @@ def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
     if not trust:
         raise ConfigurationError(
             f"loading {path} runs code that it contains; if you trust its source, pass --trust (in"
-            f" Python: trust=True), or give a folder of `safe-envs train`, whose {TENSORS} and"
-            f" {DESCRIPTION} hold no code"
+            f" Python: trust=True), or give a folder of `safe-envs train`, whose {POLICY_FILE}"
+            " holds no code"
         )
     return SB3Policy(path, *spaces)
 
 
-def policy_files(name: str) -> list[Path]:
-    """The files that `make_policy` reads, that with the numbers first; none for one of `POLICIES`."""
+def policy_file(name: str) -> Path | None:
+    """Return the file that `make_policy` reads; None for one of `POLICIES`."""
     if name in POLICIES:
-        return []
+        return None
     path = Path(name)
-    # Unlike a path, these two take any text for the name of a file.
-    if os.path.isdir(path):
-        return [path / TENSORS, path / DESCRIPTION]
-    if path.name in (TENSORS, DESCRIPTION):
-        return [path.with_name(TENSORS), path.with_name(DESCRIPTION)]
-    return [path]
+    # Unlike a path, this takes any text for the name of a file.
+    return path / POLICY_FILE if os.path.isdir(path) else path
+
+
+def is_data(file: Path | None) -> bool:
+    """Return whether a policy's file is one of this project, and not a .zip that holds code."""
+    return file is not None and file.suffix == ".npz"

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.registry import policy_files
+from safe_envs.agents.policies.registry import policy_file
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 
 _FILE = re.compile("(?<=file=)[^:+]+")
@@ -22,7 +22,7 @@ def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
         **settings,
         "filter": _FILE.sub(lambda match: os.path.realpath(match.group()), settings["filter"]),
     }
-    if policy_files(settings["policy"]) and os.path.exists(settings["policy"]):
+    if policy_file(settings["policy"]) and os.path.exists(settings["policy"]):
         found["policy"] = os.path.realpath(settings["policy"])
     if "system" in settings:
         file, _, name = settings["system"].rpartition(":")
@@ -38,7 +38,9 @@ def read_by(settings: Mapping[str, Any]) -> Iterator[Path]:
     if "system" in settings:
         yield Path(settings["system"].rpartition(":")[0])
     yield from (Path(match) for match in _FILE.findall(settings["filter"]))
-    yield from (path for path in policy_files(settings["policy"]) if os.path.exists(path))
+    policy = policy_file(settings["policy"])
+    if policy is not None and os.path.exists(policy):
+        yield policy
 
 
 def with_imported(path: Path) -> list[Path]:

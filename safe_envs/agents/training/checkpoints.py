@@ -22,7 +22,7 @@ from safetensors.numpy import load_file
 from safetensors.numpy import save as serialized
 
 from safe_envs.agents.policies.network import save_policy
-from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS
+from safe_envs.agents.policies.registry import POLICY_FILE
 from safe_envs.agents.training.learner_state import (
     Arrays,
     begin,
@@ -49,7 +49,7 @@ _STATE, _LEARNER, _BUFFER, _ENVS = (
     "envs.safetensors",
 )
 _MODEL, _SCALES = "model.zip", "normalization.pkl"
-_OF_THE_POLICY = (_MODEL, _SCALES, TENSORS, DESCRIPTION)
+_OF_THE_POLICY = (_MODEL, _SCALES, POLICY_FILE)
 _CHECKPOINT = "checkpoint_"
 _FORMAT = 2
 

@@ -73,7 +73,7 @@ def train(
     about.
 
     The folder holds `config.json` with the versions, `progress.jsonl` with all that was logged,
-    `evaluations.json`, the policy as `policy.safetensors` with `policy.json` and as
+    `evaluations.json`, the policy as `policy.npz` and as
     Stable-Baselines3's `model.zip` (beside it `normalization.pkl`, if observations are normalised),
     in `best` those with the highest return in an evaluation, whatever their safety, and the last
     checkpoint. Evaluations have episodes of their own, so that none of them is among those of

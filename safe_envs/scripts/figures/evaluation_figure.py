@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from safe_envs.agents.evaluation.evaluate import BARE, Evaluation
-from safe_envs.agents.policies.registry import DESCRIPTION, TENSORS
+from safe_envs.agents.policies.registry import POLICY_FILE
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.problem.problem import SafetyProblem
@@ -60,7 +60,7 @@ def draw(evaluation: Evaluation, path: Path) -> None:
 
 def _policy_name(path: Path) -> str:
     """That of a file or folder; a file of a policy's folder is called as all others are."""
-    return path.parent.name if path.name in (TENSORS, DESCRIPTION) else path.stem
+    return path.parent.name if path.name == POLICY_FILE else path.stem
 
 
 def add_legend(figure: Figure, handles: Sequence[Any]) -> None:

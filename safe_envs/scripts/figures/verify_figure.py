@@ -49,7 +49,7 @@ def draw(title: str, found: Verification, starts: np.ndarray, path: Path) -> Non
     """
     formulas = found.formulas
     problem = formulas.problem
-    worst = (found.kept or found.safe).worst
+    worst = (found.invariant_set or found.safe_set).worst
     several = problem.plant.n > 2
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(12.0, 5.6) if several else (7.4, 5.6))
@@ -70,7 +70,7 @@ def draw(title: str, found: Verification, starts: np.ndarray, path: Path) -> Non
 def _legend(found: Verification) -> list[Patch | Line2D]:
     formulas, missed = (
         found.formulas,
-        (found.safe.shortfall or (found.kept or found.safe).shortfall) > 0.0,
+        (found.safe_set.shortfall or (found.invariant_set or found.safe_set).shortfall) > 0.0,
     )
     degree = max(stage.stop - stage.start for stage in formulas.stages)
     several = formulas.problem.plant.n > 2
@@ -87,7 +87,7 @@ def _legend(found: Verification) -> list[Patch | Line2D]:
         Line2D([], [], color=COLORS[j - 1], linestyle="--", label=f"b_{j} = 0")
         for j in range(1, degree)
     ]
-    cross = "worst state" if (found.kept or found.safe).shortfall else "least to spare"
+    cross = "worst state" if (found.invariant_set or found.safe_set).shortfall else "least to spare"
     handles.append(
         Line2D(
             [],
@@ -209,8 +209,8 @@ def _draw_shares(
     for values in others:
         x = np.tile(values, (horizontal.size, 1))
         x[:, plane[0]], x[:, plane[1]] = horizontal.ravel(), vertical.ravel()
-        inside += formulas.kept_level(x) >= 0.0
-        missed += _missed(formulas, x, formulas.kept_level) == 1.0
+        inside += formulas.invariant_level(x) >= 0.0
+        missed += _missed(formulas, x, formulas.invariant_level) == 1.0
     with np.errstate(invalid="ignore"):
         share = np.where(inside > 0, 100.0 * missed / inside, np.nan).reshape(horizontal.shape)
     top = max(float(np.nanmax(share)) if np.isfinite(share).any() else 0.0, 1.0)
@@ -230,10 +230,10 @@ def _others(found: Verification, count: int) -> np.ndarray:
     """States whose coordinates outside the plane are tried: evenly spread ones, or of the set where
     these would rarely be in it."""
     rng = np.random.default_rng(0)
-    if found.formulas.problem.plant.n == 3 or found.kept is None:
+    if found.formulas.problem.plant.n == 3 or found.invariant_set is None:
         return found.region.draw(count.bit_length() - 1, rng)
     points = sample(
-        "the intersection of the C_j", found.formulas.kept_level, found.region, count, rng
+        "the intersection of the C_j", found.formulas.invariant_level, found.region, count, rng
     ).points
     return points[rng.choice(len(points), count, replace=False)]
 
@@ -243,7 +243,7 @@ def _missed(formulas: Formulas, x: np.ndarray, level: Evaluate) -> np.ndarray:
     elsewhere."""
     found, inside = np.full(len(x), np.nan), level(x) >= 0.0
     if inside.any():
-        found[inside] = formulas.missed(x[inside]) > 0.0
+        found[inside] = formulas.shortfall(x[inside]) > 0.0
     return found
 
 

@@ -101,15 +101,16 @@ def inputs_of(
 ) -> Iterator[tuple[str, Path]]:
     """Options and the files that a command may read: of FILE.py:NAME, of a policy, of --learned,
     and of filters with file=FILE."""
-    from safe_envs.agents.policies.registry import policy_files
+    from safe_envs.agents.policies.registry import policy_file
 
     for option, place in (("--system", system), ("--filter-spec", filter_spec)):
         source = (place or "").rpartition(":")[0]
         # Anything else is the name of a module.
         if source.endswith(".py"):
             yield option, Path(source)
-    for path in policy_files(policy):
-        yield "--policy", path
+    file = policy_file(policy)
+    if file is not None:
+        yield "--policy", file
     for path in learned:
         yield "--learned", path
     for name in filters:

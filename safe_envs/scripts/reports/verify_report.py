@@ -19,7 +19,7 @@ from safe_envs.scripts.reports.rates import percent, percent_in
 from safe_envs.scripts.reports.tables import make_table
 from safe_envs.wrappers import spec_of
 from safe_envs.wrappers.verification.feasibility import SMALL, BarrierFindings, Part, Verification
-from safe_envs.wrappers.verification.guarantee import Bound
+from safe_envs.wrappers.verification.results import Bound
 
 _NOTHING = 1e-6
 """What a coordinate of a state found by a search is off by, in parts of the workspace."""
@@ -102,8 +102,8 @@ def document(
             "notes": found.region.notes,
             "beyond_workspace": found.beyond,
             "undefined": found.undefined,
-            "safe": vars(found.safe),
-            "kept": vars(found.kept) if found.kept else None,
+            "safe_set": vars(found.safe_set),
+            "invariant_set": vars(found.invariant_set) if found.invariant_set else None,
             "barriers": [
                 {**vars(b), "vanishes": b.vanishes, "unbounded": math.isinf(b.supremum)}
                 for b in found.barriers
@@ -151,7 +151,7 @@ def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
     lines = [
         (
             f"{found.drawn} states were drawn from the workspace{ranges}; C is"
-            f" {_percent(found.safe.share)} of it, and {found.safe.points} of its states are"
+            f" {_percent(found.safe_set.share)} of it, and {found.safe_set.points} of its states are"
             " looked at"
         ),
     ]
@@ -167,12 +167,12 @@ def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
             f"a condition has no finite value on {_percent(found.undefined)} of {_searched(found)};"
             " nothing can be met or missed there"
         )
-    if found.kept is None:
+    if found.invariant_set is None:
         lines.append("the sets C_j = {b_j >= 0} have no state in common: nothing is kept")
     elif not found.formulas.first_order:
         lines.append(
             "the intersection of the C_j = {b_j >= 0}, which the condition keeps, is"
-            f" {_percent(found.kept.share)} of {_searched(found)}"
+            f" {_percent(found.invariant_set.share)} of {_searched(found)}"
         )
         outside = _outside(found, starts)
         if outside:
@@ -197,7 +197,7 @@ def _barrier_lines(found: Verification, b: BarrierFindings) -> list[str]:
     if b.vanishes:
         lines = [
             (
-                f"leading term: it vanishes at {_state(problem, b.leading_at)}: there the input has"
+                f"control authority: it vanishes at {_state(problem, b.control_authority_at)}: there the input has"
                 " no say, and the condition holds only if its offset is >= 0"
             ),
             f"  its reach over the box is {size}, below {100 * SMALL:g} % of that on"
@@ -210,8 +210,8 @@ def _barrier_lines(found: Verification, b: BarrierFindings) -> list[str]:
         ]
     else:
         lines = [
-            "leading term: it vanishes nowhere in C; its reach over the box is at least"
-            f" {_number(b.leading)}, {size}"
+            "control authority: it vanishes nowhere in C; its reach over the box is at least"
+            f" {_number(b.control_authority)}, {size}"
         ]
     missed = f"misses it by {_number(b.deepest_shortfall)}" if b.deepest_shortfall else "meets it"
     lines.append(
@@ -236,9 +236,9 @@ def _barrier_lines(found: Verification, b: BarrierFindings) -> list[str]:
 
 
 def _part_lines(found: Verification) -> list[str]:
-    parts = [(_searched(found), found.safe)]
-    if found.kept is not None and not found.formulas.first_order:
-        parts.append(("the intersection", found.kept))
+    parts = [(_searched(found), found.safe_set)]
+    if found.invariant_set is not None and not found.formulas.first_order:
+        parts.append(("the intersection", found.invariant_set))
     return [f"{name}: {_describe_part(found, part)}" for name, part in parts]
 
 

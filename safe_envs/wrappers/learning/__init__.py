@@ -12,7 +12,8 @@ from safe_envs.errors import nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import LearnedModel, Progress, Record
 from safe_envs.wrappers.learning.checks import require_problem
-from safe_envs.wrappers.learning.models.files import DATA, LearnedFileError, load
+from safe_envs.wrappers.learning.models.files import DATA, load
+from safe_envs.wrappers.learning.models.values import LearnedFileError
 
 __all__ = [
     "METHODS",

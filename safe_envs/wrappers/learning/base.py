@@ -13,15 +13,9 @@ import numpy as np
 
 from safe_envs.errors import require_whole, shortened
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.models.files import (
-    Content,
-    LearnedFileError,
-    Signature,
-    checksum,
-    require_finite,
-    require_text,
-    save,
-)
+from safe_envs.wrappers.learning.models.files import Content, checksum, save
+from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.models.values import LearnedFileError, require_finite, require_text
 
 Progress = Callable[[float], None]
 """Told which part of the work is done, from 0 to 1."""

@@ -17,7 +17,7 @@ from safe_envs.wrappers.learning.checks import Purpose, random_stream
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.estimators import by_parts, rounding
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.files import array_of
+from safe_envs.wrappers.learning.models.values import array_of
 
 _DEGREES = (0, 1, 2)
 _HELD_OUT = 0.2

@@ -15,12 +15,10 @@ from safe_envs.errors import ConfigurationError, InvalidInputError, require_whol
 from safe_envs.wrappers.learning.base import Progress
 from safe_envs.wrappers.learning.checks import Purpose, random_stream
 from safe_envs.wrappers.learning.models.network import Activation, Network, require_activation
+from safe_envs.wrappers.learning.models.values import LARGEST
 
 LEAST_ROWS = 10
 """Fewest rows from which anything is learned."""
-
-_LARGEST = 1e100
-"""Largest entry of the data: the sum of its squares is still a number."""
 
 _MOST_PARAMETERS = 10_000_000
 """Of a network: Adam keeps four numbers for each, and half a thousand epochs take hours."""
@@ -171,8 +169,8 @@ def _check_data(inputs: np.ndarray, targets: np.ndarray) -> None:
         )
     if len(inputs) < LEAST_ROWS:
         raise InvalidInputError(f"{len(inputs)} rows to learn from; give at least {LEAST_ROWS}")
-    if not all((np.abs(columns) <= _LARGEST).all() for columns in (inputs, targets)):
-        raise InvalidInputError(f"inputs or targets are not finite, or larger than {_LARGEST:g}")
+    if not all((np.abs(columns) <= LARGEST).all() for columns in (inputs, targets)):
+        raise InvalidInputError(f"inputs or targets are not finite, or larger than {LARGEST:g}")
 
 
 def _standardisation(

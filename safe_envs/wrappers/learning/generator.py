@@ -41,8 +41,9 @@ from safe_envs.wrappers.learning.estimators import (
     slack,
 )
 from safe_envs.wrappers.learning.fit import train
-from safe_envs.wrappers.learning.models.files import LearnedFileError, Signature
 from safe_envs.wrappers.learning.models.network import Network
+from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.models.values import LearnedFileError
 
 Way = Literal["network", "direct"]
 """How a generator is learned: see `learn_generator`."""

@@ -18,10 +18,10 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.files import (
+from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.models.values import (
     LARGEST,
     LearnedFileError,
-    Signature,
     array_of,
     require_finite,
 )

@@ -31,8 +31,8 @@ from safe_envs.wrappers.learning.checks import (
 )
 from safe_envs.wrappers.learning.data.collection import Step, collect_paths, draw_states
 from safe_envs.wrappers.learning.fit import LEAST_ROWS, hidden_widths, train
-from safe_envs.wrappers.learning.models.files import Signature
-from safe_envs.wrappers.learning.models.network import Network
+from safe_envs.wrappers.learning.models.network import Network, require_activation
+from safe_envs.wrappers.learning.models.signature import Signature
 
 _ROUNDING = 1e-12
 
@@ -180,6 +180,7 @@ class ResidualModel(LearnedModel):
         for i, (degree, activation) in enumerate(
             zip(details["degrees"], details["activations"], strict=True)
         ):
+            require_activation(activation)
             network, heldout = (
                 Network.from_arrays(arrays, f"part_{i}", activation),
                 arrays[f"part_{i}_heldout"].astype(float),

@@ -1,5 +1,4 @@
-"""What speaks against the bounds of conditions, in words: no bound at all, a hypothesis that fails,
-or one that is not established."""
+"""The assumptions of the bounds, in words: those that fail, and those that are not established."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
 
 
 def no_bound(formulas: Formulas) -> str:
-    """Why nothing is promised whatever the numbers are, or ""."""
+    """Say why there is no bound whatever the numbers are; "" if there may be one."""
     if not formulas.noisy:
         return ""
     for condition, stage in zip(formulas.conditions, formulas.stages, strict=True):
@@ -28,8 +27,10 @@ def no_bound(formulas: Formulas) -> str:
 
 
 def _kinked(formulas: Formulas) -> str:
-    """Which function of a chain has a kink, where the noise adds a local time that the generator
-    does not see."""
+    """Say which function of a chain has a kink; "" if none has.
+
+    The noise adds a local time there that the generator does not contain.
+    """
     for barrier, row in zip(
         formulas.problem.barriers, formulas.safety_filter.constraints, strict=True
     ):
@@ -41,7 +42,7 @@ def _kinked(formulas: Formulas) -> str:
 
 
 def mismatch(formulas: Formulas) -> str:
-    """In what the system that the conditions know differs from the plant, or ""."""
+    """Say in what the system that the conditions know differs from the plant; "" if in nothing."""
     plant, known = formulas.problem.plant, formulas.system
     parts = [
         n
@@ -52,26 +53,26 @@ def mismatch(formulas: Formulas) -> str:
     return f"the model differs from the plant in {', '.join(names or parts)}" if parts else ""
 
 
-def failures(survey: SafeSetAnalysis) -> list[str]:
-    """The hypotheses that fail, whatever a bound makes of a shortfall."""
-    found = [mismatch(survey.formulas), _undefined(survey), survey.rough]
-    if survey.runaway:
+def failures(analysis: SafeSetAnalysis) -> list[str]:
+    """Return the hypotheses that fail, apart from the shortfall, in words."""
+    found = [mismatch(analysis.formulas), _undefined(analysis), analysis.rough]
+    if analysis.runaway:
         found.append("it asks for unbounded control towards the edge")
     return [reason for reason in found if reason]
 
 
-def unverified_assumptions(survey: SafeSetAnalysis) -> list[str]:
-    """What is not established even as an estimate."""
-    found = [survey.limits]
-    if not survey.formulas.joint:
+def unverified_assumptions(analysis: SafeSetAnalysis) -> list[str]:
+    """Return the assumptions that are not established even as an estimate, in words."""
+    found = [analysis.limits]
+    if not analysis.formulas.joint:
         found.append("the shortfall of several conditions together is not established")
     return [reason for reason in found if reason]
 
 
-def _undefined(survey: SafeSetAnalysis) -> str:
-    if not len(survey.undefined):
+def _undefined(analysis: SafeSetAnalysis) -> str:
+    if not len(analysis.undefined):
         return ""
-    states = zip(survey.formulas.problem.states, survey.undefined[0].tolist(), strict=True)
+    states = zip(analysis.formulas.problem.states, analysis.undefined[0].tolist(), strict=True)
     return (
         "the condition has no finite value at"
         f" {', '.join(f'{s.symbol} = {value:.3g}' for s, value in states)}"
@@ -79,13 +80,13 @@ def _undefined(survey: SafeSetAnalysis) -> str:
 
 
 def amount(shortfall: float) -> str:
-    """By how much a condition is missed, in words."""
+    """Say by how much a condition is violated."""
     return f"by up to {shortfall:.4g}"
 
 
-def unbounded(survey: SafeSetAnalysis) -> str:
-    """Which supremum is infinite, where one matters; or ""."""
+def unbounded(analysis: SafeSetAnalysis) -> str:
+    """Say which supremum is infinite, where one matters; "" if none is."""
     growing = (
-        np.flatnonzero(np.isinf(survey.suprema)) if not survey.formulas.certain else np.empty(0)
+        np.flatnonzero(np.isinf(analysis.suprema)) if not analysis.formulas.certain else np.empty(0)
     )
-    return survey.infinite(int(growing[0])) if growing.size else ""
+    return analysis.infinite(int(growing[0])) if growing.size else ""

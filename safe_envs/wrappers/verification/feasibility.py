@@ -1,30 +1,34 @@
-"""Where conditions can be met, and what their promises rest on: found by sampling the safe set, and
-by searching it."""
+"""Where conditions can be met, and what the input can do: by sampling and searching the safe set."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from safe_envs.errors import require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
+from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
+from safe_envs.wrappers.verification.extrema import (
+    max_shortfall,
+    supremum,
+    where_inside,
+    without_control,
+)
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set import Region
 from safe_envs.wrappers.verification.safe_set_analysis import (
     SAMPLES,
     SafeSetAnalysis,
-    supremum,
-    where_inside,
-    without_control,
-    worst,
+    infeasible_part,
 )
 from safe_envs.wrappers.verification.search import largest
 
 SMALL = 0.01
-"""Below this part of its typical size a leading term counts as small."""
+"""Below this part of its typical size a control authority counts as small."""
 
 _BEYOND = 10.0
 _BEYOND_LOG2 = 12
@@ -32,14 +36,14 @@ _BEYOND_LOG2 = 12
 
 @dataclass(frozen=True)
 class Part:
-    """What was found of C, or of the intersection of the C_j.
+    """The feasibility of the conditions in a set: in C, or in the intersection of the C_j.
 
     Attributes:
-        points: how many of its points were drawn.
+        points: number of its points that were drawn.
         share: part of the workspace that it is; of C for the intersection.
-        infeasible: part of it where no action in the box meets all conditions.
-        shortfall: by how much the worst condition is missed where that is most, 0 if all can be met
-            everywhere; in the units of b_(r-1) per s.
+        infeasible: part of it where no action within the input bounds meets all conditions.
+        shortfall: by how much the worst condition is violated where that is most, 0 if all can be
+            met everywhere; in the units of b_(r-1) per s.
         worst: the state where that is, shape (n,); where the conditions are nearest to it if they
             can be met.
     """
@@ -53,32 +57,32 @@ class Part:
 
 @dataclass(frozen=True)
 class BarrierFindings:
-    """What was found of a barrier.
+    """The control authority over a barrier, and its suprema.
 
     Attributes:
         name: of the barrier.
         condition: its spec.
         degree: r.
-        leading: smallest size of the leading term L_g b_(r-1) over C: half of what the box lets it
-            contribute to the condition.
-        leading_at: the state where that is, shape (n,).
+        control_authority: smallest one over C: half of the range of L_g b_(r-1) u over the input
+            bounds.
+        control_authority_at: the state where that is, shape (n,).
         typical: its median over C.
         small: part of C where it is below `SMALL` of that.
-        small_infeasible: part of these points where no action in the box meets all conditions.
+        small_infeasible: part of these points where no action meets all conditions.
         supremum: of h over C within the workspace, infinite where it grows with the ranges that
             were chosen for states without any.
         growth: how sure it is that it is infinite, in words; empty where it is not.
         deepest: the state where h is largest in C within the workspace, shape (n,).
         deepest_h: h there.
-        deepest_shortfall: by how much its condition is missed there, 0 if it is not.
+        deepest_shortfall: by how much its condition is violated there at best.
         suprema: c_j of the b_j over the intersection, shape (r,); NaN if that is empty.
     """
 
     name: str
     condition: str
     degree: int
-    leading: float
-    leading_at: np.ndarray
+    control_authority: float
+    control_authority_at: np.ndarray
     typical: float
     small: float
     small_infeasible: float
@@ -91,45 +95,50 @@ class BarrierFindings:
 
     @property
     def vanishes(self) -> bool:
-        """Whether the leading term is 0 somewhere in C, to rounding."""
-        return self.leading <= 1e-6 * self.typical
+        """Whether the control authority is 0 somewhere in C, to rounding."""
+        return self.control_authority <= 1e-6 * self.typical
 
 
 @dataclass(frozen=True)
 class Verification:
-    """What `verify` found. All suprema are of a sample and a local search: estimates from below.
+    """The result of `verify`. Suprema are of a sample and a local search: estimates from below.
 
     Attributes:
-        survey: what the bounds rest on.
+        analysis: of the safe set.
         barriers: for each barrier.
-        safe: C, where all barriers are positive.
-        kept: the intersection of the C_j, where all chains are positive: the set that the
-            conditions keep. None if it is empty.
+        safe_set: C, where all barriers are positive.
+        invariant_set: the intersection of the C_j, where all chains are positive, which the
+            conditions make invariant. None if it is empty.
         beyond: whether C reaches beyond the workspace.
         undefined: part of C where a condition has no finite value.
     """
 
-    survey: SafeSetAnalysis
+    analysis: SafeSetAnalysis
     barriers: tuple[BarrierFindings, ...]
-    safe: Part
-    kept: Part | None
+    safe_set: Part
+    invariant_set: Part | None
     beyond: bool
     undefined: float
 
     @property
     def formulas(self) -> Formulas:
         """The chains and conditions, compiled."""
-        return self.survey.formulas
+        return self.analysis.formulas
 
     @property
     def region(self) -> Region:
-        """Where was looked."""
-        return self.survey.region
+        """The states that were searched."""
+        return self.analysis.region
+
+    @cached_property
+    def guarantee(self) -> ChainGuarantee:
+        """The bounds of the conditions, with the suprema and the shortfall that were found."""
+        return ChainGuarantee(self.formulas, self.analysis)
 
     @property
     def drawn(self) -> int:
         """Number of states that were drawn."""
-        return self.survey.safe.drawn
+        return self.analysis.safe.drawn
 
 
 def verify(
@@ -139,11 +148,10 @@ def verify(
     samples: int = SAMPLES,
     seed: int = 0,
 ) -> Verification:
-    """Sample C, and search it for the worst: where the leading terms vanish, and where no action
-    meets the conditions.
+    """Sample C, and search it for states without control authority or a feasible action.
 
     Args:
-        problem: whose barriers, box, ranges and system are taken.
+        problem: whose barriers, input bounds, ranges and system are taken.
         conditions: one for each barrier.
         knowledge: what they know, "model" or "plant".
         samples: number of states in C at which the drawing ends.
@@ -156,51 +164,61 @@ def verify(
     require_whole("samples", samples, 1)
     require_whole("seed", seed, 0)
     formulas = Formulas(problem, conditions, knowledge)
-    survey = SafeSetAnalysis(formulas, samples, seed)
-    kept = None if survey.kept is None else _kept_part(survey, survey.kept)
-    safe = _safe_part(survey, kept)
-    found = tuple(_barrier(i, survey) for i in range(len(formulas.stages)))
-    wide = survey.region.scaled(_BEYOND).draw(_BEYOND_LOG2, survey.rng(6))
-    outside = ((wide < survey.region.low) | (wide > survey.region.high)).any(axis=1)
+    analysis = SafeSetAnalysis(formulas, samples, seed)
+    points = analysis.invariant_set
+    invariant = None if points is None else _invariant_part(analysis, len(points))
+    safe = _safe_part(analysis, invariant)
+    found = tuple(_barrier(i, analysis) for i in range(len(formulas.stages)))
+    wide = analysis.region.scaled(_BEYOND).draw(_BEYOND_LOG2, analysis.rng(6))
+    outside = ((wide < analysis.region.low) | (wide > analysis.region.high)).any(axis=1)
     beyond = bool((formulas.barrier_level(wide[outside]) >= 0.0).any())
     return Verification(
-        survey, found, safe, kept, beyond, len(survey.undefined) / len(survey.safe.points)
+        analysis,
+        found,
+        safe,
+        invariant,
+        beyond,
+        len(analysis.undefined) / len(analysis.safe.points),
     )
 
 
-def _kept_part(survey: SafeSetAnalysis, kept: np.ndarray) -> Part:
-    points = survey.safe.points
-    share = float((survey.formulas.kept_level(points) >= 0.0).mean())
-    return Part(len(kept), share, _infeasible(survey.formulas, kept), *survey.missed)
+def _invariant_part(analysis: SafeSetAnalysis, count: int) -> Part:
+    level = analysis.formulas.invariant_level(analysis.safe.points)
+    share = float((level >= 0.0).mean())
+    return Part(count, share, analysis.infeasible, *analysis.max_shortfall)
 
 
-def _safe_part(survey: SafeSetAnalysis, kept: Part | None) -> Part:
-    """C: what was found of the intersection holds for it where that is all of it, but for what each
-    is a part of."""
-    formulas, points = survey.formulas, survey.safe.points
-    if kept is not None and kept.share == 1.0:
-        return replace(kept, share=survey.safe.share)
-    shortfall, state = worst(
+def _safe_part(analysis: SafeSetAnalysis, invariant: Part | None) -> Part:
+    """Return the part for C: that of the invariant set, but for its share, where this is all of C."""
+    formulas, points = analysis.formulas, analysis.safe.points
+    if invariant is not None and invariant.share == 1.0:
+        return replace(invariant, share=analysis.safe.share)
+    shortfall, state = max_shortfall(
         formulas,
         formulas.barrier_level,
-        survey.with_starts(points, formulas.barrier_level),
-        survey.rng(4),
+        analysis.with_starts(points, formulas.barrier_level),
+        analysis.rng(4),
     )
-    return Part(len(points), survey.safe.share, _infeasible(formulas, points), shortfall, state)
+    return Part(
+        len(points), analysis.safe.share, infeasible_part(formulas, points), shortfall, state
+    )
 
 
-def _barrier(i: int, survey: SafeSetAnalysis) -> BarrierFindings:
+def _barrier(i: int, analysis: SafeSetAnalysis) -> BarrierFindings:
     formulas, region, safe, rng = (
-        survey.formulas,
-        survey.region,
-        survey.safe.points,
-        survey.rng(100 + i),
+        analysis.formulas,
+        analysis.region,
+        analysis.safe.points,
+        analysis.rng(100 + i),
     )
     stages, level = formulas.stages[i], formulas.barrier_level
-    size = formulas.leading(safe)[:, i]
+    size = formulas.control_authority(safe)[:, i]
     typical = float(np.nanmedian(size))
-    negated, leading_at = largest(
-        lambda x: where_inside(level, x, lambda y: -formulas.leading(y)[:, i]), safe, region, rng
+    negated, weakest = largest(
+        lambda x: where_inside(level, x, lambda y: -formulas.control_authority(y)[:, i]),
+        safe,
+        region,
+        rng,
     )
     small = safe[size < SMALL * typical]
     _, deepest = largest(
@@ -210,32 +228,27 @@ def _barrier(i: int, survey: SafeSetAnalysis) -> BarrierFindings:
         rng,
     )
     deepest = without_control(formulas, i, deepest)
-    suprema = survey.suprema[stages]
+    suprema = analysis.suprema[stages]
     highest = (
         suprema[0]
         if formulas.first_order
         else supremum(
-            stages.start, formulas, formulas.barriers, survey.with_starts(safe, level), rng
+            stages.start, formulas, formulas.barriers, analysis.with_starts(safe, level), rng
         )
     )
     return BarrierFindings(
         name=formulas.problem.barriers[i].name,
         condition=formulas.conditions[i].spec,
         degree=stages.stop - stages.start,
-        leading=max(-negated, 0.0),
-        leading_at=leading_at,
+        control_authority=max(-negated, 0.0),
+        control_authority_at=weakest,
         typical=typical,
         small=len(small) / len(safe),
-        small_infeasible=_infeasible(formulas, small),
+        small_infeasible=infeasible_part(formulas, small),
         supremum=highest,
-        growth=survey.how_infinite(stages.start) if np.isinf(highest) else "",
+        growth=analysis.how_infinite(stages.start) if np.isinf(highest) else "",
         deepest=deepest,
         deepest_h=float(formulas.chain(deepest[None])[0, stages.start]),
-        deepest_shortfall=max(float(formulas.own(deepest[None])[0, i]), 0.0),
+        deepest_shortfall=max(float(formulas.own_shortfall(deepest[None])[0, i]), 0.0),
         suprema=suprema,
     )
-
-
-def _infeasible(formulas: Formulas, points: np.ndarray) -> float:
-    """Part of the points where a condition is missed; 0 of none."""
-    return float((formulas.missed(points) > 0.0).mean()) if len(points) else 0.0

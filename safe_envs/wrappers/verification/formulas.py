@@ -28,14 +28,11 @@ class Formulas:
     """The chains and conditions of a problem, compiled; arrays (B, n) of states in, arrays out.
 
     Attributes:
-        problem: whose they are.
-        conditions: one for each barrier.
-        knowledge: what they know, "model" or "plant".
-        safety_filter: which meets them, or says by how much it cannot.
+        safety_filter: which meets the conditions, or tells by how much it cannot.
         stages: the chain b_0..b_(r-1) of each barrier, as slices of all of them.
 
     Args:
-        problem: whose barriers, box and system are taken.
+        problem: whose barriers, input bounds and system are taken.
         conditions: one for each barrier.
         knowledge: "model" or "plant".
 
@@ -70,7 +67,7 @@ class Formulas:
 
     @property
     def barriers(self) -> list[int]:
-        """Which functions of the chain are the barriers themselves."""
+        """Indices of the barriers themselves among the chain functions."""
         return [stage.start for stage in self.stages]
 
     @property
@@ -86,13 +83,13 @@ class Formulas:
 
     @property
     def expressions(self) -> list[Any]:
-        """All that is asked of a state."""
-        return [*self._chain_expressions(), *self._row_expressions()]
+        """All functions of the state that a verification evaluates."""
+        return [*self._chain_expressions(), *self._constraint_expressions()]
 
     def _chain_expressions(self) -> list[Any]:
         return [e for c in self._constraints for e in c.chain]
 
-    def _row_expressions(self) -> list[Any]:
+    def _constraint_expressions(self) -> list[Any]:
         return [e for c in self._constraints for e in (*c.coefficient, c.offset - (c.demand or 0))]
 
     @cached_property
@@ -100,8 +97,8 @@ class Formulas:
         return self._compiled(self._chain_expressions())
 
     @cached_property
-    def _rows(self) -> Any:
-        return self._compiled(self._row_expressions())
+    def _constraints_compiled(self) -> Any:
+        return self._compiled(self._constraint_expressions())
 
     def _compiled(self, expressions: Sequence[Any]) -> Any:
         function = compile_function(
@@ -115,18 +112,26 @@ class Formulas:
         return values
 
     def chain(self, x: np.ndarray) -> np.ndarray:
-        """b_0..b_(r-1) of every barrier, one barrier after the other, shape (B, sum of the r)."""
+        """Return b_0..b_(r-1) of every barrier, one barrier after the other, (B, sum of the r)."""
         return self._chain(x)
 
     @cached_property
-    def _spreads(self) -> Any:
+    def _variation_rates(self) -> Any:
         return self._compiled(
             [quadratic_variation_rate(self.system, c.chain[0]) for c in self._constraints]
         )
 
     def quadratic_variation_rate(self, x: np.ndarray, i: int) -> np.ndarray:
-        """|sigma' grad h|^2 of a barrier, the variance of h per s, shape (B,)."""
-        return self._spreads(x)[:, i]
+        """Return |sigma' grad h|^2 of a barrier, the variance of h per s.
+
+        Args:
+            x: states, shape (B, n).
+            i: index of the barrier.
+
+        Returns:
+            Values, shape (B,).
+        """
+        return self._variation_rates(x)[:, i]
 
     @cached_property
     def region(self) -> Region:
@@ -135,120 +140,121 @@ class Formulas:
 
     @cached_property
     def _sizes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Typical sizes over the workspace: of each b_j, and of each b, shape (k,)."""
+        """Typical sizes over the workspace: of each b_j, and of each offset b, shape (k,)."""
         x = self.region.draw(_SIZES_LOG2, np.random.default_rng(0))
         return _typical(self.chain(x)), _typical(
-            self._rows(x).reshape(len(x), len(self.stages), -1)[:, :, -1]
+            self._constraints_compiled(x).reshape(len(x), len(self.stages), -1)[:, :, -1]
         )
 
     @cached_property
     def _edges(self) -> np.ndarray:
-        """How much of each b_j is left out at the edge: a hair where a reciprocal condition has no
-        value, else nothing."""
+        """Width of the strip of each b_j at the edge that does not count.
+
+        A reciprocal condition has no value there; the others have no such strip.
+        """
         reciprocal = [c.demand is not None for c in self._constraints for _ in c.chain]
         return np.where(reciprocal, _EDGE * self._sizes[0], 0.0)
 
     def barrier_level(self, x: np.ndarray) -> np.ndarray:
-        """Nonnegative in C."""
+        """Return a level (B,) that is nonnegative in C."""
         return (self.chain(x) - self._edges)[:, self.barriers].min(axis=1)
 
-    def kept_level(self, x: np.ndarray) -> np.ndarray:
-        """Nonnegative in the intersection of the C_j."""
+    def invariant_level(self, x: np.ndarray) -> np.ndarray:
+        """Return a level (B,) that is nonnegative in the invariant set, the intersection of the C_j."""
         return (self.chain(x) - self._edges).min(axis=1)
 
     @property
     def independent(self) -> bool:
-        """Whether no input appears in two conditions, so that each is met or missed for itself."""
+        """Whether no input appears in two conditions, so that each can be met by itself."""
         uses = [{j for j, a in enumerate(c.coefficient) if a != 0} for c in self._constraints]
         return sum(map(len, uses)) == len(set().union(*uses))
 
     @property
     def joint(self) -> bool:
-        """Whether it is exact what the conditions miss together: for one, independent ones, or a
-        single input.
+        """Whether the joint shortfall is exact: for one condition, independent ones or one input.
 
-        Where several share an input that cannot meet their margins of first order, these decide how
-        the filter shares out what is missed, and they depend on what is proposed.
+        Where several conditions share an input that cannot meet their sampling margins, these
+        decide how the filter distributes the violation, and they depend on the nominal action.
         """
         sampled = any(c.change is not None for c in self._constraints)
         return self.independent or (self.problem.plant.m == 1 and not sampled)
 
     @cached_property
     def _changes(self) -> Any:
-        """By how much each a changes, at most and to first order, over states that rounding cannot
-        tell apart."""
+        """Largest change of each a, to first order, over states that rounding cannot tell apart."""
         widths = (_EPSILONS * (self.region.high - self.region.low)).tolist()
         entries = [self.system.numeric(a) for c in self._constraints for a in c.coefficient]
         return self._compiled(
             [_change(a, dict(zip(self.system.states, widths, strict=True))) for a in entries]
         )
 
-    def rows(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """a, shape (B, k, m), and b, shape (B, k), of the conditions a u + b >= 0; an a that is 0
-        to rounding is 0.
+    def constraints_at(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return a (B, k, m) and b (B, k) of the constraints a u + b >= 0.
 
-        In a box that is wide enough, rounding would meet any condition.
+        An a that is 0 to rounding is 0: within input bounds that are wide enough, rounding would
+        meet any condition.
         """
-        rows = self._rows(x).reshape(len(x), len(self.stages), -1)
-        a = rows[:, :, :-1]
-        return np.where(abs(a) <= self._changes(x).reshape(a.shape), 0.0, a), rows[:, :, -1]
+        found = self._constraints_compiled(x).reshape(len(x), len(self.stages), -1)
+        a = found[:, :, :-1]
+        return np.where(abs(a) <= self._changes(x).reshape(a.shape), 0.0, a), found[:, :, -1]
 
     def defined(self, x: np.ndarray) -> np.ndarray:
-        """Whether the conditions have finite values, shape (B,)."""
-        return np.isfinite(self._rows(x)).all(axis=1)
+        """Return whether the conditions have finite values, shape (B,)."""
+        return np.isfinite(self._constraints_compiled(x)).all(axis=1)
 
-    def leading(self, x: np.ndarray) -> np.ndarray:
-        """Half of the range of L_g b_(r-1) u over the box, for each barrier, shape (B, k)."""
-        return (abs(self.rows(x)[0]) * (self._high - self._low) / 2.0).sum(axis=2)
+    def control_authority(self, x: np.ndarray) -> np.ndarray:
+        """Return half of the range of L_g b_(r-1) u over the input bounds, shape (B, k)."""
+        return (abs(self.constraints_at(x)[0]) * (self._high - self._low) / 2.0).sum(axis=2)
 
     def reach(self, x: np.ndarray) -> float:
-        """The part of the box in which the input has about as much to say as the rest of the
-        condition; at most 1."""
-        a, b = self.rows(x)
+        """Return the part of the input bounds, at most 1, that matters as much as the offset b."""
+        a, b = self.constraints_at(x)
         with np.errstate(all="ignore"):
             ratio = np.nanmedian(abs(b + a @ self._rest), axis=0) / np.nanmedian(
-                self.leading(x), axis=0
+                self.control_authority(x), axis=0
             )
         ratio = ratio[(ratio > 0.0) & np.isfinite(ratio)]
         return min(1.0, float(ratio.min())) if ratio.size else 1.0
 
-    def own(self, x: np.ndarray, reach: float = 1.0) -> np.ndarray:
-        """By how much each condition is missed by the action that is best for it alone, shape (B,
-        k).
+    def own_shortfall(self, x: np.ndarray, reach: float = 1.0) -> np.ndarray:
+        """Return by how much the action that is best for a condition alone violates it.
 
-        Where none is missed, to rounding, minus the margin of that action: the nearer to 0, the
-        nearer to being missed.
+        Where the condition can be met, to rounding, it is minus the margin of that action.
 
         Args:
             x: states, shape (B, n).
-            reach: part of the box that is allowed, about the action next to 0.
+            reach: part of the input bounds that is allowed, about the action next to 0.
+
+        Returns:
+            Amounts for each condition, shape (B, k).
         """
-        a, b = self.rows(x)
+        a, b = self.constraints_at(x)
         low, high = self._ends(reach)
         most = np.maximum(a * low, a * high).sum(axis=2)
         spare, rounding = b + most, _ROUNDING * (abs(most) + abs(b)) + _ZERO * self._sizes[1]
         return np.where(abs(spare) > rounding, -spare, 0.0)
 
-    def missed(self, x: np.ndarray, reach: float = 1.0) -> np.ndarray:
-        """By how much the worst condition is missed, shape (B,); minus the best margin that all
-        have where none is missed.
+    def shortfall(self, x: np.ndarray, reach: float = 1.0) -> np.ndarray:
+        """Return by how much the worst condition is violated at best.
 
-        Where several conditions share the inputs it is the filter that decides how a violation is
-        shared out. NaN where a condition is undefined.
+        Where all can be met, it is minus the best common margin. Where several conditions share the
+        inputs, the filter decides how a violation is distributed.
 
         Args:
             x: states, shape (B, n).
-            reach: see `own`; below 1, of several conditions the worst one is missed as little as
-                can be.
+            reach: see `own_shortfall`; below 1 the violation of the worst condition is least.
+
+        Returns:
+            Amounts, shape (B,); NaN where a condition is undefined.
         """
-        own = self.own(x, reach).max(axis=1)
+        own = self.own_shortfall(x, reach).max(axis=1)
         if self.independent:
             return own
         found = self._common(x, reach) if self.joint else own
         unsettled = (found > 0.0 if self.joint else found <= 0.0) & (reach == 1.0) & self.defined(x)
         if unsettled.any():
             slack = self.slack(x[unsettled]).max(axis=1)
-            rounding = _ROUNDING * abs(self.rows(x[unsettled])[1]).max(axis=1)
+            rounding = _ROUNDING * abs(self.constraints_at(x[unsettled])[1]).max(axis=1)
             found[unsettled] = np.where(
                 slack > rounding, np.maximum(slack, found[unsettled]), found[unsettled]
             )
@@ -260,12 +266,12 @@ class Formulas:
         )
 
     def _common(self, x: np.ndarray, reach: float) -> np.ndarray:
-        """Minus the best common margin of several conditions on one input.
+        """Return minus the best common margin of several conditions on one input, shape (B,).
 
         The smallest of the margins is concave and piecewise linear in the input: it is largest
-        where two of them cross, or at an end of the box.
+        where two of them cross, or at a bound of the input.
         """
-        a, b = self.rows(x)
+        a, b = self.constraints_at(x)
         a = a[:, :, 0]
         low, high = (end[0] for end in self._ends(reach))
         i, j = np.triu_indices(len(self.stages), 1)
@@ -281,15 +287,14 @@ class Formulas:
         return -np.where(abs(margins) > rounding, margins, 0.0).min(axis=1).max(axis=1)
 
     def slack(self, x: np.ndarray) -> np.ndarray:
-        """By how much the filter misses each condition, shape (B, k)."""
+        """Return by how much the filter violates each condition, shape (B, k)."""
         return self.safety_filter.filter(
             x, np.broadcast_to(self._rest, (len(x), len(self._rest)))
         ).slack
 
 
 def _change(expression: Any, widths: dict[sp.Symbol, float]) -> sp.Expr:
-    """Sum of the sizes of the slopes, times the widths; without those that sympy has no function
-    for, as at a kink."""
+    """Return the sum of the sizes of the slopes times the widths, without undefined ones."""
     slopes = [(sp.diff(expression, s), width) for s, width in widths.items()]
     known = [
         sp.Abs(slope) * width
@@ -300,8 +305,7 @@ def _change(expression: Any, widths: dict[sp.Symbol, float]) -> sp.Expr:
 
 
 def _typical(values: np.ndarray) -> np.ndarray:
-    """Medians of the sizes over the first axis, of those that are neither 0 nor undefined; 1 where
-    all are."""
+    """Return the medians of sizes that are neither 0 nor undefined, over the first axis; else 1."""
     sizes = np.where(np.isfinite(values) & (values != 0.0), abs(values), np.nan)
     empty = np.isnan(sizes).all(axis=0)
     return np.where(empty, 1.0, np.nanmedian(np.where(empty, 1.0, sizes), axis=0))

@@ -1,4 +1,4 @@
-"""States that were seen, held against the suprema and the shortfall that a search found."""
+"""States that were seen, compared with the suprema and the shortfall that a search found."""
 
 from __future__ import annotations
 
@@ -9,52 +9,78 @@ import numpy as np
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set import in_workspace, workspace_of
 
-_RELATIVE = 1e-6
-"""What a search and rounding may leave, in parts of the number itself."""
+RELATIVE = 1e-6
+"""Error that a search and rounding may leave, in parts of the number itself."""
 
 
 def above_suprema(formulas: Formulas, suprema: Sequence[float], x: np.ndarray) -> str:
-    """Which b_j is above its c_j at one of the states (B, n) that are in the set that the
-    conditions keep, in words; or ""."""
+    """Say which b_j is above its c_j at a state of the invariant set; "" if none is.
+
+    Args:
+        formulas: of the chains.
+        suprema: c_j of each chain function.
+        x: states (B, n), those outside the set or the workspace among them.
+    """
     if formulas.certain:
         return ""  # No supremum matters there.
     b = formulas.chain(x[_inside(formulas, x)])
-    for j in np.flatnonzero((b > np.array(suprema) * (1.0 + _RELATIVE)).any(axis=0)).tolist():
-        return (
-            f"{described(formulas, j)} reaches {b[:, j].max():.4g}, above the supremum of"
-            f" {suprema[j]:.4g} that the search found"
-        )
+    for j in np.flatnonzero((b > np.array(suprema) * (1.0 + RELATIVE)).any(axis=0)).tolist():
+        return reaches(described(formulas, j), float(b[:, j].max()), suprema[j])
     return ""
 
 
-def below_slack(formulas: Formulas, shortfall: float, x: np.ndarray, u: np.ndarray) -> str:
-    """By how much actions (E, m) miss the conditions at states (E, n) of the set that is kept, if
-    it is more than was found; or ""."""
+def above_shortfall(formulas: Formulas, shortfall: float, x: np.ndarray, u: np.ndarray) -> str:
+    """Say by how much actions violate the conditions, if by more than was found; "" if not.
+
+    Args:
+        formulas: of the conditions.
+        shortfall: the largest one that a search found.
+        x: states (E, n); those outside the invariant set do not count.
+        u: actions (E, m).
+    """
     inside = _inside(formulas, x)
     if not inside.any():
         return ""
-    a, b = formulas.rows(x[inside])
+    a, b = formulas.constraints_at(x[inside])
     moved = np.einsum("eki,ei->ek", a, u[inside])
-    # Where a condition has no finite value nothing can be said of by how much it is missed.
-    more = np.nan_to_num(-(moved + b) - shortfall, nan=0.0) > _RELATIVE * (
+    # Where a condition has no finite value nothing can be said of by how much it is violated.
+    more = np.nan_to_num(-(moved + b) - shortfall, nan=0.0) > RELATIVE * (
         shortfall + abs(moved) + abs(b)
     )
-    if not more.any():
-        return ""
-    most = float(np.where(more, -(moved + b), 0.0).max())
+    return violated_by(float(np.where(more, -(moved + b), 0.0).max()), shortfall) * bool(more.any())
+
+
+def reaches(name: str, value: float, supremum: float) -> str:
+    """Say that a function is above its supremum.
+
+    Args:
+        name: of the function.
+        value: that it has.
+        supremum: that a search found.
+    """
+    return f"{name} reaches {value:.4g}, above the supremum of {supremum:.4g} that the search found"
+
+
+def violated_by(most: float, shortfall: float) -> str:
+    """Say that a filter violated its condition by more than the shortfall.
+
+    Args:
+        most: by how much, in the units of b_(r-1) per s.
+        shortfall: that a search found.
+    """
     return (
-        f"the filter missed the condition by {most:.4g}, more than the shortfall of {shortfall:.4g}"
-        " that the search found"
+        f"the filter violated the condition by {most:.4g}, more than the shortfall of"
+        f" {shortfall:.4g} that the search found"
     )
 
 
 def _inside(formulas: Formulas, x: np.ndarray) -> np.ndarray:
-    """Which states are in the set that is kept, and in the workspace, shape (B,)."""
+    """Return which states are in the invariant set and in the workspace, shape (B,)."""
     return np.all(formulas.chain(x) > 0.0, axis=1) & in_workspace(x, workspace_of(formulas.problem))
 
 
 def described(formulas: Formulas, j: int) -> str:
-    """What the j-th of all chain functions is called."""
+    """Name the j-th of all chain functions."""
     i = next(i for i, stage in enumerate(formulas.stages) if stage.start <= j < stage.stop)
     name, stage = formulas.problem.barriers[i].name, j - formulas.stages[i].start
     return (

@@ -11,7 +11,7 @@ from safe_envs.agents.evaluation import bound_check
 from safe_envs.agents.evaluation.bound_check import Horizon, Measurement, measure, starts_of
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification.guarantee import Bound
+from safe_envs.wrappers.verification.results import Bound
 from tests.conftest import problem_of
 from tests.wrappers.verification.verified import verify_once
 

@@ -17,7 +17,6 @@ from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.verification import safe_set_analysis
 from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.guarantee import promise
 from tests.oracles import false_bounds
 
 pytestmark = pytest.mark.filterwarnings("ignore::safe_envs.errors.SystemDefinitionWarning")
@@ -44,7 +43,7 @@ FALSE = [
         false_bounds.rotated,
         "cbf:alpha=0.1",
         "no action meets the condition somewhere, by up to 0.",
-        "the filter missed the condition by",
+        "the filter violated the condition by",
     ),
 ]
 HORIZON = 0.5
@@ -104,7 +103,9 @@ def test_a_bound_over_a_posterior_sees_a_hidden_kink(monkeypatch):
     assert row["posterior_bound"]["note"].startswith(
         "h is not twice differentiable, which Ito's formula asks for, near x = "
     )
-    monkeypatch.setattr("safe_envs.wrappers.verification.posterior_bound.roughness", lambda *_: "")
+    monkeypatch.setattr(
+        "safe_envs.wrappers.verification.posterior_guarantee.roughness", lambda *_: ""
+    )
     (row,) = evaluate(problem, filters=[name], learned=[learned], episodes=40).rows
     assert row["posterior_bound"]["probability"] is None
     assert row["withheld"].startswith("the interval of the measured rate ends at")
@@ -129,8 +130,8 @@ def test_a_verification_withholds_what_its_simulation_contradicts(monkeypatch):
     for make, text in ((false_bounds.island, "scbf"), (false_bounds.rotated, "cbf:alpha=0.1")):
         problem = make()
         found = verify(problem, parse_conditions(text, problem), samples=1024)
-        inside = found.survey.safe.points[:1]
-        bounds = promise(found, inside, problem.duration)
+        inside = found.analysis.safe.points[:1]
+        bounds = found.guarantee.applicable_bounds(inside, problem.duration)
         assert "estimated" in {bound.status for bound in bounds}
         bounds, measurements = bound_check.judged(
             bounds, bound_check.measure(found, episodes=40), found
@@ -148,7 +149,7 @@ def test_a_start_above_a_supremum_withholds_at_once(monkeypatch):
     )
     problem = false_bounds.island()
     found = verify(problem, parse_conditions("scbf", problem), samples=512)
-    bounds = promise(found, np.array([[1.5, 0.3]]), HORIZON)
+    bounds = found.guarantee.applicable_bounds(np.array([[1.5, 0.3]]), HORIZON)
     assert {bound.status for bound in bounds} == {"hypothesis fails", "withheld"}
     assert all(
         "above the supremum" in bound.reason for bound in bounds if bound.status == "withheld"

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import shutil
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from safetensors.numpy import load as load_tensors
-from safetensors.numpy import save as save_tensors
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor
@@ -22,6 +19,8 @@ from safe_envs.agents import evaluate, load_problem, make_policy, refine
 from safe_envs.agents.policies.fixed_batch import BLOCK
 from safe_envs.agents.policies.network import NetworkPolicy, load_policy, save_policy
 from safe_envs.errors import InvalidInputError
+from safe_envs.wrappers.learning.models.files import load, save
+from safe_envs.wrappers.learning.models.signature import Signature
 
 pytestmark = pytest.mark.slow
 
@@ -111,7 +110,7 @@ def test_policies_predict_like_their_models(problem, tmp_path, algorithm, argume
     policy = load_policy(tmp_path / "new" / "folder", problem)
     assert isinstance(policy, NetworkPolicy)
     assert_predicts_like(model, policy, problem)
-    found = json.loads((tmp_path / "new" / "folder" / "policy.json").read_text())
+    found = load(tmp_path / "new" / "folder" / "policy.npz").details
     assert found["algorithm"] == algorithm.__name__
     assert found["output"] == ("tanh" if model.policy.squash_output else "clip")
 
@@ -179,26 +178,22 @@ def test_an_episode_has_the_same_actions_in_every_wave(saved, problem):
 
 def test_every_path_of_a_policy_is_the_policy(saved, problem):
     wanted = make_policy(str(saved), problem).predict(observations(problem))[0]
-    for path in (saved / "policy.json", saved / "policy.safetensors"):
-        np.testing.assert_array_equal(
-            make_policy(str(path), problem).predict(observations(problem))[0], wanted
-        )
-
-
-def test_the_folder_holds_two_files_and_what_they_are(saved, problem):
-    assert sorted(path.name for path in saved.iterdir()) == ["policy.json", "policy.safetensors"]
-    found = json.loads((saved / "policy.json").read_text())
-    assert (found["format"], found["layers"], found["activation"]) == (2, [4, 8, 8, 1], "tanh")
-    assert found["problem"]["features"] == ["x", "y", "cos_theta", "sin_theta"]
-    assert (found["problem"]["observation"]["low"], found["dt"]) == (
-        [-6.0, -6.0, -1.0, -1.0],
-        problem.dt,
+    np.testing.assert_array_equal(
+        make_policy(str(saved / "policy.npz"), problem).predict(observations(problem))[0], wanted
     )
-    content = (saved / "policy.safetensors").read_bytes()
-    assert found["sha256"] == hashlib.sha256(content).hexdigest()
-    assert {array.dtype for array in load_tensors(content).values()} == {np.dtype(np.float32)}
+
+
+def test_the_folder_holds_a_file_that_says_what_it_is(saved, problem):
+    assert [path.name for path in saved.iterdir()] == ["policy.npz"]
+    found = load(saved / "policy.npz")
+    assert (found.kind, found.details["activation"]) == ("policy", "tanh")
+    assert [found.arrays[f"actor_weights_{k}"].shape for k in range(3)] == [(8, 4), (8, 8), (1, 8)]
+    assert found.details["features"] == ["x", "y", "cos_theta", "sin_theta"]
+    assert found.details["observation"]["low"] == [-6.0, -6.0, -1.0, -1.0]
+    assert found.signature == Signature.of(problem)
+    digest = hashlib.sha256((saved / "policy.npz").read_bytes()).hexdigest()
     answer = evaluate(ENV_ID, str(saved), ["none"], options={"horizon": 0.1}, episodes=2)
-    assert answer.config["policy"] == {"name": str(saved), "sha256": found["sha256"]}
+    assert answer.config["policy"] == {"name": str(saved), "sha256": digest}
     assert (
         len(
             refine(
@@ -215,7 +210,7 @@ def test_another_normalisation_is_another_policy(problem, tmp_path):
     for i in range(2):
         envs.obs_rms.update(observations(problem))
         save_policy(model, tmp_path / str(i), problem)
-        sums.append(json.loads((tmp_path / str(i) / "policy.json").read_text())["sha256"])
+        sums.append(load(tmp_path / str(i) / "policy.npz").sha256)
     assert sums[0] != sums[1]
 
 
@@ -305,155 +300,104 @@ def test_policies_of_other_problems_are_errors(saved):
         (
             "safe_envs/DubinsDisk-v0",
             None,
-            "with system StochasticDubins; that of DubinsDisk is DubinsDisk",
+            "its system: StochasticDubins, that of DubinsDisk: DubinsDisk",
         ),
-        (ENV_ID, {"radius": 5.0}, "with observation "),
-        ("safe_envs/Scalar-v0", None, "with system"),
+        (ENV_ID, {"radius": 5.0}, "its observation: "),
+        ("safe_envs/Scalar-v0", None, "its system: "),
     ):
-        with pytest.raises(ConfigurationError, match=f"was trained for another problem, {message}"):
+        with pytest.raises(ConfigurationError, match=f"was trained for another problem: {message}"):
             make_policy(str(saved), load_problem(env_id, barrier and {"barrier": barrier}))
     make_policy(str(saved), load_problem(ENV_ID, {"plant": {"v": 1.5}, "dt": 0.01, "horizon": 1.0}))
 
 
 def test_missing_files_are_errors(copy, problem, tmp_path):
-    (copy / "policy.json").unlink()
-    for path in (copy, copy / "policy.json", tmp_path, tmp_path / "policy.safetensors"):
-        with pytest.raises(ConfigurationError, match="cannot be read: No such file"):
+    (copy / "policy.npz").unlink()
+    for path in (copy, copy / "policy.npz", tmp_path, tmp_path / "none.npz"):
+        with pytest.raises(ConfigurationError, match="does not exist; `safe-envs train` writes"):
             make_policy(str(path), problem)
-    with pytest.raises(ConfigurationError, match="is no folder; name one with"):
-        load_policy(tmp_path / "none", problem)
+    (tmp_path / "config.json").touch()
+    with pytest.raises(ConfigurationError, match=r"the training in .* is not finished"):
+        make_policy(str(tmp_path), problem)
 
 
-def rewrite(folder, change, arrays=None):
-    """Change the description, and have all checksums right."""
-    path, tensors = folder / "policy.json", folder / "policy.safetensors"
-    description = json.loads(path.read_text())
-    del description["sha256"]
-    change(description)
-    metadata = {
-        "description": hashlib.sha256(json.dumps(description, sort_keys=True).encode()).hexdigest()
-    }
-    content = save_tensors(arrays or load_tensors(tensors.read_bytes()), metadata=metadata)
-    tensors.write_bytes(content)
-    path.write_text(json.dumps({**description, "sha256": hashlib.sha256(content).hexdigest()}))
-
-
-def unchanged(description):
-    """Changes nothing."""
-
-
-@pytest.mark.parametrize(
-    ("name", "damage", "message"),
-    [
-        ("policy.safetensors", lambda data: data[:-1], "altered or truncated"),
-        (
-            "policy.safetensors",
-            lambda data: data[:-1] + bytes([data[-1] ^ 1]),
-            "altered or truncated",
-        ),
-        ("policy.safetensors", lambda data: b"", "altered or truncated"),
-        (
-            "policy.json",
-            lambda data: data.replace(b'"clip"', b'"tanh"'),
-            r"policy\.json was altered",
-        ),
-        (
-            "policy.json",
-            lambda data: data.replace(b'"activation": "tanh"', b'"activation": "relu"'),
-            r"policy\.json was altered",
-        ),
-        (
-            "policy.json",
-            lambda data: data.replace(b'"format": 2', b'"format": 1'),
-            "has the format 1; this version reads 2",
-        ),
-        ("policy.json", lambda data: data[:-40], "JSONDecodeError"),
-        ("policy.json", lambda data: b"[]", "TypeError"),
-        ("policy.json", lambda data: b"{}", "KeyError"),
-        ("policy.json", lambda data: b"\xff\x80", "UnicodeDecodeError"),
-        ("policy.json", lambda data: b"[" * 200_000, "damaged or altered"),
-    ],
-)
-def test_damaged_files_are_errors(copy, problem, name, damage, message):
-    before = (copy / name).read_bytes()
-    (copy / name).write_bytes(damage(before))
-    assert (copy / name).read_bytes() != before
-    with pytest.raises(ConfigurationError, match=message):
+def test_other_files_of_this_project_are_no_policies(copy, problem):
+    save(copy / "policy.npz", "transitions", Signature.of(problem), {}, {})
+    with pytest.raises(ConfigurationError, match="holds transitions, and no policy"):
         make_policy(str(copy), problem)
 
 
+def rewrite(folder, details=None, arrays=None):
+    """Change what a policy holds, under the right checksum."""
+    found = load(folder / "policy.npz")
+    save(
+        folder / "policy.npz",
+        found.kind,
+        found.signature,
+        {**found.details, **(details or {})},
+        found.arrays if arrays is None else arrays(found.arrays),
+    )
+
+
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("details", "message"),
     [
         ({"activation": "relo"}, "did you mean 'relu'"),
         ({"activation": ["tanh"]}, "TypeError"),
         ({"output": "none"}, "output = 'none'"),
-        ({"layers": [4, 8, 8, 8, 1]}, "damaged or altered"),
-        ({"layers": [4, 8, 1]}, "damaged or altered"),
-        ({"layers": "text"}, "damaged or altered"),
-        ({"layers": []}, "damaged or altered"),
         (
             {"normalization": {"mean": [0.0], "var": [1.0], "clip": 1.0, "epsilon": 1e-8}},
-            "damaged or altered",
+            "incomplete or altered",
         ),
         (
             {"normalization": {"mean": 4 * [0.0], "var": 4 * [-1.0], "clip": 1.0, "epsilon": 1e-8}},
             "the normalisation",
         ),
         (
-            {
-                "normalization": {
-                    "mean": 4 * [0.0],
-                    "var": 4 * [1.0],
-                    "clip": float("nan"),
-                    "epsilon": 1e-8,
-                }
-            },
+            {"normalization": {"mean": 4 * [0.0], "var": 4 * [1.0], "clip": 0.0, "epsilon": 1e-8}},
             "the normalisation",
         ),
         (
             {"normalization": {"mean": 4 * ["a"], "var": 4 * [1.0], "clip": 1.0, "epsilon": 1e-8}},
             "ValueError",
         ),
-        ({"box": [[-10.0, 10.0], [-10.0, 10.0]]}, "damaged or altered"),
-        ({"box": [[10.0, -10.0]]}, "damaged or altered"),
-        ({"box": [[-10.0, float("inf")]]}, "damaged or altered"),
-        ({"box": 1.0}, "damaged or altered"),
-        ({"problem": {}}, "KeyError"),
-        ({"problem": None}, "TypeError"),
+        ({"normalization": 1.0}, "TypeError"),
+        ({"box": [[-10.0, 10.0], [-10.0, 10.0]]}, "incomplete or altered"),
+        ({"box": [[10.0, -10.0]]}, "incomplete or altered"),
+        ({"box": 1.0}, "incomplete or altered"),
+        ({"features": None}, "its features: None"),
     ],
 )
-def test_descriptions_that_make_no_sense_are_errors(copy, problem, change, message):
-    rewrite(copy, lambda description: description.update(change))
+def test_descriptions_that_make_no_sense_are_errors(copy, problem, details, message):
+    rewrite(copy, details)
     with pytest.raises(ConfigurationError, match=message):
         make_policy(str(copy), problem)
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("name", "change", "message"),
     [
-        (lambda a: {**a, "weight_0": np.full_like(a["weight_0"], np.nan)}, "not all finite"),
-        (lambda a: {**a, "bias_2": np.full_like(a["bias_2"], np.inf)}, "not all finite"),
-        (lambda a: {**a, "weight_0": a["weight_0"].astype(np.float64)}, "damaged or altered"),
-        (lambda a: {**a, "weight_0": a["weight_0"][:, :3].copy()}, "damaged or altered"),
-        (lambda a: {**a, "weight_1": a["weight_1"][:, :3].copy()}, "damaged or altered"),
-        (lambda a: {**a, "bias_0": a["bias_0"][:1].copy()}, "damaged or altered"),
-        (lambda a: {**a, "bias_0": a["bias_0"][:, None].copy()}, "damaged or altered"),
-        (lambda a: {**a, "weight_0": a["bias_0"]}, "damaged or altered"),
-        (lambda a: {**a, "more": a["bias_0"]}, "damaged or altered"),
-        (lambda a: {k: v for k, v in a.items() if k != "bias_1"}, "damaged or altered"),
+        ("weights_0", lambda a: np.full_like(a, np.nan), "finite numbers"),
+        ("biases_2", lambda a: np.full_like(a, np.inf), "finite numbers"),
+        ("weights_0", lambda a: a[:, :3], "do not fit"),
+        ("weights_1", lambda a: a[:, :3], "do not fit"),
+        ("biases_0", lambda a: a[:1], "do not fit"),
+        ("biases_0", lambda a: a[:, None], "do not fit"),
+        ("weights_0", lambda a: a[0], "do not fit"),
+        ("input_scale", lambda a: 0.0 * a, "scales above 0"),
+        ("biases_1", lambda a: None, "KeyError"),
     ],
 )
-def test_tensors_that_make_no_sense_are_errors(copy, problem, change, message):
-    rewrite(copy, unchanged, change(load_tensors((copy / "policy.safetensors").read_bytes())))
+def test_arrays_that_make_no_sense_are_errors(copy, problem, name, change, message):
+    def arrays(found):
+        changed = {**found, f"actor_{name}": change(found[f"actor_{name}"])}
+        return {key: value for key, value in changed.items() if value is not None}
+
+    rewrite(copy, arrays=arrays)
     with pytest.raises(ConfigurationError, match=message):
         make_policy(str(copy), problem)
 
 
-def test_a_pickle_in_the_place_of_tensors_is_not_loaded(copy, problem):
-    torch.save({"weight_0": torch.zeros(8, 4)}, copy / "policy.safetensors")
-    description = json.loads((copy / "policy.json").read_text())
-    description["sha256"] = hashlib.sha256((copy / "policy.safetensors").read_bytes()).hexdigest()
-    (copy / "policy.json").write_text(json.dumps(description))
-    with pytest.raises(ConfigurationError, match="damaged or altered"):
+def test_a_pickle_in_the_place_of_a_policy_is_not_loaded(copy, problem):
+    torch.save({"actor_weights_0": torch.zeros(8, 4)}, copy / "policy.npz")
+    with pytest.raises(ConfigurationError, match="no file of `safe-envs train`"):
         make_policy(str(copy), problem)

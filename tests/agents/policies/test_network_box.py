@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -13,6 +11,7 @@ from stable_baselines3 import PPO, SAC
 from safe_envs.agents import load_problem, make_policy
 from safe_envs.agents.policies.network import save_policy
 from safe_envs.envs.simulation import center_and_half_width
+from safe_envs.wrappers.learning.models.files import load
 
 DUBINS, QUADROTOR = "safe_envs/StochasticDubins-v0", "safe_envs/Quadrotor-v0"
 BOXES = {DUBINS: (-10.0, 10.0), QUADROTOR: [(0.0, 20.0), (-1.0, 1.0), (-0.5, 1.0), (-0.1, 0.1)]}
@@ -102,5 +101,5 @@ def test_an_input_with_the_same_range_keeps_its_actions(trained):
 
 
 def test_the_description_holds_the_box_of_the_training(trained):
-    found = json.loads((trained[1] / "policy.json").read_text())
+    found = load(trained[1] / "policy.npz").details
     assert found["box"] == box_of(trained).tolist()

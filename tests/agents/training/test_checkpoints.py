@@ -70,7 +70,7 @@ def outcome(folder):
     return (
         logged,
         json.loads((folder / "evaluations.json").read_text()),
-        (folder / "policy.safetensors").read_bytes(),
+        (folder / "policy.npz").read_bytes(),
     )
 
 
@@ -289,7 +289,7 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize("size", [0, 300, 3000, 20_000])
 def test_a_full_disk_leaves_what_was_there_and_nothing_else(size, whole, copied):
     folder, _ = copied
-    for_more = {path.name for path in folder.iterdir()} | {"policy.safetensors"}
+    for_more = {path.name for path in folder.iterdir()} | {"policy.npz"}
     with (
         no_file_larger_than(size),
         pytest.raises(ConfigurationError, match=r"cannot write .*File too large"),

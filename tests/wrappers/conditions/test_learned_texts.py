@@ -20,10 +20,11 @@ from safe_envs.wrappers import (
     parse_condition,
     parse_conditions,
 )
-from safe_envs.wrappers.learning.models.files import LearnedFileError
-from safe_envs.wrappers.verification.estimated_bound import estimated_bound
+from safe_envs.wrappers.learning.models.values import LearnedFileError
 from safe_envs.wrappers.verification.feasibility import verify
 from safe_envs.wrappers.verification.formulas import Formulas
+from safe_envs.wrappers.verification.guarantee import guarantee_of
+from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
 from tests.conftest import problem_of
 from tests.wrappers.learned import assert_same_decisions, situations
 
@@ -242,12 +243,15 @@ def test_the_wrappers_take_text_and_conditions(kept):
         gym.make(again.spec)
 
 
-def test_no_promise_is_looked_for(kept):
+def test_bounds_are_for_known_systems_or_posteriors(kept):
     problem, condition, _ = kept
-    for look in (
+    looks = [
         lambda: Formulas(problem, [condition], "model"),
         lambda: verify(problem, [condition]),
-        lambda: estimated_bound(problem, [condition]),
-    ):
+        lambda: guarantee_of(problem, [condition]),
+    ]
+    if getattr(condition, "simultaneous", None) is not None:
+        assert isinstance(looks.pop()(), PosteriorGuarantee)
+    for look in looks:
         with pytest.raises(ConfigurationError, match="rests on something learned"):
             look()

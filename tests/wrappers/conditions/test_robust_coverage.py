@@ -16,7 +16,7 @@ from safe_envs.dynamics.lie import generator
 from safe_envs.wrappers import BayesianSCBF
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.learning.posterior import Diffusion
-from safe_envs.wrappers.verification.posterior_bound import posterior_bound
+from safe_envs.wrappers.verification.posterior_guarantee import posterior_guarantee
 from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow
@@ -113,7 +113,7 @@ def test_what_the_features_miss_is_no_noise_and_has_no_bound():
     }
     assert above[sure] <= 0.1 < above[plain]
     with pytest.raises(ConfigurationError, match=r"miss .* % of the rate of x_1"):
-        posterior_bound(problem, [BayesianSCBF(posterior, simultaneous=0.9)])
+        posterior_guarantee(problem, [BayesianSCBF(posterior, simultaneous=0.9)])
 
 
 def test_noise_that_is_taken_for_constant_and_is_not_has_no_bound():
@@ -121,7 +121,7 @@ def test_noise_that_is_taken_for_constant_and_is_not_has_no_bound():
     with pytest.warns(UserWarning, match="diffusion degree"):
         posterior = identify(pendulum)
     with pytest.raises(ConfigurationError, match="noise of theta varies"):
-        posterior_bound(pendulum, [BayesianSCBF(posterior, simultaneous=0.9)])
+        posterior_guarantee(pendulum, [BayesianSCBF(posterior, simultaneous=0.9)])
 
 
 @pytest.mark.parametrize(("sigma", "count"), [(1e-3, 40), (0.01, 200), (0.2, 50), (30.0, 1000)])

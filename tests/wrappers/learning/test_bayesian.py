@@ -22,7 +22,9 @@ from safe_envs.wrappers.learning.bayesian import Prior, fit, identify
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.files import LearnedFileError, Signature, load
+from safe_envs.wrappers.learning.models.files import load
+from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.models.values import LearnedFileError
 from safe_envs.wrappers.learning.posterior import Posterior
 from safe_envs.wrappers.learning.regression import Rows, posterior
 

@@ -15,7 +15,7 @@ from safe_envs.wrappers.learning.data.collection import collect, draw_states, pl
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning, term_names
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.files import Signature
+from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.posterior import Posterior
 
 PROBLEM = cubic_sde_disk()

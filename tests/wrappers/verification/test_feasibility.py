@@ -12,12 +12,10 @@ import sympy as sp
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.barrier import Barrier
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification.estimated_bound import from_survey
-from safe_envs.wrappers.verification.feasibility import _infeasible, verify
+from safe_envs.wrappers.verification.feasibility import verify
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.guarantee import promise
 from safe_envs.wrappers.verification.safe_set import draw_starts
-from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis
+from safe_envs.wrappers.verification.safe_set_analysis import SafeSetAnalysis, infeasible_part
 from tests.conftest import problem_of
 from tests.wrappers.verification.verified import (
     CUBIC_DISK,
@@ -40,7 +38,7 @@ STATUSES = {"estimated", "withheld", "hypothesis fails", "no bound", "not establ
 
 def test_radial_headings_leave_the_dubins_disk_without_control():
     (barrier,) = (found := findings(DUBINS)).barriers
-    x, y, theta = barrier.leading_at
+    x, y, theta = barrier.control_authority_at
     assert barrier.degree == 2
     assert barrier.vanishes
     assert abs(x * math.sin(theta) - y * math.cos(theta)) < 1e-6
@@ -50,9 +48,9 @@ def test_radial_headings_leave_the_dubins_disk_without_control():
     # is -2 v (v + rho).
     v = 0.5
     rho = -v + math.sqrt(v * v + 1)
-    assert found.kept is not None
-    assert found.kept.shortfall == pytest.approx(2 * v * (v + rho), rel=1e-6)
-    assert 0.01 < found.kept.infeasible < 0.1
+    assert found.invariant_set is not None
+    assert found.invariant_set.shortfall == pytest.approx(2 * v * (v + rho), rel=1e-6)
+    assert 0.01 < found.invariant_set.infeasible < 0.1
 
 
 @pytest.mark.parametrize(("rates", "missed"), [("1,1", 2 * 0.8**2 - 1), ("1,2", 0.0)])
@@ -66,8 +64,8 @@ def test_a_narrow_box_leaves_a_shortfall():
     # Largest at x = 1: A h = -2 x u - s^2 x^2, with |u| <= .1 and s = .6.
     problem = system_in_a_box(high=0.1)
     found = verify(problem, parse_conditions("scbf", problem))
-    assert found.safe.shortfall == pytest.approx(0.6**2 - 0.2, abs=1e-6)
-    assert found.safe.infeasible == pytest.approx(1 - 0.2 / 0.36, abs=0.01)
+    assert found.safe_set.shortfall == pytest.approx(0.6**2 - 0.2, abs=1e-6)
+    assert found.safe_set.infeasible == pytest.approx(1 - 0.2 / 0.36, abs=0.01)
 
 
 def test_conflicting_barriers_are_found_to_be_infeasible_together():
@@ -80,10 +78,11 @@ def test_conflicting_barriers_are_found_to_be_infeasible_together():
     # but not both.
     margin = parse_conditions("cbf:alpha=0.1:sampling_margin=0.5", apart)
     found = verify(apart, margin, samples=500)
-    assert found.safe.infeasible == 1.0
-    assert found.safe.shortfall >= 0.4 - 1e-6
+    assert found.safe_set.infeasible == 1.0
+    assert found.safe_set.shortfall >= 0.4 - 1e-6
     assert (
-        verify(apart, parse_conditions("cbf:alpha=0.1", apart), samples=500).safe.infeasible == 0.0
+        verify(apart, parse_conditions("cbf:alpha=0.1", apart), samples=500).safe_set.infeasible
+        == 0.0
     )
 
 
@@ -93,27 +92,27 @@ def test_every_id_is_verified_and_has_a_bound_or_a_note(env_id, monkeypatch):
     problem = found.formulas.problem
     assert len(found.barriers) == len(problem.barriers)
     for barrier in found.barriers:
-        assert 0.0 <= barrier.leading <= barrier.typical < math.inf
+        assert 0.0 <= barrier.control_authority <= barrier.typical < math.inf
         assert 0.0 <= barrier.small <= 1.0
         assert math.isfinite(barrier.deepest_h)
         assert barrier.deepest_shortfall >= 0.0
         assert barrier.suprema.shape == (barrier.degree,)
-        assert barrier.deepest.shape == barrier.leading_at.shape == (problem.plant.n,)
-    for part in (found.safe, found.kept):
+        assert barrier.deepest.shape == barrier.control_authority_at.shape == (problem.plant.n,)
+    for part in (found.safe_set, found.invariant_set):
         assert part is not None
         assert 0.0 < part.share <= 1.0
         assert 0.0 <= part.infeasible <= 1.0
         assert 0.0 <= part.shortfall < math.inf
         assert found.formulas.barrier_level(part.worst[None])[0] >= 0.0
     starts = draw_starts(problem, 16)
-    bounds = promise(found, starts, problem.horizon)
+    bounds = found.guarantee.applicable_bounds(starts, problem.horizon)
     assert bounds
     for bound in bounds:
         assert bound.status in STATUSES
         assert bound.value is None or 0.0 <= bound.value <= 1.0
         assert bound.reason or bound.status == "estimated"
     # The same look at the system gives the estimated bound, or a note on why there is none.
-    estimated = from_survey(found.survey)
+    estimated = found.guarantee
     values = estimated.at(starts, problem.horizon)
     assert values.shape == (16,)
     assert ((values >= 0.0) & (values <= 1.0)).all()
@@ -126,7 +125,7 @@ def test_infeasibility_and_shortfall_are_those_of_the_filter():
     rng = np.random.default_rng(3)
     x = rng.uniform(-2.0, 2.0, (500, 3))
     result = formulas.safety_filter.filter(x, rng.uniform(-10.0, 10.0, (500, 1)))
-    missed = formulas.missed(x)
+    missed = formulas.shortfall(x)
     np.testing.assert_array_equal(missed > 0.0, ~result.feasible)
     np.testing.assert_allclose(np.maximum(missed, 0.0), result.slack[:, 0])
     assert 0 < (missed > 0.0).sum() < 500
@@ -138,10 +137,10 @@ def test_results_depend_on_the_seed_alone():
     first, again, other = (
         verify(problem, conditions, samples=256, seed=seed) for seed in (1, 1, 2)
     )
-    assert first.safe.infeasible == again.safe.infeasible
-    np.testing.assert_array_equal(first.safe.worst, again.safe.worst)
-    assert first.safe.points != other.safe.points or not np.array_equal(
-        first.safe.worst, other.safe.worst
+    assert first.safe_set.infeasible == again.safe_set.infeasible
+    np.testing.assert_array_equal(first.safe_set.worst, again.safe_set.worst)
+    assert first.safe_set.points != other.safe_set.points or not np.array_equal(
+        first.safe_set.worst, other.safe_set.worst
     )
 
 
@@ -164,7 +163,7 @@ def test_a_wide_box_hides_no_state_without_control(exponent, seed):
         Formulas(problem, parse_conditions("hocbf:p=.5,.5", problem), "model"), 2048, seed
     )
     rho = (-2 * v + math.sqrt(4 * v * v + 4 * p * p)) / (2 * p)
-    assert found.missed[0] == pytest.approx(2 * v * (v + p * rho), rel=1e-6)
+    assert found.max_shortfall[0] == pytest.approx(2 * v * (v + p * rho), rel=1e-6)
 
 
 @pytest.mark.slow
@@ -187,7 +186,7 @@ def test_moderately_wide_boxes_do_not_depend_on_the_seed(seed):
     found = SafeSetAnalysis(
         Formulas(problem, parse_conditions("szcbf:alphas=5,5", problem), "model"), 2048, seed
     )
-    assert found.missed[0] == pytest.approx(60.878095, rel=1e-6)
+    assert found.max_shortfall[0] == pytest.approx(60.878095, rel=1e-6)
 
 
 def pockets(width, depth, offset):
@@ -212,7 +211,7 @@ def test_a_pocket_of_conflict_is_found(width):
     found = SafeSetAnalysis(
         Formulas(problem, parse_conditions("szcbf:alphas=.1", problem), "model")
     )
-    missed, state = found.missed
+    missed, state = found.max_shortfall
     assert missed == pytest.approx(4.8, rel=1e-3)
     np.testing.assert_allclose(state, [0.0, 0.0, 0.3, -0.2], atol=1e-3)
 
@@ -222,19 +221,19 @@ def test_what_is_missed_together_is_the_filters_slack():
     formulas = Formulas(problem, parse_conditions("szcbf:alphas=.1", problem), "model")
     states = formulas.region.draw(9, np.random.default_rng(0))
     result = formulas.safety_filter.filter(states, np.zeros((len(states), 1)))
-    missed = formulas.missed(states)
+    missed = formulas.shortfall(states)
     np.testing.assert_array_equal(missed > 0.0, ~result.feasible)
     np.testing.assert_allclose(np.maximum(missed, 0.0), result.slack.max(axis=1), atol=1e-9)
     assert 0 < result.feasible.sum() < len(states)
     # The common margin of a wider box is no smaller.
-    assert (formulas.missed(states, 0.1) >= formulas.missed(states, 0.5) - 1e-12).all()
+    assert (formulas.shortfall(states, 0.1) >= formulas.shortfall(states, 0.5) - 1e-12).all()
 
 
 def test_states_where_a_condition_is_undefined_are_reported():
     problem = problem_with([-sp.sqrt(x)], [1 - x**2], noise=(0.05,))
     found = made(problem, samples=1024)
     assert found.undefined == pytest.approx(0.5, abs=0.01)
-    bound, *_ = promise(found, np.array([[0.5]]), 1.0)
+    bound, *_ = found.guarantee.applicable_bounds(np.array([[0.5]]), 1.0)
     assert bound.status == "hypothesis fails"
     assert "no finite value at x = -" in bound.reason
     assert "no finite value at x = -" in (made_bound(problem).note or "")
@@ -243,8 +242,8 @@ def test_states_where_a_condition_is_undefined_are_reported():
 def test_a_tiny_unit_of_a_barrier_is_no_matter():
     problem = problem_with([0 * x], [1e-10 * (1 - x**2)], noise=(0.1,))
     # At the middle A h = -s^2 in these units.
-    assert made(problem, samples=1024).safe.shortfall == pytest.approx(1e-12, rel=1e-6)
-    assert made(problem, "srcbf", samples=1024).safe.points > 1000
+    assert made(problem, samples=1024).safe_set.shortfall == pytest.approx(1e-12, rel=1e-6)
+    assert made(problem, "srcbf", samples=1024).safe_set.points > 1000
 
 
 @pytest.mark.parametrize(
@@ -269,9 +268,9 @@ def test_the_intersection_is_a_part_of_c(slowest, rates, share):
         start=0.5,
     )
     found = made(problem, f"hocbf:p={rates}", samples=4096)
-    assert found.kept is not None
-    assert found.kept.share == pytest.approx(share, abs=0.005)
-    assert found.safe.share == pytest.approx(0.5, abs=0.005)
+    assert found.invariant_set is not None
+    assert found.invariant_set.share == pytest.approx(share, abs=0.005)
+    assert found.safe_set.share == pytest.approx(0.5, abs=0.005)
 
 
 def test_a_condition_that_is_just_met_is_met():
@@ -280,5 +279,5 @@ def test_a_condition_that_is_just_met_is_met():
     formulas = Formulas(problem, parse_conditions("scbf", problem), "model")
     states = np.zeros((4, 1))
     assert formulas.safety_filter.filter(states, np.zeros((4, 1))).feasible.all()
-    np.testing.assert_array_equal(formulas.missed(states), 0.0)
-    assert _infeasible(formulas, states) == 0.0
+    np.testing.assert_array_equal(formulas.shortfall(states), 0.0)
+    assert infeasible_part(formulas, states) == 0.0

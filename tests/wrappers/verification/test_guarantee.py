@@ -11,12 +11,11 @@ import sympy as sp
 
 from safe_envs.problem.barrier import Barrier
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification.estimated_bound import estimated_bound
+from safe_envs.wrappers.verification.extrema import unbounded
 from safe_envs.wrappers.verification.feasibility import verify
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.guarantee import best_start, promise
+from safe_envs.wrappers.verification.guarantee import guarantee_of
 from safe_envs.wrappers.verification.safe_set import draw_starts
-from safe_envs.wrappers.verification.safe_set_analysis import unbounded
 from tests.conftest import problem_of
 from tests.wrappers.verification.verified import (
     CUBIC_DISK,
@@ -40,17 +39,17 @@ def test_scbf_fails_near_the_centre_of_the_cubic_disk():
     found = findings(CUBIC_DISK)
     (barrier,) = found.barriers
     assert barrier.deepest_shortfall == pytest.approx(0.08, abs=1e-9)
-    np.testing.assert_allclose(found.safe.worst, 0.0, atol=1e-4)
-    assert found.kept is not None
+    np.testing.assert_allclose(found.safe_set.worst, 0.0, atol=1e-4)
+    assert found.invariant_set is not None
     # C is one with the intersection: the worst of both is the same.
-    assert (found.safe.shortfall, found.safe.infeasible) == (
-        found.kept.shortfall,
-        found.kept.infeasible,
+    assert (found.safe_set.shortfall, found.safe_set.infeasible) == (
+        found.invariant_set.shortfall,
+        found.invariant_set.infeasible,
     )
-    assert found.kept.share == 1.0
-    assert found.safe.share == pytest.approx(math.pi / 16, abs=0.01)
-    assert found.safe.shortfall == pytest.approx(0.08)
-    bounds = promise(found, np.array([[-0.1, 0.7]]), 1.0)
+    assert found.invariant_set.share == 1.0
+    assert found.safe_set.share == pytest.approx(math.pi / 16, abs=0.01)
+    assert found.safe_set.shortfall == pytest.approx(0.08)
+    bounds = found.guarantee.applicable_bounds(np.array([[-0.1, 0.7]]), 1.0)
     assert by_name(bounds, "4.2.8").status == "hypothesis fails"
     assert by_name(bounds, "4.2.8").value == pytest.approx(0.5)
     assert by_name(bounds, "repaired").status == "estimated"
@@ -70,7 +69,7 @@ def test_unbounded_barriers_have_no_bound_where_no_workspace_ends_them(name):
     problem = endless(f"safe_envs/{name}-v0")
     found = made(problem, samples=512)
     assert math.isinf(found.barriers[0].supremum)
-    (bound,) = promise(found, draw_starts(problem, 8), 1.0)
+    (bound,) = found.guarantee.applicable_bounds(draw_starts(problem, 8), 1.0)
     assert (bound.status, bound.value, bound.reason) == ("no bound", None, "sup h is infinite")
     assert made_bound(problem).note == "sup h is infinite"
 
@@ -94,7 +93,7 @@ def test_a_supremum_is_that_of_the_workspace(name, deepest):
         {s: getattr(ranges[s], end) if isinstance(end, str) else end for s, end in state.items()}
     )
     assert found.beyond
-    assert found.survey.suprema[0] == pytest.approx(float(highest), rel=1e-9)
+    assert found.analysis.suprema[0] == pytest.approx(float(highest), rel=1e-9)
     assert found.barriers[0].supremum == pytest.approx(float(highest), rel=1e-9)
 
 
@@ -120,19 +119,19 @@ def test_a_barrier_that_another_one_limits_is_not_unbounded(ends):
 def test_an_endless_range_counts_on_its_endless_side_only():
     problem = problem_with([0 * x], [x], ranges=((-math.inf, 2.0),), noise=(0.1,))
     assert not unbounded(Formulas(problem, parse_conditions("scbf", problem), "model"), 0)
-    assert made(problem, samples=256).survey.suprema[0] == pytest.approx(2.0, rel=1e-9)
+    assert made(problem, samples=256).analysis.suprema[0] == pytest.approx(2.0, rel=1e-9)
 
 
 def test_the_attained_bound_is_estimated():
     problem = system_in_a_box()
     conditions = parse_conditions("scbf", problem)
     found = verify(problem, conditions, samples=1024)
-    assert found.safe.shortfall == found.safe.infeasible == 0.0
+    assert found.safe_set.shortfall == found.safe_set.infeasible == 0.0
     starts = np.array([[0.0], [0.5], [-0.9]])
     np.testing.assert_allclose(
-        estimated_bound(problem, conditions).at(starts, 7.0), 1 - starts[:, 0] ** 2, rtol=1e-9
+        guarantee_of(problem, conditions).at(starts, 7.0), 1 - starts[:, 0] ** 2, rtol=1e-9
     )
-    (bound,) = promise(found, starts, 7.0)
+    (bound,) = found.guarantee.applicable_bounds(starts, 7.0)
     assert (bound.status, bound.forever) == ("estimated", True)
     assert bound.value == pytest.approx((1 - starts**2).mean())
 
@@ -143,9 +142,9 @@ def test_bounds_of_several_barriers_are_put_together_by_the_union():
     starts = np.array([[0.1, 0.2], [0.7, 0.8], [0.1, 1.1]])
     expected = np.maximum(0.0, (1 - starts**2).sum(axis=1) - 1) * (abs(starts) < 1).all(axis=1)
     np.testing.assert_allclose(
-        estimated_bound(problem, conditions).at(starts, 3.0), expected, atol=1e-8
+        guarantee_of(problem, conditions).at(starts, 3.0), expected, atol=1e-8
     )
-    (bound,) = promise(verify(problem, conditions, samples=500), starts, 3.0)
+    (bound,) = verify(problem, conditions, samples=500).guarantee.applicable_bounds(starts, 3.0)
     assert (bound.status, bound.value) == ("estimated", pytest.approx(expected.mean(), abs=1e-8))
     assert "33.3 % of the starts" in bound.reason
 
@@ -171,44 +170,52 @@ def test_a_model_without_the_noise_breaks_the_hypothesis():
     bound = estimated("safe_envs/CubicSDEDisk-v0", "scbf", model={"sigma_1": 0.0})
     assert bound.note == "the model differs from the plant in sigma_1"
     found = findings(CUBIC_DISK, "scbf", samples=512, model={"sigma_1": 0.0})
-    statuses = {b.status for b in promise(found, np.array([[0.1, 0.1]]), 1.0)}
+    statuses = {b.status for b in found.guarantee.applicable_bounds(np.array([[0.1, 0.1]]), 1.0)}
     assert statuses == {"hypothesis fails"}
 
 
 def test_a_start_outside_is_said_to_be():
     found = findings(DUBINS, "hocbf", "plant", samples=512, start="thesis")
-    (bound,) = promise(found, draw_starts(found.formulas.problem, 1), 1.0)
+    (bound,) = found.guarantee.applicable_bounds(draw_starts(found.formulas.problem, 1), 1.0)
     assert bound.status == "hypothesis fails"
     assert bound.reason == "the start is outside C_1: b_1 = -1.26"
 
 
 def test_conditions_without_noise_keep_every_path_if_they_can_be_met():
     found = findings("safe_envs/Scalar-v0", "cbf", noise=0)
-    (bound,) = promise(found, np.array([[0.0], [0.5]]), 1.0)
+    (bound,) = found.guarantee.applicable_bounds(np.array([[0.0], [0.5]]), 1.0)
     assert (bound.status, bound.value) == ("estimated", 1.0)
     weak = findings("safe_envs/Scalar-v0", "cbf:alpha=0.5", noise=0, box=[-0.8, 0.8])
-    near, far = promise(weak, np.array([[0.99]]), 1.0), promise(weak, np.array([[0.0]]), 1.0)
+    near, far = (
+        weak.guarantee.applicable_bounds(np.array([[0.99]]), 1.0),
+        weak.guarantee.applicable_bounds(np.array([[0.0]]), 1.0),
+    )
     assert by_name(near, "no path leaves").status == "hypothesis fails"
     # Missed by .2 at the edge at most: h >= h_0 e^(-t/2) - .4 (1 - e^(-t/2)) is positive up to 1 s
     # from the middle only.
-    assert weak.safe.shortfall == pytest.approx(0.2)
+    assert weak.safe_set.shortfall == pytest.approx(0.2)
     assert (by_name(near, "in spite").value, by_name(far, "in spite").value) == (0.0, 1.0)
 
 
 def test_zeroing_forms_and_the_misprint():
-    bounds = promise(findings(CUBIC_DISK, "szcbf:alphas=2"), np.array([[0.5, 0.0]]), 1.0)
-    assert by_name(bounds, "as printed").status == "not established"
-    assert by_name(bounds, "as printed").value == pytest.approx(0.75 * math.exp(-1.0))
+    bounds = findings(CUBIC_DISK, "szcbf:alphas=2").guarantee.applicable_bounds(
+        np.array([[0.5, 0.0]]), 1.0
+    )
+    assert by_name(bounds, "printed").status == "not established"
+    assert by_name(bounds, "printed").value == pytest.approx(0.75 * math.exp(-1.0))
     assert by_name(bounds, "corrected").status == "estimated"
     assert by_name(bounds, "corrected").value == pytest.approx(0.75 * math.exp(-2.0))
-    slow = promise(findings(CUBIC_DISK, "szcbf:alphas=0.5"), np.array([[0.5, 0.0]]), 1.0)
-    assert by_name(slow, "as printed").value < by_name(slow, "corrected").value
-    assert by_name(slow, "as printed").status == by_name(slow, "corrected").status
+    slow = findings(CUBIC_DISK, "szcbf:alphas=0.5").guarantee.applicable_bounds(
+        np.array([[0.5, 0.0]]), 1.0
+    )
+    assert by_name(slow, "printed").value < by_name(slow, "corrected").value
+    assert by_name(slow, "printed").status == by_name(slow, "corrected").status
 
 
 def test_the_estimated_bound_is_deterministic():
     starts = draw_starts(problem_of(CUBIC_DISK), 16)
-    np.testing.assert_array_equal(*(estimated(CUBIC_DISK).at(starts, 1.0) for _ in range(2)))
+    first, again = (estimated(CUBIC_DISK).at(starts, 1.0) for _ in range(2))
+    np.testing.assert_array_equal(first, again)
 
 
 def test_suprema_and_the_product_bound_of_the_stochastic_dubins():
@@ -221,12 +228,12 @@ def test_suprema_and_the_product_bound_of_the_stochastic_dubins():
         barrier.suprema, [r**2 - (sigma**2 / v) ** 2, 2 * v * r - 2 * sigma**2], rtol=1e-6
     )
     assert barrier.supremum == pytest.approx(r**2)
-    assert found.kept is not None
-    assert found.kept.shortfall == pytest.approx(2 * v**2, rel=1e-4)
-    start = best_start(found)
+    assert found.invariant_set is not None
+    assert found.invariant_set.shortfall == pytest.approx(2 * v**2, rel=1e-4)
+    start = found.guarantee.best_start()
     assert start is not None
     assert math.hypot(*start[:2]) == pytest.approx(math.sqrt(3.0), abs=0.02)
-    bounds = promise(found, start[None], 5.0)
+    bounds = found.guarantee.applicable_bounds(start[None], 5.0)
     assert by_name(bounds, "product").value == pytest.approx(0.383, abs=1e-3)
     assert "conditions on the future" in by_name(bounds, "product").reason
     assert by_name(bounds, "union").value < by_name(bounds, "product").value
@@ -239,7 +246,7 @@ def test_suprema_and_the_product_bound_of_the_stochastic_dubins():
 def test_no_box_holds_an_srcbf_under_noise(width, scale):
     problem = problem_with([x], [scale * (1 - x)], noise=(0.2,), box=(-width, width))
     found = made(problem, "srcbf", samples=1024)
-    (bound,) = promise(found, np.array([[0.5]]), 1.0)
+    (bound,) = found.guarantee.applicable_bounds(np.array([[0.5]]), 1.0)
     assert bound.status == "hypothesis fails"
     assert "unbounded control towards the edge" in bound.reason
     assert "unbounded control towards the edge" in (made_bound(problem, "srcbf").note or "")
@@ -253,7 +260,7 @@ def test_an_srcbf_is_kept_where_the_noise_fades_at_the_edge(noise, kept):
     # |sigma' grad h|^2/h is 4 x^2 sigma^2/h, which stays finite for a sigma^2 that falls at least
     # like h.
     problem = problem_with([0 * x], [1 - x**2], noise=(noise,), box=(-1e6, 1e6))
-    assert made(problem, "srcbf", samples=512).survey.runaway is not kept
+    assert made(problem, "srcbf", samples=512).analysis.runaway is not kept
 
 
 def test_a_kink_has_no_bound_under_noise():
@@ -274,7 +281,9 @@ def test_a_range_that_was_chosen_establishes_nothing():
         start=0.0,
     )
     reason = "looked at only for y in [-10, 10]: the workspace is unbounded"
-    bounds = promise(made(problem, "szcbf:alphas=.1", samples=512), np.array([[0.0, 0.0]]), 1.0)
+    bounds = made(problem, "szcbf:alphas=.1", samples=512).guarantee.applicable_bounds(
+        np.array([[0.0, 0.0]]), 1.0
+    )
     assert {(b.status, b.reason) for b in bounds} == {("not established", reason)}
     assert made_bound(problem, "szcbf:alphas=.1").note == reason
 
@@ -288,10 +297,10 @@ def test_conditions_that_share_several_inputs_have_no_bound():
         barriers=(Barrier(1 - x_1**2 - x_2**2 / 2, "h_1"), Barrier(1 - x_2**2 - x_1**2 / 2, "h_2")),
     )
     reason = "the shortfall of several conditions together is not established"
-    assert estimated_bound(coupled, parse_conditions("scbf", coupled)).note == reason
-    bounds = promise(
-        verify(coupled, parse_conditions("scbf", coupled), samples=256), np.array([[0.1, 0.1]]), 1.0
-    )
+    assert guarantee_of(coupled, parse_conditions("scbf", coupled)).note == reason
+    bounds = verify(
+        coupled, parse_conditions("scbf", coupled), samples=256
+    ).guarantee.applicable_bounds(np.array([[0.1, 0.1]]), 1.0)
     assert all(reason in b.reason and b.status != "estimated" for b in bounds)
 
 
@@ -307,7 +316,7 @@ def test_the_estimated_bound_is_the_best_of_them(env_id, text):
         best = max(
             (
                 b.value
-                for b in promise(found, starts, horizon)
+                for b in found.guarantee.applicable_bounds(starts, horizon)
                 if b.status == "estimated" and b.value is not None
             ),
             default=0.0,
@@ -318,21 +327,24 @@ def test_the_estimated_bound_is_the_best_of_them(env_id, text):
 def test_what_only_seems_infinite_is_said_to():
     problem = problem_with([0 * x], [x / (x + 50)], noise=(0.1,), ranges=((0.0, math.inf),))
     assert (
-        made_bound(problem).note == "sup h_1 seems infinite: it grows with the box that is searched"
+        made_bound(problem).note
+        == "sup h_1 seems infinite: it grows with the ranges that are searched"
     )
 
 
 def test_starts_that_are_inside_of_one_set_each_are_said_to_be():
     found = findings(STOCHASTIC)
     # Outwards near the middle, and inwards beyond the disk.
-    (bound,) = promise(found, np.array([[2.0, 0.0, 0.0], [3.5, 0.0, math.pi]]), 5.0)
+    (bound,) = found.guarantee.applicable_bounds(
+        np.array([[2.0, 0.0, 0.0], [3.5, 0.0, math.pi]]), 5.0
+    )
     assert (bound.status, bound.reason) == ("hypothesis fails", "no start lies in all C_j at once")
 
 
 def test_the_error_of_a_mean_is_known():
     found = findings(CUBIC_DISK)
     starts = draw_starts(found.formulas.problem, 256)
-    bound = by_name(promise(found, starts, 1.0), "4.2.8")
+    bound = by_name(found.guarantee.applicable_bounds(starts, 1.0), "4.2.8")
     values = found.formulas.chain(starts)[:, 0]
     assert bound.error == pytest.approx(values.std(ddof=1) / 16)
-    assert by_name(promise(found, starts[:1], 1.0), "4.2.8").error == 0.0
+    assert by_name(found.guarantee.applicable_bounds(starts[:1], 1.0), "4.2.8").error == 0.0

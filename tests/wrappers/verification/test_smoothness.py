@@ -67,10 +67,10 @@ def test_without_noise_a_kink_is_no_matter_and_a_pole_is():
     kink = problem_with(
         [(x**2 + 1e-4) ** sp.Rational(1, 4) * (1 - x) ** sp.Rational(3, 2)], [1 - x**2]
     )
-    assert made(kink, "cbf", samples=512).survey.rough == ""
+    assert made(kink, "cbf", samples=512).analysis.rough == ""
     pole = problem_with([0 * x], [1 / x - 0.6])
-    assert made(pole, "cbf", samples=512).survey.rough.startswith("h_1 has a pole near x = ")
+    assert made(pole, "cbf", samples=512).analysis.rough.startswith("h_1 has a pole near x = ")
     drift = problem_with([1 / (x - 0.3)], [1 - x**2])
-    assert made(drift, "cbf", samples=512).survey.rough.startswith(
+    assert made(drift, "cbf", samples=512).analysis.rough.startswith(
         "the condition on h_1 has a pole near x = 0.3"
     )

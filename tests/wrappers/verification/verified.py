@@ -8,9 +8,9 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem, Start, Variable
 from safe_envs.wrappers import parse_conditions
-from safe_envs.wrappers.verification import safe_set_analysis, search
-from safe_envs.wrappers.verification.estimated_bound import estimated_bound
+from safe_envs.wrappers.verification import extrema, safe_set_analysis, search
 from safe_envs.wrappers.verification.feasibility import verify
+from safe_envs.wrappers.verification.guarantee import guarantee_of
 from tests.conftest import problem_of
 
 DUBINS = "safe_envs/DubinsDisk-v0"
@@ -53,7 +53,7 @@ def problem_with(
 
 def hurry(monkeypatch):
     """Search less, where what is asked does not depend on how much is found."""
-    monkeypatch.setattr(safe_set_analysis, "_POOL_LOG2", 10)
+    monkeypatch.setattr(extrema, "_POOL_LOG2", 10)
     monkeypatch.setattr(search, "_ROUNDS", (20, 10))
 
 
@@ -64,7 +64,7 @@ def made(problem, text="scbf", **options):
 
 def made_bound(problem, text="scbf"):
     """The estimated bound of a problem under a filter."""
-    return estimated_bound(problem, parse_conditions(text, problem))
+    return guarantee_of(problem, parse_conditions(text, problem))
 
 
 def findings(env_id, text=None, knowledge="model", samples=safe_set_analysis.SAMPLES, **options):
@@ -103,7 +103,7 @@ def verify_once(problem, conditions, knowledge="model", samples=safe_set_analysi
 
 def estimated(env_id, text=None, knowledge="model", **options):
     problem = problem_of(env_id, **options)
-    return estimated_bound(problem, parse_conditions(text or problem.filter, problem), knowledge)
+    return guarantee_of(problem, parse_conditions(text or problem.filter, problem), knowledge)
 
 
 def by_name(bounds, part):

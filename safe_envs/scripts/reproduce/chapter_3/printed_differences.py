@@ -13,7 +13,7 @@ from safe_envs.scripts.reproduce.framework.artefact import Sample
 from safe_envs.wrappers.learning.base import Record
 from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
 from safe_envs.wrappers.learning.fit import train
-from safe_envs.wrappers.learning.models.files import Signature
+from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.residual import LearnedResidual, ResidualModel
 
 

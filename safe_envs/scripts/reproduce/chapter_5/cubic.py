@@ -32,7 +32,6 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.guarantee import promise
 
 ENV = "safe_envs/CubicSDE-v0"
 LEVELS = (0.1, 0.15)
@@ -192,12 +191,12 @@ def _no_bound(sample: Sample) -> list[str]:
     if sample.quick:
         return notes
     found = verify(problem, (SCBF(),), samples=1024)
-    reason = promise(found, np.array([FIXED]), problem.duration)[0].reason
+    reason = found.guarantee.applicable_bounds(np.array([FIXED]), problem.duration)[0].reason
     return [
         *notes,
         (
             f"{reason}; no input in the box meets the condition on"
-            f" {100 * found.safe.infeasible:.0f} % of C within the workspace"
+            f" {100 * found.safe_set.infeasible:.0f} % of C within the workspace"
         ),
     ]
 

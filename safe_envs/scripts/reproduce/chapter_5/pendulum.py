@@ -35,7 +35,6 @@ from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Numb
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
 from safe_envs.wrappers import DDSCBF, SCBF, SafetyFilter
 from safe_envs.wrappers.verification.feasibility import verify
-from safe_envs.wrappers.verification.guarantee import promise
 
 ENV = "safe_envs/Pendulum-v0"
 NOISE = 0.1
@@ -252,7 +251,9 @@ def _bounds(first: Lesson, scbf: Runs, sample: Sample) -> list[str]:
     ]
     if sample.quick:
         return notes
-    bound = promise(verify(problem, (SCBF(),)), starts_of(problem), problem.duration)[0]
+    bound = verify(problem, (SCBF(),)).guarantee.applicable_bounds(
+        starts_of(problem), problem.duration
+    )[0]
     bound = bound.without(by_rate(bound.value, scbf.row["ci_high"]))
     value = f"none, {bound.reason}" if bound.value is None else f"{100 * bound.value:.1f} %"
     return [

@@ -236,7 +236,7 @@ class _Place:
 def _rates(sample: Sample) -> Outcome:
     world = load_problem(ENV)
     models, found = _Models.learn(world, sample), verify(world, [SCBF()], seed=sample.seed)
-    worst = _Worst(float(found.survey.suprema[0]), float(found.survey.missed[0]))
+    worst = _Worst(float(found.analysis.suprema[0]), float(found.analysis.max_shortfall[0]))
     places = [_Place.run(i, world, models, worst, sample) for i in range(len(PLACES))]
     # A quick sample learns nothing of what is only shown beside the table.
     rough = {

@@ -17,7 +17,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import Progress
 from safe_envs.wrappers.learning.checks import Purpose, random_stream, require_problem, require_room
 from safe_envs.wrappers.learning.data.transitions import Transitions, numbers
-from safe_envs.wrappers.learning.models.files import Signature
+from safe_envs.wrappers.learning.models.signature import Signature
 
 Step = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]
 """From states (B, n), physical inputs (B, m) held and a generator to the states (B, n) one dt

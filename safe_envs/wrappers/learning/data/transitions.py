@@ -11,7 +11,9 @@ import numpy as np
 from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole, shortened, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.checks import require_kind, require_problem
-from safe_envs.wrappers.learning.models.files import DATA, LearnedFileError, Signature, load, save
+from safe_envs.wrappers.learning.models.files import DATA, load, save
+from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.models.values import LearnedFileError
 
 _ARRAYS = ("x", "u", "successors", "dt")
 

@@ -1,11 +1,11 @@
-"""Evaluation of a trained network and of its slopes, in NumPy alone."""
+"""A small network, of a learned model or a policy: its outputs and slopes in NumPy alone."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from safe_envs.dynamics.codegen import finite
 from safe_envs.errors import ConfigurationError, nearest, shown
 
 Activation = Literal["relu", "tanh"]
+"""Of the networks that are trained here, whose slopes are needed."""
 
 _BLOCK = 32
 """States in a matrix product. BLAS computes the rows of products of other shapes by other kernels,
@@ -20,6 +21,19 @@ with other roundings: with one shape alone, a state's outputs are the same to th
 batch. More states would be wasted on small batches."""
 
 _ZERO = np.array(0.0)
+# relu and tanh, which learned conditions ask at every step, work in place; maximum lets NaN through.
+_ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "identity": lambda x: x,
+    "tanh": lambda x: np.tanh(x, out=x),
+    "relu": lambda x: np.maximum(x, _ZERO, out=x),
+    "leaky_relu": lambda x: np.where(x < 0.0, 0.01 * x, x),
+    "elu": lambda x: np.where(x < 0.0, np.expm1(np.minimum(x, 0.0)), x),
+    "silu": lambda x: 0.5 * x * (1.0 + np.tanh(0.5 * x)),
+}
+
+# By the activated value. The sign of a rectified value is its slope, and NaN for NaN.
+_SLOPES: dict[str, Callable[[np.ndarray], Any]] = {"relu": np.sign, "tanh": lambda y: 1.0 - y * y}
+
 _VECTORS = ("input_mean", "input_scale", "output_mean", "output_scale")
 
 
@@ -31,7 +45,7 @@ class Network:
     Attributes:
         weights: of each layer, (outputs, inputs) of the layer.
         biases: of each layer, (outputs,).
-        activation: after every layer but the last.
+        activation: after every layer but the last; slopes are for those of `Activation`.
         input_mean: (p,), subtracted from the inputs.
         input_scale: (p,), by which they are divided then.
         output_mean: (q,), added to the outputs.
@@ -44,7 +58,7 @@ class Network:
 
     weights: tuple[np.ndarray, ...]
     biases: tuple[np.ndarray, ...]
-    activation: Activation
+    activation: str
     input_mean: np.ndarray
     input_scale: np.ndarray
     output_mean: np.ndarray
@@ -65,7 +79,7 @@ class Network:
             raise ConfigurationError("the numbers of a network are too large to be multiplied")
 
     def _check(self) -> None:
-        require_activation(self.activation)
+        require_activation(self.activation, _ACTIVATIONS)
         sizes = [w.shape[-1] for w in self.weights] + [len(self.output_mean)]
         fits = bool(self.weights) and [w.shape for w in self.weights] == list(
             zip(sizes[1:], sizes, strict=False)
@@ -88,8 +102,7 @@ class Network:
             raise ConfigurationError("a network needs finite numbers, and scales above 0")
 
     def _fold(self) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]:
-        """Weights, their transposes and biases of each layer, with the standardisation in the first
-        and in the last one."""
+        """Return weights, their transposes and biases of each layer, standardisation included."""
         weights, biases = list(self.weights), list(self.biases)
         weights[0] = weights[0] / self.input_scale
         biases[0] = biases[0] - weights[0] @ self.input_mean
@@ -100,12 +113,31 @@ class Network:
             for w, b in zip(weights, biases, strict=True)
         )
 
+    @classmethod
+    def unscaled(
+        cls, weights: Sequence[np.ndarray], biases: Sequence[np.ndarray], activation: str
+    ) -> Network:
+        """Make a network of bare layers, without standardisation.
+
+        Args:
+            weights: of each layer, (outputs, inputs) of the layer.
+            biases: of each layer, (outputs,).
+            activation: after every layer but the last.
+        """
+        p, q = weights[0].shape[1], len(biases[-1])
+        ends = (np.zeros(p), np.ones(p), np.zeros(q), np.ones(q))
+        return cls(tuple(weights), tuple(biases), activation, *ends)
+
+    def outputs(self, x: np.ndarray) -> np.ndarray:
+        """Return the outputs (..., q) for inputs (..., p) in one matrix product a layer."""
+        return self._layers(x)[-1]
+
     def floats(self, inputs: Sequence[float]) -> list[float]:
-        """The q outputs for p inputs; NaN where an input is not finite."""
+        """Return the q outputs for p inputs; NaN where an input is not finite."""
         return self._layers(_one(inputs))[-1].tolist()
 
     def arrays(self, inputs: Sequence[np.ndarray]) -> tuple[np.ndarray, ...]:
-        """The outputs at a batch.
+        """Return the outputs at a batch.
 
         Args:
             inputs: p components (B,).
@@ -119,7 +151,7 @@ class Network:
     def values_and_slopes_floats(
         self, inputs: Sequence[float], output: int
     ) -> tuple[list[float], list[float]]:
-        """All outputs, and the slopes of one of them.
+        """Return all outputs, and the slopes of one of them.
 
         Args:
             inputs: p numbers.
@@ -134,36 +166,40 @@ class Network:
     def values_and_slopes_arrays(
         self, inputs: Sequence[np.ndarray], output: int
     ) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
-        """The same at a batch: p components (B,) in; q components and p components out."""
+        """Return the same at a batch.
+
+        Args:
+            inputs: p components (B,).
+            output: see `values_and_slopes_floats`.
+
+        Returns:
+            q components (B,) of the outputs, and p components (B,) of the slopes.
+        """
         count, layers = len(inputs[0]), self._layers(_blocks(inputs))
         return _components(layers[-1], count), _components(self._slopes(layers, output), count)
 
     def _layers(self, x: np.ndarray) -> list[np.ndarray]:
-        """What each layer gives for inputs (..., p)."""
-        found = [x]
+        """Return what each layer gives for inputs (..., p)."""
+        found, activated = [x], _ACTIVATIONS[self.activation]
         for k, (_, transposed, bias) in enumerate(self._folded, start=1):
             x = x.dot(transposed) if x.ndim == 1 else x @ transposed
             x += bias
             if k < len(self._folded):
-                # In place, and with maximum, which lets NaN through.
-                x = np.maximum(x, _ZERO, out=x) if self.activation == "relu" else np.tanh(x, out=x)
+                x = activated(x)
             found.append(x)
         return found[1:]
 
     def _slopes(self, layers: Sequence[np.ndarray], output: int) -> np.ndarray:
-        """Derivatives (..., p) of an output by backpropagation through what the layers gave."""
+        """Return the derivatives (..., p) of an output, by backpropagation through the layers."""
         slopes = np.broadcast_to(
             self._folded[-1][0][output], (*layers[0].shape[:-1], self._folded[-1][0].shape[1])
         )
         for (weights, _, _), value in zip(self._folded[-2::-1], layers[-2::-1], strict=True):
-            # The sign of a rectified value is its slope, and NaN for NaN.
-            slopes = (
-                slopes * (np.sign(value) if self.activation == "relu" else 1.0 - value * value)
-            ) @ weights
+            slopes = (slopes * _SLOPES[self.activation](value)) @ weights
         return slopes
 
     def to_arrays(self, prefix: str) -> dict[str, np.ndarray]:
-        """The numbers by name, each name beginning with a prefix; for an npz file."""
+        """Return the numbers by name, each name beginning with a prefix; for an npz file."""
         numbered = {
             f"{name}_{k}": a
             for name in ("weights", "biases")
@@ -176,9 +212,14 @@ class Network:
 
     @classmethod
     def from_arrays(
-        cls, mapping: Mapping[str, np.ndarray], prefix: str, activation: Activation
+        cls, mapping: Mapping[str, np.ndarray], prefix: str, activation: str
     ) -> Network:
         """Make a network of what `to_arrays` gave.
+
+        Args:
+            mapping: arrays by name, others among them.
+            prefix: of the names.
+            activation: after every layer but the last.
 
         Raises:
             KeyError: an array is missing.
@@ -192,17 +233,14 @@ class Network:
         return cls(weights, biases, activation, *(mapping[f"{prefix}_{name}"] for name in _VECTORS))
 
 
-def require_activation(name: str) -> None:
-    """Raise ConfigurationError unless there is an activation of this name."""
-    if name not in get_args(Activation):
-        raise ConfigurationError(
-            f"activation = {shown(name)}; {nearest(name, get_args(Activation))}"
-        )
+def require_activation(name: str, allowed: Iterable[str] = get_args(Activation)) -> None:
+    """Raise ConfigurationError unless an activation is one of the allowed ones."""
+    if name not in allowed:
+        raise ConfigurationError(f"activation = {shown(name)}; {nearest(str(name), allowed)}")
 
 
 def _one(inputs: Sequence[float]) -> np.ndarray:
-    """Inputs (p,); all NaN if one is not finite: a saturated activation would answer to infinity as
-    if nothing were wrong."""
+    """Return inputs (p,), all NaN if one is not finite: a saturated activation would hide it."""
     return (
         np.array(inputs, dtype=float)
         if all(map(math.isfinite, inputs))
@@ -211,8 +249,10 @@ def _one(inputs: Sequence[float]) -> np.ndarray:
 
 
 def _blocks(inputs: Sequence[np.ndarray]) -> np.ndarray:
-    """Components (B,) as whole blocks of states, shape (blocks, _BLOCK, p); zeros fill the last
-    one, NaN stands for infinity."""
+    """Return components (B,) as blocks of states (blocks, _BLOCK, p), filled up with zeros.
+
+    NaN stands for infinity.
+    """
     count = len(inputs[0])
     x = np.zeros((-(-count // _BLOCK), _BLOCK, len(inputs)))
     rows = x.reshape(-1, len(inputs))
@@ -224,5 +264,5 @@ def _blocks(inputs: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _components(blocks: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
-    """The first `count` rows of blocks as contiguous components."""
+    """Return the first `count` rows of blocks as contiguous components."""
     return tuple(np.ascontiguousarray(blocks.reshape(-1, blocks.shape[-1])[:count].T))

@@ -13,7 +13,8 @@ from safe_envs.registry import load_problem
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.models import files
-from safe_envs.wrappers.learning.models.files import LearnedFileError, Signature
+from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.models.values import LearnedFileError
 
 DISK = load_problem("safe_envs/CubicSDEDisk-v0")
 SIGNATURE = Signature.of(DISK)

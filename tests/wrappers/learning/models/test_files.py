@@ -12,7 +12,9 @@ import pytest
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import load_problem
 from safe_envs.wrappers.learning import load_learned
-from safe_envs.wrappers.learning.models.files import LearnedFileError, Signature, load, save
+from safe_envs.wrappers.learning.models.files import load, save
+from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.models.values import LearnedFileError
 
 DISK = load_problem("safe_envs/CubicSDEDisk-v0")
 SIGNATURE = Signature.of(DISK)

@@ -15,7 +15,7 @@ from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.wrappers import SCBF, BayesianSCBF, SafetyFilter, SafetyFilterVectorWrapper
 from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.verification.posterior_bound import posterior_bound
+from safe_envs.wrappers.verification.posterior_guarantee import posterior_guarantee
 from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow
@@ -35,12 +35,12 @@ def posterior(cubic):
 
 @pytest.fixture(scope="module")
 def found(cubic, posterior):
-    return posterior_bound(cubic, [BayesianSCBF(posterior, simultaneous=0.95)])
+    return posterior_guarantee(cubic, [BayesianSCBF(posterior, simultaneous=0.95)])
 
 
 @pytest.fixture(scope="module")
 def looser(cubic, posterior):
-    return posterior_bound(cubic, [BayesianSCBF(posterior, simultaneous=0.5)])
+    return posterior_guarantee(cubic, [BayesianSCBF(posterior, simultaneous=0.5)])
 
 
 def best_rows(problem, posterior, simultaneous, x):
@@ -113,19 +113,19 @@ def test_the_probability_by_hand(found):
 
 
 def test_it_is_hardly_another_with_another_seed(cubic, posterior, found):
-    other = posterior_bound(cubic, [BayesianSCBF(posterior, simultaneous=0.95)], seed=1)
+    other = posterior_guarantee(cubic, [BayesianSCBF(posterior, simultaneous=0.95)], seed=1)
     assert other.shortfall == pytest.approx(found.shortfall, rel=1e-3)
 
 
 def test_plant_and_model_do_not_matter(cubic, posterior, found):
     blind = cubic.configured(model={"a": 5.0}, plant={"a": 9.0}, noise=3.0)
-    other = posterior_bound(blind, [BayesianSCBF(posterior, simultaneous=0.95)])
+    other = posterior_guarantee(blind, [BayesianSCBF(posterior, simultaneous=0.95)])
     assert (other.shortfall, other.supremum) == (found.shortfall, found.supremum)
 
 
 @pytest.mark.slow
 def test_more_data_give_a_larger_bound(cubic, found):
-    few = posterior_bound(
+    few = posterior_guarantee(
         cubic, [BayesianSCBF(identify(cubic, starts=200, repetitions=50), simultaneous=0.95)]
     )
     assert few.shortfall > 1.2 * found.shortfall
@@ -152,7 +152,7 @@ def test_what_has_no_bound_is_refused(cubic, posterior):
         with pytest.raises(
             ConfigurationError, match="one barrier with bayesian-scbf:simultaneous=P"
         ):
-            posterior_bound(problem, conditions)
+            posterior_guarantee(problem, conditions)
 
 
 @pytest.mark.slow
@@ -161,17 +161,17 @@ def test_an_unbounded_set_has_none(cubic, posterior):
     # Its noise varies with the state: no intervals of sigma are known.
     varying = identify(problem, starts=200, repetitions=20, diffusion_degree=2)
     with pytest.raises(ConfigurationError, match="intervals of sigma are known for constant noise"):
-        posterior_bound(problem, [BayesianSCBF(varying, simultaneous=0.9)])
+        posterior_guarantee(problem, [BayesianSCBF(varying, simultaneous=0.9)])
     # The same set with the noise of the disk, which is constant.
     parabola = replace(cubic, barriers=problem.barriers)
     endless = replace(
         parabola, states=tuple(replace(s, low=-np.inf, high=np.inf) for s in cubic.states)
     )
     with pytest.raises(ConfigurationError, match="beyond the states that are searched"):
-        posterior_bound(endless, [BayesianSCBF(posterior, simultaneous=0.9)])
+        posterior_guarantee(endless, [BayesianSCBF(posterior, simultaneous=0.9)])
     # To leave a workspace ends an episode, so that h counts inside of it only: 1 - x_1 - x_2^2 is
     # largest at x_1 = -2.
-    assert posterior_bound(
+    assert posterior_guarantee(
         parabola, [BayesianSCBF(posterior, simultaneous=0.9)]
     ).supremum == pytest.approx(3.0, rel=1e-9)
 
@@ -187,7 +187,7 @@ def test_the_bound_is_below_what_happens(cubic, monkeypatch, identifications):
         condition = BayesianSCBF(
             identify(cubic, starts=800, repetitions=50, degree=3, seed=seed), simultaneous=0.9
         )
-        (bound,) = posterior_bound(cubic, [condition]).at(np.array([START]), horizon)
+        (bound,) = posterior_guarantee(cubic, [condition]).at(np.array([START]), horizon)
         env = SafetyFilterVectorWrapper(
             gym.make_vec("safe_envs/CubicSDEDisk-v0", num_envs=envs, start=START, horizon=horizon),
             condition,
@@ -241,7 +241,7 @@ def test_long_steps_bias_what_is_identified_and_are_allowed_for(identifications)
         ]
         q0, q1, q2 = compile_function(problem.plant.states, row.uncertainty, "arrays")(x)
         robust = parts[0] * u + parts[1] - np.sqrt(q0 + 2 * q1 * u + q2 * u**2)
-        found = posterior_bound(problem, [condition])
+        found = posterior_guarantee(problem, [condition])
         covered += bool((robust <= truth).all())
         allowed += bool((robust - found.bias <= truth).all())
         assert "steps of 0.05 s in the data may shift the rate of h by up to" in found.remark

@@ -1,5 +1,4 @@
-"""The bound over a posterior: an estimate of the probability that a robust filter keeps every
-system that the data leave possible."""
+"""The guarantee over a posterior: for every system that the data leave possible."""
 
 from __future__ import annotations
 
@@ -17,6 +16,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import BayesianSCBF, Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification import bounds
+from safe_envs.wrappers.verification.observed import RELATIVE, reaches, violated_by
 from safe_envs.wrappers.verification.safe_set import (
     Region,
     draw_starts,
@@ -36,12 +36,10 @@ _SAMPLES = 8192
 _STARTS = 64
 _BEYOND = 10.0
 _BEYOND_LOG2 = 12
-_RELATIVE = 1e-6
-"""What a search and rounding may leave, in parts of the number itself."""
 
 
 @dataclass(frozen=True)
-class PosteriorBound:
+class PosteriorGuarantee:
     """(1 - delta) (h_0 - (m + e) T)/c, estimated for P(safe on [0, T]) of a simultaneous
     `BayesianSCBF`.
 
@@ -56,8 +54,8 @@ class PosteriorBound:
         delta: probability that the identification is outside its regions, delta_theta +
             delta_sigma.
         supremum: c, of h over C.
-        shortfall: m, by how much the robust condition is missed where that is most, in the units of
-            h per s.
+        shortfall: m, by how much the robust condition is violated where that is most, in the units
+            of h per s.
         bias: e, by how much the length of the steps in the data may shift A h, in the units of h
             per s; see `safe_envs.wrappers.verification.step_bias.rate_bias`.
         remark: what weakens it, in words; may be empty.
@@ -70,43 +68,36 @@ class PosteriorBound:
     remark: str
     _barrier: Any
     _workspace: tuple[np.ndarray, np.ndarray]
+    note: None = None
 
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
-        """The estimate at starts (B, n) for a horizon in s, shape (B,)."""
+        """Return the estimate at starts; see `Guarantee.at`."""
         h = _values(self._barrier, np.asarray(starts, dtype=np.float64))
         return (1.0 - self.delta) * bounds.stage_bound(
             h, self.supremum, horizon, shortfall=self.shortfall + self.bias
         )
 
     def contradiction(
-        self, reached: np.ndarray, missed: np.ndarray, actions: np.ndarray, slack: np.ndarray
+        self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
     ) -> str:
-        """What states say against c and m; see
-        `safe_envs.wrappers.verification.estimated_bound.EstimatedBound.contradiction`."""
+        """Say what states contradict in c and m; see `Guarantee.contradiction`."""
         h = _values(self._barrier, reached[in_workspace(reached, self._workspace)])
-        if (h > self.supremum * (1.0 + _RELATIVE)).any():
-            return (
-                f"h reaches {h.max():.4g}, above the supremum of {self.supremum:.4g} that the"
-                " search found"
-            )
-        inside = in_workspace(missed, self._workspace) & (_values(self._barrier, missed) > 0.0)
+        if (h > self.supremum * (1.0 + RELATIVE)).any():
+            return reaches("h", h.max(), self.supremum)
+        inside = in_workspace(violated, self._workspace) & (_values(self._barrier, violated) > 0.0)
         most = float(slack[inside].max(initial=0.0))
-        if most > self.shortfall * (1.0 + _RELATIVE):
-            return (
-                f"the filter missed the condition by {most:.4g}, more than the shortfall of"
-                f" {self.shortfall:.4g} that the search found"
-            )
-        return ""
+        exceeded = most > self.shortfall * (1.0 + RELATIVE)
+        return violated_by(most, self.shortfall) if exceeded else ""
 
 
-def posterior_bound(
+def posterior_guarantee(
     problem: SafetyProblem, conditions: Sequence[Condition], seed: int = 0
-) -> PosteriorBound:
+) -> PosteriorGuarantee:
     """Estimate the bound of a robust filter over its posterior.
 
     Args:
-        problem: whose barrier, box, workspace and starts are taken; its plant and model do not
-            matter.
+        problem: whose barrier, input bounds, workspace and starts are taken; its plant and model
+            do not matter.
         conditions: one, a `BayesianSCBF` with `simultaneous`.
         seed: of the search.
 
@@ -138,7 +129,7 @@ def posterior_bound(
 
     rest = np.mean(problem.box, axis=1)
 
-    def missed(x: np.ndarray) -> np.ndarray:
+    def shortfall_at(x: np.ndarray) -> np.ndarray:
         return np.where(
             level(x) >= 0.0,
             robust.filter(x, np.broadcast_to(rest, (len(x), len(rest)))).slack[:, 0],
@@ -151,7 +142,7 @@ def posterior_bound(
     points = np.concatenate([points, starts[level(starts) >= 0.0]])
     _require_smooth(problem, expression, level, points, region, np.random.default_rng([seed, 4]))
     highest, _ = largest(level, points, region, np.random.default_rng([seed, 2]))
-    shortfall, _ = largest(missed, points, region, np.random.default_rng([seed, 3]))
+    shortfall, _ = largest(shortfall_at, points, region, np.random.default_rng([seed, 3]))
     bias = rate_bias(condition.learned, expression, np.array(problem.box), points)
     remarks = [f"no action meets the robust condition somewhere, by up to {shortfall:.3g}"] * (
         shortfall > 0.0
@@ -161,7 +152,7 @@ def posterior_bound(
         f" {bias:.3g}"
     ] * (bias > 0.0)
     delta, ends = condition.delta_theta + condition.delta_sigma, workspace_of(problem)
-    return PosteriorBound(
+    return PosteriorGuarantee(
         delta, highest, max(shortfall, 0.0), bias, "; ".join(remarks), barrier, ends
     )
 
