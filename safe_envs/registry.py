@@ -8,9 +8,10 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
-from safe_envs import ENV_IDS, SafeEnv, SafetyProblem
+from safe_envs.envs.env import SystemEnv
 from safe_envs.errors import ConfigurationError, nearest, shown
-from safe_envs.systems import CUSTOM_ID
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.systems import CUSTOM_ID, ENV_IDS
 
 
 def full_id(env_id: str) -> str:
@@ -49,45 +50,39 @@ def title_of(env_id: str, options: Mapping[str, Any]) -> str:
     return options.get("system") or env_id
 
 
-def require_ours(env_id: str) -> None:
-    """Raise ConfigurationError unless an id is registered, and of this project."""
-    spec = gym.spec(full_id(env_id))
-    creator = (
-        load_env_creator(spec.entry_point)
-        if isinstance(spec.entry_point, str)
-        else spec.entry_point
-    )
-    if not (isinstance(creator, type) and issubclass(creator, SafeEnv)):
+def env_class(env_id: str) -> type[SystemEnv]:
+    """Return the class of a registered env.
+
+    Raises:
+        ConfigurationError: The id is unknown or not of this project.
+    """
+    entry_point = gym.spec(full_id(env_id)).entry_point
+    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    if not (isinstance(creator, type) and issubclass(creator, SystemEnv)):
         raise ConfigurationError(
             f"{env_id} is not one of this project's envs. `safe-envs evaluate {env_id}"
             " --filter-spec FILE.py:NAME` puts a filter over any env of Gymnasium's. For an env of"
             f" this project: {nearest(env_id, ENV_IDS)}"
         )
+    return creator
 
 
-def make_env(env_id: str, options: Mapping[str, Any] | None = None) -> SafeEnv:
-    """Make the scalar env of an id, without wrappers.
+def make_problem(env_id: str, **options: Any) -> SafetyProblem:
+    """Return the problem of a registered env, without making the env.
 
     Args:
         env_id: registered id.
-        options: arguments of `gym.make`; those that are None are left out.
+        **options: fields of `safe_envs.problem.options.ProblemOptions`, arguments of the barrier by
+            themselves, and `system` for the id "safe_envs/Custom-v0". Those that are None are left
+            out.
 
     Raises:
-        ConfigurationError: the id is unknown or not of this project, or an argument is not allowed.
+        ConfigurationError: The id is unknown or not of this project, or an option is not allowed.
     """
-    require_ours(env_id)
-    given = {key: value for key, value in (options or {}).items() if value is not None}
-    return gym.make(full_id(env_id), disable_env_checker=True, **given).unwrapped  # pyright: ignore[reportReturnType]
-
-
-def load_problem(env_id: str, options: Mapping[str, Any] | None = None) -> SafetyProblem:
-    """The problem of a registered env; arguments and errors as for `make_env`.
-
-    Raises:
-        ConfigurationError: `max_episode_steps` is given, which is no property of a problem.
-    """
-    if (options or {}).get("max_episode_steps") is not None:
+    found = env_class(env_id)
+    if options.get("max_episode_steps") is not None:
         raise ConfigurationError(
             "max_episode_steps is not part of a problem; shorten its episodes by horizon"
         )
-    return make_env(env_id, options).problem
+    given = {name: value for name, value in options.items() if value is not None}
+    return found.make_problem(**{**gym.spec(full_id(env_id)).kwargs, **given})

@@ -8,9 +8,8 @@ import hypothesis
 import hypothesis.strategies as st
 import pytest
 
-from safe_envs.dynamics.sde import finite_number
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
-from safe_envs.number_text import real, real_or_complex, whole_or_real
+from safe_envs.number_text import finite_number, real, real_or_complex, whole_or_real
 from tests.conftest import problem_of
 
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.registry import full_id
 from tests.conftest import problem_of
 
 
 def test_problem_is_that_of_the_registered_env(env_id):
-    assert load_problem(env_id) == problem_of(env_id)
-    assert load_problem(env_id.split("/")[1], {"noise": 0.05, "dt": None}) == problem_of(
-        env_id, noise=0.05
-    )
+    assert make_problem(env_id) == problem_of(env_id)
+    assert make_problem(env_id.split("/")[1], noise=0.05, dt=None) == problem_of(env_id, noise=0.05)
     assert full_id(env_id) == full_id(env_id.split("/")[1]) == env_id
 
 
@@ -26,20 +24,20 @@ def test_unknown_ids_and_arguments_name_the_nearest():
             " 'safe_envs/StochasticDubins-v0'"
         ),
     ):
-        load_problem("safe_envs/StochasticDubin-v0")
+        make_problem("safe_envs/StochasticDubin-v0")
     with pytest.raises(ConfigurationError, match="not one of this project's envs"):
-        load_problem("CartPole-v1")
+        make_problem("CartPole-v1")
     with pytest.raises(ConfigurationError, match="did you mean 'horizon'"):
-        load_problem("Scalar-v0", {"horizn": 1.0})
+        make_problem("Scalar-v0", horizn=1.0)
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
 def test_arguments_of_foreign_envs_are_errors_too(env_id):
     with pytest.raises(ConfigurationError):
-        load_problem(env_id, {"noise": 0.1})
+        make_problem(env_id, noise=0.1)
 
 
 @pytest.mark.parametrize("env_id", [":x", "./x:y", "no_such_module:Env-v0"])
 def test_ids_with_an_impossible_module_are_errors(env_id):
     with pytest.raises(ConfigurationError):
-        load_problem(env_id)
+        make_problem(env_id)

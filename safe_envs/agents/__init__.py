@@ -18,7 +18,7 @@ from safe_envs.agents.evaluation.statistics import (
 from safe_envs.agents.policies.clf import CLFController
 from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
 from safe_envs.agents.policies.registry import POLICIES, Policy, make_policy
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 
 __all__ = [
     "POLICIES",
@@ -30,8 +30,8 @@ __all__ = [
     "Refinement",
     "ZeroController",
     "evaluate",
-    "load_problem",
     "make_policy",
+    "make_problem",
     "make_sb3_env",  # pyright: ignore[reportUnsupportedDunderAll]
     "mcnemar_p",
     "paired_difference_interval",

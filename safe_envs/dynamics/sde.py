@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -12,7 +11,7 @@ import sympy as sp
 
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
-from safe_envs.number_text import real
+from safe_envs.number_text import finite_number
 
 _REAL = sp.Symbol("real", real=True).assumptions0
 
@@ -34,17 +33,6 @@ def _matrix(name: str, entries: Any, shape: tuple[int, int | None]) -> sp.Immuta
     return sp.ImmutableMatrix(
         matrix.applyfunc(lambda entry: sp.Integer(0) if entry.is_Float and entry.is_zero else entry)
     )
-
-
-def finite_number(name: str, value: Any) -> float:
-    """Return `value` as a float, or say why it cannot be one."""
-    try:
-        number = real(value) if isinstance(value, str) else float(value)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ConfigurationError(f"{name} = {shown(value)} is not a number") from error
-    if not math.isfinite(number):
-        raise ConfigurationError(f"{name} = {number} is not finite")
-    return number
 
 
 def _require_real(states: Iterable[Any], inputs: Iterable[Any], parameters: Iterable[Any]) -> None:

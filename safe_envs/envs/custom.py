@@ -1,79 +1,19 @@
-"""Systems of your own behind `gym.make`: from the place of their statement, FILE.py:NAME or
-MODULE:NAME, to an env."""
+"""Systems from outside this package behind `gym.make`."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping
-from functools import lru_cache
 from typing import Any
 
 import gymnasium as gym
 
-from safe_envs.envs.env import SafeEnv, make_problem
-from safe_envs.envs.vector_env import AutoresetMode, SafeVectorEnv
+from safe_envs.envs.env import SystemEnv
+from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError
-from safe_envs.object_import import called, load_object, resolved
+from safe_envs.object_import import resolved
+from safe_envs.problem.factory import Factory, build_problem, load_system
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.problem.validation import require_sound
-from safe_envs.systems import CUSTOM_ID
-
-Factory = Callable[..., SafetyProblem]
 
 _ENTRY = "safe_envs.envs.custom:Custom"
-
-
-def load_system(place: Any) -> Factory:
-    """Import the statement of a system.
-
-    Args:
-        place: FILE.py:NAME or MODULE:NAME of a `SafetyProblem`, or of a function that returns one.
-            Importing runs the code there.
-
-    Returns:
-        The function, whose keyword arguments are those of `--barrier`; one without any for a
-        problem.
-
-    Raises:
-        ConfigurationError: there is no such place, or the code there ends with an error.
-    """
-    if not isinstance(place, str) or not place:
-        raise ConfigurationError(
-            f"system = {place!r}; give the place of its statement as a text, FILE.py:NAME or"
-            f" MODULE:NAME, like gym.make({CUSTOM_ID!r}, system='cart_pole.py:problem')"
-        )
-    found = load_object(place)
-    if isinstance(found, SafetyProblem):
-        require_sound(found)
-        return lambda: found
-    if not inspect.isfunction(found):
-        raise ConfigurationError(
-            f"{place} is {type(found).__name__}; give a SafetyProblem, or a function that"
-            " returns one"
-        )
-
-    def factory(**arguments: Any) -> SafetyProblem:
-        given = tuple(sorted(arguments.items()))
-        remembered = all(isinstance(value, int | float | str) for value in arguments.values())
-        return (_stated if remembered else _stated.__wrapped__)(found, place, given)
-
-    factory.__signature__ = inspect.signature(found)  # pyright: ignore[reportFunctionMemberAccess]
-    return factory
-
-
-@lru_cache(maxsize=64)
-def _stated(
-    function: Callable[..., Any], place: str, arguments: tuple[tuple[str, Any], ...]
-) -> SafetyProblem:
-    """Remembered: an env is often made more than once, and stating its problem takes longer than
-    all else."""
-    problem = called(function, place, dict(arguments))
-    if not isinstance(problem, SafetyProblem):
-        raise ConfigurationError(
-            f"{place} returned {type(problem).__name__}; it is to return a SafetyProblem"
-        )
-    require_sound(problem)
-    return problem
 
 
 def register(env_id: str, system: str | Factory) -> None:
@@ -117,50 +57,27 @@ def register(env_id: str, system: str | Factory) -> None:
     )
 
 
-class Custom(SafeEnv):
-    """A system of your own.
+class Custom(SystemEnv):
+    """A system from outside this package.
 
     Args:
-        system: where it is stated: see `load_system`.
-        barrier: arguments of the function that states it, by name; each may also be given by
-            itself.
-        max_episode_steps: truncate after so many control periods, if that is before the horizon.
-        render_mode: see `SafeEnv`.
-        **options: `noise`, `plant`, `model`, `dt`, `substeps`, `horizon`, `box` and `start` as for
-          `SystemEnv`.
+        system: where it is defined: see `safe_envs.problem.factory.load_system`.
+        **options: as for `SystemEnv`.
 
     Raises:
-        ConfigurationError: the place or an argument is unknown or out of range.
+        ConfigurationError: The place or an argument is unknown or out of range.
     """
 
-    def __init__(
-        self,
-        system: str = "",
-        *,
-        barrier: Mapping[str, Any] | None = None,
-        max_episode_steps: int | None = None,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        super().__init__(
-            make_problem(system, load_system(system), barrier, options),
-            max_episode_steps,
-            render_mode,
-        )
+    def __init__(self, system: str = "", **options: Any) -> None:
+        super().__init__(system=system, **options)
+
+    @classmethod
+    def make_problem(cls, *, system: str = "", **options: Any) -> SafetyProblem:
+        """Return the problem at a place, with these options."""
+        return build_problem(system, load_system(system), options)
 
 
-class CustomVector(SafeVectorEnv):
-    """The same, batched; further arguments as for `SafeVectorEnv`."""
+class CustomVector(SystemVectorEnv):
+    """`Custom` in a batch."""
 
-    def __init__(
-        self,
-        system: str = "",
-        num_envs: int = 1,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        barrier: Mapping[str, Any] | None = None,
-        max_episode_steps: int | None = None,
-        render_mode: str | None = None,
-        **options: Any,
-    ) -> None:
-        problem = make_problem(system, load_system(system), barrier, options)
-        super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)
+    env_class = Custom

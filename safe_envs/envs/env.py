@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache, wraps
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.envs.info import Info, safety_info
+from safe_envs.envs.episode import Episode
+from safe_envs.envs.info import Info
 from safe_envs.envs.simulation import NoiseStream, Simulation, center_and_half_width, steps_until
-from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, nearest, shown
+from safe_envs.errors import InvalidInputError, NumericalError
+from safe_envs.problem.factory import build_problem, remembering
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 from safe_envs.validators import real_array
@@ -29,62 +29,6 @@ def observation_box(problem: SafetyProblem) -> gym.spaces.Box:
 def action_box(problem: SafetyProblem) -> gym.spaces.Box:
     """Action space of a problem: [-1, 1] for each input, which stands for the physical box."""
     return gym.spaces.Box(-1.0, 1.0, (len(problem.inputs),), dtype=np.float32)
-
-
-def make_problem(
-    name: str, factory: Any, barrier: Mapping[str, Any] | None, options: Mapping[str, Any]
-) -> SafetyProblem:
-    """Build a problem with the arguments of `gym.make`.
-
-    Args:
-        name: of the env, for errors.
-        factory: function that states the problem.
-        barrier: its arguments, which may also be given by themselves in `options`.
-        options: arguments of `SafetyProblem.configured`.
-
-    Raises:
-        ConfigurationError: an argument is unknown or out of range.
-    """
-    of_factory = inspect.signature(factory).parameters
-    of_problem = [
-        name for name in inspect.signature(SafetyProblem.configured).parameters if name != "self"
-    ]
-    for what, values in (
-        ("barrier", barrier),
-        *((what, options.get(what)) for what in ("plant", "model")),
-    ):
-        if values is not None and not (
-            isinstance(values, Mapping) and all(isinstance(key, str) for key in values)
-        ):
-            raise ConfigurationError(f"{what} = {values!r}; give a dictionary of names and values")
-    shape = {
-        **(barrier or {}),
-        **{key: value for key, value in options.items() if key in of_factory},
-    }
-    settings = {key: value for key, value in options.items() if key not in of_factory}
-    for what, allowed, given in (
-        ("barrier argument", of_factory, shape),
-        ("argument", (*of_problem, *of_factory), settings),
-    ):
-        for key in given:
-            if key not in allowed:
-                raise ConfigurationError(
-                    f"{name} has no {what} {shown(key)}; {nearest(key, allowed)}"
-                )
-    return factory(**shape).configured(**settings)
-
-
-def _remembering(factory: Callable[..., SafetyProblem]) -> Callable[..., SafetyProblem]:
-    """The factory, which answers with the very object of the last time: its symbols take most of
-    the time that an env takes to make."""
-    remembered = lru_cache(maxsize=32, typed=True)(factory)
-
-    @wraps(factory)
-    def answer(**arguments: Any) -> SafetyProblem:
-        numbers = all(isinstance(value, int | float) for value in arguments.values())
-        return remembered(**arguments) if numbers else factory(**arguments)
-
-    return answer
 
 
 class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -137,9 +81,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         self._limit = steps_until(problem, max_episode_steps)
         self.executed: Sequence[float] = ()
         self._x: tuple[float, ...] | None = None
-        self._steps = 0
-        self._h_min = math.inf
-        self._episode_cost = 0.0
+        self._episode = Episode()
 
     @property
     def components(self) -> tuple[float, ...]:
@@ -189,10 +131,8 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         if seed is not None:
             self._noise.clear()
-        self._x = self._simulation.draw_start(self.np_random)
-        self._steps = 0
-        self._h_min = math.inf
-        self._episode_cost = 0.0
+        self._x = self._simulation.starts.draw(self.np_random)
+        self._episode.restart()
         observation, _, _, info = self._observe([c for c, _ in self._scales])
         if self.viewer is not None:
             self.viewer.restart([self._x], [0.0], [0])
@@ -214,15 +154,15 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             self._x = self._simulation.integrator.step(
                 self.components, u, self._noise.next(self.np_random)
             )
-            self._steps += 1
+            self._episode.steps += 1
             observation, reward, terminated, info = self._observe(u)
         except (OverflowError, ZeroDivisionError, ValueError) as error:
             raise NumericalError(
                 f"the simulation of {self.problem.name!r} broke down at {self._x}: {error}"
             ) from error
         if self.viewer is not None:
-            self.viewer.advance([self._x], [self._steps * self.problem.dt], [u])
-        return observation, reward, terminated, self._steps >= self._limit, info
+            self.viewer.advance([self._x], [self._episode.steps * self.problem.dt], [u])
+        return observation, reward, terminated, self._episode.steps >= self._limit, info
 
     def render(self) -> Any:
         """Draw the state, with the trail of the episode and what a filter decided.
@@ -254,7 +194,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
         x = self.components
         features, barriers, reward, outside, goal = self._simulation.measure(
-            x, u, self._steps * self.problem.dt
+            x, u, self._episode.steps * self.problem.dt
         )
         h = min(barriers)
         if not math.isfinite(h + sum(x)):
@@ -262,65 +202,44 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
                 f"the state {x} of {self.problem.name!r} has left the finite numbers; reduce dt or"
                 " raise substeps"
             )
-        violation = h < 0.0
-        cost = 1.0 if violation else 0.0
-        self._episode_cost += cost
-        if h < self._h_min:
-            self._h_min = h
         left = outside > 0.0
         if left:
             features = np.clip(features, self._bounds.low, self._bounds.high)
         observation = np.array(features, dtype=np.float32)
-        info = safety_info(
-            violation=violation,
-            cost=cost,
-            barrier=np.array(barriers),
-            h_min=self._h_min,
-            episode_cost=self._episode_cost,
-        )
-        return observation, reward, left or goal >= 0.0, info
+        return observation, reward, left or goal >= 0.0, self._episode.count(barriers, h)
 
 
 class SystemEnv(SafeEnv):
     """Base of the registered envs: a system's problem behind the arguments of `gym.make`.
 
     Args:
-        noise: diffusion of plant and model, one number for all channels or one for each; 0 turns it
-            off.
-        plant: parameters of the simulated system, by name.
-        model: parameters that the designer believes, by name.
-        barrier: arguments of the problem's factory (of the barrier, mostly), by name; each may also
-            be given by itself.
-        dt: control period in s.
-        substeps: integration steps in a control period.
-        horizon: length of an episode in s.
-        box: physical bounds (low, high) of every input, or one pair for each.
-        start: name of an initial distribution, or a fixed initial state.
         max_episode_steps: truncate after so many control periods, if that is before the horizon.
         render_mode: "rgb_array", "human" or None; see `SafeEnv`.
+        **options: fields of `safe_envs.problem.options.ProblemOptions`; arguments of the barrier
+            may also be given by themselves.
 
     Raises:
-        ConfigurationError: an argument names something unknown or is out of range.
+        ConfigurationError: An argument names something unknown or is out of range.
     """
 
     problem_factory: ClassVar[Any]
-    """States the problem; asked once for the same arguments."""
+    """Builds the problem from the arguments of the barrier; called once for equal arguments."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         super().__init_subclass__(**keywords)
         if "problem_factory" in vars(cls):
-            cls.problem_factory = staticmethod(_remembering(cls.problem_factory))
+            cls.problem_factory = staticmethod(remembering(cls.problem_factory))
 
     def __init__(
         self,
         *,
-        barrier: Mapping[str, Any] | None = None,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        super().__init__(
-            make_problem(type(self).__name__, type(self).problem_factory, barrier, options),
-            max_episode_steps,
-            render_mode,
-        )
+        super().__init__(type(self).make_problem(**options), max_episode_steps, render_mode)
+
+    @classmethod
+    def make_problem(cls, **options: Any) -> SafetyProblem:
+        """Return the problem that the env has with these options, without making the env."""
+        return build_problem(cls.__name__, cls.problem_factory, options)

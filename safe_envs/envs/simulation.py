@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import Components, Flavour, compile_function, stacked
+from safe_envs.dynamics.codegen import Components, Flavour, compile_function
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import ConfigurationError
-from safe_envs.problem.problem import TIME, SafetyProblem
+from safe_envs.problem.initial_distribution import StartSampler
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import TIME
 
 _CHUNK = 256
-_TRIES_AT_ONCE = 4
-_MOST_TRIES = 10_000
 
 
 class Simulation:
@@ -39,17 +39,9 @@ class Simulation:
         self._measure = compile_function(
             (*problem.plant.states, *problem.plant.inputs, TIME), read, flavour
         )
-        start = problem.starts[problem.start]
-        self._uniforms = len(start.uniforms)
-        self._tries = 1 if start.condition is None else _TRIES_AT_ONCE
-        # Few envs start together, and each from numbers of its own: plain floats are the quickest
-        # way.
-        self._start = compile_function(start.uniforms, start.state, "floats")
-        if start.condition is not None:
-            condition = problem.model.numeric(start.condition)
-            self._accept = compile_function(problem.plant.states, (condition,), "floats")
-        else:
-            self._accept = None
+        self.starts = StartSampler(
+            problem.starts[problem.start], problem.model, f"{problem.name!r} ({problem.start})"
+        )
 
     def measure(
         self, x: Components, u: Sequence[Any], time: Any
@@ -68,34 +60,6 @@ class Simulation:
         values = self._measure(*x, *u, time)
         f, b = self._features, self._barriers
         return values[:f], values[f:b], values[b], values[b + 1], values[b + 2]
-
-    def draw_start(self, rng: np.random.Generator) -> Components:
-        """Draw an initial state, by rejection: a plain float for each state."""
-        for _ in range(_MOST_TRIES // self._tries):
-            for uniforms in rng.random((self._tries, self._uniforms)).tolist():
-                x = self._start(*uniforms)
-                if self._accept is None or self._accept(*x)[0] > 0:
-                    return x
-        raise ConfigurationError(
-            f"no start of {self.problem.name!r} met the condition of the distribution"
-            f" {self.problem.start!r} in {_MOST_TRIES} tries; give a fixed start or another"
-            " distribution"
-        )
-
-    def draw_starts(self, rngs: Sequence[np.random.Generator]) -> np.ndarray:
-        """Draw an initial state from each generator; shape (n, len(rngs))."""
-        if rngs and not self._uniforms:
-            # Nothing is drawn for a fixed start.
-            return np.repeat(np.array([self.draw_start(rngs[0])], dtype=float).T, len(rngs), axis=1)
-        return np.array([self.draw_start(rng) for rng in rngs], dtype=float).T.copy()
-
-
-def proposed_starts(problem: SafetyProblem, count: int) -> np.ndarray:
-    """Some states of a problem's start, whether or not they meet its condition: always the same,
-    shape (count, n)."""
-    start = problem.starts[problem.start]
-    uniforms = np.random.default_rng(0).random((len(start.uniforms), count))
-    return stacked(compile_function(start.uniforms, start.state, "arrays")(*uniforms), count)
 
 
 class NoiseStream:

@@ -7,13 +7,14 @@ from typing import Any, ClassVar
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from safe_envs.dynamics.codegen import Components, constants, filled, finite, settled, stacked
-from safe_envs.envs.env import action_box, make_problem, observation_box
-from safe_envs.envs.info import Info, safety_info, with_masks
+from safe_envs.envs.env import SystemEnv, action_box, observation_box
+from safe_envs.envs.episode import Episodes
+from safe_envs.envs.info import Info, with_masks
+from safe_envs.envs.seeding import Generators
 from safe_envs.envs.simulation import NoiseStreams, Simulation, center_and_half_width, steps_until
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.problem.problem import SafetyProblem
@@ -21,8 +22,6 @@ from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewe
 from safe_envs.validators import real_array
 
 _LOWEST, _HIGHEST = constants((-1.0, 1.0))
-
-_OF_EPISODES = ("steps", "h_min", "episode_cost", "ended")
 
 VectorStep = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Info]
 
@@ -90,15 +89,10 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             i for i, state in enumerate(problem.plant.states) if state not in observed
         ]
         self._limit = steps_until(problem, max_episode_steps)
-        self._rngs: list[np.random.Generator] = []
-        self._seeds: list[int] = []
+        self._generators = Generators(num_envs)
         self.executed: Sequence[Any] = ()
         self._x: Components = ()
-        self._everywhere = np.ones(num_envs, dtype=bool)
-        self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._h_min = np.full(num_envs, np.inf)
-        self._episode_cost = np.zeros(num_envs)
-        self._ended = np.zeros(num_envs, dtype=bool)
+        self.episodes = Episodes(num_envs)
 
     @property
     def components(self) -> Components:
@@ -119,7 +113,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> tuple[np.random.Generator, ...]:
         """The generator of each env."""
         self._seed([None] * self.num_envs)
-        return tuple(self._rngs)
+        return tuple(self._generators.rngs)
 
     @property
     def np_random_seed(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -127,7 +121,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> tuple[int, ...]:
         """The seed of each env."""
         self._seed([None] * self.num_envs)
-        return tuple(self._seeds)
+        return tuple(self._generators.seeds)
 
     def physical_action(self, actions: Any) -> Components:
         """Map actions in [-1, 1], shape (num_envs, m), to the components of the physical inputs,
@@ -175,23 +169,20 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             seed: seed of env 0, with env i seeded by seed + i, or a seed (or None) for each env.
             options: may hold "reset_mask", a bool array of shape (num_envs,).
         """
-        seeds = self._one_seed_each(seed)
+        seeds = self._generators.spread(seed)
         mask = self._reset_mask(options)
         self._seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
         self._restart(np.flatnonzero(mask))
         observation, _, _, _, info = self._observe(tuple(self._center), counted=mask)
         if self.viewer is not None:
             self.viewer.restart(
-                self.state, self._steps * self.problem.dt, np.flatnonzero(mask).tolist()
+                self.state, self.episodes.steps * self.problem.dt, np.flatnonzero(mask).tolist()
             )
         return observation, with_masks(info, mask)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Where each episode stands: arrays with the batch in front, from which `restore` goes on."""
-        return {
-            "state": self.state,
-            **{name: getattr(self, f"_{name}").copy() for name in _OF_EPISODES},
-        }
+        return {"state": self.state, **self.episodes.snapshot()}
 
     def restore(
         self, snapshot: Mapping[str, np.ndarray], seed: int | Sequence[int | None] | None = None
@@ -212,12 +203,13 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f"the snapshot has states of shape {shape}; these envs have"
                 f" {(self.num_envs, self.problem.plant.n)}"
             )
-        self._seed(self._one_seed_each(seed))
+        self._seed(self._generators.spread(seed))
         self._x = tuple(np.array(snapshot["state"], dtype=float).T.copy())
-        for name in _OF_EPISODES:
-            setattr(self, f"_{name}", np.array(snapshot[name]))
+        self.episodes.restore(snapshot)
         if self.viewer is not None:
-            self.viewer.restart(self.state, self._steps * self.problem.dt, range(self.num_envs))
+            self.viewer.restart(
+                self.state, self.episodes.steps * self.problem.dt, range(self.num_envs)
+            )
 
     def step(self, actions: Any) -> VectorStep:
         """Hold an action in each env for one control period.
@@ -233,41 +225,44 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """`step` for the components of physical inputs inside the box, as a filter has them."""
         x = self.components
         self.executed = u
-        anew = self._ended.copy() if np.count_nonzero(self._ended) else None
-        if anew is not None and self._autoreset == AutoresetMode.DISABLED:
+        episodes = self.episodes
+        due = episodes.due()
+        if due is not None and self._autoreset == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded(
-                f"the episodes of envs {np.flatnonzero(anew)[:5].tolist()} have ended: reset them"
+                f"the episodes of envs {np.flatnonzero(due)[:5].tolist()} have ended: reset them"
             )
-        draws = self._noise.next(self._rngs, None if anew is None else ~anew)
+        draws = self._noise.next(self._generators.rngs, None if due is None else ~due)
         # A state that overflows is found by `_observe`, which says so better than a warning.
         with np.errstate(over="ignore", invalid="ignore"):
             self._x = self._simulation.integrator.step(x, u, draws)
-            self._steps += 1
-            if anew is not None:
-                self._restart(np.flatnonzero(anew))
+            episodes.steps += 1
+            if due is not None:
+                self._restart(np.flatnonzero(due))
             observation, reward, terminated, truncated, info = self._observe(u)
-        if anew is not None:
-            reward = np.where(anew, 0.0, reward)
+        if due is not None:
+            reward = np.where(due, 0.0, reward)
         ended = terminated | truncated
         last: Info = {}
         if self._autoreset == AutoresetMode.SAME_STEP:
             if np.count_nonzero(ended):
                 last = self._last_of_episode(ended, observation, info)
                 observation, _, _, _, info = self._observe(tuple(self._center), counted=ended)
-            anew = ended
+            episodes.begun = ended
         else:
-            self._ended = ended
+            episodes.ended = ended
         if self.viewer is not None:
-            fresh = [] if anew is None else np.flatnonzero(anew).tolist()
             self.viewer.advance(
-                self.state, self._steps * self.problem.dt, np.stack(u, axis=-1), fresh
+                self.state,
+                episodes.steps * self.problem.dt,
+                np.stack(u, axis=-1),
+                np.flatnonzero(episodes.begun).tolist(),
             )
         return (
             observation,
             reward,
             terminated,
             truncated,
-            {**with_masks(info, self._everywhere.copy()), **last},
+            {**with_masks(info, episodes.everywhere.copy()), **last},
         )
 
     def render(self) -> tuple[np.ndarray, ...] | None:
@@ -300,27 +295,12 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return with_masks({"final_obs": final, "final_info": with_masks(info, ended)}, ended)
 
     def _seed(self, seeds: Sequence[int | None]) -> None:
-        first = not self._rngs
-        if first:
-            self._rngs, self._seeds = [None] * self.num_envs, [0] * self.num_envs  # pyright: ignore[reportAttributeAccessIssue]
-        chosen = [i for i, s in enumerate(seeds) if first or s is not None]
-        for i in chosen:
-            self._rngs[i], self._seeds[i] = seeding.np_random(seeds[i])
-        self._noise.clear(chosen)
-
-    def _one_seed_each(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
-        if seed is None:
-            return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + i for i in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ConfigurationError(f"{len(seed)} seeds were given for {self.num_envs} envs")
-        return [None if s is None else int(s) for s in seed]
+        self._noise.clear(self._generators.seed(seeds))
 
     def _reset_mask(self, options: Mapping[str, Any] | None) -> np.ndarray:
         given = (options or {}).get("reset_mask")
         if given is None:
-            return self._everywhere.copy()
+            return self.episodes.everywhere.copy()
         mask = np.asarray(given)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_ or not mask.any():
             raise ConfigurationError(
@@ -335,22 +315,21 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _restart(self, envs: np.ndarray) -> None:
         """Put some envs at the start of an episode."""
-        start = self._simulation.draw_starts([self._rngs[i] for i in envs.tolist()])
+        start = self._simulation.starts.draw_batch(
+            [self._generators.rngs[i] for i in envs.tolist()]
+        )
         if envs.size == self.num_envs:
             self._x = tuple(start)
         else:
             self._x = tuple([x.copy() for x in self._x])
             for x, fresh in zip(self._x, start, strict=True):
                 x[envs] = fresh
-        self._steps[envs] = 0
-        self._h_min[envs] = np.inf
-        self._episode_cost[envs] = 0.0
-        self._ended[envs] = False
+        self.episodes.restart(envs)
 
     def _observe(self, u: Sequence[Any], counted: np.ndarray | None = None) -> VectorStep:
         """Read the states; `counted` are the envs whose states are new (None: all)."""
         self._x = x = settled(self.components, (self.num_envs,))
-        time = self._steps * self.problem.dt if self._simulation.timed else 0.0
+        time = self.episodes.steps * self.problem.dt if self._simulation.timed else 0.0
         features, barriers, reward, outside, goal = self._simulation.measure(x, u, time)
         rows = np.empty((len(features), self.num_envs), dtype=np.float32)
         for row, feature in zip(rows, features, strict=True):
@@ -358,10 +337,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         observation = rows.T
         barrier = stacked(barriers, self.num_envs)
         h = barriers[0] if len(barriers) == 1 else barrier.min(axis=1)
-        violation = h < 0.0
-        cost = violation.astype(np.float64)
-        self._episode_cost += cost if counted is None else cost * counted
-        np.minimum(self._h_min, h, out=self._h_min)
+        info = self.episodes.count(barrier, h, counted)
         terminated = filled(outside > 0.0, (self.num_envs,))
         sound = finite(h) and finite(rows)
         for i in self._unobserved:
@@ -373,12 +349,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             self._report_breakdown(h, observation)
         if self.problem.goal is not None:
             terminated = terminated | (goal >= 0.0)
-        info = safety_info(violation, cost, barrier, self._h_min.copy(), self._episode_cost.copy())
         return (
             observation,
             filled(reward, (self.num_envs,)).copy(),
             terminated,
-            self._steps >= self._limit,
+            self.episodes.steps >= self._limit,
             info,
         )
 
@@ -394,21 +369,25 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
 
 class SystemVectorEnv(SafeVectorEnv):
-    """Base of the registered vector envs; arguments as for `SystemEnv`, and `num_envs` and
-    `autoreset_mode`."""
+    """Base of the registered vector envs.
 
-    env_class: ClassVar[type[Any]]
+    Args:
+        num_envs: see `SafeVectorEnv`.
+        autoreset_mode: see `SafeVectorEnv`.
+        max_episode_steps: see `SafeVectorEnv`.
+        render_mode: see `SafeVectorEnv`.
+        **options: as for `SystemEnv`.
+    """
+
+    env_class: ClassVar[type[SystemEnv]]
 
     def __init__(
         self,
         num_envs: int = 1,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        barrier: Mapping[str, Any] | None = None,
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         **options: Any,
     ) -> None:
-        problem = make_problem(
-            self.env_class.__name__, self.env_class.problem_factory, barrier, options
-        )
+        problem = self.env_class.make_problem(**options)
         super().__init__(problem, num_envs, autoreset_mode, max_episode_steps, render_mode)

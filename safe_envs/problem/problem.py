@@ -6,68 +6,24 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE, finite_number
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
+from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.options import ProblemOptions
 from safe_envs.problem.sampling_domain import SamplingDomain
-
-TIME = sp.Symbol("t", nonnegative=True)
-"""Time since the start of the episode, in s: references and rewards may depend on it. No state or
-input, which may have any sign, is the same symbol, even if its name is t."""
+from safe_envs.problem.signals import TIME, Feature, Variable, excess
 
 _WIDEST = 1e100
 """Largest bound of a box: its square, an effort, is still a number."""
-
-
-@dataclass(frozen=True)
-class Variable:
-    """A state or an input with its range.
-
-    For a state the range is the workspace: an episode ends when the state leaves it (an infinite
-    range never ends one). For an input it is the box of admissible actions, finite.
-    """
-
-    symbol: sp.Symbol
-    low: float
-    high: float
-    unit: str = ""
-
-
-@dataclass(frozen=True)
-class Feature:
-    """An entry of the observation: an expression of the states and of `TIME`, with finite bounds."""
-
-    name: str
-    expression: sp.Expr
-    low: float
-    high: float
-
-    @property
-    def symbol(self) -> sp.Symbol:
-        """The symbol by which a nominal controller refers to it."""
-        return sp.Symbol(self.name, real=True)
-
-
-@dataclass(frozen=True)
-class Start:
-    """Distribution of the initial state: a map of independent uniforms on [0, 1), kept where
-    `condition` > 0."""
-
-    state: tuple[sp.Expr, ...]
-    uniforms: tuple[sp.Symbol, ...] = ()
-    condition: sp.Expr | None = None
-
-    @classmethod
-    def at(cls, values: Sequence[float]) -> Start:
-        """A fixed initial state."""
-        return cls(tuple(sp.Float(v, 17) for v in values))
 
 
 @dataclass(frozen=True)
@@ -239,48 +195,30 @@ class SafetyProblem:
     @property
     def outside(self) -> sp.Expr:
         """Positive where the state has left the workspace; -1 if the workspace is unbounded."""
-        return _excess(tuple((s.symbol, s.low, s.high) for s in self.states))
+        return excess(self.states)
 
-    def configured(
-        self,
-        *,
-        noise: float | Sequence[float] | None = None,
-        plant: Mapping[str, float] | None = None,
-        model: Mapping[str, float] | None = None,
-        dt: float | None = None,
-        substeps: int | None = None,
-        horizon: float | None = None,
-        box: Sequence[Any] | None = None,
-        start: str | Sequence[float] | None = None,
-    ) -> SafetyProblem:
-        """Return the problem with other numbers; None keeps the default.
+    def configured(self, **options: Any) -> SafetyProblem:
+        """Return the problem with other numbers; what is not given stays.
 
         Args:
-            noise: diffusion of plant and model alike, one number for all channels or one for each;
-                0 turns it off.
-            plant: parameters of the plant, by name.
-            model: parameters of the model, by name.
-            dt: control period in s.
-            substeps: integration steps in a control period.
-            horizon: length of an episode in s.
-            box: (low, high) for every input, or one such pair for each.
-            start: name of an initial distribution, or a fixed initial state.
+            **options: fields of `ProblemOptions`, except `barrier`, whose arguments go to the
+                function that builds the problem.
 
         Raises:
-            ConfigurationError: a name is unknown or a value is not allowed.
+            ConfigurationError: A name is unknown or a value is not allowed.
         """
-        levels = self._noise_levels(noise)
+        given = ProblemOptions.of(self.name, options, ())
+        levels = self._noise_levels(given.noise)
         changes: dict[str, Any] = {
-            "plant": self.plant.with_parameters(**{**levels, **(plant or {})}),
-            "model": self.model.with_parameters(**{**levels, **(model or {})}),
+            "plant": self.plant.with_parameters(**{**levels, **(given.plant or {})}),
+            "model": self.model.with_parameters(**{**levels, **(given.model or {})}),
         }
-        for name, value in (("dt", dt), ("horizon", horizon)):
-            if value is not None:
-                changes[name] = finite_number(name, value)
-        if substeps is not None:
-            changes["substeps"] = substeps
-        if box is not None:
-            changes["inputs"] = self._boxed(box)
+        for name in ("dt", "substeps", "horizon"):
+            if getattr(given, name) is not None:
+                changes[name] = getattr(given, name)
+        if given.box is not None:
+            changes["inputs"] = self._boxed(given.box)
+        start = given.start
         if isinstance(start, str):
             if start not in self.starts:
                 raise ConfigurationError(
@@ -357,18 +295,3 @@ def _numbers(given: Any) -> np.ndarray:
         return np.empty(0) if found.dtype.kind in "US" else np.atleast_1d(found.astype(float))
     except (TypeError, ValueError, OverflowError):
         return np.empty(0)
-
-
-@lru_cache(maxsize=256)
-def _excess(ranges: tuple[tuple[sp.Symbol, float, float], ...]) -> sp.Expr:
-    """By how much the furthest state is outside its range; -1 without a bound. Remembered, for
-    sympy compares all it takes the most of."""
-    symmetric: dict[float, list[sp.Expr]] = {}
-    excess: list[sp.Expr] = []
-    for symbol, low, high in ranges:
-        if low == -high and math.isfinite(high):
-            symmetric.setdefault(high, []).append(sp.Abs(symbol))
-        else:
-            excess += [symbol - high] * math.isfinite(high) + [low - symbol] * math.isfinite(low)
-    excess += [sp.Max(*sizes) - half for half, sizes in symmetric.items()]
-    return sp.Max(*excess) if excess else sp.Integer(-1)

@@ -21,7 +21,6 @@ from safe_envs.dynamics.lie import (
     relative_degree,
 )
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.envs.simulation import proposed_starts
 from safe_envs.errors import SystemDefinitionError, SystemDefinitionWarning
 from safe_envs.problem.problem import SafetyProblem
 
@@ -117,7 +116,8 @@ def _safe_starts(problem: SafetyProblem) -> Components:
     Raises:
         SystemDefinitionError: there are none.
     """
-    x, states = tuple(proposed_starts(problem, _STARTS).T.copy()), problem.plant.states
+    proposals = problem.starts[problem.start].proposals(_STARTS)
+    x, states = tuple(proposals.T.copy()), problem.plant.states
     within = np.ones(_STARTS, dtype=bool)
     for state, values in zip(problem.states, x, strict=True):
         inside = (values >= state.low) & (values <= state.high)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from safe_envs.problem.problem import SafetyProblem, Variable
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import Variable
 from safe_envs.rendering.barrier_chart import BarrierChart
 from safe_envs.rendering.canvas import Box, Canvas
 from safe_envs.rendering.scenes.base import warning_color

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
-from safe_envs.number_text import real
+from safe_envs.number_text import named_values, real
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
@@ -98,7 +98,7 @@ def identify(
     of what is collected are refused. The truth, with which the estimates are compared at states
     drawn anew from where the problem is explored, is that of the plant, with its --noise.
     """
-    from safe_envs.registry import load_problem, title_of
+    from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.identify_report import (
         Identification,
         Source,
@@ -119,7 +119,7 @@ def identify(
     if data is not None:
         _refuse_collecting(chosen, env)
         source = {"data": _load_data(method, learner, data)}
-    problem = load_problem(env.full_id, arguments)
+    problem = make_problem(env.full_id, **arguments)
     with progress_bar("Learning") as tell, warnings.catch_warnings():
         # They are in the record, and printed with the results.
         warnings.simplefilter("ignore", IdentifiabilityWarning)
@@ -153,7 +153,7 @@ def read_settings(method: str, learner: Callable[..., Any], texts: Sequence[str]
     """
     allowed = settings_of(learner)
     hints = typing.get_type_hints(learner)
-    found = text_options.parameters("--set", texts, words=True)
+    found = named_values("--set", texts, words=True)
     for name, value in found.items():
         if name not in allowed:
             given = shortened(f"{name}={value}")

@@ -129,9 +129,9 @@ def _of_env(
     the filter."""
     from safe_envs.agents.training.config import Training
     from safe_envs.agents.training.trainer import train
-    from safe_envs.registry import load_problem
+    from safe_envs.registry import make_problem
 
-    natural = load_problem(env_id).filter
+    natural = make_problem(env_id).filter
     rows = _evaluated(env_id, "nominal", "nominal", ["none", natural], known, None)
     for i, (name, in_loop, filters) in enumerate(
         (

@@ -19,16 +19,15 @@ def list_envs(json: Json = None) -> None:
     """List the registered envs."""
     from rich.markup import escape
 
-    from safe_envs.registry import make_env
+    from safe_envs.registry import env_class, make_problem
 
     require_result(json)
     table = make_table("pl", "id, and what is to be kept safe", *_COLUMNS)
     table.columns[0].max_width = 50
     rows = []
     for env_id in ENV_IDS:
-        env = make_env(env_id)
-        about = (type(env).__doc__ or "").strip().partition("\n")[0]
-        rows.append({"env_id": env_id, "about": about, **_defaults(env.problem)})
+        about = (env_class(env_id).__doc__ or "").strip().partition("\n")[0]
+        rows.append({"env_id": env_id, "about": about, **_defaults(make_problem(env_id))})
         cells = [_cell(name, rows[-1][name]) for name in _COLUMNS]
         table.add_row(f"[bold]{env_id}[/]\n{escape(about)}\n", *cells)
     stdout().print(table)

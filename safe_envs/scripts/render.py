@@ -85,7 +85,7 @@ def render(
     The episode is that of an env which is reset with the seed. Filters that rest on something
     learned learn it first, unless --learned gives it.
     """
-    from safe_envs.registry import load_problem
+    from safe_envs.registry import make_problem
 
     if filter_name is not None and compare is not None:
         raise ConfigurationError(
@@ -105,7 +105,7 @@ def render(
         out=out,
         inputs=text_options.inputs_of(env.system, policy, names or (), learned or ()),
     )
-    problem = load_problem(env.full_id, env.arguments)
+    problem = make_problem(env.full_id, **env.arguments)
     with progress_bar("Drawing") as tell:
         runs = make_runs(
             problem,

@@ -73,7 +73,7 @@ def verify(
     """
     from safe_envs.agents.evaluation.bound_check import judged, measure, starts_of
     from safe_envs.agents.policies.registry import make_policy
-    from safe_envs.registry import load_problem, title_of
+    from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.verify_report import document, print_report
     from safe_envs.wrappers import parse_conditions
     from safe_envs.wrappers.verification.feasibility import verify as find
@@ -84,7 +84,7 @@ def verify(
     )
     known, arguments = env.full_id, env.arguments
     title = title_of(known, arguments)
-    problem = load_problem(known, arguments)
+    problem = make_problem(known, **arguments)
     actor = make_policy(
         policy, problem, trust
     )  # An unknown one is to show before the search, and without a simulation too.

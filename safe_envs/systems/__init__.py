@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import gymnasium as gym
 
-_CLASSES = {
+MODULES = {
     "DubinsDisk": "dubins",
     "DubinsObstacle": "dubins_obstacle",
     "DubinsObstacles": "dubins_obstacles",
@@ -20,10 +20,10 @@ _CLASSES = {
     "CubicSDEDisk": "cubic",
     "Scalar": "scalar",
 }
+"""The module of each env class."""
 
-ENV_IDS = tuple(f"safe_envs/{name}-v0" for name in _CLASSES)
+ENV_IDS = tuple(f"safe_envs/{name}-v0" for name in MODULES)
 """Every registered id."""
-
 
 CUSTOM_ID = "safe_envs/Custom-v0"
 """The id that takes any system, as its argument `system`; see `safe_envs.envs.custom`."""
@@ -36,6 +36,9 @@ def register_all() -> None:
         entry_point="safe_envs.envs.custom:Custom",
         vector_entry_point="safe_envs.envs.custom:CustomVector",
     )
-    for name, module in _CLASSES.items():
-        path = f"safe_envs.systems.{module}:{name}"
-        gym.register(f"safe_envs/{name}-v0", entry_point=path, vector_entry_point=f"{path}Vector")
+    for name, module in MODULES.items():
+        gym.register(
+            f"safe_envs/{name}-v0",
+            entry_point=f"safe_envs.systems.{module}:{name}",
+            vector_entry_point=f"safe_envs.systems.vectors:{name}Vector",
+        )

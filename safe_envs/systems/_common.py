@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import finite_number
 from safe_envs.errors import ConfigurationError
+from safe_envs.number_text import finite_number
 
 
 def positive(name: str, value: float) -> float:

@@ -8,12 +8,13 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
-from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import positive
 
 u = sp.Symbol("u", real=True)
@@ -241,12 +242,6 @@ class ACC(SystemEnv):
     problem_factory = staticmethod(acc)
 
 
-class ACCVector(SystemVectorEnv):
-    """`ACC` in a batch."""
-
-    env_class = ACC
-
-
 class ACCGap(SystemEnv):
     """A car that wants to drive faster than the one ahead is to keep a minimum distance.
 
@@ -301,9 +296,3 @@ class ACCGap(SystemEnv):
     """
 
     problem_factory = staticmethod(acc_gap)
-
-
-class ACCGapVector(SystemVectorEnv):
-    """`ACCGap` in a batch."""
-
-    env_class = ACCGap

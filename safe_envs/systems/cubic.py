@@ -9,11 +9,12 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
-from safe_envs.problem.problem import SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.signals import Variable
 from safe_envs.systems._common import around, in_disk, positive, uniforms
 
 x_1, x_2, u = sp.symbols("x_1 x_2 u", real=True)
@@ -174,12 +175,6 @@ class CubicSDE(SystemEnv):
     problem_factory = staticmethod(cubic_sde)
 
 
-class CubicSDEVector(SystemVectorEnv):
-    """`CubicSDE` in a batch."""
-
-    env_class = CubicSDE
-
-
 class CubicSDEDisk(SystemEnv):
     """A cubic planar system with additive noise is to stay in a disk.
 
@@ -232,9 +227,3 @@ class CubicSDEDisk(SystemEnv):
     """
 
     problem_factory = staticmethod(cubic_sde_disk)
-
-
-class CubicSDEDiskVector(SystemVectorEnv):
-    """`CubicSDEDisk` in a batch."""
-
-    env_class = CubicSDEDisk

@@ -11,10 +11,11 @@ import sympy as sp
 from safe_envs.dynamics.lie import generator, lie_derivative_f
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import in_disk, positive, uniforms
 
 x, y, theta, omega = sp.symbols("x y theta omega", real=True)
@@ -232,12 +233,6 @@ class DubinsDisk(SystemEnv):
     problem_factory = staticmethod(dubins_disk)
 
 
-class DubinsDiskVector(SystemVectorEnv):
-    """`DubinsDisk` in a batch."""
-
-    env_class = DubinsDisk
-
-
 class StochasticDubins(SystemEnv):
     """A vehicle at constant speed, disturbed by noise, is to stay in a disk.
 
@@ -293,9 +288,3 @@ class StochasticDubins(SystemEnv):
     """
 
     problem_factory = staticmethod(stochastic_dubins)
-
-
-class StochasticDubinsVector(SystemVectorEnv):
-    """`StochasticDubins` in a batch."""
-
-    env_class = StochasticDubins

@@ -10,10 +10,11 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import around, positive, uniforms
 from safe_envs.systems.dubins import omega, theta, turn_rate_towards, vehicle, x, y
 
@@ -187,9 +188,3 @@ class DubinsObstacle(SystemEnv):
     """
 
     problem_factory = staticmethod(dubins_obstacle)
-
-
-class DubinsObstacleVector(SystemVectorEnv):
-    """`DubinsObstacle` in a batch."""
-
-    env_class = DubinsObstacle

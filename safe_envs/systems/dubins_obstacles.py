@@ -8,10 +8,11 @@ import math
 import sympy as sp
 
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import around, positive, uniforms
 from safe_envs.systems.dubins import omega, theta, x, y
 from safe_envs.systems.dubins_obstacle import separation, vehicle_among, way_to
@@ -179,9 +180,3 @@ class DubinsObstacles(SystemEnv):
     """
 
     problem_factory = staticmethod(dubins_obstacles)
-
-
-class DubinsObstaclesVector(SystemVectorEnv):
-    """`DubinsObstacles` in a batch."""
-
-    env_class = DubinsObstacles

@@ -6,10 +6,11 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.signals import Variable
 from safe_envs.systems._common import around, positive, uniforms
 
 theta, thetadot, u = sp.symbols("theta thetadot u", real=True)
@@ -133,9 +134,3 @@ class Pendulum(SystemEnv):
     """
 
     problem_factory = staticmethod(pendulum)
-
-
-class PendulumVector(SystemVectorEnv):
-    """`Pendulum` in a batch."""
-
-    env_class = Pendulum

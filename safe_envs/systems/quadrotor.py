@@ -10,9 +10,10 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
-from safe_envs.problem.problem import Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import around, uniforms
 from safe_envs.systems.quadrotor_altitude import (
     CLIMB_RATES,
@@ -250,9 +251,3 @@ class Quadrotor(SystemEnv):
     """
 
     problem_factory = staticmethod(quadrotor_full)
-
-
-class QuadrotorVector(SystemVectorEnv):
-    """`Quadrotor` in a batch."""
-
-    env_class = Quadrotor

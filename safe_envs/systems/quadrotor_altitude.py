@@ -6,12 +6,14 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE, finite_number
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
+from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import TIME, Feature, SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
+from safe_envs.problem.signals import TIME, Feature, Variable
 from safe_envs.systems._common import around, positive, uniforms
 
 z, zdot, phi, theta = sp.symbols("z zdot phi theta", real=True)
@@ -169,9 +171,3 @@ class QuadrotorAltitude(SystemEnv):
     """
 
     problem_factory = staticmethod(quadrotor_altitude)
-
-
-class QuadrotorAltitudeVector(SystemVectorEnv):
-    """`QuadrotorAltitude` in a batch."""
-
-    env_class = QuadrotorAltitude

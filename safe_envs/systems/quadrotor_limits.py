@@ -7,12 +7,12 @@ import math
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import finite_number
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.errors import ConfigurationError
+from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import TIME, Feature, SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import TIME, Feature
 from safe_envs.systems._common import around, uniforms
 from safe_envs.systems.quadrotor import (
     LARGEST_TILT,
@@ -156,9 +156,3 @@ class QuadrotorLimits(SystemEnv):
     """
 
     problem_factory = staticmethod(quadrotor_limits)
-
-
-class QuadrotorLimitsVector(SystemVectorEnv):
-    """`QuadrotorLimits` in a batch."""
-
-    env_class = QuadrotorLimits

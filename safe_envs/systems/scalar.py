@@ -6,9 +6,10 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SystemEnv
-from safe_envs.envs.vector_env import SystemVectorEnv
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import Variable
 from safe_envs.systems._common import around, positive, uniforms
 
 x, u, sigma = sp.symbols("x u sigma", real=True)
@@ -113,9 +114,3 @@ class Scalar(SystemEnv):
     """
 
     problem_factory = staticmethod(scalar)
-
-
-class ScalarVector(SystemVectorEnv):
-    """`Scalar` in a batch."""
-
-    env_class = Scalar

@@ -41,7 +41,7 @@ def states_near_starts(problem, count=4):
     return [
         [
             mpmath.mpf(c)
-            for c in np.add(simulation.draw_start(rng), 0.3 * rng.normal(size=problem.plant.n))
+            for c in np.add(simulation.starts.draw(rng), 0.3 * rng.normal(size=problem.plant.n))
         ]
         for _ in range(count)
     ]

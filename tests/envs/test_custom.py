@@ -14,8 +14,10 @@ from gymnasium.utils.env_checker import check_env
 
 import safe_envs
 from safe_envs import ConfigurationError, SafetyProblem, SystemDefinitionError, state_problem
-from safe_envs.envs.custom import Custom, load_system
+from safe_envs.envs.custom import Custom
 from safe_envs.object_import import load_object
+from safe_envs.problem.factory import load_system
+from safe_envs.registry import make_problem
 from safe_envs.systems import CUSTOM_ID
 
 STATEMENT = """
@@ -228,7 +230,7 @@ def test_ids_of_others_are_not_replaced(tmp_path, my_id):
 def test_the_id_for_any_system_asks_for_one(make, arguments):
     with pytest.raises(
         ConfigurationError,
-        match=r"system = .*; give the place of its statement as a text, FILE.py:NAME",
+        match=r"system = .*; give the place where it is defined as a text, FILE.py:NAME",
     ):
         make(CUSTOM_ID, **arguments)
 
@@ -242,3 +244,18 @@ def test_the_id_for_any_system_asks_for_one(make, arguments):
 def test_dictionaries_are_asked_for(make, arguments):
     with pytest.raises(ConfigurationError, match="give a dictionary of names and values"):
         make("safe_envs/Scalar-v0", **arguments)
+
+
+def test_an_installed_system_goes_by_its_name(tmp_path, monkeypatch):
+    (tmp_path / "carts-1.0.dist-info").mkdir()
+    (tmp_path / "carts-1.0.dist-info" / "METADATA").write_text("Name: carts\nVersion: 1.0\n")
+    (tmp_path / "carts-1.0.dist-info" / "entry_points.txt").write_text(
+        "[safe_envs.systems]\ncart = carts_of_a_test:problem\n"
+    )
+    (tmp_path / "carts_of_a_test.py").write_text(STATEMENT.replace("SIGN", "1"))
+    monkeypatch.syspath_prepend(tmp_path)
+    problem = make_problem(CUSTOM_ID, system="cart", edge=2.0, noise=0.3)
+    assert list(problem.plant.parameters.values()) == [0.3]
+    assert gym.make(CUSTOM_ID, system="cart", edge=2.0, noise=0.3).unwrapped.problem == problem  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(ConfigurationError, match="has no 'card'; did you mean 'cart'"):
+        make_problem(CUSTOM_ID, system="card")

@@ -72,7 +72,7 @@ def test_starts_are_safe_and_in_the_workspace(env_id):
     simulation = Simulation(problem, "floats")
     rng = np.random.default_rng(0)
     for _ in range(200):
-        x = simulation.draw_start(rng)
+        x = simulation.starts.draw(rng)
         _, barriers, _, outside, goal = simulation.measure(x, [0.0] * problem.plant.m, 0.0)
         assert min(barriers) > 0
         assert outside <= 0

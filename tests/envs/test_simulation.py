@@ -11,7 +11,7 @@ import sympy as sp
 
 from safe_envs import ControlAffineSDE, NumericalError, SafeEnv, SafeVectorEnv, state_problem
 from safe_envs.dynamics.integrators import Integrator
-from safe_envs.problem.problem import Feature
+from safe_envs.problem.signals import Feature
 
 x, v, u = sp.symbols("x v u", real=True)
 ENVS = [SafeEnv, lambda problem, **arguments: SafeVectorEnv(problem, 2, **arguments)]

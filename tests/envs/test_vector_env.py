@@ -3,6 +3,8 @@ included."""
 
 from __future__ import annotations
 
+import pickle
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from safe_envs import ConfigurationError
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.systems import vectors
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
 
@@ -224,7 +227,19 @@ def test_a_fixed_start_is_that_of_every_env_and_draws_nothing():
     )
     envs.reset(seed=0)
     np.testing.assert_array_equal(envs.state, [[2.0, 1.3, 0.3, 0.5, 1.0]] * 3)
-    before = [rng.bit_generator.state for rng in envs._rngs]
+    before = [rng.bit_generator.state for rng in envs._generators.rngs]
     envs.reset(options={"reset_mask": np.array([True, False, True])})
     np.testing.assert_array_equal(envs.state, [[2.0, 1.3, 0.3, 0.5, 1.0]] * 3)
-    assert [rng.bit_generator.state for rng in envs._rngs] == before
+    assert [rng.bit_generator.state for rng in envs._generators.rngs] == before
+
+
+def test_the_batched_class_is_one_object_by_name(env_id):
+    made = type(gym.make_vec(env_id, num_envs=1).unwrapped)
+    assert made is getattr(vectors, made.__name__) is pickle.loads(pickle.dumps(made))
+    assert gym.spec(env_id).vector_entry_point == f"{made.__module__}:{made.__name__}"
+
+
+@pytest.mark.parametrize("name", ["Scalar", "NobodyVector", "Vector"])
+def test_no_batched_class_of_another_name(name):
+    with pytest.raises(AttributeError, match=name):
+        getattr(vectors, name)

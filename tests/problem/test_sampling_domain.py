@@ -10,11 +10,11 @@ import pytest
 import sympy as sp
 
 from safe_envs.errors import SystemDefinitionError
-from safe_envs.problem.problem import Variable
 from safe_envs.problem.sampling_domain import SamplingDomain
-from safe_envs.registry import load_problem
+from safe_envs.problem.signals import Variable
+from safe_envs.registry import make_problem
 
-DISK = load_problem("safe_envs/CubicSDEDisk-v0")
+DISK = make_problem("safe_envs/CubicSDEDisk-v0")
 x, theta, w = sp.symbols("x theta w", real=True)
 
 
@@ -85,7 +85,7 @@ def test_what_does_not_fit_is_refused(given, message):
 
 
 def test_every_problem_can_be_explored(env_id):
-    problem = load_problem(env_id)
+    problem = make_problem(env_id)
     exploration = problem.exploration
     assert len(exploration.region) == len(problem.states)
     low, high = np.array(problem.box).T

@@ -15,7 +15,7 @@ from safe_envs import (
     state_problem,
 )
 from safe_envs.problem.clf import CLF
-from safe_envs.problem.problem import TIME, Feature
+from safe_envs.problem.signals import TIME, Feature
 from safe_envs.wrappers import SafetyFilter
 
 x, v, u, k, sigma = sp.symbols("x v u k sigma", real=True)

@@ -5,7 +5,8 @@ import pytest
 import sympy as sp
 
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, SafeEnv, SafetyProblem
-from safe_envs.problem.problem import Feature, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.signals import Feature, Variable
 from safe_envs.rendering import style
 from tests.conftest import problem_of
 from tests.rendering.drawn import SCENE, shown, stepped

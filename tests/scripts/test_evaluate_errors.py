@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from tests.scripts.conftest import strictly
 
 pytestmark = pytest.mark.usefixtures("coarse_bounds")
@@ -135,7 +135,7 @@ def ppo(tmp_path):
     from safe_envs.agents.policies.network import save_policy
 
     model = PPO("MlpPolicy", gym.make(DUBINS), policy_kwargs={"net_arch": [8]}, device="cpu")
-    save_policy(model, tmp_path / "ppo", load_problem(DUBINS))
+    save_policy(model, tmp_path / "ppo", make_problem(DUBINS))
     model.save(tmp_path / "ppo" / "model.zip")
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from safe_envs.agents.evaluation.evaluate import package_versions
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.identify import SETTINGS, read_settings, settings_of
 from safe_envs.scripts.reports.identify_report import Function, Source, percent, unit_of
 from safe_envs.wrappers.learning import METHODS, learner_of, load_learned
@@ -58,7 +58,7 @@ def identify(safe_envs_command):
 @pytest.fixture(scope="module")
 def bad_files(tmp_path_factory):
     """A folder of files that cannot be learned from."""
-    folder, pendulum = tmp_path_factory.mktemp("bad"), load_problem("Pendulum-v0")
+    folder, pendulum = tmp_path_factory.mktemp("bad"), make_problem("Pendulum-v0")
     (folder / "damaged.npz").write_bytes(b"PK")
     collect(pendulum, 5, 2).save(folder / "other.npz")
     learner_of("ddscbf")(pendulum, points=5, repetitions=2, way="direct").save(folder / "model.npz")
@@ -140,7 +140,7 @@ def test_the_report_names_what_was_learned_and_the_picture_shows_it(
 def test_the_file_loads_again(identify, method, tmp_path):
     env_id, *rest = QUICK[method]
     assert identify(env_id, *rest, "--seed", 3, "--json", "out.json", "--out", "out.npz")[0] == 0
-    model = load_learned(tmp_path / "out.npz", load_problem(env_id), method)
+    model = load_learned(tmp_path / "out.npz", make_problem(env_id), method)
     document = strictly("out.json")
     assert document["sha256"] == model.sha256
     assert document["record"]["transitions"] == model.record.transitions
@@ -182,7 +182,7 @@ def test_the_same_seed_gives_the_same_file(identify, tmp_path):
 @pytest.mark.slow
 def test_learning_from_a_file_of_data(identify, tmp_path):
     path = "some data.npz"
-    collect(load_problem("CubicSDEDisk-v0"), 40, 5, seed=7, dt=0.02).save(tmp_path / path)
+    collect(make_problem("CubicSDEDisk-v0"), 40, 5, seed=7, dt=0.02).save(tmp_path / path)
     status, out, err = identify(
         *PLAIN,
         "--data",
@@ -209,11 +209,11 @@ def test_learning_from_a_file_of_data(identify, tmp_path):
     assert compared in (tmp_path / "out.svg").read_text()
     assert "dt = 0.01" not in out
     assert strictly("out.json")["config"]["data"] == path
-    assert load_learned("out.npz", load_problem("CubicSDEDisk-v0")).record.seed == 7
+    assert load_learned("out.npz", make_problem("CubicSDEDisk-v0")).record.seed == 7
 
 
 def test_what_is_said_of_data_from_elsewhere():
-    data = collect(load_problem("CubicSDEDisk-v0"), 4)
+    data = collect(make_problem("CubicSDEDisk-v0"), 4)
     logged = Transitions.from_log(
         data.signature, data.x, data.u, data.successors[:, 0], 0.01 * np.arange(1, data.points + 1)
     )

@@ -26,11 +26,11 @@ grid:
 """
 
 SYSTEM = """
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 
 def problem(first=0, second=0):
     1 / (2 - first - second)
-    return load_problem("Scalar-v0", {"horizon": 0.2})
+    return make_problem("Scalar-v0", horizon=0.2)
 """
 
 

@@ -12,7 +12,7 @@ import sympy as sp
 import torch
 
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, InvalidInputError
-from safe_envs.agents import load_problem
+from safe_envs.agents import make_problem
 from safe_envs.wrappers import CBF, SafetyFilter, parse_conditions
 from safe_envs.wrappers import torch_layer as torch_filter
 from safe_envs.wrappers.torch_layer import TorchFilter
@@ -50,7 +50,7 @@ def visited(env_id, count):
 def registered(request):
     """A filter of a registered env, states on its way and inputs that leave the box sometimes."""
     name, condition = FILTERS[request.param]
-    problem = load_problem(f"safe_envs/{name}-v0")
+    problem = make_problem(f"safe_envs/{name}-v0")
     module = TorchFilter.for_problem(problem, parse_conditions(condition, problem))
     rng = np.random.default_rng(1)
     low, high = np.array(problem.box).T
@@ -212,7 +212,7 @@ def test_second_derivatives():
 
 
 def test_floats_of_less_precision_are_computed_in_double():
-    problem = load_problem("safe_envs/StochasticDubins-v0")
+    problem = make_problem("safe_envs/StochasticDubins-v0")
     module = TorchFilter.for_problem(problem, "scbf")
     x = torch.tensor([0.5, 2.5, 1.2])
     u = torch.tensor([-1.0], requires_grad=True)
@@ -322,7 +322,7 @@ def test_learning_through_the_filter():
 
 
 def test_what_is_no_plain_row_is_refused():
-    problem = load_problem("safe_envs/CubicSDE-v0")
+    problem = make_problem("safe_envs/CubicSDE-v0")
     for condition, reason in (
         ("srcbf", "reciprocal"),
         ("scbf:sampling_margin=first-order", "first order"),

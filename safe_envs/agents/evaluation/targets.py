@@ -16,7 +16,7 @@ from safe_envs.envs.simulation import center_and_half_width
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import full_id, load_problem, title_of
+from safe_envs.registry import full_id, make_problem, title_of
 from safe_envs.wrappers import Condition, FilterSpec, SafetyFilterVectorWrapper, SafetyMonitorVector
 
 _MOST_ENVS = 64
@@ -52,7 +52,7 @@ class NativeTarget:
             )
         self.options = {k: v for k, v in (options or {}).items() if v is not None}
         self.problem = (
-            problem if isinstance(problem, SafetyProblem) else load_problem(problem, options)
+            problem if isinstance(problem, SafetyProblem) else make_problem(problem, **self.options)
         )
 
     @property

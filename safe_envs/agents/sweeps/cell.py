@@ -18,12 +18,10 @@ from typing import Any
 from safe_envs.agents.evaluation.evaluate import evaluate, package_versions
 from safe_envs.bounded_reading import read_bytes
 from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened
+from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS
 from safe_envs.registry import which_env
 
-PARAMETERS = ("plant", "model", "barrier")
-"""Groups of parameters, which a setting names as plant.NAME."""
-
-ENV_OPTIONS = ("system", "noise", "dt", "substeps", "horizon", "box", "start")
+ENV_OPTIONS = ("system", *(name for name in OPTION_NAMES if name not in PARAMETER_GROUPS))
 """Settings that are arguments of `gym.make`."""
 
 _FRAMES = 3
@@ -70,7 +68,7 @@ class Cell:
     def options(self) -> dict[str, Any]:
         """The arguments of `gym.make`."""
         options = {name: self.settings[name] for name in ENV_OPTIONS if name in self.settings}
-        for group in PARAMETERS:
+        for group in PARAMETER_GROUPS:
             of_group = {
                 name.partition(".")[2]: value
                 for name, value in self.settings.items()

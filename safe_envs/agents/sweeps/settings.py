@@ -9,9 +9,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from safe_envs.agents.evaluation.evaluate import BARE
-from safe_envs.agents.sweeps.cell import ENV_OPTIONS, PARAMETERS
+from safe_envs.agents.sweeps.cell import ENV_OPTIONS
 from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import real
+from safe_envs.problem.options import PARAMETER_GROUPS
 from safe_envs.registry import full_id
 
 _SECTIONS = ("fixed", "grid", "cells")
@@ -25,7 +26,7 @@ _DEFAULTS: dict[str, Any] = {
 }
 _NAMES = ("env", "filter", *ENV_OPTIONS, *_DEFAULTS)
 _WORDS = ("env", "system", "filter", "policy", "knowledge", "objective")
-_GROUPS = tuple(f"{group}.NAME" for group in PARAMETERS)
+_GROUPS = tuple(f"{group}.NAME" for group in PARAMETER_GROUPS)
 
 Settings = dict[str, Any]
 
@@ -82,7 +83,7 @@ def text_of(value: Any) -> str:
 
 
 def _rank(name: str) -> int:
-    return _NAMES.index(name) if name in _NAMES else PARAMETERS.index(name.partition(".")[0])
+    return _NAMES.index(name) if name in _NAMES else PARAMETER_GROUPS.index(name.partition(".")[0])
 
 
 def _mapping(given: Any, what: str, allowed: Sequence[str] | None) -> dict[str, Any]:
@@ -131,14 +132,14 @@ def _listed(given: Any, what: str) -> list[Settings]:
 
 def _is_known(name: str) -> bool:
     group, dot, parameter = name.partition(".")
-    return name in _NAMES or (group in PARAMETERS and bool(dot and parameter))
+    return name in _NAMES or (group in PARAMETER_GROUPS and bool(dot and parameter))
 
 
 def _require_known(name: str, what: str) -> None:
     if not _is_known(name):
         hint = (
             f"; give its parameters as {name}.NAME"
-            if name in PARAMETERS
+            if name in PARAMETER_GROUPS
             else f"; {nearest(name, (*_NAMES, *_GROUPS))}"
         )
         raise ConfigurationError(f"{what} has the setting {shown(name)}{hint}")

@@ -17,7 +17,7 @@ from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_importe
 from safe_envs.agents.sweeps.document import document_in
 from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_of
 from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shown
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.wrappers import LEARNED, SafetyFilter, require_readable
 
 _NO_PART = ("seed", "episodes", "bounds")
@@ -176,7 +176,7 @@ def _check_cell(cell: Cell, derive: bool) -> None:
             raise ConfigurationError(
                 f"{name} = {shown(settings[name])}; {nearest(settings[name], allowed)}"
             )
-    problem = load_problem(cell.env_id, cell.options)
+    problem = make_problem(cell.env_id, **cell.options)
     if settings["filter"] != BARE:
         require_readable(settings["filter"], problem)
         rests_on_learned = any(

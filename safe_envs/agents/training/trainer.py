@@ -37,7 +37,7 @@ from safe_envs.atomic_io import write_json, writing
 from safe_envs.bounded_reading import read_bytes
 from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened
 from safe_envs.file_locks import locked
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 
 _OF_EVALUATIONS = 2**32 - 1
 """Key of their seeds, which no number of steps is."""
@@ -202,7 +202,7 @@ class _Session:
 
         self.seconds = 0.0
         self._training, self._folder = training, folder
-        self._problem = load_problem(training.env_id, training.options)
+        self._problem = make_problem(training.env_id, **training.options)
         self._figures = SafetyFigures()
         envs = VecMonitor(
             make_sb3_env(

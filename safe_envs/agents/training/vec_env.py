@@ -24,7 +24,7 @@ from safe_envs.envs.info import Info
 from safe_envs.envs.simulation import center_and_half_width
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import ConfigurationError, require_whole
-from safe_envs.registry import full_id, require_ours
+from safe_envs.registry import env_class, full_id
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 from safe_envs.wrappers.conditions import Condition
 
@@ -74,7 +74,7 @@ def make_sb3_env(
         require_whole("seed", seed, 0)
     given = {key: value for key, value in options.items() if value is not None}
     # This refuses ids of other projects, whose vector envs take other arguments.
-    require_ours(env_id)
+    env_class(env_id)
     env = gym.make_vec(
         full_id(env_id),
         int(num_envs),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-from safe_envs.envs.simulation import proposed_starts
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Range, nice_step
 from safe_envs.rendering.safe_set import Barriers
@@ -26,7 +25,7 @@ def first_range(problem: SafetyProblem, i: int) -> Range:
     Returns:
         A range with round ends.
     """
-    starts = proposed_starts(problem, _DRAWN)
+    starts = problem.starts[problem.start].proposals(_DRAWN)
     low, high, middle = float(starts[:, i].min()), float(starts[:, i].max()), starts.mean(axis=0)
     barriers = Barriers(problem)
     for power in _HALF_POWERS:

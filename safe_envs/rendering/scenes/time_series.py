@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.problem.problem import TIME, SafetyProblem
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import TIME
 from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Box, Canvas
 from safe_envs.rendering.safe_set import Barriers, SafeSet

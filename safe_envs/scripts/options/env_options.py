@@ -7,14 +7,26 @@ import functools
 import inspect
 import shlex
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any
+from dataclasses import Field, dataclass, fields
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
+from safe_envs.problem.options import ProblemOptions
 from safe_envs.scripts.options import completion
 from safe_envs.scripts.options.console import with_signature
-from safe_envs.scripts.options.text_options import parameters, read_box, read_noise, read_start
+
+_KINDS = get_type_hints(ProblemOptions)
+
+
+def _annotation(option: Field[Any]) -> Any:
+    """Return the annotation by which typer reads an option."""
+    text = list[str] if option.metadata["repeatable"] else str
+    kind = _KINDS[option.name] if option.metadata["reader"] is None else text | None
+    return Annotated[
+        kind, typer.Option(metavar=option.metadata["metavar"], help=option.metadata["help"])
+    ]
+
 
 _OPTIONS: dict[str, Any] = {
     "env_id": Annotated[
@@ -36,43 +48,7 @@ _OPTIONS: dict[str, Any] = {
             ),
         ),
     ],
-    "noise": Annotated[
-        str | None,
-        typer.Option(
-            metavar="X",
-            help="Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.",
-        ),
-    ],
-    "plant": Annotated[
-        list[str] | None,
-        typer.Option(metavar="K=V", help="Parameter of the simulated system. Repeatable."),
-    ],
-    "model": Annotated[
-        list[str] | None,
-        typer.Option(metavar="K=V", help="Parameter that the designer believes. Repeatable."),
-    ],
-    "barrier": Annotated[
-        list[str] | None, typer.Option(metavar="K=V", help="Argument of the barrier. Repeatable.")
-    ],
-    "dt": Annotated[float | None, typer.Option(help="Control period in s.")],
-    "substeps": Annotated[int | None, typer.Option(help="Integration steps in a control period.")],
-    "horizon": Annotated[float | None, typer.Option(help="Length of an episode in s.")],
-    "box": Annotated[
-        list[str] | None,
-        typer.Option(metavar="LO,HI", help="Physical bounds of all inputs, or once for each."),
-    ],
-    "start": Annotated[
-        str | None,
-        typer.Option(metavar="A,B,..", help="Initial state, or the name of a distribution."),
-    ],
-}
-_READERS: dict[str, Callable[[Any], Any]] = {
-    "noise": read_noise,
-    "plant": functools.partial(parameters, "--plant"),
-    "model": functools.partial(parameters, "--model"),
-    "barrier": functools.partial(parameters, "--barrier", words=True),
-    "box": read_box,
-    "start": read_start,
+    **{option.name: _annotation(option) for option in fields(ProblemOptions)},
 }
 
 
@@ -112,8 +88,11 @@ class EnvOptions:
         """
         system = {} if self.system is None else {"system": self.system}
         return system | {
-            name: _READERS[name](value) if name in _READERS else value
-            for name, value in self.changes.items()
+            option.name: value if reader is None else reader(f"--{option.name}", value)
+            for option in fields(ProblemOptions)
+            for value in (self.changes.get(option.name),)
+            for reader in (option.metadata["reader"],)
+            if value is not None
         }
 
     def evaluate_command(self, *words: str) -> str:

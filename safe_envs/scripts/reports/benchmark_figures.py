@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reports.benchmark_cases import (
     ENV_ID,
     NUM_ENVS,
@@ -104,7 +104,7 @@ def _learn() -> tuple[dict[str, LearnedModel], Figures]:
     """
     learned, seconds = {}, {}
     for name, (env_id, method, settings) in _LEARNED.items():
-        problem = load_problem(env_id)
+        problem = make_problem(env_id)
         began = time.perf_counter()
         learned[name] = learner_of(method)(problem, **settings)
         seconds[f"{name}, learned in s"] = time.perf_counter() - began
@@ -120,7 +120,7 @@ def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
     }
     cases, rng = {}, np.random.default_rng(0)
     for name, (env_id, method, _) in _LEARNED.items():
-        problem = load_problem(env_id)
+        problem = make_problem(env_id)
         safety_filter = SafetyFilter.for_problem(
             problem, conditions[method](learned[name], problem)
         )

@@ -116,12 +116,12 @@ def envs() -> Iterator[Check]:
 
 
 def _step(env_id: str) -> tuple[bool, str]:
-    from safe_envs.registry import make_env
+    from safe_envs.envs.env import SafeEnv
+    from safe_envs.registry import make_problem
     from safe_envs.wrappers import SafetyFilterWrapper
 
-    unfiltered = make_env(env_id)
-    problem = unfiltered.problem
-    env = SafetyFilterWrapper(unfiltered, problem.filter)
+    problem = make_problem(env_id)
+    env = SafetyFilterWrapper(SafeEnv(problem), problem.filter)
     env.reset(seed=0)
     low, high = np.transpose(problem.box)
     inside = True

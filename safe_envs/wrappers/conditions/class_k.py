@@ -11,8 +11,8 @@ import mpmath
 import sympy as sp
 from sympy.printing.str import StrPrinter
 
-from safe_envs.dynamics.sde import finite_number
 from safe_envs.errors import ConfigurationError, shortened, shown
+from safe_envs.number_text import finite_number
 from safe_envs.wrappers.conditions.class_k_text import S, parsed
 
 _DIGITS = 150

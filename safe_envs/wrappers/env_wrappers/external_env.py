@@ -12,12 +12,15 @@ import gymnasium as gym
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE, finite_number
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, InvalidInputError, nearest
+from safe_envs.number_text import finite_number
 from safe_envs.object_import import load_object
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.builder import law_of, named_barriers, suitable
-from safe_envs.problem.problem import SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import Variable
 from safe_envs.problem.validation import degree_of
 
 Map = Callable[[np.ndarray], np.ndarray]

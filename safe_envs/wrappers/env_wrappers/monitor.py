@@ -12,7 +12,8 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, Flavour, compile_function, stacked
-from safe_envs.envs.info import Info, safety_info
+from safe_envs.envs.episode import Episode
+from safe_envs.envs.info import Info
 from safe_envs.errors import InvalidInputError, NumericalError, SystemDefinitionWarning
 from safe_envs.rendering.viewer import Viewer
 from safe_envs.validators import real_array
@@ -58,11 +59,9 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         self.viewer = (
             Viewer(self.problem, "rgb_array", 1) if env.render_mode == "rgb_array" else None
         )
-        self._steps = 0
         self.executed: Sequence[float] = ()
         self._x: tuple[float, ...] | None = None
-        self._h_min = math.inf
-        self._episode_cost = 0.0
+        self._episode = Episode()
 
     @property
     def components(self) -> tuple[float, ...]:
@@ -94,7 +93,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
     ) -> tuple[np.ndarray, Info]:
         """Start an episode."""
         observation, info = self.env.reset(seed=seed, options=options)
-        self._h_min, self._episode_cost, self._steps = math.inf, 0.0, 0
+        self._episode.restart()
         seen = self._seen(observation)
         if self.viewer is not None:
             self.viewer.restart([self.components], [0.0], [0])
@@ -104,10 +103,11 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         """Pass on an action, and look at what comes of it."""
         self.executed = self.physical_action(action)
         observation, reward, terminated, truncated, info = self.env.step(action)
+        self._episode.steps += 1
         seen = self._seen(observation)
         if self.viewer is not None:
-            self._steps += 1
-            self.viewer.advance([self.components], [self._steps * self.problem.dt], [self.executed])
+            time = self._episode.steps * self.problem.dt
+            self.viewer.advance([self.components], [time], [self.executed])
         return observation, reward, terminated, truncated, {**info, **seen}
 
     def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, Any, bool, bool, Info]:
@@ -133,13 +133,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         h = min(barrier)
         if not math.isfinite(h):
             raise _undefined(self.problem.name, self._x)
-        violation = h < 0.0
-        cost = 1.0 if violation else 0.0
-        self._h_min = min(self._h_min, h)
-        self._episode_cost += cost
-        return safety_info(
-            violation, cost, np.array(barrier, dtype=np.float64), self._h_min, self._episode_cost
-        )
+        return self._episode.count(barrier, h)
 
 
 def doubt_layers(env: gym.Env[Any, Any]) -> None:

@@ -10,7 +10,8 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from safe_envs.dynamics.codegen import Components
-from safe_envs.envs.info import Info, safety_info, with_masks
+from safe_envs.envs.episode import Episodes
+from safe_envs.envs.info import Info, with_masks
 from safe_envs.envs.vector_env import VectorStep
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.rendering.viewer import Viewer
@@ -65,13 +66,9 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
             if env.render_mode == "rgb_array"
             else None
         )
-        self._steps = np.zeros(self.num_envs, dtype=np.int64)
         self.executed: Components = ()
         self._x: Components = ()
-        self._everywhere = np.ones(self.num_envs, dtype=bool)
-        self._ended = np.zeros(self.num_envs, dtype=bool)
-        self._h_min = np.full(self.num_envs, np.inf)
-        self._episode_cost = np.zeros(self.num_envs)
+        self.episodes = Episodes(self.num_envs)
 
     @property
     def components(self) -> Components:
@@ -108,16 +105,16 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`."""
         # Gymnasium's own vector envs take the mask out of the mapping that they are given.
-        anew = np.array((options or {}).get("reset_mask", self._everywhere), dtype=bool)
+        anew = np.array((options or {}).get("reset_mask", self.episodes.everywhere), dtype=bool)
         observation, info = self.env.reset(
             seed=seed, options=None if options is None else dict(options)
         )
-        self._forget(anew)
+        self.episodes.restart(anew)
         seen = self._seen(observation, anew)
         if self.viewer is not None:
             self.viewer.restart(
                 np.stack(self._x, axis=-1),
-                self._steps * self.problem.dt,
+                self.episodes.steps * self.problem.dt,
                 np.flatnonzero(anew).tolist(),
             )
         return observation, {**info, **with_masks(seen, anew)}
@@ -126,26 +123,30 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         """Pass on actions, and look at what comes of them."""
         self.executed = self.physical_action(actions)
         observation, reward, terminated, truncated, info = self.env.step(actions)
-        ended = terminated | truncated
+        ended, episodes = terminated | truncated, self.episodes
+        episodes.steps += 1
         if self._mode == AutoresetMode.SAME_STEP:
-            anew, shown = ended, self._of_same_step(observation, ended, info)
+            shown = self._of_same_step(observation, ended, info)
+            episodes.begun = ended
         else:
-            anew = self._ended
-            self._forget(anew)
-            self._ended = ended.copy()
-            shown = self._seen(observation, self._everywhere)
+            due = episodes.due()
+            if due is not None:
+                episodes.restart(due)
+            episodes.ended = ended
+            shown = self._seen(observation, episodes.everywhere)
         if self.viewer is not None:
-            self._steps += ~anew
-            times, begun = self._steps * self.problem.dt, np.flatnonzero(anew).tolist()
             self.viewer.advance(
-                np.stack(self._x, axis=-1), times, np.stack(self.executed, axis=-1), begun
+                np.stack(self._x, axis=-1),
+                episodes.steps * self.problem.dt,
+                np.stack(self.executed, axis=-1),
+                np.flatnonzero(episodes.begun).tolist(),
             )
         return (
             observation,
             reward,
             terminated,
             truncated,
-            {**info, **with_masks(shown, self._everywhere.copy())},
+            {**info, **with_masks(shown, episodes.everywhere.copy())},
         )
 
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
@@ -170,34 +171,22 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         """What is shown after a step that restarted the envs that ended: their last step goes to
         `final_info`."""
         if not ended.any():
-            return self._seen(observation, self._everywhere)
+            return self._seen(observation, self.episodes.everywhere)
         last = np.array(observation)
         for i in np.flatnonzero(ended).tolist():
             last[i] = info["final_obs"][i]
         info["final_info"] = {
             **info.get("final_info", {}),
-            **with_masks(self._seen(last, self._everywhere), ended),
+            **with_masks(self._seen(last, self.episodes.everywhere), ended),
         }
-        self._forget(ended)
+        self.episodes.restart(ended)
         return self._seen(observation, ended)
 
     def _seen(self, observation: np.ndarray, counted: np.ndarray) -> Info:
         """Read the states; `counted` are the envs whose observations are new."""
         self._x = _columns(self._spec.state(observation, (self.num_envs,)))
         barrier = barrier_table(self._barriers, self.problem.name, self._x)
-        h = barrier.min(axis=1)
-        violation = h < 0.0
-        cost = violation.astype(np.float64)
-        self._episode_cost += cost * counted
-        # What was counted before cannot lower the smallest h again.
-        np.minimum(self._h_min, h, out=self._h_min)
-        return safety_info(violation, cost, barrier, self._h_min.copy(), self._episode_cost.copy())
-
-    def _forget(self, envs: np.ndarray) -> None:
-        self._h_min[envs] = np.inf
-        self._episode_cost[envs] = 0.0
-        self._steps[envs] = 0
-        self._ended = self._ended & ~envs
+        return self.episodes.count(barrier, barrier.min(axis=1), counted)
 
 
 def _one_of(env: gym.vector.VectorEnv) -> Any:

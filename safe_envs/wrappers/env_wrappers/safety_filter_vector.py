@@ -63,7 +63,6 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         self._mode = env.metadata["autoreset_mode"]
         self._interventions = np.zeros(self.num_envs, dtype=np.int64)
         self._infeasible = np.zeros(self.num_envs, dtype=np.int64)
-        self._ended = np.zeros(self.num_envs, dtype=bool)
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
@@ -94,7 +93,6 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
         self._interventions, self._infeasible = (
             np.array(snapshot[name]) for name in ("interventions", "infeasible")
         )
-        self._ended = np.array(snapshot["ended"])
 
     def step(self, actions: Any) -> VectorStep:
         """Filter the actions and hold them for one control period."""
@@ -123,16 +121,12 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
                 if not np.allclose(u, v, rtol=0.0, atol=tolerance):
                     raise changed_action(self, decision.action, self._inner.executed)
         added = self._decided(decision, active)
-        ended = terminated | truncated
-        if self._mode == AutoresetMode.SAME_STEP and np.count_nonzero(ended):
-            info["final_info"].update(
-                with_masks({key: value.copy() for key, value in added.items()}, ended)
-            )
-            self._start_anew(added, ended)
-        elif self._mode == AutoresetMode.NEXT_STEP:
-            if np.count_nonzero(self._ended):
-                self._start_anew(added, self._ended)
-            self._ended = ended
+        begun = self._inner.episodes.begun
+        if np.count_nonzero(begun):
+            if self._mode == AutoresetMode.SAME_STEP:
+                last = {key: value.copy() for key, value in added.items()}
+                info["final_info"].update(with_masks(last, begun))
+            self._start_anew(added, begun)
         info.update(with_masks(added, info["_cost"]))
         return observation, reward, terminated, truncated, info
 
@@ -172,7 +166,6 @@ class SafetyFilterVectorWrapper(gym.vector.VectorWrapper):
     def _forget(self, envs: np.ndarray) -> None:
         self._interventions[envs] = 0
         self._infeasible[envs] = 0
-        self._ended = self._ended & ~envs
 
 
 def readable(env: gym.vector.VectorEnv) -> SafeVectorEnv | SafetyMonitorVector:

@@ -85,4 +85,4 @@ def require_degrees(problem: SafetyProblem, given: Any) -> None:
 def require_problem(problem: Any) -> None:
     """Raise ConfigurationError where something else was given for a problem: the id of an env, or
     an env."""
-    require_kind("problem", problem, SafetyProblem, "load_problem of safe_envs.registry")
+    require_kind("problem", problem, SafetyProblem, "make_problem of safe_envs.registry")

@@ -19,8 +19,9 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.dynamics.lie import derivatives, lie_derivative_f, lie_derivative_g, relative_degree
-from safe_envs.dynamics.sde import ControlAffineSDE, finite_number
+from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, require_whole, shown
+from safe_envs.number_text import finite_number
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import LearnedModel, Progress, Record
 from safe_envs.wrappers.learning.checks import (

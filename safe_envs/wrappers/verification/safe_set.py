@@ -149,7 +149,7 @@ def draw_starts(problem: SafetyProblem, count: int, seed: int = 0) -> np.ndarray
     rngs: list[Any] = [
         np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)
     ]
-    return Simulation(problem, "floats").draw_starts(rngs).T
+    return Simulation(problem, "floats").starts.draw_batch(rngs).T
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError, RelativeDegreeError
-from safe_envs.agents import NominalController, evaluate, load_problem
+from safe_envs.agents import NominalController, evaluate, make_problem
 from safe_envs.agents.evaluation.rollout import Recorder, run_episodes
 from safe_envs.envs.vector_env import SafeVectorEnv
 
@@ -27,7 +27,7 @@ def assert_same_to_the_bit(first, second):
 
 
 def test_answer_is_the_same_for_every_num_envs(env_id):
-    problem = load_problem(env_id, {"noise": 0.2})
+    problem = make_problem(env_id, noise=0.2)
     problem = problem.configured(horizon=6 * problem.dt)
     # The mean of a bound over the starts goes the same way for all ids.
     arguments = {
@@ -60,7 +60,7 @@ def test_answer_is_the_same_for_every_num_envs(env_id):
     ],
 )
 def test_long_and_ending_episodes_are_the_same_for_every_num_envs(policy, env_id, filters, options):
-    problem = load_problem(env_id, options)
+    problem = make_problem(env_id, **options)
     given = {"episodes": 3, "seed": 1, "record": True, "bounds": False}
     answers = [evaluate(problem, policy, filters, num_envs=n, **given) for n in (3, 1, 2)]
     for other in answers[1:]:
@@ -86,7 +86,7 @@ def test_more_episodes_begin_with_the_same_ones():
 
 
 def test_starts_are_told_wave_by_wave():
-    problem = load_problem("StochasticDubins-v0", {"horizon": 0.2})
+    problem = make_problem("StochasticDubins-v0", horizon=0.2)
     policy = NominalController(problem)
     told = []
     totals = run_episodes(
@@ -149,8 +149,8 @@ def test_config_is_enough_to_run_it_again():
 
 
 def test_a_problem_gives_the_same_as_its_id_and_defaults_are_the_natural_filter(env_id):
-    options = {"horizon": 5 * load_problem(env_id).dt}
-    problem = load_problem(env_id, options)
+    options = {"horizon": 5 * make_problem(env_id).dt}
+    problem = make_problem(env_id, **options)
     # The bounds go the same way for all ids.
     arguments = {"episodes": 5, "bounds": env_id.endswith(("CubicSDEDisk-v0", "Pendulum-v0"))}
     by_id = evaluate(env_id, options=options, **arguments)
@@ -187,7 +187,7 @@ def test_recorder_keeps_a_bounded_number_of_episodes():
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_episodes():
-    problem = load_problem("Scalar-v0", {"horizon": 0.02})
+    problem = make_problem("Scalar-v0", horizon=0.02)
 
     def peak(episodes):
         tracemalloc.start()
@@ -275,4 +275,4 @@ def test_conditions_that_do_not_suit_are_errors_before_any_episode():
         evaluate("StochasticDubins-v0", filters=["none", "cbf"], progress=told.append)
     assert told == []
     with pytest.raises(ConfigurationError, match="options"):
-        evaluate(load_problem("Scalar-v0"), options={"noise": 1.0})
+        evaluate(make_problem("Scalar-v0"), options={"noise": 1.0})

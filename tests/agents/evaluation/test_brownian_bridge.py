@@ -12,7 +12,7 @@ import sympy as sp
 from scipy.stats import kstest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents import evaluate, load_problem
+from safe_envs.agents import evaluate, make_problem
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, Exponentials, bridge_notes
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.policies.nominal import RandomPolicy
@@ -39,7 +39,7 @@ def test_minimum_has_the_law_of_a_brownian_bridge(before, after):
 
 
 def test_variance_is_that_of_the_beginning_of_the_period():
-    problem = load_problem("safe_envs/CubicSDE-v0", {"noise": 0.3})
+    problem = make_problem("safe_envs/CubicSDE-v0", noise=0.3)
     bridge, x = BrownianBridge(problem), (np.array([0.5, -1.0]), np.array([0.2, 0.8]))
     h = problem.barriers[0].expression
     points: list[Any] = [
@@ -130,7 +130,7 @@ def test_answer_is_the_same_for_every_num_envs():
 
 
 def test_bridges_policies_and_envs_of_all_episodes_have_streams_of_their_own():
-    policy = RandomPolicy(load_problem("Scalar-v0"))
+    policy = RandomPolicy(make_problem("Scalar-v0"))
     policy.begin(range(3), 7)
     generators = [*Exponentials(7, range(3), 1)._generators, *policy._streams]
     generators += [np.random.default_rng(episode_seed(7, i)) for i in range(3)]
@@ -138,7 +138,7 @@ def test_bridges_policies_and_envs_of_all_episodes_have_streams_of_their_own():
 
 
 def test_without_noise_in_h_nothing_changes_and_a_note_says_so():
-    problem = load_problem("safe_envs/ACC-v0", {"noise": 0.0, "horizon": 1.0})
+    problem = make_problem("safe_envs/ACC-v0", noise=0.0, horizon=1.0)
     (note,) = bridge_notes(problem)
     assert "no noise reaches" in note
     rows = [
@@ -146,7 +146,7 @@ def test_without_noise_in_h_nothing_changes_and_a_note_says_so():
         for m in ("discrete", "continuous")
     ]
     assert rows[0] == rows[1]
-    assert bridge_notes(load_problem("safe_envs/ACC-v0")) == []
+    assert bridge_notes(make_problem("safe_envs/ACC-v0")) == []
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from safe_envs.agents import evaluate, load_problem
+from safe_envs.agents import evaluate, make_problem
 from tests.agents.evaluation.evaluated import Constant, Schedule, replay, safe_so_far
 
 pytestmark = pytest.mark.slow
@@ -96,7 +96,7 @@ def test_episodes_replayed_by_hand(env_id, spec, policy, options):
         assert np.isnan(recorded[len(h) :, i]).all()
     curve = answer.rows[0]["curve"]
     assert curve["safe"] == safe_so_far(
-        trajectories, curve["time"], load_problem(env_id, options).dt
+        trajectories, curve["time"], make_problem(env_id, **options).dt
     )
     assert curve["rate"] == [count / episodes for count in curve["safe"]]
     assert all(later <= earlier for earlier, later in itertools.pairwise(curve["safe"]))
@@ -123,7 +123,7 @@ def test_filters_that_know_the_plant_are_replayed_too():
 def test_counting_ends_with_the_first_violation_and_simulation_goes_on():
     # dx = (x + u) dt under constant u: x' = e^dt x + (e^dt - 1) u. Over the edge with the fourth
     # input, back, and over again.
-    problem = load_problem("Scalar-v0", {"noise": 0.0, "start": [0.9], "dt": 0.05, "horizon": 0.5})
+    problem = make_problem("Scalar-v0", noise=0.0, start=[0.9], dt=0.05, horizon=0.5)
     inputs = [-0.5, -1.0, -0.9, 4.0, -9.0, -9.0, 0.0, 0.0, 9.0, 9.0]
     x, grown = [0.9], math.exp(0.05)
     for u in inputs:
@@ -145,7 +145,7 @@ def test_counting_ends_with_the_first_violation_and_simulation_goes_on():
 
 
 def test_curve_of_one_episode_falls_at_its_first_violation_for_good():
-    problem = load_problem("Scalar-v0", {"noise": 0.0, "start": [0.9], "dt": 0.05, "horizon": 0.5})
+    problem = make_problem("Scalar-v0", noise=0.0, start=[0.9], dt=0.05, horizon=0.5)
     inputs = [-0.5, -1.0, -0.9, 4.0, -9.0, -9.0, 0.0, 0.0, 9.0, 9.0]
     (row,) = evaluate(problem, Schedule(problem, inputs), ["none"], episodes=3, num_envs=2).rows
     assert row["curve"]["time"] == [k * 0.05 for k in range(11)]
@@ -158,8 +158,8 @@ def test_curve_of_a_long_episode_is_thinned_out():
     x = np.cumsum([0.0] + [1e-3] * 701)
     inputs = (x[1:] - math.exp(1e-3) * x[:-1]) / (math.exp(1e-3) - 1)
     for last in (301, 303, 700, 701):
-        problem = load_problem(
-            "Scalar-v0", {**options, "barrier": {"limit": float(x[last - 1] + x[last]) / 2}}
+        problem = make_problem(
+            "Scalar-v0", **options, barrier={"limit": float(x[last - 1] + x[last]) / 2}
         )
         (row,) = evaluate(problem, Schedule(problem, inputs), ["none"], episodes=2).rows
         assert len(row["curve"]["time"]) == 177
@@ -172,8 +172,8 @@ def test_curve_of_a_long_episode_is_thinned_out():
 def test_interventions_after_a_violation_do_not_count():
     # With u = 0 at first, x grows over the edge in step 3; a box with no negative input makes each
     # later step infeasible.
-    problem = load_problem(
-        "Scalar-v0", {"noise": 0.0, "start": [0.95], "dt": 0.02, "box": [-0.5, 1.0], "horizon": 0.2}
+    problem = make_problem(
+        "Scalar-v0", noise=0.0, start=[0.95], dt=0.02, box=[-0.5, 1.0], horizon=0.2
     )
     (row,) = evaluate(problem, Constant(1.0), ["cbf:alpha=1"], episodes=1).rows
     # The condition 1 - x - (x + u) >= 0 asks for u <= 1 - 2 x < -.5 from the start: the
@@ -213,7 +213,7 @@ def test_an_episode_that_starts_on_the_edge_is_unsafe_and_counts_no_step():
 def test_touching_the_edge_is_unsafe():
     options = {"noise": 0.0, "start": [0.5], "horizon": 0.05}
     up_and_down = [3.0, -3.0, -3.0, -3.0, -3.0]
-    problem = load_problem("Scalar-v0", options)
+    problem = make_problem("Scalar-v0", **options)
     reached = (
         evaluate(problem, Schedule(problem, up_and_down), ["none"], episodes=1, record=True)
         .recorders["none"]
@@ -221,7 +221,7 @@ def test_touching_the_edge_is_unsafe():
     )
     assert reached[1] == reached.max()
     for limit, safe in ((reached[1], 0), (np.nextafter(reached[1], 1.0), 1)):
-        problem = load_problem("Scalar-v0", {**options, "barrier": {"limit": float(limit)}})
+        problem = make_problem("Scalar-v0", **options, barrier={"limit": float(limit)})
         answer = evaluate(
             problem, Schedule(problem, up_and_down), ["none"], episodes=1, record=True
         )

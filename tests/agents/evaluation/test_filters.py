@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents import evaluate, load_problem
+from safe_envs.agents import evaluate, make_problem
 from safe_envs.agents.evaluation.statistics import (
     mcnemar_p,
     paired_difference_interval,
@@ -115,7 +115,7 @@ def test_filters_see_the_same_episodes_until_they_act():
 
 
 def test_a_filter_may_have_a_condition_for_each_barrier():
-    problem = load_problem("StochasticDubins-v0", {"horizon": 1.0, "noise": 0.4})
+    problem = make_problem("StochasticDubins-v0", horizon=1.0, noise=0.4)
     disk = problem.barriers[0]
     wall = replace(disk, name="wall", expression=1 - problem.plant.states[0])
     problem = replace(problem, barriers=(disk, wall))

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents import evaluate, load_problem
+from safe_envs.agents import evaluate, make_problem
 from safe_envs.agents.evaluation.identification import Learning, learned_of
 from safe_envs.wrappers import BayesianSCBF
 from safe_envs.wrappers.learning import LearnedFileError, learner_of
 
 pytestmark = pytest.mark.slow
 
-DISK = load_problem("CubicSDEDisk-v0", {"start": [-0.1, 0.7]})
-LINE = load_problem("Scalar-v0", {"start": [0.5], "noise": 0.5, "horizon": 0.5})
+DISK = make_problem("CubicSDEDisk-v0", start=[-0.1, 0.7])
+LINE = make_problem("Scalar-v0", start=[0.5], noise=0.5, horizon=0.5)
 LEARNED = ("bayesian-scbf", "bayesian-scbf:confidence=0.9")
 
 
@@ -81,7 +81,7 @@ def test_what_does_not_fit_is_refused(posterior):
     with pytest.raises(ConfigurationError, match="two learned models of the method bayesian"):
         Learning(DISK, LEARNED, [posterior, posterior], 1, 0)
     with pytest.raises(LearnedFileError, match="Pendulum"):
-        Learning(load_problem("Pendulum-v0"), LEARNED, [posterior], 1, 0)
+        Learning(make_problem("Pendulum-v0"), LEARNED, [posterior], 1, 0)
     with pytest.raises(
         ConfigurationError, match="holds bayesian, on which no filter rests; add bayesian-scbf"
     ):
@@ -134,7 +134,7 @@ def test_the_filter_from_a_file_gives_the_same_as_from_memory(posterior, tmp_pat
 def test_the_answer_is_the_same_for_every_num_envs_and_from_a_file(
     env_id, name, settings, tmp_path
 ):
-    problem = load_problem(env_id, {"horizon": 0.2})
+    problem = make_problem(env_id, horizon=0.2)
     model = learner_of("bayesian" if name.startswith("bayesian") else name)(
         problem, seed=1, **settings
     )
@@ -223,7 +223,7 @@ def test_progress_goes_from_the_learning_to_the_end():
 
 
 def test_what_does_not_fit_the_heading_is_remarked(tmp_path):
-    model = learner_of("ddscbf")(load_problem("ACCGap-v0"), points=30, repetitions=40)
+    model = learner_of("ddscbf")(make_problem("ACCGap-v0"), points=30, repetitions=40)
     model.save(tmp_path / "gap.npz")
     louder = {"noise": 0.3, "horizon": 0.5}
     for given in (model, tmp_path / "gap.npz"):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from safe_envs.agents import RandomPolicy, evaluate, load_problem
+from safe_envs.agents import RandomPolicy, evaluate, make_problem
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.evaluation.statistics import wilson_interval
 from tests.agents.evaluation.evaluated import Constant, Levelling
@@ -31,7 +31,7 @@ def test_gaussian_law_of_adaptive_cruise_control(scheme, tolerance):
         "noise": sigma,
         "dt": dt,
     }
-    problem = load_problem("ACC-v0", options)
+    problem = make_problem("ACC-v0", **options)
     policy, filters = (
         (Levelling(problem, tau), ["none"]) if scheme == "policy" else (Constant(1.0), ["scbf"])
     )
@@ -92,7 +92,7 @@ def test_episode_seeds_differ():
 
 
 def test_random_policy_and_noise_do_not_share_their_numbers():
-    problem = load_problem("Scalar-v0")
+    problem = make_problem("Scalar-v0")
     policy = RandomPolicy(problem)
     policy.begin(range(400), seed=0)
     actions = policy.predict(np.zeros((400, 1)))[0][:, 0]

@@ -8,7 +8,7 @@ import math
 import pytest
 
 from safe_envs import ConfigurationError
-from safe_envs.agents import evaluate, load_problem
+from safe_envs.agents import evaluate, make_problem
 from safe_envs.agents.evaluation.refinement import TOLERANCE, refine, verdict
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
 from tests.oracles.laws import survival
@@ -102,7 +102,7 @@ def test_horizons_that_are_no_multiple_of_the_period_stay_as_simulated():
 
 
 def test_document_is_that_of_the_given_period_and_the_refinement():
-    problem = load_problem("Scalar-v0", {"horizon": 0.1})
+    problem = make_problem("Scalar-v0", horizon=0.1)
     answer = refine(problem, episodes=6, record=True)
     document = json.loads(json.dumps(answer.document(), allow_nan=False))
     plain = evaluate(problem, episodes=6)

@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 SYSTEM = """
 import os, signal
 from pathlib import Path
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 
 def problem(kind="plain"):
     marker = Path(__file__).with_suffix(".ended")
@@ -43,7 +43,7 @@ def problem(kind="plain"):
         marker.touch()
         assert os.environ["SPARED"] != str(os.getpid())
         os.kill(os.getpid(), signal.SIGKILL)
-    return load_problem("Scalar-v0", {"horizon": 0.2})
+    return make_problem("Scalar-v0", horizon=0.2)
 """
 
 # The sweep of a file, told where: in a process of its own, which may be made to end after some

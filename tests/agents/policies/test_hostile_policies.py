@@ -19,7 +19,7 @@ import pytest
 from safe_envs.agents.policies.network import load_policy
 from safe_envs.agents.policies.registry import make_policy
 from safe_envs.errors import ConfigurationError
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.wrappers.learning.models.files import load, save
 from tests.agents.policies.test_network import small
 from tests.test_bounded_reading import damaged_by
@@ -32,7 +32,7 @@ ENV_ID = "safe_envs/StochasticDubins-v0"
 
 @pytest.fixture(scope="module")
 def problem():
-    return load_problem(ENV_ID)
+    return make_problem(ENV_ID)
 
 
 @pytest.fixture(scope="module")

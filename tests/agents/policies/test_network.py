@@ -15,7 +15,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from safe_envs import ConfigurationError
-from safe_envs.agents import evaluate, load_problem, make_policy, refine
+from safe_envs.agents import evaluate, make_policy, make_problem, refine
 from safe_envs.agents.policies.fixed_batch import BLOCK
 from safe_envs.agents.policies.network import NetworkPolicy, load_policy, save_policy
 from safe_envs.errors import InvalidInputError
@@ -36,7 +36,7 @@ def one_thread():
 
 @pytest.fixture(scope="module")
 def problem():
-    return load_problem(ENV_ID)
+    return make_problem(ENV_ID)
 
 
 def small(algorithm=PPO, env=None, env_id=ENV_ID, **arguments):
@@ -118,7 +118,7 @@ def test_policies_predict_like_their_models(problem, tmp_path, algorithm, argume
 @pytest.mark.parametrize("passed", [True, False])
 def test_normalisation_is_part_of_the_policy(tmp_path, passed):
     env_id = "safe_envs/QuadrotorAltitude-v0"
-    problem = load_problem(env_id)
+    problem = make_problem(env_id)
     envs = VecNormalize(DummyVecEnv([lambda: gym.make(env_id)]), clip_obs=1.5, epsilon=1e-3)
     envs.obs_rms.update(observations(problem))
     model = small(SAC, envs, **OFF_POLICY)
@@ -281,7 +281,7 @@ def test_diverged_policies_and_those_of_other_problems_are_not_saved(problem, tm
     with pytest.raises(
         ConfigurationError, match="the policy of PPO was trained for another observation space"
     ):
-        save_policy(model, tmp_path, load_problem("ACC-v0"))
+        save_policy(model, tmp_path, make_problem("ACC-v0"))
     with torch.no_grad():
         model.policy.action_net.bias[0] = torch.nan
     with pytest.raises(ConfigurationError, match="not all finite: its training diverged"):
@@ -306,8 +306,8 @@ def test_policies_of_other_problems_are_errors(saved):
         ("safe_envs/Scalar-v0", None, "its system: "),
     ):
         with pytest.raises(ConfigurationError, match=f"was trained for another problem: {message}"):
-            make_policy(str(saved), load_problem(env_id, barrier and {"barrier": barrier}))
-    make_policy(str(saved), load_problem(ENV_ID, {"plant": {"v": 1.5}, "dt": 0.01, "horizon": 1.0}))
+            make_policy(str(saved), make_problem(env_id, barrier=barrier))
+    make_policy(str(saved), make_problem(ENV_ID, plant={"v": 1.5}, dt=0.01, horizon=1.0))
 
 
 def test_missing_files_are_errors(copy, problem, tmp_path):

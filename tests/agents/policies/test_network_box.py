@@ -8,7 +8,7 @@ import pytest
 import torch
 from stable_baselines3 import PPO, SAC
 
-from safe_envs.agents import load_problem, make_policy
+from safe_envs.agents import make_policy, make_problem
 from safe_envs.agents.policies.network import save_policy
 from safe_envs.envs.simulation import center_and_half_width
 from safe_envs.wrappers.learning.models.files import load
@@ -37,19 +37,19 @@ def trained(request, tmp_path_factory):
     last = model.policy.action_net if algorithm is PPO else model.policy.actor.mu
     with torch.no_grad():
         last.weight.mul_(300.0 if algorithm is PPO else 30.0)
-    save_policy(model, folder, load_problem(env_id, {"box": BOXES[env_id]}))
+    save_policy(model, folder, make_problem(env_id, box=BOXES[env_id]))
     return env_id, folder
 
 
 def box_of(trained):
     """The box of the training, shape (m, 2)."""
-    return np.array(load_problem(trained[0], {"box": BOXES[trained[0]]}).box)
+    return np.array(make_problem(trained[0], box=BOXES[trained[0]]).box)
 
 
 def actions_in(trained, box):
     """What the policy does in a box: actions, and the inputs for which they stand there."""
     env_id, folder = trained
-    problem = load_problem(env_id, {"box": box.tolist()})
+    problem = make_problem(env_id, box=box.tolist())
     low, high = np.array([(f.low, f.high) for f in problem.features]).T
     given = np.random.default_rng(0).uniform(low, high, (300, len(low))).astype(np.float32)
     actions = make_policy(str(folder), problem).predict(given)[0]
@@ -85,7 +85,7 @@ def test_the_env_executes_the_same_input(trained):
         env = gym.make(trained[0], box=box)
         observation, _ = env.reset(seed=0)
         before = env.unwrapped.state  # pyright: ignore[reportAttributeAccessIssue]
-        policy = make_policy(str(trained[1]), load_problem(trained[0], {"box": box}))
+        policy = make_policy(str(trained[1]), make_problem(trained[0], box=box))
         env.step(policy.predict(observation)[0])
         reached.append(env.unwrapped.state - before)  # pyright: ignore[reportAttributeAccessIssue]
     np.testing.assert_allclose(reached[1], reached[0], rtol=0, atol=1e-6)

@@ -12,8 +12,8 @@ from safe_envs.agents import (
     NominalController,
     RandomPolicy,
     ZeroController,
-    load_problem,
     make_policy,
+    make_problem,
 )
 
 pytestmark = pytest.mark.slow
@@ -35,7 +35,7 @@ def physical(problem, actions):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_actions_of_one_and_of_many_observations(env_id, name):
-    problem = load_problem(env_id)
+    problem = make_problem(env_id)
     policy = make_policy(name, problem)
     many = observations(problem, 50)
     m = len(problem.inputs)
@@ -55,7 +55,7 @@ def test_actions_of_one_and_of_many_observations(env_id, name):
 
 
 def test_nominal_controllers_know_the_model_and_never_the_plant(env_id):
-    given = load_problem(env_id)
+    given = make_problem(env_id)
     levels = {p.name: value for p, value in given.plant.parameters.items()}
     elsewhere = {name: 1.3 * value + 0.1 for name, value in levels.items()}
     many = observations(given, 200)
@@ -69,7 +69,7 @@ def test_nominal_controllers_know_the_model_and_never_the_plant(env_id):
 
 
 def test_zero_controller_executes_the_point_of_the_box_nearest_to_zero(env_id):
-    problem = load_problem(env_id)
+    problem = make_problem(env_id)
     action = ZeroController(problem).predict(observations(problem, 3))[0]
     np.testing.assert_allclose(physical(problem, action), 0.0, atol=1e-12)
 
@@ -86,7 +86,7 @@ def test_zero_controller_in_boxes_off_centre(box, wanted):
 
 
 def test_nominal_actions_are_clipped_to_the_box():
-    problem = load_problem("Scalar-v0", {"box": [-0.5, 2.0]})
+    problem = make_problem("Scalar-v0", box=[-0.5, 2.0])
     observation = np.array([[-2.5], [0.0], [1.9]])
     np.testing.assert_allclose(
         physical(problem, NominalController(problem).predict(observation)[0]),
@@ -95,9 +95,11 @@ def test_nominal_actions_are_clipped_to_the_box():
 
 
 def test_quadrotor_law_is_the_closed_form():
-    problem = load_problem(
+    problem = make_problem(
         "QuadrotorAltitude-v0",
-        {"model": {"m": 0.45}, "plant": {"m": 0.9}, "box": [-1000.0, 1000.0]},
+        model={"m": 0.45},
+        plant={"m": 0.9},
+        box=[-1000.0, 1000.0],
     )
     given = observations(problem, 300)
     z, zdot, z_ref, z_ref_rate = given.astype(float).T
@@ -111,7 +113,7 @@ def test_quadrotor_law_is_the_closed_form():
 
 
 def test_full_quadrotor_has_the_thrust_of_the_altitude_law():
-    problem = load_problem("Quadrotor-v0", {"box": [-1e9, 1e9]})
+    problem = make_problem("Quadrotor-v0", box=[-1e9, 1e9])
     given = observations(problem, 100)
     names = [f.name for f in problem.features]
     z, zdot, z_ref, z_ref_rate = (
@@ -130,7 +132,7 @@ def test_cruise_law_solves_its_quadratic_program(env_id, speed, rate, slack_weig
     # min 2 (u/M)^2 + w_d d^2 subject to A V + rate V <= d with V = (v - 22)^2, over u/M, with the
     # best d for each u.
     M = 1500.0
-    problem = load_problem(env_id, {"model": {"sigma_1": sigma, "M": M}, "box": [-1e6, 1e6]})
+    problem = make_problem(env_id, model={"sigma_1": sigma, "M": M}, box=[-1e6, 1e6])
     column = [f.name for f in problem.features].index(speed)
     given = observations(problem, 60, seed=3)
     given[:30, column] = np.linspace(21.01, 23.0, 30)
@@ -158,14 +160,14 @@ def test_cruise_law_solves_its_quadratic_program(env_id, speed, rate, slack_weig
 
 @pytest.mark.parametrize("name", NAMES)
 def test_wrong_shapes_are_errors(name):
-    policy = make_policy(name, load_problem("QuadrotorAltitude-v0"))
+    policy = make_policy(name, make_problem("QuadrotorAltitude-v0"))
     for shape in [(), (3,), (5,), (4, 3), (1, 2, 4), (0,)]:
         with pytest.raises(InvalidInputError, match=r"\(4,\) or \(B, 4\)"):
             policy.predict(np.zeros(shape))
 
 
 def test_no_finite_value_is_an_error_that_names_the_observation():
-    policy = make_policy("nominal", load_problem("QuadrotorAltitude-v0"))
+    policy = make_policy("nominal", make_problem("QuadrotorAltitude-v0"))
     for given in (
         np.array([5.0, np.nan, 5.0, 0.0]),
         np.array([[5.0, 0.0, 5.0, 0.0], [5.0, np.nan, 5.0, 0.0]]),
@@ -175,7 +177,7 @@ def test_no_finite_value_is_an_error_that_names_the_observation():
 
 
 def test_random_policy_does_not_depend_on_the_batch():
-    problem = load_problem("Quadrotor-v0")
+    problem = make_problem("Quadrotor-v0")
     width, steps = len(problem.features), 300  # more than are drawn at once
     together = RandomPolicy(problem)
     together.begin(range(10), seed=5)
@@ -190,7 +192,7 @@ def test_random_policy_does_not_depend_on_the_batch():
 
 
 def test_random_policy_is_uniform_and_independent():
-    problem = load_problem("Quadrotor-v0")
+    problem = make_problem("Quadrotor-v0")
     policy = RandomPolicy(problem)
     policy.begin(range(40), seed=0)
     drawn = np.stack([policy.predict(np.zeros((40, len(problem.features))))[0] for _ in range(200)])
@@ -204,7 +206,7 @@ def test_random_policy_is_uniform_and_independent():
 
 
 def test_random_policy_outside_an_evaluation_follows_its_seed():
-    problem = load_problem("Scalar-v0")
+    problem = make_problem("Scalar-v0")
     first, second, other = (
         RandomPolicy(problem, seed).predict(np.zeros((5, 1)))[0] for seed in (3, 3, 4)
     )
@@ -213,6 +215,6 @@ def test_random_policy_outside_an_evaluation_follows_its_seed():
 
 
 def test_unknown_policies_name_the_nearest_one():
-    problem = load_problem("Scalar-v0")
+    problem = make_problem("Scalar-v0")
     with pytest.raises(ConfigurationError, match="unknown policy 'nominl'; did you mean 'nominal'"):
         make_policy("nominl", problem)

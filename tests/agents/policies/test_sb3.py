@@ -13,7 +13,7 @@ import torch
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
 from safe_envs import ConfigurationError
-from safe_envs.agents import evaluate, load_problem, make_policy, refine
+from safe_envs.agents import evaluate, make_policy, make_problem, refine
 
 pytestmark = pytest.mark.slow
 
@@ -67,7 +67,7 @@ def saved(tmp_path, algorithm, env, **arguments):
 
 def observations(count):
     rng = np.random.default_rng(0)
-    problem = load_problem(ENV_ID)
+    problem = make_problem(ENV_ID)
     low, high = np.array([(f.low, f.high) for f in problem.features]).T
     return rng.uniform(low, high, (count, len(low))).astype(np.float32)
 
@@ -85,7 +85,7 @@ def assert_predicts_like(model, policy):
 @pytest.mark.parametrize("name", ["ppo", "sac"])
 def test_loaded_policy_predicts_like_the_model(trained, name):
     model, path = trained[name]
-    assert_predicts_like(model, make_policy(path, load_problem(ENV_ID), trust=True))
+    assert_predicts_like(model, make_policy(path, make_problem(ENV_ID), trust=True))
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_loaded_policy_predicts_like_the_model(trained, name):
 )
 def test_every_algorithm_with_continuous_actions_is_loaded(tmp_path, algorithm, arguments):
     model, path = saved(tmp_path, algorithm, gym.make(ENV_ID), **arguments)
-    assert_predicts_like(model, make_policy(path, load_problem(ENV_ID), trust=True))
+    assert_predicts_like(model, make_policy(path, make_problem(ENV_ID), trust=True))
 
 
 @pytest.mark.slow
@@ -158,7 +158,7 @@ def test_an_episode_keeps_its_row_of_a_network_call(trained):
             )
 
     sizes = set()
-    policy = make_policy(trained["ppo"][1], load_problem(ENV_ID), trust=True)
+    policy = make_policy(trained["ppo"][1], make_problem(ENV_ID), trust=True)
     policy._network = Coarse()
     rows = [
         evaluate(
@@ -206,7 +206,7 @@ class Bomb:
 
 
 def test_a_file_is_loaded_only_where_it_is_trusted(trained, tmp_path):
-    problem, _, path = load_problem(ENV_ID), *trained["ppo"]
+    problem, _, path = make_problem(ENV_ID), *trained["ppo"]
     model = PPO.load(path, device="cpu")
     model.bomb = Bomb(tmp_path / "exploded")
     model.save(tmp_path / "bomb.zip")
@@ -230,7 +230,7 @@ def test_a_file_is_loaded_only_where_it_is_trusted(trained, tmp_path):
 
 
 def test_missing_files_and_files_of_another_kind_are_errors(tmp_path):
-    problem = load_problem(ENV_ID)
+    problem = make_problem(ENV_ID)
     with pytest.raises(ConfigurationError, match="there is no such file"):
         make_policy(str(tmp_path / "none.zip"), problem)
     text = tmp_path / "text.zip"
@@ -270,15 +270,15 @@ def test_damaged_archives_are_errors(trained, tmp_path, changed):
             if content is not None:
                 archive.writestr(name, content)
     with pytest.raises(ConfigurationError, match=r"damaged\.zip"):
-        make_policy(str(path), load_problem(ENV_ID), trust=True)
+        make_policy(str(path), make_problem(ENV_ID), trust=True)
 
 
 def test_policies_for_other_spaces_are_errors(trained, tmp_path):
     _, path = trained["ppo"]
     with pytest.raises(ConfigurationError, match="another observation space"):
-        make_policy(path, load_problem("safe_envs/ACCGap-v0"), trust=True)
+        make_policy(path, make_problem("safe_envs/ACCGap-v0"), trust=True)
     with pytest.raises(ConfigurationError, match="another observation space, between"):
-        make_policy(path, load_problem(ENV_ID, {"barrier": {"radius": 5.0}}), trust=True)
+        make_policy(path, make_problem(ENV_ID, barrier={"radius": 5.0}), trust=True)
     with pytest.raises(ConfigurationError, match="another observation space"):
         evaluate("safe_envs/Scalar-v0", path, trust=True, episodes=1)
 
@@ -292,7 +292,7 @@ def test_policies_for_other_actions_are_errors(tmp_path, space):
     env.action_space = space
     _, path = saved(tmp_path, PPO, env)
     with pytest.raises(ConfigurationError, match="another action space"):
-        make_policy(path, load_problem(ENV_ID), trust=True)
+        make_policy(path, make_problem(ENV_ID), trust=True)
 
 
 @pytest.mark.parametrize(
@@ -309,10 +309,10 @@ def test_policies_of_normalised_observations_are_refused(trained, tmp_path, name
             ConfigurationError,
             match=r"trained on normalised observations.*save_policy\(model, folder, problem, norm",
         ) as error:
-            make_policy(str(path), load_problem(ENV_ID), trust=trust)
+            make_policy(str(path), make_problem(ENV_ID), trust=trust)
         assert str(beside) in str(error.value)
     beside.unlink()
-    make_policy(str(path), load_problem(ENV_ID), trust=True)
+    make_policy(str(path), make_problem(ENV_ID), trust=True)
 
 
 def test_the_normalisation_of_another_training_is_no_matter(trained, tmp_path):
@@ -320,4 +320,4 @@ def test_the_normalisation_of_another_training_is_no_matter(trained, tmp_path):
     for name in ("run1/normalization.pkl", "logs/ppo/vecnormalize.pkl"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).touch()
-    make_policy(str(tmp_path / "model.zip"), load_problem(ENV_ID), trust=True)
+    make_policy(str(tmp_path / "model.zip"), make_problem(ENV_ID), trust=True)

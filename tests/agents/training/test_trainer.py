@@ -21,7 +21,7 @@ from safe_envs.agents.training.config import Training
 from safe_envs.agents.training.hyperparameters import ALGORITHMS, scheduled
 from safe_envs.agents.training.trainer import _Session, train
 from safe_envs.agents.training.vec_env import make_sb3_env
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.wrappers.learning.models.files import load
 
 pytestmark = pytest.mark.slow
@@ -283,7 +283,7 @@ def test_a_rollout_is_cut_into_whole_batches():
 
 
 def test_the_filter_in_the_loop_knows_what_it_is_to_know(tmp_path):
-    problem = load_problem("safe_envs/QuadrotorAltitude-v0")
+    problem = make_problem("safe_envs/QuadrotorAltitude-v0")
     for knowledge, system in (("model", problem.model), ("plant", problem.plant)):
         session = _Session(
             Training.of("QuadrotorAltitude-v0", "ppo", filter="hocbf", knowledge=knowledge),

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from safe_envs.agents import evaluate
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.evaluate import LEARNED_PARAMETERS
 from safe_envs.scripts.reports.evaluation_report import heading, print_evaluation
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
@@ -58,18 +58,18 @@ def row(learning=None, bound=None, name="bayesian-scbf"):
     ],
 )
 def test_a_bound_over_the_posterior_is_proposed_where_there_may_be_one(env_id, rows, first):
-    notes = learned_notes(rows, load_problem(env_id))
+    notes = learned_notes(rows, make_problem(env_id))
     assert notes[0] == first
     assert sum(note.startswith(NO_BOUND) for note in notes) == 1
 
 
 def test_nothing_is_said_where_nothing_was_learned():
-    assert not learned_notes([row()], load_problem("CubicSDEDisk-v0"))
+    assert not learned_notes([row()], make_problem("CubicSDEDisk-v0"))
     assert not learned_columns([row()])
 
 
 def test_repeats_are_means_and_their_intervals_have_a_condition():
-    problem = load_problem("CubicSDEDisk-v0")
+    problem = make_problem("CubicSDEDisk-v0")
     rows = [row(), row(LEARNING), row(OFTEN)]
     speeds = [{"learning_seconds": seconds} for seconds in (None, 1.5, 1.5)]
     columns = learned_columns(rows)

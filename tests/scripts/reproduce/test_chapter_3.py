@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reproduce.chapter_3 import (
     dubins_disk,
     dubins_learning,
@@ -31,7 +31,7 @@ def compute(name):
     """The quick outcome, of shorter runs in the disk."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            dubins_disk, "disk", lambda _: load_problem(dubins_disk.DISK).configured(horizon=1.5)
+            dubins_disk, "disk", lambda _: make_problem(dubins_disk.DISK).configured(horizon=1.5)
         )
         return ARTEFACTS[name].compute(QUICK)
 
@@ -78,7 +78,7 @@ def test_what_the_thesis_prints_stands_in_the_modules(outcomes):
     )
     assert {c["p"] for c in outcome.data["curves"]} == {0.5, 1.0, 5.0}
     # Sec. 3.5.1, moving case, with Fig. 3.2; p_1 = p_2 = 1 are of thesis-notes.
-    world = load_problem(dubins_learning.OBSTACLE, {"start": "thesis"})
+    world = make_problem(dubins_learning.OBSTACLE, start="thesis")
     assert [learned_runs.parameters(world.plant)[name] for name in ("v", "v_o")] == [0.8, 0.5]
     assert [learned_runs.parameters(world.model)[name] for name in ("v", "v_o")] == [0.5, 0.5]
     instants = outcomes["figure-3.2a"].data["instants"]
@@ -139,14 +139,14 @@ def test_what_is_told_of_the_learning_is_so(outcomes):
         told = {"states": 400, "label_dt": 1e-3, "hidden": [100, 30], "epochs": 80}
         assert [model.record.settings for model in models] == [told, told]
     coordinates = [
-        list(map(str, load_problem(env_id).exploration.coordinates))
+        list(map(str, make_problem(env_id).exploration.coordinates))
         for env_id in (dubins_disk.DISK, dubins_learning.OBSTACLE)
     ]
     assert coordinates == [
         ["x", "y", "cos(theta)", "sin(theta)"],
         ["cos(theta)", "sin(theta)", "-x + x_o", "-y + y_o"],
     ]
-    assert load_problem(quadrotor.QUADROTOR).exploration.inputs == ((3.0,), (9.0,))
+    assert make_problem(quadrotor.QUADROTOR).exploration.inputs == ((3.0,), (9.0,))
     for name in ("figure-3.1", "figure-3.2a", "figure-3.2b"):
         assert any("3 inputs; " in line for line in ARTEFACTS[name].corrections)
     assert all(
@@ -208,13 +208,13 @@ def test_curves_are_thinned(name, outcomes):
 def test_the_printed_start_of_the_disk_is_outside_the_kept_set(p, b_1):
     # By hand: h = .18, L_f h = -2 v x = -1.44, L_f^2 h = -2 v^2 = -1.28.
     h, first, second = dubins_disk.chain_at(
-        load_problem(dubins_disk.DISK), p, dubins_disk.PRINTED_START
+        make_problem(dubins_disk.DISK), p, dubins_disk.PRINTED_START
     )
     assert h == pytest.approx(0.18)
     assert first == pytest.approx(b_1)
     assert second == pytest.approx(-1.28 - 1.44 * 2 * p + 0.18 * p * p)
     assert second < 0
-    assert dubins_disk.chain_at(load_problem(dubins_disk.DISK), p, dubins_disk.VALID_START)[
+    assert dubins_disk.chain_at(make_problem(dubins_disk.DISK), p, dubins_disk.VALID_START)[
         1
     ] == pytest.approx(0.99 * p)
 
@@ -222,7 +222,7 @@ def test_the_printed_start_of_the_disk_is_outside_the_kept_set(p, b_1):
 @pytest.mark.parametrize("p", [0.5, 1.0])
 def test_with_a_fine_period_the_exact_filter_follows_the_closed_form(p):
     dt = 0.002
-    world = load_problem(dubins_disk.DISK).configured(
+    world = make_problem(dubins_disk.DISK).configured(
         start=dubins_disk.PRINTED_START, dt=dt, horizon=2.6, box=(-1000.0, 1000.0)
     )
     (run,) = runs(world, [f"hocbf:p={p},{p}"], policy="zero", knowledge="plant")
@@ -232,7 +232,7 @@ def test_with_a_fine_period_the_exact_filter_follows_the_closed_form(p):
 
 
 def test_the_printed_differences_give_half_of_the_gain():
-    problem = load_problem(dubins_disk.DISK).configured(dt=1e-3)
+    problem = make_problem(dubins_disk.DISK).configured(dt=1e-3)
     _, share = printed_residuals(problem, QUICK, 0)
     assert share == pytest.approx(0.5, abs=1e-3)
 
@@ -334,7 +334,7 @@ def test_the_obstacle_is_drawn_where_it_is(outcomes):
 
 
 def test_the_printed_row_differs_from_the_derived_one_as_the_errata_say():
-    problem = load_problem(quadrotor.QUADROTOR)
+    problem = make_problem(quadrotor.QUADROTOR)
     barrier, model = problem.barriers[0], problem.model
     derived, printed = (
         condition.constraint(model, barrier)

@@ -7,14 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reproduce.chapter_3 import dubins_disk, dubins_learning, quadrotor
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import Run
 from safe_envs.scripts.reproduce.framework import verdict
 from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
 
 GOAL = (3.0, 1.5)
-OBSTACLE = load_problem(dubins_learning.OBSTACLE)
+OBSTACLE = make_problem(dubins_learning.OBSTACLE)
 
 
 def run_with(*h, at=(0.0, 0.0), lengths=()):

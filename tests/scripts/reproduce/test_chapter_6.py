@@ -12,7 +12,7 @@ import pytest
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.lie import derivatives, generator
 from safe_envs.errors import RelativeDegreeError
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reproduce.chapter_6 import (
     bayesian_cruise,
     bayesian_cubic,
@@ -121,7 +121,7 @@ def test_printed_numbers_and_settings_are_those_of_the_thesis():
     assert (cubic_drift.POINTS, cubic_drift.SHOWN, bayesian_cruise.FRESH) == (100, 30, 100)
     # Sec. 6.3.2: N = 300 and K = 10000 of DDSCBF; the starts are in the captions of the tables.
     assert (learning_times.POINTS, learning_times.GENERATOR_REPETITIONS) == (300, 10_000)
-    disk, car = load_problem(bayesian_cubic.ENV), load_problem(bayesian_cruise.ENV)
+    disk, car = make_problem(bayesian_cubic.ENV), make_problem(bayesian_cruise.ENV)
     starts = [disk.starts[name].state for name in bayesian_cubic.PLACES.values()] + [
         car.starts[car.start].state
     ]
@@ -181,7 +181,7 @@ def test_a_seed_gives_the_same_outcome_and_another_one_another(name):
 
 
 def test_the_error_of_the_drift_is_the_law_for_states_over_the_disk():
-    problem = load_problem(bayesian_cubic.ENV)
+    problem = make_problem(bayesian_cubic.ENV)
     x = np.random.default_rng(1).uniform(-0.6, 0.6, (400, 2))
     found = cubic_drift.study(problem, x, 10, range(6), 1000, 1)
     # Ten features, sigma = .2, K = 10, R = 1000, dt = .01. Near the centre the errors are smaller
@@ -242,7 +242,7 @@ def test_the_bounds_of_the_table_and_what_known_noise_makes_of_it():
 
 
 def test_the_printed_generator_of_the_disk_lacks_what_was_found():
-    problem = load_problem(bayesian_cubic.ENV)
+    problem = make_problem(bayesian_cubic.ENV)
     (x_1, x_2), (u,) = problem.plant.states, problem.plant.inputs
     printed = bayesian_cubic.printed_generator(problem)
     _, derived = derivatives(problem.plant, problem.barriers[0].expression, 1, generator)
@@ -252,7 +252,7 @@ def test_the_printed_generator_of_the_disk_lacks_what_was_found():
 
 
 def test_a_row_by_hand_gives_the_same_episodes_as_the_condition():
-    problem = load_problem(bayesian_cubic.ENV, {"start": "thesis-1"})
+    problem = make_problem(bayesian_cubic.ENV, start="thesis-1")
     (x_1, x_2), _ = problem.plant.states, problem.plant.inputs
     row = bayesian_cubic.printed_generator(problem) + x_1 * x_2
     by_hand = printed_totals(problem, row, 60, 0)
@@ -263,7 +263,7 @@ def test_a_row_by_hand_gives_the_same_episodes_as_the_condition():
 
 
 def test_the_printed_second_generator_of_the_car_is_not_safe():
-    problem = replace(load_problem(bayesian_cruise.ENV), horizon=24.0)
+    problem = replace(make_problem(bayesian_cruise.ENV), horizon=24.0)
     printed = printed_totals(problem, bayesian_cruise.printed_second_generator(problem), 20, 0)
     assert printed.safe < 6
     assert known(problem, 20, 0).rows[0]["safe"] > 12
@@ -287,7 +287,7 @@ def test_the_recursion_takes_longest():
 
 
 def test_a_controller_is_compared_on_the_episodes_of_the_reference():
-    problem = load_problem(bayesian_cubic.ENV, {"start": "thesis-2"})
+    problem = make_problem(bayesian_cubic.ENV, start="thesis-2")
     reference = known(problem, 30, 0)
     learned = identifications.identified(problem, 100, 0, bayesian_cubic.PRIOR)
     found = Learned.run(problem, "bayesian-scbf", [learned, learned], reference)
@@ -300,7 +300,7 @@ def test_a_controller_is_compared_on_the_episodes_of_the_reference():
 
 
 def test_an_identification_without_any_input_is_counted_as_the_bare_env(monkeypatch):
-    problem = load_problem(bayesian_cubic.ENV, {"start": "thesis-2"})
+    problem = make_problem(bayesian_cubic.ENV, start="thesis-2")
     reference = known(problem, 20, 0)
 
     def blind(*args, learned=(), **how):

@@ -11,7 +11,7 @@ import sympy as sp
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import Start
+from safe_envs.problem.initial_distribution import Start
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.verification.feasibility import verify
 from safe_envs.wrappers.verification.formulas import Formulas

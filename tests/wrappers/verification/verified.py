@@ -6,7 +6,9 @@ import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import SafetyProblem, Start, Variable
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import Variable
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.verification import extrema, safe_set_analysis, search
 from safe_envs.wrappers.verification.feasibility import verify

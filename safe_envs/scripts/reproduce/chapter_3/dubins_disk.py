@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     CORRECTED,
@@ -44,7 +44,7 @@ Learnings = Sequence[Sequence[Run]]  # one run for each gain, for each learning
 
 def disk(sample: Sample) -> SafetyProblem:
     """The problem, as long as the sample lets it be."""
-    world = load_problem(DISK)
+    world = make_problem(DISK)
     return world.configured(horizon=world.dt * sample.work(world.steps))
 
 
@@ -59,7 +59,7 @@ def compute_disk(sample: Sample) -> Outcome:
         for start, problem in at.items()
     }
     estimates, shares = zip(
-        *(printed_residuals(load_problem(DISK), sample, seed) for seed in seeds(sample)),
+        *(printed_residuals(make_problem(DISK), sample, seed) for seed in seeds(sample)),
         strict=True,
     )
     by_print = trajectories(at[PRINTED_START], estimates, _NO_MARGIN)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_3.dubins_disk import FIGURE as DISK_FIGURE
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
@@ -50,7 +50,7 @@ Ways = Mapping[
 def passages(sample: Sample, **model: float) -> dict[str, list[Run]]:
     """Trajectories around the obstacle: with learned derivatives for each learning, one each with
     others and without a filter."""
-    problem = load_problem(OBSTACLE, {"start": "thesis", "model": model or None})
+    problem = make_problem(OBSTACLE, start="thesis", model=model or None)
     exact = f"hocbf:p={OBSTACLE_RATES}"
     nominal, none = runs(problem, [exact, "none"])
     learned = [
@@ -67,7 +67,7 @@ def passages(sample: Sample, **model: float) -> dict[str, list[Run]]:
 
 def compute_passage(sample: Sample) -> Outcome:
     """The ways around the obstacle."""
-    found, problem = passages(sample), load_problem(OBSTACLE)
+    found, problem = passages(sample), make_problem(OBSTACLE)
     learned, none = found["learned"], found["none"][0]
     return Outcome(
         numbers=[
@@ -171,8 +171,8 @@ def _at(run: Run, time: float, dt: float) -> dict[str, Any]:
 
 def compute_clearance(sample: Sample) -> Outcome:
     """The barrier on the way around the obstacle."""
-    found, at_rest, problem = passages(sample), passages(sample, v_o=0.0), load_problem(OBSTACLE)
-    true_speed = load_problem(OBSTACLE, {"start": "thesis", "model": {"v": SPEED, "v_o": 0.0}})
+    found, at_rest, problem = passages(sample), passages(sample, v_o=0.0), make_problem(OBSTACLE)
+    true_speed = make_problem(OBSTACLE, start="thesis", model={"v": SPEED, "v_o": 0.0})
     blind = runs(true_speed, [f"hocbf:p={OBSTACLE_RATES}"])[0]
     return Outcome(
         numbers=_clearance_numbers(found),
@@ -332,7 +332,7 @@ def draw_clearance(figure: Figure, outcome: Outcome) -> None:
 
 def setting(sample: Sample) -> tuple[str, ...]:
     """How it is simulated."""
-    problem = load_problem(OBSTACLE)
+    problem = make_problem(OBSTACLE)
     plant, model = parameters(problem.plant), parameters(problem.model)
     return (
         (

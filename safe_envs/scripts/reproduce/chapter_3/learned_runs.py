@@ -15,7 +15,7 @@ from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS
 from safe_envs.scripts.reproduce.framework.artefact import Number, Sample
 from safe_envs.wrappers.learning.residual import ResidualModel, learn_residual
@@ -113,7 +113,7 @@ def parameters(system: ControlAffineSDE) -> dict[str, float]:
 def residuals(env_id: str, sample: Sample, **model: float) -> tuple[ResidualModel, ...]:
     """What is learned of a problem, anew for each repetition; remembered, for two figures show the
     same."""
-    problem = load_problem(env_id, {"model": model or None})
+    problem = make_problem(env_id, model=model or None)
     states, epochs = settings(sample)
     return tuple(
         learn_residual(problem, states=states, label_dt=LABEL_STEP, epochs=epochs, seed=seed)

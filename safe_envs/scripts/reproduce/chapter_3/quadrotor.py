@@ -15,7 +15,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     CORRECTED,
@@ -134,7 +134,7 @@ def compute(sample: Sample) -> Outcome:
 
 def hover(sample: Sample) -> SafetyProblem:
     """The problem from the printed start, as long as the sample lets it be."""
-    problem = load_problem(QUADROTOR, {"start": "thesis"})
+    problem = make_problem(QUADROTOR, start="thesis")
     return problem.configured(horizon=problem.dt * max(LEAST_STEPS, sample.work(problem.steps)))
 
 

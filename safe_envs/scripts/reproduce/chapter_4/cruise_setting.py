@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from scipy.special import ndtr
 
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.systems.acc import WEIGHT
 
 ACC = "safe_envs/ACC-v0"
@@ -55,7 +55,7 @@ class CruiseSettings:
             "dt": step,
             "horizon": HORIZON,
         }
-        return load_problem(ACC, options)
+        return make_problem(ACC, **options)
 
     @property
     def filters(self) -> dict[str, str]:

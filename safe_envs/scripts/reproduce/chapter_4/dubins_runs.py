@@ -16,7 +16,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reproduce.chapter_4.paired_episodes import Exits, difference, exits
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Outcome
 from safe_envs.wrappers import AffineConstraint, Condition
@@ -108,7 +108,7 @@ PRINTED_FORM = {name: PrintedSZCBF(alphas) for name, alphas in ALPHAS.items()}
 def dubins_problem(noise: float, start: Any) -> SafetyProblem:
     """The vehicle up to the longest horizon."""
     options = {"noise": noise, "start": start, "box": BOX, "dt": STEP, "horizon": max(HORIZONS)}
-    return load_problem(DUBINS, {**options, "barrier": {"radius": RADIUS}})
+    return make_problem(DUBINS, **options, barrier={"radius": RADIUS})
 
 
 def simulate(

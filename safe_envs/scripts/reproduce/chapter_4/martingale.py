@@ -18,8 +18,10 @@ from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import SafetyProblem, Start, Variable
-from safe_envs.registry import load_problem
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import Variable
+from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 from safe_envs.wrappers import SafetyFilter, parse_conditions
@@ -76,7 +78,7 @@ def setting(sample: Sample) -> tuple[str, ...]:
 def largest_inputs(text: str, noise: float) -> np.ndarray:
     """The largest u that a condition allows at each of `DISTANCES`: a filter's answer to a far
     larger one."""
-    problem = load_problem(SCALAR, {"noise": noise, "box": [-UNBOUNDED, UNBOUNDED]})
+    problem = make_problem(SCALAR, noise=noise, box=[-UNBOUNDED, UNBOUNDED])
     answer = SafetyFilter.for_problem(problem, parse_conditions(text, problem))
     state = (1.0 - DISTANCES)[:, None]
     return answer.filter(state, np.full_like(state, UNBOUNDED)).action[:, 0]

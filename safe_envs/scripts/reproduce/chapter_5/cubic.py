@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
     FIT_ERRATA,
     draw_learning,
@@ -176,7 +176,7 @@ def beside_no_filter(found: Levels) -> list[str]:
 
 def _no_bound(sample: Sample) -> list[str]:
     """Why h/sup h says nothing here."""
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     condition = SCBF().constraint(problem.model, problem.barriers[0])
     read = compile_function(
         problem.model.states,

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_5.cubic import ALPHA, CBF, ENV, LEVELS, START, STATES, TASK
 from safe_envs.scripts.reproduce.chapter_5.noise_terms import lessons
@@ -195,7 +195,7 @@ _CLAIMS: dict[str, Callable[[Mapping[str, Path]], Claim]] = {
 
 def draw_paths(figure: Figure, outcome: Outcome) -> None:
     """Trajectories in the plane, one of them bold, with the unsafe region."""
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     axes = figure.subplots()
     lines = [np.array(line) for line in outcome.data["paths"]]
     for line in reversed(lines[1:]):

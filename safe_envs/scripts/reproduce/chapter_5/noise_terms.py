@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient, ito_correction
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legend
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Outcome, Sample
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
@@ -79,7 +79,7 @@ def lesson(
 ) -> Lesson:
     """Follow Algorithm 2 at one noise level, by the repaired and by the printed estimator; `whole`
     adds all labels."""
-    problem = load_problem(env_id, {"noise": noise})
+    problem = make_problem(env_id, noise=noise)
     data = collect(problem, points, repetitions, [[0.0]], seed=seed)
     estimators: tuple[Estimator, ...] = ("martingale", "printed")
     learned = {
@@ -150,7 +150,7 @@ def learning_outcome(
         formula: the same as a function of the state.
         sample: how much is simulated.
     """
-    problem, learned = load_problem(env_id, {"noise": noise}), lessons(env_id, noise, sample)
+    problem, learned = make_problem(env_id, noise=noise), lessons(env_id, noise, sample)
     first = learned[0]
     x = [draw_states(problem, VALIDATION, np.random.default_rng(each.seed)) for each in learned]
     repaired, printed = (

@@ -11,7 +11,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.bound_check import starts_of
 from safe_envs.agents.evaluation.contradiction import by_rate
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
     FIT_ERRATA,
     Lesson,
@@ -231,7 +231,7 @@ def _horizons(setting: Setting, sample: Sample) -> str:
 
 def _bounds(first: Lesson, scbf: Runs, sample: Sample) -> list[str]:
     """What Prop. 4.2.8 gives, and what Prop. 5.2.2 asks for at the origin."""
-    problem, model = load_problem(ENV, B.options(sample)), first.learned["martingale"]
+    problem, model = make_problem(ENV, **B.options(sample)), first.learned["martingale"]
     margin = next(iter(model.record.errors.values()))
     slack = float(
         np.max(

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
     FIT_ERRATA,
@@ -67,7 +67,7 @@ PRINTED = {"SCBF": 83, "DDSCBF": 65, "Bayesian SCBF": 78}
 
 
 def _drift_picture(sample: Sample) -> Outcome:
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     x = draw_states(problem, FRESH, np.random.default_rng([sample.seed, 64]))
     truth, chosen = true_drift(problem, x), seeds(sample, _IDENTIFICATIONS)
     learned = [identified(problem, REPETITIONS[-1], seed, PRIOR) for seed in chosen]
@@ -165,7 +165,7 @@ def _draw_drift(figure: Figure, outcome: Outcome) -> None:
 
 
 def _noise_picture(sample: Sample) -> Outcome:
-    return noise_levels(load_problem(ENV), sample, PRIOR, ("m/s/sqrt(s)", "m/sqrt(s)"))
+    return noise_levels(make_problem(ENV), sample, PRIOR, ("m/s/sqrt(s)", "m/sqrt(s)"))
 
 
 def printed_second_generator(problem: SafetyProblem) -> Any:
@@ -185,7 +185,7 @@ def printed_second_generator(problem: SafetyProblem) -> Any:
 
 
 def _world(sample: Sample) -> SafetyProblem:
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     return replace(problem, horizon=_QUICK_HORIZON) if sample.quick else problem
 
 

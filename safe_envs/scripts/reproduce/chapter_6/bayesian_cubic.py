@@ -10,7 +10,7 @@ from typing import Any
 from safe_envs.agents.evaluation.contradiction import by_rate
 from safe_envs.agents.evaluation.evaluate import Evaluation, evaluate
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reproduce.chapter_6 import cubic_drift
 from safe_envs.scripts.reproduce.chapter_6.cubic_drift import DATA, ENV, PRIOR
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
@@ -62,7 +62,7 @@ PLACES = {"(-.1, .7)": "thesis-1", "(-.1, .8)": "thesis-2"}
 
 
 def _noise_picture(sample: Sample) -> Outcome:
-    return noise_levels(load_problem(ENV), sample, PRIOR, ("1/sqrt(s)", "1/sqrt(s)"))
+    return noise_levels(make_problem(ENV), sample, PRIOR, ("1/sqrt(s)", "1/sqrt(s)"))
 
 
 def printed_generator(problem: SafetyProblem) -> Any:
@@ -234,7 +234,7 @@ class _Place:
 
 
 def _rates(sample: Sample) -> Outcome:
-    world = load_problem(ENV)
+    world = make_problem(ENV)
     models, found = _Models.learn(world, sample), verify(world, [SCBF()], seed=sample.seed)
     worst = _Worst(float(found.analysis.suprema[0]), float(found.analysis.max_shortfall[0]))
     places = [_Place.run(i, world, models, worst, sample) for i in range(len(PLACES))]

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from safe_envs.agents.evaluation.statistics import repeated_interval
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
     AT_REST,
@@ -163,7 +163,7 @@ def falls_as_printed(
 
 
 def _drift_errors(sample: Sample) -> Outcome:
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     x = draw_states(problem, POINTS, np.random.default_rng([sample.seed, 61]))
     chosen = seeds(sample, _IDENTIFICATIONS)
     found = {k: study(problem, x, k, chosen, STARTS, STEPS) for k in REPETITIONS}
@@ -220,7 +220,7 @@ def _beside_the_law(problem: SafetyProblem, x: np.ndarray, chosen: range, follow
 
 
 def _drift_picture(sample: Sample) -> Outcome:
-    problem = load_problem(ENV)
+    problem = make_problem(ENV)
     x = draw_states(problem, SHOWN, np.random.default_rng([sample.seed, 62]))
     x = x[x[:, 0].argsort()]
     chosen = seeds(sample, _PICTURED)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import time
 from functools import cache
 
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reproduce.chapter_6.identifications import (
     REPETITIONS,
     STARTS,
@@ -36,7 +36,7 @@ _FAR_LESS = 10.0
 def _recursion(seed: int, points: int, repetitions: int) -> GeneratorModel:
     """DDSCBF's networks of both orders, by the printed estimate; learned once for both tables."""
     return learn_generator(
-        load_problem(ENV),
+        make_problem(ENV),
         points=points,
         repetitions=repetitions,
         way="network",
@@ -71,7 +71,7 @@ def sooner(ratio: float) -> list[Claim]:
 
 def _runtimes(sample: Sample) -> Outcome:
     problem, points, repetitions = (
-        load_problem(ENV),
+        make_problem(ENV),
         sample.work(POINTS),
         sample.work(GENERATOR_REPETITIONS),
     )

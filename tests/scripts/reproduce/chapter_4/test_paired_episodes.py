@@ -8,7 +8,7 @@ import pytest
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
 from safe_envs.agents.policies.nominal import ZeroController
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.scripts.reproduce.chapter_4.paired_episodes import (
     difference,
     exits,
@@ -20,7 +20,7 @@ from safe_envs.scripts.reproduce.chapter_4.paired_episodes import (
 
 def test_exits_are_those_of_an_evaluation() -> None:
     """The same episodes, counted the same way, at each instant and in more than one wave."""
-    problem = load_problem("safe_envs/StochasticDubins-v0", {"start": "uniform", "horizon": 0.5})
+    problem = make_problem("safe_envs/StochasticDubins-v0", start="uniform", horizon=0.5)
     found = exits(problem, "scbf", ZeroController(problem), 1100, 3)
     row = evaluate(problem, "zero", ["scbf"], episodes=1100, seed=3, bounds=False).rows[0]
     assert [found.safe(k).sum() for k in range(problem.steps + 1)] == row["curve"]["safe"]

@@ -14,7 +14,7 @@ from safe_envs import ENV_IDS
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.sampling_domain import SamplingDomain
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.wrappers.learning.data import collection as module
 from safe_envs.wrappers.learning.data.collection import (
     collect,
@@ -24,8 +24,8 @@ from safe_envs.wrappers.learning.data.collection import (
     plant_step,
 )
 
-DISK = load_problem("safe_envs/CubicSDEDisk-v0")
-SMOOTH = load_problem("safe_envs/CubicSDEDisk-v0", {"noise": 0.0})
+DISK = make_problem("safe_envs/CubicSDEDisk-v0")
+SMOOTH = make_problem("safe_envs/CubicSDEDisk-v0", noise=0.0)
 
 
 def rates(x, u):
@@ -125,7 +125,7 @@ def test_dt_is_that_of_the_step():
 
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_all_data_are_from_where_a_problem_is_explored(env_id):
-    problem = load_problem(env_id)
+    problem = make_problem(env_id)
     data = collect(problem, 5, steps=20)
     low, high = np.array(problem.exploration.region).T
     assert ((low <= data.x) & (data.x <= high)).all()
@@ -320,7 +320,7 @@ class TestEnvStep:
         np.testing.assert_array_equal(x, before)
 
     def test_it_feeds_the_collector(self, pendulum):
-        problem = load_problem("safe_envs/Pendulum-v0")
+        problem = make_problem("safe_envs/Pendulum-v0")
         step = env_step(
             pendulum,
             self.set_state,
@@ -371,6 +371,6 @@ def test_numbers_of_numpy_are_numbers():
 @pytest.mark.parametrize("problem", ["safe_envs/Pendulum-v0", None])
 def test_what_is_no_problem_is_refused(problem):
     with pytest.raises(
-        ConfigurationError, match=r"problem = .* give a SafetyProblem, as load_problem"
+        ConfigurationError, match=r"problem = .* give a SafetyProblem, as make_problem"
     ):
         collect(problem, 3)

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError, InvalidInputError
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.models import files
 from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.models.values import LearnedFileError
 
-DISK = load_problem("safe_envs/CubicSDEDisk-v0")
+DISK = make_problem("safe_envs/CubicSDEDisk-v0")
 SIGNATURE = Signature.of(DISK)
 
 
@@ -201,7 +201,7 @@ def test_data_of_another_problem_are_told_from_models():
         LearnedFileError,
         match="the data are of another problem: its system: CubicSDEDisk, that of Scalar",
     ):
-        logged().require(load_problem("safe_envs/Scalar-v0"))
+        logged().require(make_problem("safe_envs/Scalar-v0"))
 
 
 def test_a_seed_of_numpy_is_kept(tmp_path):

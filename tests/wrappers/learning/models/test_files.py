@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.wrappers.learning import load_learned
 from safe_envs.wrappers.learning.models.files import load, save
 from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.models.values import LearnedFileError
 
-DISK = load_problem("safe_envs/CubicSDEDisk-v0")
+DISK = make_problem("safe_envs/CubicSDEDisk-v0")
 SIGNATURE = Signature.of(DISK)
 ARRAYS = {"weights": np.linspace(0.0, 1.0, 40).reshape(8, 5), "count": np.array(3)}
 DETAILS = {"degree": 3, "names": ["f", "g"], "scale": 0.1}
@@ -212,21 +212,21 @@ def test_another_system_is_refused():
     with pytest.raises(
         LearnedFileError, match="its system: CubicSDEDisk, that of Scalar: Scalar; learn again"
     ):
-        SIGNATURE.require(load_problem("safe_envs/Scalar-v0"))
+        SIGNATURE.require(make_problem("safe_envs/Scalar-v0"))
     with pytest.raises(LearnedFileError, match="its state units"):
         replace(SIGNATURE, state_units=("m", "m")).require(DISK)
 
 
 def test_what_else_has_to_fit():
-    slower = load_problem("safe_envs/CubicSDEDisk-v0", {"dt": 0.02})
+    slower = make_problem("safe_envs/CubicSDEDisk-v0", dt=0.02)
     SIGNATURE.require(slower, "barriers", "model")
     with pytest.raises(LearnedFileError, match=r"its dt: 0\.01, that of CubicSDEDisk: 0\.02"):
         SIGNATURE.require(slower, "dt")
-    noisier = load_problem("safe_envs/CubicSDEDisk-v0", {"noise": 0.5})
+    noisier = make_problem("safe_envs/CubicSDEDisk-v0", noise=0.5)
     SIGNATURE.require(noisier, "barriers", "dt")
     with pytest.raises(LearnedFileError, match="its model"):
         SIGNATURE.require(noisier, "model")
-    smaller = load_problem("safe_envs/CubicSDEDisk-v0", {"barrier": {"radius": 0.5}})
+    smaller = make_problem("safe_envs/CubicSDEDisk-v0", barrier={"radius": 0.5})
     SIGNATURE.require(smaller, "model", "dt")
     with pytest.raises(LearnedFileError, match="its barriers"):
         SIGNATURE.require(smaller, "barriers")
@@ -243,7 +243,7 @@ def test_data_are_no_model(tmp_path):
 
 
 def test_the_plant_is_kept_and_compared_but_not_required(tmp_path):
-    other = load_problem("safe_envs/CubicSDEDisk-v0", {"plant": {"a": 0.8}})
+    other = make_problem("safe_envs/CubicSDEDisk-v0", plant={"a": 0.8})
     signature = Signature.of(other)
     signature.require(DISK, "model", "barriers", "dt")
     save(tmp_path / "model.npz", "regression", signature, DETAILS, ARRAYS)

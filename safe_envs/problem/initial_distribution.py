@@ -1,0 +1,87 @@
+"""Distributions of the initial state, and draws from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.codegen import Components, compile_function, stacked
+from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.errors import ConfigurationError
+
+_TRIES_AT_ONCE = 4
+_MOST_TRIES = 10_000
+
+
+@dataclass(frozen=True)
+class Start:
+    """Distribution of the initial state: a map of independent uniforms on [0, 1), restricted to
+    `condition` > 0."""
+
+    state: tuple[sp.Expr, ...]
+    uniforms: tuple[sp.Symbol, ...] = ()
+    condition: sp.Expr | None = None
+
+    @classmethod
+    def at(cls, values: Sequence[float]) -> Start:
+        """Return the distribution of a fixed initial state."""
+        return cls(tuple(sp.Float(v, 17) for v in values))
+
+    def proposals(self, count: int) -> np.ndarray:
+        """Return some states, always the same, whether or not they meet the condition.
+
+        Args:
+            count: how many.
+
+        Returns:
+            Shape (count, n).
+        """
+        uniforms = np.random.default_rng(0).random((len(self.uniforms), count))
+        return stacked(compile_function(self.uniforms, self.state, "arrays")(*uniforms), count)
+
+
+class StartSampler:
+    """Draws from a `Start` by rejection.
+
+    Args:
+        start: the distribution.
+        model: by whose parameters its condition is evaluated.
+        title: name of the distribution, for errors.
+    """
+
+    def __init__(self, start: Start, model: ControlAffineSDE, title: str) -> None:
+        self._title = title
+        self._uniforms = len(start.uniforms)
+        # Few envs start together, and each from numbers of its own: plain floats are fastest.
+        self._state = compile_function(start.uniforms, start.state, "floats")
+        self._tries, self._accept = 1, None
+        if start.condition is not None:
+            condition = model.numeric(start.condition)
+            self._tries = _TRIES_AT_ONCE
+            self._accept = compile_function(model.states, (condition,), "floats")
+
+    def draw(self, rng: np.random.Generator) -> Components:
+        """Draw an initial state: a plain float for each state.
+
+        Raises:
+            ConfigurationError: The condition is hardly ever met.
+        """
+        for _ in range(_MOST_TRIES // self._tries):
+            for uniforms in rng.random((self._tries, self._uniforms)).tolist():
+                x = self._state(*uniforms)
+                if self._accept is None or self._accept(*x)[0] > 0:
+                    return x
+        raise ConfigurationError(
+            f"no start of {self._title} met the condition of the distribution in {_MOST_TRIES}"
+            " tries; give a fixed start or another distribution"
+        )
+
+    def draw_batch(self, rngs: Sequence[np.random.Generator]) -> np.ndarray:
+        """Draw an initial state from each generator; shape (n, len(rngs))."""
+        if rngs and not self._uniforms:
+            # Nothing is drawn for a fixed start.
+            return np.repeat(np.array([self.draw(rngs[0])], dtype=float).T, len(rngs), axis=1)
+        return np.array([self.draw(rng) for rng in rngs], dtype=float).T.copy()

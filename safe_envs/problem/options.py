@@ -1,0 +1,148 @@
+"""The options of a problem: the one schema behind `gym.make`, the command line and sweeps.
+
+A new option is a field of `ProblemOptions`, and what it changes in `SafetyProblem.configured`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from typing import Any
+
+from safe_envs.errors import ConfigurationError, nearest, shown
+from safe_envs.number_text import finite_number, named_values, numbers
+
+Reader = Callable[[str, Any], Any]
+"""From the name of an option and its text (texts, where it is repeatable) to its value."""
+
+
+def _read_noise(option: str, text: str) -> float | list[float]:
+    levels = numbers(option, text)
+    return levels[0] if len(levels) == 1 else levels
+
+
+def _read_start(option: str, text: str) -> str | list[float]:
+    try:
+        return numbers(option, text)
+    except ConfigurationError:
+        if "," in text:
+            raise
+        return text
+
+
+def _read_box(option: str, texts: Sequence[str]) -> list[float] | list[list[float]]:
+    pairs = [numbers(option, text) for text in texts]
+    for text, pair in zip(texts, pairs, strict=True):
+        if len(pair) != 2:
+            raise ConfigurationError(f"{option} {shown(text)} has {len(pair)} numbers; give LO,HI")
+    return pairs[0] if len(pairs) == 1 else pairs
+
+
+def _option(
+    text: str, reader: Reader | None = None, metavar: str | None = None, repeatable: bool = False
+) -> Any:
+    """Return a field with what a command line needs: the reader is None where a number is read."""
+    of_texts = {"reader": reader, "metavar": metavar, "repeatable": repeatable}
+    return field(default=None, metadata={"help": text, **of_texts})
+
+
+def _parameters(text: str, words: bool = False) -> Any:
+    return _option(f"{text} Repeatable.", partial(named_values, words=words), "K=V", True)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProblemOptions:
+    """What may be changed in a problem; None keeps the problem's own value.
+
+    Attributes:
+        noise: diffusion of plant and model alike, one number for all channels or one for each; 0
+            turns it off.
+        plant: parameters of the simulated system, by name.
+        model: parameters that the designer believes, by name.
+        barrier: arguments of the function that builds the problem (of its barrier, mostly), by
+            name.
+        dt: control period in s.
+        substeps: integration steps in a control period.
+        horizon: length of an episode in s.
+        box: physical bounds (low, high) of every input, or one such pair for each.
+        start: name of an initial distribution, or a fixed initial state.
+
+    Raises:
+        ConfigurationError: A value is of the wrong kind.
+    """
+
+    noise: float | Sequence[float] | None = _option(
+        "Diffusion, one number for all channels or one for each (.1,.2); 0 turns it off.",
+        _read_noise,
+        "X",
+    )
+    plant: Mapping[str, float] | None = _parameters("Parameter of the simulated system.")
+    model: Mapping[str, float] | None = _parameters("Parameter that the designer believes.")
+    barrier: Mapping[str, Any] | None = _parameters("Argument of the barrier.", words=True)
+    dt: float | None = _option("Control period in s.")
+    substeps: int | None = _option("Integration steps in a control period.")
+    horizon: float | None = _option("Length of an episode in s.")
+    box: Sequence[Any] | None = _option(
+        "Physical bounds of all inputs, or once for each.", _read_box, "LO,HI", True
+    )
+    start: str | Sequence[float] | None = _option(
+        "Initial state, or the name of a distribution.", _read_start, "A,B,.."
+    )
+
+    def __post_init__(self) -> None:
+        for name in PARAMETER_GROUPS:
+            values = getattr(self, name)
+            if values is not None and not (
+                isinstance(values, Mapping) and all(isinstance(key, str) for key in values)
+            ):
+                raise ConfigurationError(
+                    f"{name} = {values!r}; give a dictionary of names and values"
+                )
+        for name in ("dt", "horizon"):
+            if getattr(self, name) is not None:
+                object.__setattr__(self, name, finite_number(name, getattr(self, name)))
+
+    @classmethod
+    def of(
+        cls, title: str, arguments: Mapping[str, Any], of_barrier: Collection[str]
+    ) -> ProblemOptions:
+        """Sort the arguments of `gym.make`.
+
+        Args:
+            title: name of the env, for errors.
+            arguments: options, and arguments of the barrier by themselves.
+            of_barrier: names of the arguments that the barrier has.
+
+        Raises:
+            ConfigurationError: An argument is unknown or of the wrong kind.
+        """
+        apart = {name: value for name, value in arguments.items() if name in of_barrier}
+        options = {name: value for name, value in arguments.items() if name not in of_barrier}
+        _require_known(f"{title} has no argument", options, (*OPTION_NAMES, *of_barrier))
+        found = cls(**options)
+        barrier = {**(found.barrier or {}), **apart}
+        _require_known(f"{title} has no barrier argument", barrier, of_barrier)
+        return replace(found, barrier=barrier)
+
+    @property
+    def changes(self) -> dict[str, Any]:
+        """The options that are given, by name, without those of the barrier."""
+        return {
+            name: value
+            for name in OPTION_NAMES
+            if name != "barrier" and (value := getattr(self, name)) is not None
+        }
+
+
+OPTION_NAMES = tuple(option.name for option in fields(ProblemOptions))
+"""Every option, in the order of the command line."""
+
+PARAMETER_GROUPS = ("plant", "model", "barrier")
+"""The options that are values by name."""
+
+
+def _require_known(complaint: str, given: Mapping[str, Any], allowed: Collection[str]) -> None:
+    for name in given:
+        if name not in allowed:
+            raise ConfigurationError(f"{complaint} {shown(name)}; {nearest(name, allowed)}")

@@ -1,0 +1,71 @@
+"""The options of a problem: read from texts, checked, and the same for every interface."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import pytest
+
+from safe_envs import ConfigurationError
+from safe_envs.agents.sweeps.cell import ENV_OPTIONS
+from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS, ProblemOptions
+from safe_envs.registry import make_problem
+
+READERS = {option.name: option.metadata["reader"] for option in fields(ProblemOptions)}
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "value"),
+    [
+        ("noise", "0.2", 0.2),
+        ("noise", "0.1,.2,0", [0.1, 0.2, 0.0]),
+        ("start", "-1,2e1,.5", [-1.0, 20.0, 0.5]),
+        ("start", "inward", "inward"),
+        ("box", ["-1,2"], [-1.0, 2.0]),
+        ("box", ["-1,2", "0,3"], [[-1.0, 2.0], [0.0, 3.0]]),
+        ("plant", ["v=.8", "m=-2"], {"v": 0.8, "m": -2}),
+        ("barrier", ["kind=round", "power=3", "D=3.0"], {"kind": "round", "power": 3, "D": 3.0}),
+    ],
+)
+def test_texts_become_values(name, text, value):
+    assert repr(READERS[name](name, text)) == repr(value)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("noise", "a", "--noise 'a'"),
+        ("noise", "", "--noise ''"),
+        ("start", "1,b", "--start '1,b'"),
+        ("box", ["1"], "--box '1' has 1 numbers; give LO,HI"),
+        ("box", ["1,2,3"], "--box '1,2,3' has 3 numbers"),
+        ("box", ["a,b"], "--box 'a,b'"),
+        ("plant", ["v"], "--plant 'v' is not of this form; give NAME=VALUE"),
+        ("plant", ["=1"], "NAME=VALUE"),
+        ("plant", ["v="], "NAME=VALUE"),
+        ("plant", ["v=1", "v=2"], "comes twice"),
+        ("model", ["v=fast"], "'fast' is not a number"),
+    ],
+)
+def test_texts_of_another_form_are_named(name, text, message):
+    with pytest.raises(ConfigurationError, match=message):
+        READERS[name](f"--{name}", text)
+
+
+def test_every_option_can_be_varied_by_a_sweep():
+    assert {*ENV_OPTIONS, *PARAMETER_GROUPS} == {"system", *OPTION_NAMES}
+
+
+def test_arguments_of_the_barrier_go_to_its_function():
+    problem = make_problem("Scalar-v0", noise=0.0, limit=2.0)
+    assert problem == make_problem("Scalar-v0", barrier={"limit": 2.0}).configured(noise=0.0)
+    with pytest.raises(ConfigurationError, match="no barrier argument"):
+        problem.configured(barrier={"limit": 1.0})
+    with pytest.raises(ConfigurationError, match="did you mean 'noise'"):
+        problem.configured(nois=0.0)
+
+
+@pytest.mark.parametrize("options", [{"dt": "fast"}, {"horizon": float("nan")}, {"plant": 3}])
+def test_values_of_another_kind_are_refused(options):
+    with pytest.raises(ConfigurationError, match=f"{next(iter(options))} = "):
+        ProblemOptions(**options)
