@@ -17,7 +17,8 @@ from matplotlib.ticker import MaxNLocator
 
 from safe_envs.atomic_io import write_atomically
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, add_legend
-from safe_envs.scripts.reports.identify_report import Function, Identification, percent
+from safe_envs.scripts.reports.identify_answer import Function, Identification
+from safe_envs.scripts.reports.quantities import relative_text
 from safe_envs.wrappers.learning.posterior import Diffusion, Posterior
 from safe_envs.wrappers.learning.regression import sigma_samples
 
@@ -48,7 +49,7 @@ def draw(found: Identification, path: Path) -> None:
         path: of the picture; its suffix is the format.
     """
     levels = _levels(found)
-    rest = [function for function in found.shown if function.name not in levels]
+    rest = [f for f in found.compared if not f.vanishes and f.name not in levels]
     shown = sorted(rest, key=lambda function: (-function.size, -function.error))[
         : _MOST - len(levels)
     ]
@@ -81,9 +82,9 @@ def draw(found: Identification, path: Path) -> None:
 def _levels(found: Identification) -> dict[str, tuple[int, Function]]:
     """The constant variances that are shown as posteriors of sigma, by name, with their state."""
     diffusion = _constant_noise(found)
-    if diffusion is None or isinstance(found.functions, str):
+    named = {function.name: function for function in found.compared}
+    if diffusion is None or not named:
         return {}
-    named = {function.name: function for function in found.functions}
     names = [f"covariance[{s}, {s}]" for s in found.problem.plant.states]
     noisy = [
         (i, named[name])
@@ -106,7 +107,7 @@ def _constant_noise(found: Identification) -> Diffusion | None:
 def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
     """The estimates against a truth that varies, and how often they occur for one that does not;
     returns what the legend needs."""
-    off = "truth 0" if function.relative is None else f"error {percent(function.relative)}"
+    off = "truth 0" if function.relative is None else f"error {relative_text(function.relative)}"
     axes.set_title(f"{function.name}: {off}")
     power = _power(np.concatenate([function.truth, function.estimate]))
     truth, estimate = function.truth / 10.0**power, function.estimate / 10.0**power

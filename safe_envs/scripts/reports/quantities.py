@@ -12,6 +12,8 @@ from safe_envs.scripts.reports.rates import percent
 _NOTHING = 1e-6
 """Accuracy of a coordinate of a state found by a search, in parts of the workspace."""
 
+_ROUNDING = 1e-8
+
 
 def state_text(problem: SafetyProblem, x: np.ndarray) -> str:
     """Return a state as "(x = 1, v = 0.5)".
@@ -40,3 +42,10 @@ def share_text(share: float | None) -> str:
     if share is None or share == 0.0 or share >= 0.01:
         return percent(share)
     return f"{100 * share:.2g} %"
+
+
+def relative_text(share: float) -> str:
+    """Return a relative error in per cent with two digits; below the rounding error, its bound."""
+    if share < _ROUNDING:
+        return f"< {100 * _ROUNDING:g} %"
+    return f"{100 * share:.0f} %" if share >= 0.1 else f"{100 * share:.2g} %"
