@@ -1,5 +1,4 @@
-"""`safe-envs benchmark`: the speed of filters, envs and learning, with a hand-written loop as the
-limit."""
+"""`safe-envs benchmark`: the speed of filters, envs and learning."""
 
 from __future__ import annotations
 

@@ -63,8 +63,7 @@ def verify(
         ),
     ] = None,
 ) -> None:
-    """Print where the filter's conditions cannot be met, and compare bounds on its safety with a
-    simulation.
+    """Print where a filter's conditions cannot be met, and its bounds next to a simulation.
 
     The safe set C is sampled, and searched for the worst states: where the input has no effect,
     where no action within the input bounds meets the conditions, and the suprema that the bounds

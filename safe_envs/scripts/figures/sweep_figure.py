@@ -1,4 +1,4 @@
-"""The picture of a sweep: safety rates over a swept setting, with bands."""
+"""The picture of a sweep: safety rates over a swept setting, with confidence bands."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _COLUMNS = 3
 
 Row = dict[str, Any]
 Rate = tuple[float, float, float]
-"""Of safe episodes, and the ends of its interval."""
+"""The share of safe episodes, and the ends of its interval."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Which swept setting is where.
+    """The place of each swept setting.
 
     Attributes:
         x: across; None where nothing but seeds was swept.
@@ -51,8 +51,17 @@ class Layout:
         x: str | None = None,
         lines: str | None = None,
     ) -> Layout:
-        """The given settings, or else the one with most numbers across, and the filter, or the one
-        with most values, as lines."""
+        """Choose the places of settings that are not given.
+
+        Args:
+            rows: of the cells.
+            swept: names of the settings.
+            x: setting across; by default a number with most values.
+            lines: setting with a line for each value; by default the filter, or that with most.
+
+        Returns:
+            The layout, with all other settings as panels.
+        """
         rest = [
             name
             for name in swept
@@ -76,11 +85,11 @@ def draw(rows: Sequence[Row], layout: Layout, path: Path) -> int:
 
     Args:
         rows: of `safe_envs.agents.sweeps.store.read`.
-        layout: which setting is where.
+        layout: places of the settings.
         path: of the picture.
 
     Returns:
-        How many panels there was no room for.
+        The number of panels without room.
 
     Raises:
         ConfigurationError: the picture cannot be written.
@@ -109,13 +118,13 @@ def draw(rows: Sequence[Row], layout: Layout, path: Path) -> int:
 
 
 def _common(rows: Sequence[Row]) -> str:
-    """What all cells simulate, if it is one env."""
+    """Return the env of the cells, if all have the same."""
     titles = {json.loads(row["config"])["title"] for row in rows}
     return f"{titles.pop()}: " if len(titles) == 1 else ""
 
 
 def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Sequence[Row]) -> None:
-    """Rates over the setting across: with bands where it is a number, and else with bars."""
+    """Draw rates over the setting across: with bands if it is a number, otherwise with bars."""
     numeric = layout.x is not None and _is_numeric(everything, layout.x)
     places = [None] if layout.x is None else _values(everything, layout.x)
     position: dict[Any, Any] = {value: value if numeric else k for k, value in enumerate(places)}
@@ -141,7 +150,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
         if numeric:
             _draw_band(axes, found, color, label)
         else:
-            # Beside each other, since they would hide each other.
+            # Next to each other, since they would hide each other.
             _draw_bars(
                 axes,
                 [(at + 0.12 * (k - (len(kinds) - 1) / 2), rate) for at, rate in found],
@@ -159,7 +168,7 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
 
 
 def _shades(count: int) -> list[Any]:
-    """Colours in the order of numbers."""
+    """Return colours in the order of numbers."""
     return [mpl.colormaps["viridis"](0.9 * k / max(count - 1, 1)) for k in range(count)]
 
 
@@ -191,11 +200,10 @@ def _at(rows: Iterable[Row], name: str | None, value: Any) -> list[Row]:
 
 
 def _rate(rows: Sequence[Row]) -> Rate | None:
-    """The rate of cells that differ in their seeds only, whose episodes are independent; None
-    without any.
+    """Return the rate of cells that differ in their seeds only; None without cells.
 
-    Where each seed learned anew what its filter rests on, its episodes have that in common, and the
-    interval is over both.
+    Their episodes are independent, unless the filter was retrained for each seed: then the interval
+    is over models and episodes.
     """
     if not rows:
         return None
@@ -211,13 +219,12 @@ def _rate(rows: Sequence[Row]) -> Rate | None:
 
 
 def _learned(row: Row) -> tuple[str, ...]:
-    """Checksums of the models on which the filter of a cell rests; none for one that learned
-    nothing."""
+    """Return checksums of the models of a filter; none if it learned nothing."""
     return tuple((json.loads(row["row"])["learning"] or {}).get("sha256", ()))
 
 
 def _values(rows: Sequence[Row], name: str) -> list[Any]:
-    """The values of a setting in the order of the cells, numbers by their size."""
+    """Return the values of a setting in the order of the cells, numbers by their size."""
     values = list(dict.fromkeys(row[name] for row in rows))
     return sorted(values) if _is_numeric(rows, name) else values
 

@@ -1,5 +1,4 @@
-"""What a shell offers after a part of a word. Nothing heavy is imported: it answers between two
-keystrokes."""
+"""Completion of words in a shell; no heavy module is imported, so that it answers at once."""
 
 from __future__ import annotations
 
@@ -30,7 +29,7 @@ ALGORITHMS = ("ppo", "a2c", "sac", "td3")
 
 
 def env_ids(incomplete: str) -> list[str]:
-    """Registered ids, with or without their namespace."""
+    """Return the registered ids that begin so, with or without their namespace."""
     return [
         name
         for env_id in ENV_IDS
@@ -40,7 +39,7 @@ def env_ids(incomplete: str) -> list[str]:
 
 
 def words(allowed: Sequence[str]) -> Callable[[str], list[str]]:
-    """Completion by a list of words."""
+    """Return the completion by a list of words."""
 
     def complete(incomplete: str) -> list[str]:
         return [word for word in allowed if word.startswith(incomplete)]
@@ -52,7 +51,7 @@ filters, policies, algorithms = (words(names) for names in (FILTERS, POLICIES, A
 
 
 def artefacts(incomplete: str) -> list[str]:
-    """Tables and figures of the thesis that `reproduce` computes."""
+    """Return the tables and figures of the thesis that begin so."""
     return words(("all", *ARTEFACTS))(incomplete)
 
 

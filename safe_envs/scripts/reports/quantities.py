@@ -38,7 +38,7 @@ def number_text(value: float) -> str:
 
 
 def share_text(share: float | None) -> str:
-    """Return a share in per cent, with two digits below 1 %, so that a small one does not read 0."""
+    """Return a share in per cent, with two digits below 1 %, so that it does not read as 0."""
     if share is None or share == 0.0 or share >= 0.01:
         return percent(share)
     return f"{100 * share:.2g} %"

@@ -111,9 +111,10 @@ def _barrier_lines(found: Verification, b: BarrierFindings) -> list[str]:
     size = f"{number_text(b.typical)} in the median"
     if b.vanishes:
         infeasible = f"; no action meets the condition on {share_text(b.small_infeasible)} of it"
+        at = state_text(problem, b.control_authority_at)
         lines = [
-            f"control authority: it vanishes at {state_text(problem, b.control_authority_at)}, where"
-            " the input has no effect, and the condition holds only if its offset is >= 0",
+            f"control authority: it vanishes at {at}, where the input has no effect, and the"
+            " condition holds only if its offset is >= 0",
             f"  its reach within the input bounds is {size}, below {100 * SMALL:g} % of that on"
             f" {share_text(b.small)} of {_searched(found)}{infeasible * bool(b.small)}",
         ]
