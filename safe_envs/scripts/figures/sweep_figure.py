@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -134,29 +135,15 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
     )
     for k, kind in enumerate(kinds):
         of_kind = [row for row in rows if layout.lines is None or row[layout.lines] == kind]
-        found = [
-            (position[place], rate)
-            for place in places
-            if (rate := _rate(_at(of_kind, layout.x, place)))
-        ]
+        rates = {position[place]: _rate(_at(of_kind, layout.x, place)) for place in places}
+        found = {at: rate for at, rate in rates.items() if rate is not None}
         color = _BARE_COLOR if kind == BARE else colors[k % len(colors)]
-        label = (
-            None
-            if layout.lines is None
-            else _text(kind)
-            if layout.lines == "filter"
-            else f"{layout.lines} = {_text(kind)}"
-        )
-        if numeric:
-            _draw_band(axes, found, color, label)
-        else:
-            # Next to each other, since they would hide each other.
-            _draw_bars(
-                axes,
-                [(at + 0.12 * (k - (len(kinds) - 1) / 2), rate) for at, rate in found],
-                color,
-                label,
-            )
+        label = None if layout.lines is None else _text(kind)
+        if layout.lines not in (None, "filter"):
+            label = f"{layout.lines} = {label}"
+        # Bars are next to each other, since they would hide each other.
+        shift = 0.0 if numeric else 0.12 * (k - (len(kinds) - 1) / 2)
+        _draw_rates(axes, [at + shift for at in found], list(found.values()), numeric, color, label)
     axes.set_xlabel("" if layout.x is None else layout.x)
     if numeric and all(isinstance(place, int) for place in places):
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -172,27 +159,22 @@ def _shades(count: int) -> list[Any]:
     return [mpl.colormaps["viridis"](0.9 * k / max(count - 1, 1)) for k in range(count)]
 
 
-def _draw_band(
-    axes: Axes, found: Sequence[tuple[float, Rate]], color: Any, label: str | None
+def _draw_rates(
+    axes: Axes,
+    at: Sequence[float],
+    rates: Sequence[Rate],
+    band: bool,
+    color: Any,
+    label: str | None,
 ) -> None:
-    at = [place for place, _ in found]
-    rate, low, high = ([100 * each[i] for _, each in found] for i in range(3))
-    axes.fill_between(at, low, high, color=color, alpha=0.2, linewidth=0)
-    axes.plot(at, rate, "o-", color=color, linewidth=1.8, markersize=3.5, label=label)
-
-
-def _draw_bars(
-    axes: Axes, found: Sequence[tuple[float, Rate]], color: Any, label: str | None
-) -> None:
-    at = [place for place, _ in found]
-    rate, low, high = ([100 * each[i] for _, each in found] for i in range(3))
-    lengths = [
-        [r - a for r, a in zip(rate, low, strict=True)],
-        [b - r for r, b in zip(rate, high, strict=True)],
-    ]
-    axes.errorbar(
-        at, rate, yerr=lengths, fmt="o", color=color, markersize=4, capsize=3, label=label
-    )
+    """Draw rates with their intervals, as a band or as bars."""
+    rate, low, high = 100 * np.array(rates).reshape(-1, 3).T
+    if band:
+        axes.fill_between(at, low, high, color=color, alpha=0.2, linewidth=0)
+        axes.plot(at, rate, "o-", color=color, linewidth=1.8, markersize=3.5, label=label)
+    else:
+        style: Any = {"fmt": "o", "markersize": 4, "capsize": 3}
+        axes.errorbar(at, rate, yerr=[rate - low, high - rate], color=color, label=label, **style)
 
 
 def _at(rows: Iterable[Row], name: str | None, value: Any) -> list[Row]:
