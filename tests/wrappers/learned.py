@@ -13,10 +13,10 @@ from safe_envs.dynamics.codegen import compile_function, filled, stacked
 from safe_envs.dynamics.lie import derivatives, generator, lie_derivative_f, lie_derivative_g
 from safe_envs.wrappers.learning.base import Record
 from safe_envs.wrappers.learning.data.collection import draw_states
-from safe_envs.wrappers.learning.generator import GeneratorModel
+from safe_envs.wrappers.learning.models.generator import GeneratorModel
 from safe_envs.wrappers.learning.models.network import Network
+from safe_envs.wrappers.learning.models.residual import ResidualModel
 from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.residual import ResidualModel
 
 NO_RECORD = Record(0, 0.0, 0.0)
 

@@ -5,7 +5,7 @@ A bound is withheld, and the reason said, where the episodes themselves show tha
 rests on, is wrong: a start or a visited state has a b_j above the supremum c_j that was found, the
 filter missed a condition by more than the shortfall m that was found, or the interval of the
 measured rate lies below the bound. See
-`safe_envs.wrappers.verification.results.Guarantee.contradiction` for the first two.
+`safe_envs.wrappers.verification.chain_guarantee.ChainGuarantee.contradiction` for the first two.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from safe_envs.agents.evaluation.visited_states import Seen
-from safe_envs.wrappers.verification.results import Guarantee
+from safe_envs.wrappers.verification.guarantee import Guarantee
 
 ADVICE = "bounds are of continuous time: try a smaller dt, or --refine"
 

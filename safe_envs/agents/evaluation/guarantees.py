@@ -17,9 +17,8 @@ from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import BayesianSCBF, Condition
-from safe_envs.wrappers.verification.guarantee import guarantee_of
+from safe_envs.wrappers.verification.guarantee import Guarantee, guarantee_of
 from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
-from safe_envs.wrappers.verification.results import Guarantee
 
 _SIZES = ("delta", "supremum", "shortfall", "bias")
 """What a bound over a posterior is made of."""
@@ -101,7 +100,7 @@ class GuaranteeAverager:
             sizes = {} if found is None else {name: getattr(found, name) for name in _SIZES}
             row |= {
                 "estimated_bound": None,
-                "bound_note": "it rests on something learned: see its bound over the posterior",
+                "bound_note": "the condition is learned: see its bound over the posterior",
             }
             row |= {"posterior_bound": {"probability": bound, "note": note, **sizes}}
         else:

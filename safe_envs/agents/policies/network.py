@@ -272,6 +272,6 @@ def _require_problem(path: Path, content: files.Content, problem: SafetyProblem)
             difference = f"its {name}: {content.details[name]}, that of {problem.name}: {wanted}"
     if difference:
         raise ConfigurationError(
-            f"the policy in {path} was trained for another problem: {shortened(difference)}. Use the"
-            " env and the arguments that it was trained with, or train for this one"
+            f"the policy in {path} was trained for another problem: {shortened(difference)}. Use"
+            " the env and the arguments that it was trained with, or train for this one"
         )

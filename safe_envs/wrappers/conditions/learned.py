@@ -31,9 +31,9 @@ from safe_envs.wrappers.conditions.class_k import positive_rates
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
     from safe_envs.wrappers.learning.base import LearnedModel
-    from safe_envs.wrappers.learning.generator import GeneratorModel
-    from safe_envs.wrappers.learning.posterior import Posterior
-    from safe_envs.wrappers.learning.residual import ResidualModel
+    from safe_envs.wrappers.learning.models.generator import GeneratorModel
+    from safe_envs.wrappers.learning.models.posterior import Posterior
+    from safe_envs.wrappers.learning.models.residual import ResidualModel
 
 
 @dataclass(frozen=True)

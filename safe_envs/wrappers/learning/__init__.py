@@ -1,5 +1,4 @@
-"""Learning what a model lacks: residuals of derivatives, the generator of unknown noise, or the
-whole system."""
+"""Learning what a model lacks: residuals of derivatives, unknown noise, or the whole system."""
 
 from __future__ import annotations
 
@@ -35,8 +34,7 @@ METHODS = {
 
 
 def learner_of(method: str) -> Callable[..., LearnedModel]:
-    """The function that learns a problem by a method: (problem, *, seed, progress, ...) ->
-    LearnedModel.
+    """Return the learner of a method: (problem, *, seed, progress, ...) -> LearnedModel.
 
     Raises:
         LearnedFileError: the method is unknown.

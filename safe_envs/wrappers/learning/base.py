@@ -1,4 +1,4 @@
-"""What learned models have in common: how they were learned, and how they are kept."""
+"""What learned models have in common: their records, and how they are saved."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.models.values import LearnedFileError, require_finite, require_text
 
 Progress = Callable[[float], None]
-"""Told which part of the work is done, from 0 to 1."""
+"""Called with the part of the work that is done, from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +81,11 @@ class LearnedModel(ABC):
 
     @abstractmethod
     def arrays(self) -> dict[str, np.ndarray]:
-        """The numbers, by name."""
+        """Return the numbers, by name."""
 
     @abstractmethod
     def details(self) -> dict[str, Any]:
-        """What else `restored` needs, JSON-able."""
+        """Return what else `restored` needs, JSON-able."""
 
     @classmethod
     @abstractmethod
@@ -96,19 +96,38 @@ class LearnedModel(ABC):
         details: Mapping[str, Any],
         arrays: Mapping[str, np.ndarray],
     ) -> Self:
-        """Make the model again for a problem whose signature fits."""
+        """Make the model again for a problem whose signature fits.
+
+        Args:
+            problem: for which it is to be used.
+            record: how it was learned.
+            details: see `details`.
+            arrays: see `arrays`.
+        """
 
     @classmethod
     @abstractmethod
     def check(cls, signature: Signature, problem: SafetyProblem) -> None:
-        """Raise LearnedFileError where a model with a signature is of no use for a problem."""
+        """Raise LearnedFileError where a model with a signature is of no use for a problem.
+
+        Args:
+            signature: of the model.
+            problem: for which it is to be used.
+        """
 
     @abstractmethod
     def compare(
         self, problem: SafetyProblem, x: np.ndarray
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """(truth, estimate) of each learned function at states (B, n), by name, values (B,); the
-        plant is the truth."""
+        """Return truth and estimate of each learned function; the plant is the truth.
+
+        Args:
+            problem: whose plant is taken.
+            x: states, shape (B, n).
+
+        Returns:
+            (truth, estimate) by name, values of shape (B,).
+        """
 
     def _saved(self) -> dict[str, Any]:
         record = asdict(self.record)
@@ -116,20 +135,22 @@ class LearnedModel(ABC):
 
     @cached_property
     def sha256(self) -> str:
-        """Checksum of the model with its record, but for how long it took: the same seed and data
-        give the same."""
+        """Checksum of the model with its record, but for the time that learning took."""
         saved = self._saved()
         del saved["record"]["seconds"]
         return checksum(self.method, self.signature, saved, self.arrays())
 
     def save(self, path: Path) -> None:
-        """Write the model as data, without pickle; see
-        `safe_envs.wrappers.learning.models.files.save`."""
+        """Write the model as data; see `safe_envs.wrappers.learning.models.files.save`."""
         save(path, self.method, self.signature, self._saved(), self.arrays())
 
     @classmethod
     def from_content(cls, content: Content, problem: SafetyProblem) -> Self:
         """Make the model of a file again.
+
+        Args:
+            content: of the file.
+            problem: for which it is to be used.
 
         Raises:
             LearnedFileError: it is of another system, or incomplete.

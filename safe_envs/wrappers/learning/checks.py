@@ -1,5 +1,4 @@
-"""What every way of learning asks for before it begins: sizes that fit into memory, the right
-objects; and its randomness."""
+"""Checks that every method makes before it learns, and its random streams."""
 
 from __future__ import annotations
 
@@ -18,11 +17,11 @@ _BYTES = 8
 
 
 class Purpose(IntEnum):
-    """Second entries of the seeds of everything random in learning, so that no two uses of a seed
-    share their randomness.
+    """Second entries of the seeds of everything random in learning: no two uses share a stream.
 
     None is 0: NumPy takes [s, 0] for s, whose children are those of safe sets and episodes. The
-    small numbers belong to surveys, bounds and the states at which an identification is reported.
+    small numbers belong to safe-set analyses, bounds and the states at which an identification is
+    reported.
     """
 
     DATA = 1001
@@ -33,7 +32,11 @@ class Purpose(IntEnum):
 
 
 def random_stream(seed: int, purpose: Purpose) -> np.random.Generator:
-    """The randomness of a seed for a purpose.
+    """Return the random stream of a seed for a purpose.
+
+    Args:
+        seed: from 0.
+        purpose: of the stream.
 
     Raises:
         ConfigurationError: the seed is no whole number from 0.
@@ -75,14 +78,17 @@ def require_kind(name: str, value: Any, kind: type, source: str) -> None:
 
 
 def require_degrees(problem: SafetyProblem, given: Any) -> None:
-    """Raise ValueError unless these are the relative degrees of a problem's barriers: what a file
-    says is to be so before it is used."""
+    """Raise ValueError unless these are the relative degrees of a problem's barriers.
+
+    Args:
+        problem: whose barriers are taken.
+        given: degrees that a file tells.
+    """
     wanted = [relative_degree(problem.model, b.expression) for b in problem.barriers]
     if given != wanted:
         raise ValueError(f"the degrees {shown(given)}, where the barriers have {wanted}")
 
 
 def require_problem(problem: Any) -> None:
-    """Raise ConfigurationError where something else was given for a problem: the id of an env, or
-    an env."""
+    """Raise ConfigurationError where an env or its id was given for a problem."""
     require_kind("problem", problem, SafetyProblem, "make_problem of safe_envs.registry")

@@ -1,5 +1,4 @@
-"""The covariance of the noise, learned once from one-step transitions: with a known drift, every
-generator follows from it."""
+"""The covariance of the noise, from which with a known drift every generator follows."""
 
 from __future__ import annotations
 
@@ -15,7 +14,8 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.checks import Purpose, random_stream
 from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.estimators import by_parts, rounding
+from safe_envs.wrappers.learning.drift_checks import rounding
+from safe_envs.wrappers.learning.estimators import by_parts
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.values import array_of
 
@@ -69,8 +69,7 @@ class LearnedDiffusion:
         rate: np.ndarray,
         allowed: np.ndarray | float = 0.0,
     ) -> tuple[LearnedDiffusion, dict[str, float]]:
-        """Regress the covariances at the points, by least squares, with the degree that the
-        information criterion BIC prefers.
+        """Regress the covariances by least squares, with the degree of least BIC.
 
         Args:
             problem: over whose region the features are scaled.
@@ -111,7 +110,7 @@ class LearnedDiffusion:
         return sp.ImmutableMatrix(matrix)
 
     def system(self, model: ControlAffineSDE) -> ControlAffineSDE:
-        """The model with a diffusion L for which L L' = C.
+        """Return the model with a diffusion L for which L L' = C.
 
         L is a Cholesky factor in symbols, whose roots cancel in L L': `ito_correction`, and with it
         every generator, sees the polynomials themselves. To evaluate L is another matter: where the
@@ -140,7 +139,7 @@ class LearnedDiffusion:
         ]
 
     def to_arrays(self) -> dict[str, np.ndarray]:
-        """The weights by name."""
+        """Return the weights by name."""
         return {_name(e.row, e.column): e.weights for e in self.entries}
 
     @classmethod
@@ -151,6 +150,11 @@ class LearnedDiffusion:
         arrays: Mapping[str, np.ndarray],
     ) -> LearnedDiffusion:
         """Make it again of what `details` and `to_arrays` gave.
+
+        Args:
+            states: n symbols.
+            details: see `details`.
+            arrays: see `to_arrays`.
 
         Raises:
             KeyError: a part is missing.
@@ -195,8 +199,7 @@ def covariances(data: Transitions, rate: np.ndarray) -> np.ndarray:
 
 
 def _designs(problem: SafetyProblem, x: np.ndarray) -> list[tuple[Features, np.ndarray]]:
-    """The features of each degree at states (P, n), as far as there are two points for each
-    feature."""
+    """Return the features (P, M) of each degree at states (P, n), while M is at most P/2."""
     candidates = [
         Features.of(problem, degree) for degree in _DEGREES if Features.allowed(problem, degree)
     ]
@@ -206,8 +209,7 @@ def _designs(problem: SafetyProblem, x: np.ndarray) -> list[tuple[Features, np.n
 def _fit(
     designs: Sequence[tuple[Features, np.ndarray]], values: np.ndarray, may_vanish: bool
 ) -> tuple[Features, np.ndarray] | None:
-    """Features and weights of the regression of values (P,) with the least BIC; None for the zero
-    function."""
+    """Return features and weights of the regression of values (P,) with least BIC; None for 0."""
     # A fit without any residual would win over all others, by an infinite margin.
     floor = len(values) * (_EXACT * np.abs(values).max()) ** 2
 
@@ -230,11 +232,11 @@ def _held_out_errors(
     if len(np.unique(data.x, axis=0)) < _FEWEST_STARTS:
         return {}
     held = data.held_out(_HELD_OUT, random_stream(data.seed or 0, Purpose.HELD_OUT))
-    kept = ~held
-    designs, errors = _designs(problem, data.x[kept]), {}
+    trained = ~held
+    designs, errors = _designs(problem, data.x[trained]), {}
     for entry in entries:
         fit = _fit(
-            designs, found[kept, entry.row, entry.column], may_vanish=entry.row != entry.column
+            designs, found[trained, entry.row, entry.column], may_vanish=entry.row != entry.column
         )
         predicted = 0.0 if fit is None else fit[0].matrix(data.x[held]) @ fit[1]
         names = ", ".join(problem.states[i].symbol.name for i in (entry.row, entry.column))
@@ -245,8 +247,7 @@ def _held_out_errors(
 
 
 def _projected(matrix: sp.ImmutableMatrix) -> sp.ImmutableMatrix:
-    """The positive semidefinite matrix of numbers that is nearest to a symmetric one, with all
-    pivots positive where it is not 0."""
+    """Return the nearest positive semidefinite matrix of numbers, with positive pivots or 0."""
     numbers = np.array(matrix, dtype=float)
     live = np.flatnonzero(numbers.diagonal())
     values, vectors = np.linalg.eigh(numbers[np.ix_(live, live)])

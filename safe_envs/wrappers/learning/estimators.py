@@ -1,5 +1,4 @@
-"""Estimates of what the noise adds to the generator of a function, from one-step transitions; the
-drift is known."""
+"""Estimates of what noise adds to the generator of a function, from one-step data; drift known."""
 
 from __future__ import annotations
 
@@ -13,7 +12,6 @@ import sympy as sp
 from safe_envs.dynamics.codegen import Components, compile_function, filled, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, shown
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.models.network import Network
 
@@ -37,18 +35,6 @@ _BLOCK = 64
 """States in a matrix product: few enough for BLAS to stay on one thread, since threads that wait
 for each other take far longer."""
 
-_SUSPECT = 1.5
-"""Score of a drift, in standard errors, from which it does not fit the data."""
-
-_SURE = 5.0
-"""Standard errors from which a log does not fit a drift."""
-
-_MATERIAL = 0.05
-"""Part of a state's steps, or of all states, from which something is told."""
-
-_ROUNDING = 64 * np.finfo(float).eps
-"""Part of the size of a state up to which a residual is taken for a rounding error."""
-
 
 @dataclass(frozen=True)
 class Estimate:
@@ -65,17 +51,24 @@ class Estimate:
 
 
 def rates(model: ControlAffineSDE, data: Transitions) -> np.ndarray:
-    """f(x) + g(x) u of a model at each point under its input, in units of the states per s, shape
-    (P, n)."""
+    """Return f(x) + g(x) u of a model at each point.
+
+    Args:
+        model: that is known.
+        data: transitions under any inputs.
+
+    Returns:
+        Rates in units of the states per s, shape (P, n).
+    """
     return _rate_of(model, data)(data.x)
 
 
 def mean_rates(model: ControlAffineSDE, data: Transitions, rate: np.ndarray) -> np.ndarray:
-    """Mean of f + g u of a model over each step, as the data were integrated, shape (P, n).
+    """Return the mean of f + g u of a model over each step, as the data were integrated.
 
     An Euler step takes the rate at its beginning, an exact one differs from that by an order of dt,
-    and one of several Euler steps is between them. Which it was is one number, told by least
-    squares over all data; for noise it must not be taken.
+    and one of several Euler steps is between them. Which it was is one number, found by least
+    squares over all data; noise must not be taken for it.
 
     Args:
         model: that is known.
@@ -98,7 +91,7 @@ def mean_rates(model: ControlAffineSDE, data: Transitions, rate: np.ndarray) -> 
 
 
 def _rate_of(model: ControlAffineSDE, data: Transitions) -> Callable[[np.ndarray], np.ndarray]:
-    """The function f + g u of a model, of states (P, n) under the inputs of the points."""
+    """Return the function f + g u of a model, of states (P, n) under the inputs of the points."""
     rate = model.numeric(model.drift + model.input_matrix * sp.Matrix(model.inputs))
     compiled, u = (
         compile_function((*model.states, *model.inputs), tuple(rate), "arrays"),
@@ -108,7 +101,7 @@ def _rate_of(model: ControlAffineSDE, data: Transitions) -> Callable[[np.ndarray
 
 
 def by_parts(data: Transitions) -> Iterator[tuple[slice, list[np.ndarray]]]:
-    """A few points at a time, with the n components (points, K) of their successors."""
+    """Yield a few points at a time, with the n components (points, K) of their successors."""
     points = max(1, _AT_ONCE // data.repetitions)
     for begin in range(0, data.points, points):
         part = slice(begin, begin + points)
@@ -121,118 +114,8 @@ def by_parts(data: Transitions) -> Iterator[tuple[slice, list[np.ndarray]]]:
         )
 
 
-def rounding(data: Transitions, rate: np.ndarray) -> np.ndarray:
-    """The largest residual of each state that may be a rounding error, shape (n,); arguments as for
-    `drift_score`."""
-    return _ROUNDING * (np.abs(data.x) + np.abs(rate) * data.dt[:, None]).max(axis=0)
-
-
-def slack(data: Transitions, rate: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """The largest residual of each state that another way of integrating may make, shape (n,);
-    arguments as for `drift_warnings`."""
-    return _MATERIAL * (np.abs(mean - rate) * data.dt[:, None]).max(axis=0)
-
-
-def drift_score(data: Transitions, rate: np.ndarray, allowed: np.ndarray | float = 0.0) -> float:
-    """How far the mean steps are from a drift's, in standard errors: root mean square over points
-    and states; 1 if it is right.
-
-    Steps without repetitions say nothing about it and score 1, and so do residuals within the
-    rounding.
-
-    Args:
-        data: transitions under any inputs.
-        rate: f(x) + g(x) u at each point, or its mean over the steps, shape (P, n).
-        allowed: part of the mean residual of each state that does not count, shape (n,); see
-            `slack`.
-    """
-    expected, small = (data.x + rate * data.dt[:, None]).T, rounding(data, rate)
-    ignored = np.broadcast_to(allowed, small.shape)
-    scores = np.ones((data.points, len(expected)))
-    for part, successors in by_parts(data):
-        for i, after in enumerate(successors):
-            residual = after - expected[i, part, None]
-            mean = np.maximum(np.abs(residual.mean(axis=1)) - ignored[i], 0.0)
-            square = np.einsum("pk,pk->p", residual, residual) / data.repetitions
-            np.divide(
-                mean**2 * data.repetitions,
-                square,
-                out=scores[part, i],
-                where=square > small[i] ** 2,
-            )
-    return float(np.sqrt(scores.mean()))
-
-
-def drift_warnings(
-    data: Transitions, rate: np.ndarray, mean: np.ndarray, names: Sequence[str]
-) -> tuple[str, ...]:
-    """What a user has to know where a drift does not fit the data.
-
-    Args:
-        data: transitions under any inputs.
-        rate: f(x) + g(x) u at each point, shape (P, n).
-        mean: what it is over the steps; see `mean_rates`.
-        names: of the states.
-    """
-    score = drift_score(data, mean, slack(data, rate, mean))
-    if score >= _SUSPECT:
-        return (
-            (
-                f"the mean steps are {score:.1f} standard errors away from those of the model's f"
-                " and g, where 1 is expected: the method takes both for known, and what is learned"
-                " of the noise contains their error. A wrong dt looks the same"
-            ),
-        )
-    return _factor_warnings(data, mean, names)
-
-
-def _factor_warnings(data: Transitions, mean: np.ndarray, names: Sequence[str]) -> tuple[str, ...]:
-    """The same where the score sees nothing: of a log without repetitions, by regression of the
-    steps on those of the drift."""
-    moved = mean * data.dt[:, None]
-    product = (data.successors.mean(axis=1) - data.x - moved) * moved
-    size, total, spread = (
-        (moved**2).sum(axis=0),
-        product.sum(axis=0),
-        np.sqrt((product**2).sum(axis=0)),
-    )
-    excess = np.divide(total, size, out=np.zeros_like(size), where=size > 0)
-    bad = (np.abs(total) > _SURE * spread) & (np.abs(excess) > _MATERIAL)
-    if not bad.any():
-        return ()
-    factors = ", ".join(f"{name} {1.0 + excess[i]:.2g}" for i, name in enumerate(names) if bad[i])
-    return (
-        (
-            "the steps in the data are not those of the model's f and g over dt, but times:"
-            f" {factors}. A wrong dt, columns in another order or a wrong model does this; the"
-            " method takes all three for right, and what is learned of the noise contains their"
-            " error"
-        ),
-    )
-
-
-def region_warnings(problem: SafetyProblem, data: Transitions) -> tuple[str, ...]:
-    """Which states of the data are to a material part outside the region in which a problem is
-    explored."""
-    found = []
-    for variable, (low, high), column in zip(
-        problem.states, problem.exploration.region, data.x.T, strict=True
-    ):
-        # Of an unbounded angle any turn will do.
-        bounded = np.isfinite(variable.low) or np.isfinite(variable.high)
-        share = np.mean((column < low) | (column > high))
-        if bounded and share > _MATERIAL:
-            found.append(
-                f"{share:.0%} of the data have {variable.symbol} outside the explored region,"
-                f" [{low:g}, {high:g}]: it is from {column.min():g} to {column.max():g}. Learn from"
-                " data of the region, where what is learned will be used"
-            )
-    return tuple(found)
-
-
 def in_bulk(network: Network, inputs: Sequence[np.ndarray]) -> np.ndarray:
-    """The first output of a tanh network at very many states, in single precision, which is much
-    faster.
+    """Return the first output of a tanh network at very many states, in fast single precision.
 
     Args:
         network: with tanh for its activation.

@@ -49,86 +49,96 @@ class Trained:
     heldout: np.ndarray
 
 
-def train(
-    inputs: np.ndarray,
-    targets: np.ndarray,
-    *,
-    hidden: Sequence[int] = (100, 30),
-    activation: Activation = "relu",
-    epochs: int = 500,
-    batch: int = 256,
-    rate: float = 1e-3,
-    seed: int = 0,
-    sizes: np.ndarray | None = None,
-    progress: Progress | None = None,
-) -> Trained:
-    """Fit a network: 70 % of the rows train it, 15 % choose the epoch, 15 % measure it. One thread,
-    no global generator.
+@dataclass(frozen=True)
+class AdamSettings:
+    """Layers of a network, and how Adam trains it.
 
-    A target that is the same in all rows, up to rounding, is answered by this constant: of a
-    barrier to which the noise adds nothing, a network would learn its own error.
-
-    Args:
-        inputs: (N, p).
-        targets: (N, q).
+    Attributes:
         hidden: width of each hidden layer.
         activation: after each of them.
         epochs: at most; training stops when the validation loss has not fallen for 60 of them.
         batch: rows in a step.
         rate: of Adam.
+
+    Raises:
+        ConfigurationError: a setting is out of its range.
+    """
+
+    hidden: Sequence[int] = (100, 30)
+    activation: Activation = "relu"
+    epochs: int = 500
+    batch: int = 256
+    rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "batch"):
+            require_whole(name, getattr(self, name), 1)
+        object.__setattr__(self, "hidden", _widths(self.hidden))
+        require_activation(self.activation)
+        if not 0 < self.rate < 1:
+            raise ConfigurationError(f"rate = {shown(self.rate)}; give a number between 0 and 1")
+
+
+def train(
+    inputs: np.ndarray,
+    targets: np.ndarray,
+    settings: AdamSettings | None = None,
+    *,
+    seed: int = 0,
+    sizes: np.ndarray | None = None,
+    progress: Progress | None = None,
+) -> Trained:
+    """Fit a network: 70 % of the rows train it, 15 % choose the epoch, 15 % measure it.
+
+    One thread and no global generator are used. A target that is the same in all rows, up to
+    rounding, is answered by this constant: of a barrier to which the noise adds nothing, a network
+    would learn its own error.
+
+    Args:
+        inputs: (N, p).
+        targets: (N, q).
+        settings: of the training; by default those of `AdamSettings`.
         seed: of the split, the first weights and the order of the rows; the same seed gives the
             same network.
         sizes: (q,), against which the spread of each target is judged small (see
             `_standardisation`); its largest entry by default.
-        progress: told after each epoch.
+        progress: called after each epoch.
 
     Raises:
         InvalidInputError: the arrays have other shapes, fewer than ten rows, or entries that are
             not finite or above 1e100.
-        ConfigurationError: a setting is out of its range, or the network would have more than ten
+        ConfigurationError: the seed is out of its range, or the network would have more than ten
             million parameters.
 
     Source: thesis Sec. 3.4.2, whose loss lacks the square and whose update has the wrong sign.
     """
     _check_data(inputs, targets)
-    for name, value in (("epochs", epochs), ("batch", batch)):
-        require_whole(name, value, 1)
-    widths = (inputs.shape[1], *hidden_widths(hidden), targets.shape[1])
+    how = settings or AdamSettings()
+    widths = (inputs.shape[1], *how.hidden, targets.shape[1])
     _require_size(widths)
     rows = random_stream(seed, Purpose.TRAINING).permutation(len(inputs))
-    require_activation(activation)
-    if not 0 < rate < 1:
-        raise ConfigurationError(f"rate = {shown(rate)}; give a number between 0 and 1")
     fitted, validated = int(_TRAINED * len(rows)), int(_VALIDATED * len(rows))
     parts = np.split(rows, [fitted, fitted + validated])
     ends = (*_standardisation(inputs), *_standardisation(targets, sizes))
     x, y = (inputs - ends[0]) / ends[1], (targets - ends[2]) / ends[3]
     constant = np.ptp(targets, axis=0) <= _ROUNDING * np.abs(targets).max(axis=0)
     with _single_thread():
-        layers, run, loss = _fit(
-            x,
-            y,
-            parts,
-            widths,
-            activation,
-            0 if constant.all() else epochs,
-            batch,
-            rate,
-            int(seed),
-            progress,
-        )
+        allowed = 0 if constant.all() else how.epochs
+        layers, run, loss = _fit(x, y, parts, how, allowed, int(seed), progress)
     # In the last layer, whose output the mean is added to.
     for numbers in layers[-1]:
         numbers[constant] = 0.0
-    network = Network(tuple(w for w, _ in layers), tuple(b for _, b in layers), activation, *ends)
+    network = Network(
+        tuple(w for w, _ in layers), tuple(b for _, b in layers), how.activation, *ends
+    )
     predicted = np.stack(network.arrays(tuple(inputs[parts[2]].T)), axis=1)
     return Trained(
         network, run, 0.0 if constant.all() else loss, np.abs(predicted - targets[parts[2]])
     )
 
 
-def hidden_widths(hidden: Any) -> tuple[int, ...]:
-    """The widths of hidden layers as Python's numbers.
+def _widths(hidden: Any) -> tuple[int, ...]:
+    """Return the widths of hidden layers as Python's numbers.
 
     Raises:
         ConfigurationError: they are no whole numbers from 1.
@@ -176,7 +186,7 @@ def _check_data(inputs: np.ndarray, targets: np.ndarray) -> None:
 def _standardisation(
     columns: np.ndarray, sizes: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and scale of each column (N, k).
+    """Return mean and scale of each column (N, k).
 
     A column that should be constant, such as Delta_2 of a Dubins vehicle, still varies by the
     rounding and truncation of its labels, up to about 1e-5 of its size. Divided by its own
@@ -191,8 +201,7 @@ def _standardisation(
 
 @contextmanager
 def _single_thread() -> Iterator[None]:
-    """Let torch use one thread: on small matrices more are slower, and the order of sums would hang
-    on their number."""
+    """Let torch use one thread: more are slower on small matrices, and change the order of sums."""
     import torch
 
     threads = torch.get_num_threads()
@@ -207,38 +216,35 @@ def _fit(
     x: np.ndarray,
     y: np.ndarray,
     parts: Sequence[np.ndarray],
-    widths: Sequence[int],
-    activation: Activation,
+    how: AdamSettings,
     epochs: int,
-    batch: int,
-    rate: float,
     seed: int,
     progress: Progress | None,
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], int, float]:
-    """Train on standardised data; return (weights, bias) of each layer, the epochs that were run,
-    and the validation loss."""
+    """Train on standardised data; return weights and biases, the epochs and the validation loss."""
     import torch
 
     generator = torch.Generator().manual_seed(seed)
     (x_fit, x_val), (y_fit, y_val) = (
         [torch.tensor(a[part], dtype=torch.float32) for part in parts[:2]] for a in (x, y)
     )
+    widths = (x.shape[1], *how.hidden, y.shape[1])
     shapes = [shape for into, out in pairwise(widths) for shape in ((out, into), (out,))]
     # All parameters in one tensor: Adam's cost is in the number of its calls, not in the size of
     # what it updates.
     flat = _first_parameters(shapes, generator).requires_grad_()
-    optimizer = torch.optim.Adam([flat], lr=rate)
+    optimizer = torch.optim.Adam([flat], lr=how.rate)
     loss_of = torch.nn.functional.mse_loss
     best, least, since, epoch = flat.detach().clone(), float("inf"), 0, 0
     for epoch in range(1, epochs + 1):
-        for rows in torch.randperm(len(x_fit), generator=generator).split(batch):
+        for rows in torch.randperm(len(x_fit), generator=generator).split(how.batch):
             optimizer.zero_grad()
             loss_of(
-                _forward(_unpacked(flat, shapes), x_fit[rows], activation), y_fit[rows]
+                _forward(_unpacked(flat, shapes), x_fit[rows], how.activation), y_fit[rows]
             ).backward()
             optimizer.step()
         with torch.no_grad():
-            loss = loss_of(_forward(_unpacked(flat, shapes), x_val, activation), y_val).item()
+            loss = loss_of(_forward(_unpacked(flat, shapes), x_val, how.activation), y_val).item()
         since += 1
         if loss < least:
             best, least, since = flat.detach().clone(), loss, 0
@@ -251,8 +257,7 @@ def _fit(
 
 
 def _first_parameters(shapes: Sequence[tuple[int, ...]], generator: Any) -> Any:
-    """Weights and biases of all layers in one tensor, each uniform within 1/sqrt(inputs of the
-    layer)."""
+    """Draw all weights and biases into one tensor, uniform within 1/sqrt(inputs of the layer)."""
     import torch
 
     bounds = [weights[1] ** -0.5 for weights in shapes[::2] for _ in range(2)]
@@ -266,7 +271,7 @@ def _first_parameters(shapes: Sequence[tuple[int, ...]], generator: Any) -> Any:
 
 
 def _unpacked(flat: Any, shapes: Sequence[tuple[int, ...]]) -> list[Any]:
-    """Weights and bias of each layer in turn, as views of the tensor that holds them all."""
+    """Yield weights and bias of each layer in turn, as views of the tensor that holds them all."""
     return [
         part.view(shape)
         for part, shape in zip(flat.split([math.prod(s) for s in shapes]), shapes, strict=True)
@@ -274,7 +279,7 @@ def _unpacked(flat: Any, shapes: Sequence[tuple[int, ...]]) -> list[Any]:
 
 
 def _forward(parameters: Sequence[Any], x: Any, activation: Activation) -> Any:
-    """Outputs of the layers for a batch, as tensors."""
+    """Return the outputs of the layers for a batch, as tensors."""
     import torch
 
     for k in range(0, len(parameters), 2):

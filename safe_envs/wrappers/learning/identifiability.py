@@ -1,5 +1,4 @@
-"""What data cannot tell about a system: inputs that are not excited, features that cannot be told
-apart."""
+"""What data cannot tell about a system: inputs without excitation, features that look alike."""
 
 from __future__ import annotations
 
@@ -27,7 +26,7 @@ _PART = 0.05
 """Share of a weight in a direction from which it is named."""
 
 _MATERIAL = 0.05
-"""Part of a state's rate, or of its noise, from which a misfit is told."""
+"""Part of a state's rate, or of its noise, from which there is a warning of a misfit."""
 
 _MOST_NAMED = 4
 
@@ -45,7 +44,7 @@ def weaknesses(
     learned: Gaussian,
     prior: float,
 ) -> tuple[str, ...]:
-    """What the data leave open, in words.
+    """Say what the data leave open.
 
     Args:
         features: M of them.
@@ -83,7 +82,7 @@ def weaknesses(
 
 
 def misfits(features: Features, misfit: np.ndarray, variation: np.ndarray) -> tuple[str, ...]:
-    """What the features leave out, in words.
+    """Say what the features leave out.
 
     Args:
         features: of the regression.
@@ -91,7 +90,7 @@ def misfits(features: Features, misfit: np.ndarray, variation: np.ndarray) -> tu
         variation: part by which the variance of its noise varies although it is taken for constant,
             (n,).
     """
-    missed = [
+    left_out = [
         f"{state}: features of degree {features.degree} miss {100 * part:.3g} % of its rate; give a"
         " higher degree"
         for state, part in zip(features.states, misfit, strict=True)
@@ -103,12 +102,16 @@ def misfits(features: Features, misfit: np.ndarray, variation: np.ndarray) -> tu
         for state, part in zip(features.states, variation, strict=True)
         if part > _MATERIAL
     ]
-    return (*missed, *varied)
+    return (*left_out, *varied)
 
 
 def term_names(features: Features, inputs: Sequence[str]) -> tuple[str, ...]:
-    """Names of the D columns of the regression: monomials of the states, then these times each
-    input."""
+    """Return the names of the D columns of the regression: monomials, then these times each input.
+
+    Args:
+        features: of the states.
+        inputs: names of the m inputs.
+    """
     # Whatever the ranges are, the order of the monomials is the same: on [-1, 1] their names are
     # short.
     plain = Features(
@@ -138,8 +141,7 @@ def _steady(features: Features, inputs: Sequence[str], x: np.ndarray, u: np.ndar
 
 
 def _confounded(terms: Sequence[str], null: np.ndarray) -> str:
-    """The groups of terms that mix in the null space with the orthonormal basis `null` (d, D);
-    whatever the basis is."""
+    """Return the groups of terms that mix in the null space with orthonormal basis (d, D)."""
     projector = null.T @ null
     involved = np.flatnonzero(projector.diagonal() > _PART)
     count, group = connected_components(
@@ -155,8 +157,10 @@ def _confounded(terms: Sequence[str], null: np.ndarray) -> str:
 def _weak(
     terms: Sequence[str], seen: np.ndarray, learned: Gaussian, prior: float
 ) -> list[tuple[str, ...]]:
-    """For each output the terms in those directions that the data show, but hardly; `seen` (r, D)
-    is a basis."""
+    """Return for each output the terms in directions that the data hardly show.
+
+    `seen` (r, D) is a basis of the directions that they show at all.
+    """
     values, vectors = np.linalg.eigh(seen @ learned.covariance @ seen.T)
     found = []
     for sizes, directions in zip(values, vectors, strict=True):

@@ -1,5 +1,4 @@
-"""Bayesian linear regression: the rows of one-step data, the posterior of weights, and that of a
-noise level."""
+"""Bayesian linear regression: rows of one-step data, posteriors of weights and of a noise level."""
 
 from __future__ import annotations
 
@@ -57,19 +56,29 @@ class Rows:
 
     @property
     def repeated(self) -> bool:
-        """Whether rows repeat often enough that their scatter tells most about the noise, whatever
-        the drift is."""
+        """Whether rows repeat so often that their scatter tells most about the noise."""
         return 2 * (len(self.group) - len(self.count)) >= len(self.group)
 
     def design(self, features: Features, input_scale: np.ndarray) -> np.ndarray:
-        """Phi, s_1 u_1 Phi, .., s_m u_m Phi of the rows, (G, M (1 + m))."""
+        """Return Phi, s_1 u_1 Phi, .., s_m u_m Phi of the rows, (G, M (1 + m)).
+
+        Args:
+            features: Phi.
+            input_scale: s, shape (m,).
+        """
         phi = features.matrix(self.x)
         scaled = np.column_stack((np.ones(len(phi)), self.u * input_scale))
         return (scaled[:, :, None] * phi[:, None, :]).reshape(len(phi), -1)
 
 
 def grouped(values: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Sums of values (R, n) over each group, divided by its count (G,), shape (G, n)."""
+    """Return sums over groups, divided by counts, shape (G, n).
+
+    Args:
+        values: shape (R, n).
+        group: index of the group of each row, shape (R,).
+        count: divisor of each group, shape (G,).
+    """
     return np.column_stack([np.bincount(group, column) / count for column in values.T])
 
 
@@ -86,7 +95,7 @@ class Gaussian:
     covariance: np.ndarray
 
     def sample(self, rng: np.random.Generator) -> np.ndarray:
-        """Weights (n, D), drawn from it."""
+        """Draw weights (n, D)."""
         values, vectors = np.linalg.eigh(self.covariance)
         draws = np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(self.mean.shape)
         return self.mean + np.einsum("ide,ie->id", vectors, draws)
@@ -95,11 +104,11 @@ class Gaussian:
 def posterior(
     design: np.ndarray, y: np.ndarray, variance: np.ndarray, prior: np.ndarray | float
 ) -> Gaussian:
-    """Distribution of the weights of y = design w + noise under the prior N(0, prior_i I), for
-    every output i.
+    """Return the posterior of w in y = design w + noise, for every output i.
 
-    The whitened rows are reduced by QR and an SVD, not by their Gram matrix: directions that the
-    data do not show keep the prior, even where an output is nearly free of noise.
+    The prior is N(0, prior_i I). The whitened rows are reduced by QR and an SVD, not by their Gram
+    matrix: directions that the data do not show keep the prior, even where an output is nearly free
+    of noise.
 
     Args:
         design: (P, D).
@@ -143,7 +152,7 @@ def posterior(
 def _shared(
     design: np.ndarray, y: np.ndarray, variance: np.ndarray, ratio: np.ndarray, prior: np.ndarray
 ) -> Gaussian:
-    """The same where the noise of output i has the variance `variance` (P,) times `ratio` (n,)."""
+    """Return the same where the noise of output i has the variance `variance` (P,) by ratio_i."""
     count = design.shape[1]
     reduced = np.asarray(
         np.linalg.qr(np.hstack((design, y)) / np.sqrt(variance)[:, None], mode="r")
@@ -161,7 +170,7 @@ def _shared(
 def sigma_map(
     squares: np.ndarray, counts: np.ndarray, alpha: float = 1.0, beta: float = 1.0
 ) -> np.ndarray:
-    """The most probable noise level after N increments, where the prior of sigma is inverse-gamma.
+    """Return the most probable noise level after N increments, for an inverse-gamma prior.
 
     sigma = [beta + sqrt(beta^2 + 4 (N + alpha + 1) S)]/(2 (N + alpha + 1)).
 
@@ -174,7 +183,7 @@ def sigma_map(
     Raises:
         ConfigurationError: alpha or beta is negative.
 
-    Source: thesis Eq. (6.11), whose solution the print calls intractable; it prints the likelihood
+    Source: thesis Eq. (6.11), whose solution the thesis calls intractable; it prints the likelihood
         N(0, sigma^2), without dt,
     with N - 1 factors.
     """
@@ -186,10 +195,10 @@ def sigma_map(
 def sigma_quantile(
     levels: np.ndarray, squares: float, count: float, alpha: float = 1.0, beta: float = 1.0
 ) -> np.ndarray:
-    """Quantiles of the posterior of sigma, p(sigma) ~ sigma^-(N + alpha + 1) exp(-S/(2 sigma^2) -
-    beta/sigma).
+    """Return quantiles of the posterior of sigma, tabulated around its mode.
 
-    The density of log sigma is log-concave; it is tabulated around its mode.
+    p(sigma) ~ sigma^-(N + alpha + 1) exp(-S/(2 sigma^2) - beta/sigma); the density of log sigma is
+    log-concave.
 
     Args:
         levels: probabilities in [0, 1], of any shape.

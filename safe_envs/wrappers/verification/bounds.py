@@ -1,12 +1,11 @@
-"""Lower bounds on the probability of staying safe, as functions of numbers: each with its
-hypotheses.
+"""Lower bounds on the probability of staying safe, as functions of numbers, with their hypotheses.
 
 All of them are of continuous time, with the condition met at every instant: an input that is held
-for a control period meets it at its beginning only. They rest on one inequality. Let G be the set
-where b_0, ..., b_(r-1) are positive, cut to the inside of the workspace where leaving that ends an
-episode. Let b be twice continuously differentiable in G, continuous on its closure and at most c.
-Let X be stopped when it leaves G, at the time tau, and let A b >= -a b - m up to then, with a, m >=
-0. Then
+for a control period meets it at its beginning only. They follow from one inequality. Let G be the
+set where b_0, ..., b_(r-1) are positive, cut to the inside of the workspace where leaving that ends
+an episode. Let b be twice continuously differentiable in G, continuous on its closure and at most
+c. Let X be stopped when it leaves G, at the time tau, and let A b >= -a b - m up to then, with a, m
+>= 0. Then
 
     e^(a t) b(X_t) + m (e^(a t) - 1)/a     (m t in place of the last term where a = 0)
 
@@ -16,10 +15,10 @@ others follow from it. An episode that has left the workspace before is at an en
 then: so c and m are taken over G alone. For that a >= 0 is needed, since tau may come before T.
 
 These are theorems about the numbers they are given. A bound with c and m from a search is an
-estimate: a larger c or m that the search missed would make it smaller.
+estimate: a larger c or m that the search did not find would make it smaller.
 
-Every function broadcasts over arrays of starts, and returns values in [0, 1]. A value of 0 promises
-nothing, and so does an infinite c.
+Every function broadcasts over arrays of starts, and returns values in [0, 1]. A value of 0
+guarantees nothing, and so does an infinite c.
 """
 
 from __future__ import annotations
@@ -36,8 +35,7 @@ _FOREVER = math.inf
 def stage_bound(
     b: ArrayLike, c: ArrayLike, horizon: float = _FOREVER, rate: float = 0.0, shortfall: float = 0.0
 ) -> np.ndarray:
-    """[b e^(-a T) - m (1 - e^(-a T))/a]/c: how likely b is not what X leaves the set by, up to the
-    horizon.
+    """Return [b e^(-a T) - m (1 - e^(-a T))/a]/c: a bound on P(X does not leave by b = 0 up to T).
 
     Hypotheses: A b >= -a b - m wherever X is before it leaves the set; b is positive at the start;
         b <= c there.
@@ -55,18 +53,17 @@ def stage_bound(
     # (1 - e^(-a T))/a without the loss of digits at small a T; T itself in the limit.
     spent = -math.expm1(-rate * horizon) / rate if rate else horizon
     lost = shortfall * spent if shortfall else 0.0
-    kept = b * (math.exp(-rate * horizon) if rate else 1.0) - lost
+    left = b * (math.exp(-rate * horizon) if rate else 1.0) - lost
     with np.errstate(divide="ignore", invalid="ignore"):
-        bound = np.where((b > 0.0) & (c > 0.0) & np.isfinite(c), kept / c, 0.0)
+        bound = np.where((b > 0.0) & (c > 0.0) & np.isfinite(c), left / c, 0.0)
     return np.clip(bound, 0.0, 1.0)
 
 
 def proposition_4_2_8(h: ArrayLike, c: float) -> np.ndarray:
-    """h/c, for ever.
+    """Return h/c, a bound for ever.
 
     Hypotheses: relative degree 1; A h >= 0 on all of C, so that the condition can be met everywhere
-        on it; c = sup h over C is
-    finite, which the print does not ask for.
+        on it; c = sup h over C is finite, which the thesis does not ask for.
 
     Args:
         h: value of the barrier at the start.
@@ -78,7 +75,7 @@ def proposition_4_2_8(h: ArrayLike, c: float) -> np.ndarray:
 
 
 def proposition_4_2_5(h: ArrayLike, c: float, k: float, horizon: float) -> np.ndarray:
-    """(h/c) e^(-k T).
+    """Return (h/c) e^(-k T).
 
     Hypotheses: relative degree 1; A h >= -k h on all of C; c = sup h over C is finite.
 
@@ -88,18 +85,18 @@ def proposition_4_2_5(h: ArrayLike, c: float, k: float, horizon: float) -> np.nd
         k: rate in 1/s.
         horizon: T in s.
 
-    Source: thesis Prop. 4.2.5, corrected: Eq. (4.16) and (4.17) print e^(-c T), see
+    Source: thesis Prop. 4.2.5, corrected: Eq. (4.16) and (4.17) have e^(-c T), see
         `proposition_4_2_5_printed`.
     """
     return stage_bound(h, c, horizon, rate=k)
 
 
 def proposition_4_2_5_printed(h: ArrayLike, c: float, horizon: float) -> np.ndarray:
-    """(h/c) e^(-c T), as it is printed: false for k > c, and its exponent has the units of h times
-    s.
+    """Return the printed (h/c) e^(-c T), which is false for k > c.
 
-    For Brownian motion of variance s^2 t on (0, pi) and h = sin(x), A h = -k h with k = s^2/2 and c
-    = 1: the probability of staying is about (4/pi) h e^(-k T), which falls below h e^(-T) if k > 1.
+    Its exponent has the units of h times s. For Brownian motion of variance s^2 t on (0, pi) and
+    h = sin(x), A h = -k h with k = s^2/2 and c = 1: the probability of staying is about
+    (4/pi) h e^(-k T), which falls below h e^(-T) if k > 1.
 
     Args:
         h: value of the barrier at the start.
@@ -112,14 +109,14 @@ def proposition_4_2_5_printed(h: ArrayLike, c: float, horizon: float) -> np.ndar
 
 
 def shortfall_repaired(h: ArrayLike, c: float, shortfall: float, horizon: float) -> np.ndarray:
-    """(h - m T)/c: Prop. 4.2.8 where A h >= 0 cannot be met everywhere.
+    """Return (h - m T)/c: Prop. 4.2.8 where A h >= 0 cannot be met everywhere.
 
     Hypotheses: relative degree 1; A h >= -m on all of C; c = sup h over C is finite.
 
     Args:
         h: value of the barrier at the start.
         c: supremum of h over C.
-        shortfall: m, by which the condition is missed at worst, in the units of h per s.
+        shortfall: m, by which the condition is violated at worst, in the units of h per s.
         horizon: T in s.
 
     Source: submartingale h + m t, see the head of this module.
@@ -134,17 +131,16 @@ def union_bound(
     rates: Sequence[float] | None = None,
     shortfalls: Sequence[float] | None = None,
 ) -> np.ndarray:
-    """max(0, sum of the stages' bounds - (r - 1)): the valid form of Thm. 4.2.10.
+    """Return max(0, sum of the stages' bounds - (r - 1)): the valid form of Thm. 4.2.10.
 
     X leaves the set through some b_j: each of these events has at most the probability that its
     `stage_bound` leaves, and together at most their sum. No independence is needed.
 
     Hypotheses: A b_j >= -a_j b_j - m_j for each j while all of b_0..b_(r-1) are positive. For j < r
-        - 1 that holds by the
-    definition b_(j+1) = A b_j + a_j b_j, with m_j = 0; for the last one it is the condition. All
-    b_j are positive at the start, and each c_j = sup b_j over the intersection of the {b_j >= 0} is
-    finite. Stages of several barriers may be put together if one action meets all conditions up to
-    the m_j.
+        - 1 that holds by the definition b_(j+1) = A b_j + a_j b_j, with m_j = 0; for the last one
+        it is the condition. All b_j are positive at the start, and each c_j = sup b_j over the
+        intersection of the {b_j >= 0} is finite. Stages of several barriers may be put together if
+        one action meets all conditions up to the m_j.
 
     Args:
         b: b_0..b_(r-1) at the starts, shape (..., r).
@@ -165,8 +161,7 @@ def union_bound(
 def theorem_4_2_10_printed(
     b: ArrayLike, c: ArrayLike, horizon: float = _FOREVER, rates: Sequence[float] | None = None
 ) -> np.ndarray:
-    """The product of b_j/c_j, as it is printed, or its form for the zeroing chain: without a valid
-    proof for r >= 2.
+    """Return the printed product of b_j/c_j, or its zeroing form; it has no valid proof for r >= 2.
 
     Its proof takes P(b_j stays positive | b_(j+1) stays positive) for at least b_j/c_j, Eq. (4.23).
     That conditions on the future: the paths on which b_(j+1) stays positive are not those of the
@@ -175,7 +170,7 @@ def theorem_4_2_10_printed(
 
     Args:
         b: b_0..b_(r-1) at the starts, shape (..., r).
-        c: c_0..c_(r-1), suprema over the intersection of the {b_j >= 0}, shape (r,). The print
+        c: c_0..c_(r-1), suprema over the intersection of the {b_j >= 0}, shape (r,). The thesis
             takes them over each C_j alone, where they may be infinite.
         horizon: T in s; infinite for ever.
         rates: a_1..a_r in 1/s; zeros by default.

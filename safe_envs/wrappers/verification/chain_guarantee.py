@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +16,13 @@ from safe_envs.wrappers.verification.assumptions import (
     unbounded,
     unverified_assumptions,
 )
+from safe_envs.wrappers.verification.candidates import (
+    Candidate,
+    Stages,
+    of_order_one,
+    of_stages,
+    surely_safe,
+)
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.observed import above_shortfall, above_suprema, described
 from safe_envs.wrappers.verification.results import Bound, Status
@@ -26,38 +32,6 @@ from safe_envs.wrappers.verification.search import largest
 
 _SAMPLES = 2048
 _EMPTY = "the sets C_j have no state in common"
-
-
-class Stages(NamedTuple):
-    """The chains of all barriers, with what the bounds need of them.
-
-    Attributes:
-        rates: of each stage, in 1/s; NaN where a chain has none.
-        suprema: c_j of each.
-        shortfalls: m_j of each, 0 except for the last one of a barrier.
-    """
-
-    rates: tuple[float, ...]
-    suprema: tuple[float, ...]
-    shortfalls: tuple[float, ...]
-
-
-class Candidate(NamedTuple):
-    """A result that suits the conditions.
-
-    Attributes:
-        name: of it.
-        values: at the starts, shape (B,).
-        forever: whether it is of all times.
-        gap: what its proof lacks even where its hypotheses hold; may be empty.
-        allows_shortfall: whether the conditions may be violated somewhere.
-    """
-
-    name: str
-    values: np.ndarray
-    forever: bool = False
-    gap: str = ""
-    allows_shortfall: bool = False
 
 
 class ChainGuarantee:
@@ -114,7 +88,7 @@ class ChainGuarantee:
             degree = stage.stop - stage.start
             rates += condition.chain_rates(degree) or (math.nan,) * degree
             shortfalls += [*[0.0] * (degree - 1), shortfall]
-        # Where every path is kept, no supremum matters.
+        # Where every path is safe, no supremum matters.
         suprema = (1.0,) * len(rates) if self.formulas.certain else self.analysis.suprema.tolist()
         return Stages(tuple(rates), tuple(suprema), tuple(shortfalls))
 
@@ -125,16 +99,29 @@ class ChainGuarantee:
         return not any(stages.shortfalls) or not (noisy or any(map(math.isnan, stages.rates)))
 
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
-        """Return the largest bound whose hypotheses hold; see `Guarantee.at`."""
+        """Return the largest bound on P(safe up to the horizon) whose hypotheses hold.
+
+        Args:
+            starts: states, shape (B, n).
+            horizon: T in s.
+
+        Returns:
+            Values in [0, 1], shape (B,); 0 where there is no bound.
+        """
         b = self.formulas.chain(np.asarray(starts, dtype=np.float64))
         return np.zeros(len(b)) if self.note else self._candidates(b, horizon)[-1].values
 
     def contradiction(
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
     ) -> str:
-        """Say what states contradict; see `Guarantee.contradiction`.
+        """Say what states contradict in the numbers of the bound; "" if nothing.
 
-        The actions themselves tell how much of the slack is a sampling margin.
+        Args:
+            reached: states that were reached, starts among them, shape (B, n).
+            violated: states where the filter violated its conditions, shape (E, n).
+            actions: what it executed there, shape (E, m).
+            slack: by how much it reports to have violated them, shape (E,); the actions themselves
+                tell how much of it is a sampling margin.
         """
         if self.note:
             return ""
@@ -202,13 +189,13 @@ class ChainGuarantee:
             found = [Candidate(self._name_of_certainty, (b > 0.0).all(axis=1).astype(float), True)]
             if any(stages.shortfalls) and self._certain_up_to_a_time:
                 name = "no noise, in spite of the shortfall: safe up to T"
-                values = _surely_safe(stages, b, horizon)
+                values = surely_safe(stages, b, horizon)
                 found.append(Candidate(name, values, allows_shortfall=True))
             return found
         found = (
-            _of_order_one(b[:, 0], stages, horizon)
+            of_order_one(b[:, 0], stages, horizon)
             if b.shape[1] == 1
-            else _of_stages(b, stages, horizon, len(self.formulas.stages) > 1)
+            else of_stages(b, stages, horizon, len(self.formulas.stages) > 1)
         )
         if any(stages.shortfalls):
             name = f"repaired for the shortfall m = {max(stages.shortfalls):.4g}, up to T"
@@ -242,62 +229,6 @@ class ChainGuarantee:
             return bounds.theorem_4_2_10_printed(formulas.chain(x), self.stages.suprema)
 
         return largest(printed, points, region, rng)[1]
-
-
-def _of_order_one(h: np.ndarray, stages: Stages, horizon: float) -> list[Candidate]:
-    """Return the results for one barrier of relative degree 1, with values h (B,)."""
-    (k,), (c,) = stages.rates, stages.suprema
-    if not k:
-        return [Candidate("Prop. 4.2.8: h/c, for ever", bounds.proposition_4_2_8(h, c), True)]
-    # For k <= c the misprinted exponent is merely larger than it has to be.
-    false = f"its exponent is misprinted, and false for k > c: k = {k:g}, c = {c:.4g}" * (k > c)
-    return [
-        Candidate(
-            "Prop. 4.2.5, printed formula: (h/c) e^(-c T)",
-            bounds.proposition_4_2_5_printed(h, c, horizon),
-            gap=false,
-        ),
-        Candidate(
-            "Prop. 4.2.5, corrected: (h/c) e^(-k T)", bounds.proposition_4_2_5(h, c, k, horizon)
-        ),
-    ]
-
-
-def _of_stages(b: np.ndarray, stages: Stages, horizon: float, several: bool) -> list[Candidate]:
-    """Return the printed product, for a single barrier, and the union over the stages."""
-    forever = not any(stages.rates)
-    time, length = (math.inf, "for ever") if forever else (horizon, "up to T")
-    union = Candidate(
-        f"union over the stages{' of all barriers' * several}, {length}",
-        bounds.union_bound(b, stages.suprema, time, stages.rates),
-        forever,
-    )
-    if several:
-        return [union]
-    name = (
-        "Thm. 4.2.10, printed formula: product of b_j/c_j"
-        if forever
-        else "Thm. 4.2.10, zeroing: product of (b_j/c_j) e^(-a_j T)"
-    )
-    product = bounds.theorem_4_2_10_printed(b, stages.suprema, time, stages.rates)
-    gap = "its proof conditions on the future"
-    return [Candidate(f"{name}, {length}", product, forever, gap), union]
-
-
-def _surely_safe(stages: Stages, b: np.ndarray, horizon: float) -> np.ndarray:
-    """Return 1 for starts from which no path leaves up to T, and 0 elsewhere, shape (B,).
-
-    Without noise b is at least what `stage_bound` subtracts from, so that a positive one is enough.
-    """
-    safe = [
-        (
-            bounds.stage_bound(b[:, j], 1.0 + abs(b[:, j]), horizon, rate, m) > 0.0
-            if m
-            else b[:, j] > 0.0
-        )
-        for j, (rate, m) in enumerate(zip(stages.rates, stages.shortfalls, strict=True))
-    ]
-    return np.all(safe, axis=0).astype(float)
 
 
 def _outside(formulas: Formulas, b: np.ndarray) -> str:

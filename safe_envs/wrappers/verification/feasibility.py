@@ -1,4 +1,4 @@
-"""Where conditions can be met, and what the input can do: by sampling and searching the safe set."""
+"""Where conditions can be met, and what the input can do, found by sampling and searching."""
 
 from __future__ import annotations
 
@@ -189,7 +189,7 @@ def _invariant_part(analysis: SafeSetAnalysis, count: int) -> Part:
 
 
 def _safe_part(analysis: SafeSetAnalysis, invariant: Part | None) -> Part:
-    """Return the part for C: that of the invariant set, but for its share, where this is all of C."""
+    """Return the part for C, which is that of the invariant set where this is all of C."""
     formulas, points = analysis.formulas, analysis.safe.points
     if invariant is not None and invariant.share == 1.0:
         return replace(invariant, share=analysis.safe.share)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -47,8 +47,8 @@ class Formulas:
         self.problem, self.conditions, self.knowledge = problem, tuple(conditions), knowledge
         if any(isinstance(c, LearnedCondition) for c in self.conditions):
             raise ConfigurationError(
-                "what a condition promises is known for a known system only; this one rests on"
-                " something learned"
+                "the condition is learned; for bayesian-scbf:simultaneous=P a bound is estimated"
+                " over the posterior"
             )
         self.safety_filter = SafetyFilter.for_problem(problem, self.conditions, knowledge)
         self.system = self.safety_filter.model
@@ -62,7 +62,7 @@ class Formulas:
 
     @property
     def first_order(self) -> bool:
-        """Whether all relative degrees are 1, so that the intersection of the C_j is C itself."""
+        """Whether all relative degrees are 1, so that the invariant set is C itself."""
         return self.stages[-1].stop == len(self.stages)
 
     @property
@@ -93,7 +93,8 @@ class Formulas:
         return [e for c in self._constraints for e in (*c.coefficient, c.offset - (c.demand or 0))]
 
     @cached_property
-    def _chain(self) -> Any:
+    def chain(self) -> Callable[[np.ndarray], np.ndarray]:
+        """States (B, n) to b_0..b_(r-1) of each barrier, one after the other, (B, sum of the r)."""
         return self._compiled(self._chain_expressions())
 
     @cached_property
@@ -111,27 +112,12 @@ class Formulas:
 
         return values
 
-    def chain(self, x: np.ndarray) -> np.ndarray:
-        """Return b_0..b_(r-1) of every barrier, one barrier after the other, (B, sum of the r)."""
-        return self._chain(x)
-
     @cached_property
-    def _variation_rates(self) -> Any:
+    def variation_rates(self) -> Callable[[np.ndarray], np.ndarray]:
+        """States (B, n) to |sigma' grad h|^2 of each barrier, the variance of h per s, (B, k)."""
         return self._compiled(
             [quadratic_variation_rate(self.system, c.chain[0]) for c in self._constraints]
         )
-
-    def quadratic_variation_rate(self, x: np.ndarray, i: int) -> np.ndarray:
-        """Return |sigma' grad h|^2 of a barrier, the variance of h per s.
-
-        Args:
-            x: states, shape (B, n).
-            i: index of the barrier.
-
-        Returns:
-            Values, shape (B,).
-        """
-        return self._variation_rates(x)[:, i]
 
     @cached_property
     def region(self) -> Region:
@@ -160,7 +146,7 @@ class Formulas:
         return (self.chain(x) - self._edges)[:, self.barriers].min(axis=1)
 
     def invariant_level(self, x: np.ndarray) -> np.ndarray:
-        """Return a level (B,) that is nonnegative in the invariant set, the intersection of the C_j."""
+        """Return a level (B,) that is nonnegative in the invariant set."""
         return (self.chain(x) - self._edges).min(axis=1)
 
     @property

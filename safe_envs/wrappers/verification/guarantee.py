@@ -4,19 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import BayesianSCBF, Condition, LearnedCondition
+from safe_envs.wrappers.conditions import BayesianSCBF, Condition
 from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.posterior_guarantee import posterior_guarantee
-from safe_envs.wrappers.verification.results import Guarantee
+from safe_envs.wrappers.verification.posterior_guarantee import (
+    PosteriorGuarantee,
+    posterior_guarantee,
+)
+
+Guarantee = ChainGuarantee | PosteriorGuarantee
+"""The largest bound that is estimated for a filter: `at` starts, with a `note` where there is none,
+a `remark` where it is weak, and the `contradiction` by states that were seen."""
 
 
 def guarantee_of(
     problem: SafetyProblem, conditions: Sequence[Condition], knowledge: str = "model"
 ) -> Guarantee:
-    """Estimate the bound of conditions, deterministically and without a look at more than it needs.
+    """Estimate the bound of conditions, deterministically and with no more search than it needs.
 
     For a known system it is a `ChainGuarantee`, with the suprema and the shortfall of `verify` with
     its defaults. For a robust condition on an identified one it is a `PosteriorGuarantee`.
@@ -33,9 +38,4 @@ def guarantee_of(
     """
     if any(isinstance(c, BayesianSCBF) and c.simultaneous is not None for c in conditions):
         return posterior_guarantee(problem, conditions)
-    if any(isinstance(c, LearnedCondition) for c in conditions):
-        raise ConfigurationError(
-            "it rests on something learned; for bayesian-scbf:simultaneous=P a bound is estimated"
-            " over the posterior"
-        )
     return ChainGuarantee(Formulas(problem, conditions, knowledge))

@@ -80,7 +80,12 @@ def _inside(formulas: Formulas, x: np.ndarray) -> np.ndarray:
 
 
 def described(formulas: Formulas, j: int) -> str:
-    """Name the j-th of all chain functions."""
+    """Name one of the chain functions.
+
+    Args:
+        formulas: of the chains.
+        j: index among all of them.
+    """
     i = next(i for i, stage in enumerate(formulas.stages) if stage.start <= j < stage.stop)
     name, stage = formulas.problem.barriers[i].name, j - formulas.stages[i].start
     return (

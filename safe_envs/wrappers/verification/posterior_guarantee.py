@@ -30,7 +30,7 @@ from safe_envs.wrappers.verification.smoothness import Asked, roughness
 from safe_envs.wrappers.verification.step_bias import rate_bias
 
 if TYPE_CHECKING:
-    from safe_envs.wrappers.learning.posterior import Posterior
+    from safe_envs.wrappers.learning.models.posterior import Posterior
 
 _SAMPLES = 8192
 _STARTS = 64
@@ -40,8 +40,7 @@ _BEYOND_LOG2 = 12
 
 @dataclass(frozen=True)
 class PosteriorGuarantee:
-    """(1 - delta) (h_0 - (m + e) T)/c, estimated for P(safe on [0, T]) of a simultaneous
-    `BayesianSCBF`.
+    """(1 - delta) (h_0 - (m + e) T)/c, estimated for P(safe on [0, T]) of a robust `BayesianSCBF`.
 
     With probability 1 - delta of the posterior, A h of the true system is at least -(m + e)
     wherever X is in C and in the workspace, and h/c less what that costs is then a lower bound
@@ -71,7 +70,7 @@ class PosteriorGuarantee:
     note: None = None
 
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
-        """Return the estimate at starts; see `Guarantee.at`."""
+        """Return the estimate at starts; see `ChainGuarantee.at`."""
         h = _values(self._barrier, np.asarray(starts, dtype=np.float64))
         return (1.0 - self.delta) * bounds.stage_bound(
             h, self.supremum, horizon, shortfall=self.shortfall + self.bias
@@ -80,7 +79,7 @@ class PosteriorGuarantee:
     def contradiction(
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
     ) -> str:
-        """Say what states contradict in c and m; see `Guarantee.contradiction`."""
+        """Say what states contradict in c and m; see `ChainGuarantee.contradiction`."""
         h = _values(self._barrier, reached[in_workspace(reached, self._workspace)])
         if (h > self.supremum * (1.0 + RELATIVE)).any():
             return reaches("h", h.max(), self.supremum)
@@ -183,14 +182,16 @@ def _require_smooth(
 
 
 def _require_consistent(posterior: Posterior) -> None:
-    """Whatever is beyond chance counts: the regions of the weights and of sigma are for exact
-    features and constant noise."""
-    for state, missed, varying in zip(
+    """Raise ConfigurationError where the data show a misfit or varying noise beyond chance.
+
+    The regions of the weights and of sigma are for exact features and constant noise.
+    """
+    for state, misfit, varying in zip(
         posterior.features.states, posterior.misfit, posterior.variation, strict=True
     ):
-        if missed:
+        if misfit:
             raise ConfigurationError(
-                f"the features miss {100 * missed:.3g} % of the rate of {state}, beyond chance;"
+                f"the features miss {100 * misfit:.3g} % of the rate of {state}, beyond chance;"
                 " raise the degree"
             )
         if varying:
@@ -207,8 +208,10 @@ def _values(barrier: Any, x: np.ndarray) -> np.ndarray:
 def _require_inside(
     level: Score, region: Region, problem: SafetyProblem, rng: np.random.Generator
 ) -> None:
-    """C may reach beyond the workspace, where episodes are at an end, but not beyond ranges that
-    were chosen in place of one."""
+    """Raise ConfigurationError where C reaches beyond ranges that were chosen for unbounded states.
+
+    It may reach beyond the workspace, where episodes are at an end.
+    """
     wide = region.scaled(_BEYOND).within(*workspace_of(problem)).draw(_BEYOND_LOG2, rng)
     outside = ((wide < region.low) | (wide > region.high)).any(axis=1)
     if (level(wide[outside]) >= 0.0).any():

@@ -42,17 +42,27 @@ class Region:
     notes: tuple[str, ...] = ()
 
     def scaled(self, factor: float) -> Region:
-        """The box that is larger by a factor about the same centre; a period stays one."""
+        """Return the box that is larger by a factor about the same centre; a period stays one."""
         half = np.where(self.periodic, 1.0, factor) * (self.high - self.low) / 2.0
         center = (self.high + self.low) / 2.0
         return replace(self, low=center - half, high=center + half)
 
     def within(self, low: np.ndarray, high: np.ndarray) -> Region:
-        """The part of the box between ends, shape (n,), which may be infinite."""
+        """Return the part of the box between ends.
+
+        Args:
+            low: lower ends, shape (n,); may be infinite.
+            high: upper ends, shape (n,); may be infinite.
+        """
         return replace(self, low=np.maximum(self.low, low), high=np.minimum(self.high, high))
 
     def around(self, points: np.ndarray, widened: float) -> Region:
-        """The part of the box around points, wider than they are by a factor."""
+        """Return the part of the box around points.
+
+        Args:
+            points: states, shape (B, n).
+            widened: factor by which it is wider than they are.
+        """
         low, high = points.min(axis=0), points.max(axis=0)
         more = (widened - 1.0) * (high - low) / 2.0 + 1e-6 * (self.high - self.low)
         return replace(
@@ -60,15 +70,22 @@ class Region:
         )
 
     def inside(self, x: np.ndarray) -> np.ndarray:
-        """States (B, n) moved into the box: by whole periods, and to its nearest end."""
+        """Return states (B, n) moved into the box, by whole periods or to its nearest end."""
         clipped = x.clip(self.low, self.high)
         if not self.periodic.any():
             return clipped
         return np.where(self.periodic, self.low + (x - self.low) % (self.high - self.low), clipped)
 
     def draw(self, log2: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw 2^log2 points that fill the box evenly: a Sobol sequence, shifted at random; shape
-        (2^log2, n)."""
+        """Draw points that fill the box evenly: a Sobol sequence, shifted at random.
+
+        Args:
+            log2: binary logarithm of their number.
+            rng: of the shift.
+
+        Returns:
+            States, shape (2^log2, n).
+        """
         from scipy.stats import qmc
 
         unit = qmc.Sobol(len(self.low), scramble=False).random_base2(log2)
@@ -76,14 +93,20 @@ class Region:
 
 
 def workspace_of(problem: SafetyProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper ends of the workspace, shape (n,); infinite where it has none. To leave it
-    ends an episode."""
+    """Return lower and upper ends of the workspace, shape (n,); infinite where it has none."""
     return np.array([v.low for v in problem.states]), np.array([v.high for v in problem.states])
 
 
 def in_workspace(x: np.ndarray, ends: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-    """Which states (B, n) are between the ends of a workspace, which the last step of an episode
-    may leave, shape (B,)."""
+    """Return which states are in a workspace, which the last step of an episode may leave.
+
+    Args:
+        x: states, shape (B, n).
+        ends: lower and upper ends, shape (n,) each.
+
+    Returns:
+        Shape (B,).
+    """
     low, high = ends
     return np.all((x >= low) & (x <= high), axis=1)
 
@@ -91,7 +114,7 @@ def in_workspace(x: np.ndarray, ends: tuple[np.ndarray, np.ndarray]) -> np.ndarr
 def region_of(
     problem: SafetyProblem, system: ControlAffineSDE, expressions: Sequence[sp.Expr]
 ) -> Region:
-    """The workspace of a problem, with a finite range for what it leaves unbounded.
+    """Return the workspace of a problem, with a finite range for what it leaves unbounded.
 
     Args:
         problem: whose ranges are taken.
@@ -129,10 +152,14 @@ def region_of(
 
 
 def repeats(expression: Any, s: sp.Symbol) -> bool:
-    """Whether a state appears only within sines, cosines and tangents of whole multiples of it:
-    then 2 pi more change nothing.
+    """Return whether an expression has the period 2 pi in a state, by its form.
 
-    A look at values would not do: what is constant over some of the states may not be elsewhere.
+    The state has to appear only within sines, cosines and tangents of whole multiples of it. Values
+    would not tell: what is constant over some of the states may not be elsewhere.
+
+    Args:
+        expression: of the states.
+        s: symbol of the state.
     """
 
     def is_wave(part: Any) -> bool:
@@ -145,7 +172,16 @@ def repeats(expression: Any, s: sp.Symbol) -> bool:
 
 
 def draw_starts(problem: SafetyProblem, count: int, seed: int = 0) -> np.ndarray:
-    """Draw initial states of a problem, shape (count, n)."""
+    """Draw initial states of a problem.
+
+    Args:
+        problem: whose starts are taken.
+        count: number of states.
+        seed: of the draws.
+
+    Returns:
+        States, shape (count, n).
+    """
     rngs: list[Any] = [
         np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(count)
     ]
@@ -170,8 +206,7 @@ class Sample:
 def sample(
     what: str, level: Score, region: Region, wanted: int, rng: np.random.Generator
 ) -> Sample:
-    """Draw points of the set {level >= 0}, in smaller and smaller boxes if it is a small part of
-    the region.
+    """Draw points of the set {level >= 0}, in smaller and smaller boxes if the set is small.
 
     Args:
         what: the set, for the message.
@@ -207,8 +242,7 @@ def sample(
 
 
 def _covers(box: Region, region: Region, points: np.ndarray) -> bool:
-    """Whether the points keep away from those ends of a box that are not the region's: then nothing
-    is cut off."""
+    """Return whether a box cuts nothing off: points keep away from its ends within the region."""
     width = 0.01 * (box.high - box.low)
     below = (points.min(axis=0) > box.low + width) | (box.low <= region.low)
     above = (points.max(axis=0) < box.high - width) | (box.high >= region.high)
@@ -218,8 +252,7 @@ def _covers(box: Region, region: Region, points: np.ndarray) -> bool:
 def _climbed(
     level: Score, tried: np.ndarray, region: Region, rng: np.random.Generator
 ) -> np.ndarray:
-    """Points with level >= 0, from the population of a search for the largest level, as soon as
-    there are enough."""
+    """Return points with level >= 0, found by a search for the largest level."""
     population, values = search(
         level, tried, region, rng, until=lambda values: int(np.count_nonzero(values >= 0.0)) >= _FEW
     )

@@ -162,7 +162,7 @@ class SafeSetAnalysis:
         an even smaller h.
         """
         far, near = (self._largest_variation(i, part) for part in (_NEAR, _NEARER))
-        typical = float(np.nanmedian(self.formulas.quadratic_variation_rate(self.safe.points, i)))
+        typical = float(np.nanmedian(self.formulas.variation_rates(self.safe.points)[:, i]))
         return near > _FALL * far and near > _TOUCHED * _NEARER * typical
 
     def _largest_variation(self, i: int, part: float) -> float:
@@ -190,7 +190,7 @@ class SafeSetAnalysis:
             above = (h(middle)[:, i] > level)[:, None]
             inner, outer = np.where(above, middle, inner), np.where(above, outer, middle)
         edge = inner[(h(inner) > 0.0).all(axis=1)]
-        return float(np.nan_to_num(formulas.quadratic_variation_rate(edge, i)).max(initial=0.0))
+        return float(np.nan_to_num(formulas.variation_rates(edge)[:, i]).max(initial=0.0))
 
     def infinite(self, j: int) -> str:
         """Say that the supremum of the j-th chain function is infinite, or seems so."""
@@ -209,5 +209,10 @@ class SafeSetAnalysis:
 
 
 def infeasible_part(formulas: Formulas, points: np.ndarray) -> float:
-    """Return the part of points (B, n) where no action meets all conditions; 0 of none."""
+    """Return the part of points where no action meets all conditions; 0 of none.
+
+    Args:
+        formulas: of the conditions.
+        points: states, shape (B, n).
+    """
     return float((formulas.shortfall(points) > 0.0).mean()) if len(points) else 0.0

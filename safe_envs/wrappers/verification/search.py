@@ -1,4 +1,10 @@
-"""The search of a box of states for those where a function is largest, or zero."""
+"""The search of a box of states for those where a function is largest, or zero.
+
+Differential evolution of SciPy in place of `search`, with the same populations and numbers of
+rounds, took 2 to 6 times as long for the registered problems and never found a larger supremum or
+shortfall, but smaller ones for 6 of 11 (control authority 3e-7 to 1e-3 in place of 0 for three): it
+has neither the steps of all sizes, which follow ridges, nor periodic states.
+"""
 
 from __future__ import annotations
 
@@ -34,14 +40,14 @@ class Box(Protocol):
         ...
 
     def inside(self, x: np.ndarray) -> np.ndarray:
-        """States moved into the box."""
+        """Return states moved into the box."""
         ...
 
 
 def largest(
     score: Score, points: np.ndarray, region: Box, rng: np.random.Generator
 ) -> tuple[float, np.ndarray]:
-    """The largest score that is found, and the state (n,) that has it.
+    """Return the largest score that is found, and the state (n,) that has it.
 
     Args:
         score: -inf or NaN where a state does not count.
@@ -102,8 +108,7 @@ def _joined(
     score: Score,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A population of the chosen points and random others, which count if there are any; of near
-    ones where there are few."""
+    """Return a population of the chosen points and others, of near ones where there are few."""
     counting = np.flatnonzero(np.isfinite(values))
     pool = counting if len(counting) else np.arange(len(points))
     others = rng.choice(pool, min(len(pool), _POPULATION - len(chosen)), replace=False)
@@ -141,11 +146,10 @@ def _evolved(
 
 
 def _moved(x: np.ndarray, top: np.ndarray, region: Box, rng: np.random.Generator) -> np.ndarray:
-    """A trial for each member, from itself or, of a quarter, from the best one, half of them by a
-    difference and half by a normal step.
+    """Return a trial for each member, by a difference or by a normal step.
 
-    The normal steps are of all sizes, along one axis or all: where a whole ridge is best,
-    differences never get small.
+    A quarter begins at the best member, the others at themselves. Normal steps are of all
+    sizes, along one axis or all: where a whole ridge is best, differences never get small.
     """
     size, n = x.shape
     base = np.where(rng.random((size, 1)) < 0.25, top, x)
@@ -166,8 +170,7 @@ def _scores(score: Score, x: np.ndarray) -> np.ndarray:
 def towards_zero(
     function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, region: Box
 ) -> np.ndarray:
-    """States moved to where a function is zero, the shortest way, by Newton's method; they may end
-    where it is not.
+    """Move states to where a function is zero by Newton's method; they may end where it is not.
 
     Args:
         function: from states (B, n) to values (B, m).

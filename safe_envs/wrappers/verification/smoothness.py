@@ -1,5 +1,4 @@
-"""Where functions are not smooth, by what they are made of: poles, and roots whose radicand reaches
-0."""
+"""Where functions are not smooth, by their parts: poles, and roots whose radicand reaches 0."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ _TOUCHED = 1e-6
 """Part of its typical size at which a function counts as one that reaches 0."""
 
 _LONGEST = 60
-"""Number of characters of a part that are told."""
+"""Number of characters of a part that a message shows."""
 
 
 class Edge(NamedTuple):
@@ -35,7 +34,7 @@ class Edge(NamedTuple):
 
 
 def edges(expression: Any) -> Iterator[Edge]:
-    """The parts of an expression that are smooth in the inside of their domains only, each once."""
+    """Yield the parts of an expression that are smooth only inside their domains, each once."""
     part: Any
     for part in dict.fromkeys(sp.preorder_traversal(expression)):
         arguments: tuple[Any, ...] = part.args
@@ -73,8 +72,10 @@ class Asked(NamedTuple):
 
 
 def asked_of(formulas: Formulas) -> list[Asked]:
-    """What the bounds of conditions ask to be smooth: the chains, which without noise need no
-    derivative; the rows need values."""
+    """Return the functions that the bounds require to be smooth.
+
+    They are the chains, which without noise need no derivative; the constraints need values.
+    """
     found = []
     numeric = formulas.system.numeric
     for barrier, row in zip(
@@ -103,10 +104,10 @@ def roughness(
     region: Box,
     rng: np.random.Generator,
 ) -> str:
-    """Which function is not smooth somewhere in a set, and where; "" if none was found.
+    """Say which function is not smooth somewhere in a set, and where; "" if none was found.
 
     Ito's formula asks for two continuous derivatives, and without noise paths may not pass a pole.
-    What is a function with a kink by its name is found by `safe_envs.dynamics.lie.has_kinks`.
+    A function with a kink by its name is found by `safe_envs.dynamics.lie.has_kinks`.
 
     Args:
         asked: what has to be smooth.
@@ -143,7 +144,7 @@ def _reaches_zero(
     region: Box,
     rng: np.random.Generator,
 ) -> np.ndarray | None:
-    """A state (n,) of the set where a function is 0 to rounding, as far as a search finds one."""
+    """Return a state (n,) of the set where a function is 0 to rounding; None if none is found."""
     compiled = compile_function(tuple(states), [base], "arrays")
 
     def size(x: np.ndarray) -> np.ndarray:

@@ -1,5 +1,4 @@
-"""What the length of steps does to an identified system: a regression takes the mean of a step for
-the rate at its start."""
+"""The bias of an identified system by the length of steps: means are taken for initial rates."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ import sympy as sp
 from safe_envs.dynamics.codegen import compile_function, stacked
 
 if TYPE_CHECKING:
-    from safe_envs.wrappers.learning.posterior import Posterior
+    from safe_envs.wrappers.learning.models.posterior import Posterior
 
 _SLOPE, _CURVE = 1e-6, 1e-3
 """Parts of its range by which a state is moved for first and second derivatives."""
@@ -22,8 +21,7 @@ _MOST_STATES = 1024
 
 
 def rate_bias(posterior: Posterior, barrier: sp.Expr, box: np.ndarray, x: np.ndarray) -> float:
-    """The most by which A h of the identified system is off over states and inputs, to first order
-    in the length of the steps.
+    """Return by how much A h of the identified system is off at most, to first order in the step.
 
     Along F = f + g u with held u the mean of a step of dt is F dt + dt^2/2 L F, with the generator
     L of the system, and its covariance is S dt + dt^2/2 (J S + S J'), with S = sigma sigma' and J
@@ -35,7 +33,7 @@ def rate_bias(posterior: Posterior, barrier: sp.Expr, box: np.ndarray, x: np.nda
         posterior: of the system; its mean stands for the truth.
         barrier: h, an expression of the states with numbers for all parameters.
         box: (low, high) of each input, shape (m, 2).
-        x: states of the set that is kept, shape (B, n).
+        x: states of the safe set, shape (B, n).
     """
     if posterior.record.settings.get("substeps") == 1:
         return 0.0
@@ -77,8 +75,7 @@ def _derivatives(
 def _rates(
     posterior: Posterior, x: np.ndarray, u: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """F (B, n), its Jacobian (B, n, n) and 1/2 tr(S F_xx) (B, n) under an input (m,), by
-    differences."""
+    """Return F (B, n), its Jacobian (B, n, n) and 1/2 tr(S F_xx) (B, n), by differences."""
     n, parts = len(posterior.mean), 1 + len(posterior.inputs)
     weights = np.einsum(
         "ipk,p->ki",

@@ -253,5 +253,5 @@ def test_bounds_are_for_known_systems_or_posteriors(kept):
     if getattr(condition, "simultaneous", None) is not None:
         assert isinstance(looks.pop()(), PosteriorGuarantee)
     for look in looks:
-        with pytest.raises(ConfigurationError, match="rests on something learned"):
+        with pytest.raises(ConfigurationError, match="the condition is learned"):
             look()

@@ -18,14 +18,15 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.systems.acc import acc_gap
 from safe_envs.systems.cubic import cubic_sde, cubic_sde_disk
 from safe_envs.systems.dubins import dubins_disk
-from safe_envs.wrappers.learning.bayesian import Prior, fit, identify
+from safe_envs.wrappers.learning.bayesian import identify
+from safe_envs.wrappers.learning.bayesian_fit import Prior, fit
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.files import load
+from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.models.values import LearnedFileError
-from safe_envs.wrappers.learning.posterior import Posterior
 from safe_envs.wrappers.learning.regression import Rows, posterior
 
 pytestmark = pytest.mark.slow

@@ -11,10 +11,12 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.wrappers.learning.base import Record
-from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states, plant_step
+from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
+from safe_envs.wrappers.learning.data.steps import plant_step
 from safe_envs.wrappers.learning.models.files import load
+from safe_envs.wrappers.learning.models.residual import ResidualModel
 from safe_envs.wrappers.learning.models.values import LearnedFileError
-from safe_envs.wrappers.learning.residual import ResidualModel, learn_residual, residual_labels
+from safe_envs.wrappers.learning.residual import learn_residual, residual_labels
 from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow

@@ -27,7 +27,7 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
 from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 from safe_envs.wrappers import HOCBF
-from safe_envs.wrappers.learning.residual import ResidualModel
+from safe_envs.wrappers.learning.models.residual import ResidualModel
 
 DISK = "DubinsDisk-v0"
 RATES = (0.5, 1.0, 5.0)  # p_1 = p_2, 1/s

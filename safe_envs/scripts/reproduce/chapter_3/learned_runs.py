@@ -18,7 +18,8 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.registry import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS
 from safe_envs.scripts.reproduce.framework.artefact import Number, Sample
-from safe_envs.wrappers.learning.residual import ResidualModel, learn_residual
+from safe_envs.wrappers.learning.models.residual import ResidualModel
+from safe_envs.wrappers.learning.residual import learn_residual
 
 LEARNINGS, QUICK_LEARNINGS = 3, 2  # repetitions of the learning, from other seeds
 STATES, LEAST_STATES = (

@@ -12,9 +12,9 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import settings
 from safe_envs.scripts.reproduce.framework.artefact import Sample
 from safe_envs.wrappers.learning.base import Record
 from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
-from safe_envs.wrappers.learning.fit import train
+from safe_envs.wrappers.learning.fit import AdamSettings, train
+from safe_envs.wrappers.learning.models.residual import LearnedResidual, ResidualModel
 from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.residual import LearnedResidual, ResidualModel
 
 
 def printed_residuals(
@@ -45,7 +45,7 @@ def printed_residuals(
         compile_function(problem.plant.states, coordinates, "arrays")(*np.ascontiguousarray(x.T)),
         count,
     )
-    trained = train(inputs, targets, epochs=epochs, seed=seed)
+    trained = train(inputs, targets, AdamSettings(epochs=epochs), seed=seed)
     part = LearnedResidual(problem.plant.states, coordinates, 2, trained.network, trained.heldout)
     record = Record(3 * count, 3 * count * problem.dt, 0.0, seed)
     return ResidualModel(Signature.of(problem), record, (part,)), float(

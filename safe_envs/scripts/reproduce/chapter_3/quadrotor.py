@@ -36,7 +36,7 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
 from safe_envs.systems.quadrotor_altitude import g, m, z, zdot
 from safe_envs.wrappers import AffineConstraint, Condition, SafetyFilterVectorWrapper
-from safe_envs.wrappers.learning.residual import ResidualModel
+from safe_envs.wrappers.learning.models.residual import ResidualModel
 
 QUADROTOR = "QuadrotorAltitude-v0"
 GAINS = (2.0, 8.0)  # p_1, p_2, 1/s

@@ -21,7 +21,8 @@ from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legen
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Outcome, Sample
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
 from safe_envs.wrappers.learning.estimators import Estimator, ito_part, rates
-from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
+from safe_envs.wrappers.learning.generator import learn_generator
+from safe_envs.wrappers.learning.models.generator import GeneratorModel
 
 POINTS, REPETITIONS = 200, 50_000
 """Of Algorithm 2: start states, and one-step transitions from each."""

@@ -11,7 +11,7 @@ from safe_envs.agents.evaluation.comparison import SafetyBits, compare_all
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Sample
-from safe_envs.wrappers.learning.generator import GeneratorModel
+from safe_envs.wrappers.learning.models.generator import GeneratorModel
 
 EPISODES = 1000
 """Of each rate in Tables 5.1 and 5.2."""

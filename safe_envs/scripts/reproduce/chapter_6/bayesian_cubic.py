@@ -38,8 +38,9 @@ from safe_envs.scripts.reproduce.chapter_6.worst_case import (
 )
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Number, Outcome, Sample
 from safe_envs.wrappers import SCBF
-from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
-from safe_envs.wrappers.learning.posterior import Posterior
+from safe_envs.wrappers.learning.generator import learn_generator
+from safe_envs.wrappers.learning.models.generator import GeneratorModel
+from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.verification.bounds import proposition_4_2_8, shortfall_repaired
 from safe_envs.wrappers.verification.feasibility import verify
 

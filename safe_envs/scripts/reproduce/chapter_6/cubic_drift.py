@@ -37,7 +37,7 @@ from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Numb
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.posterior import Posterior
+from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.learning.regression import Rows, posterior
 
 ENV = "safe_envs/CubicSDEDisk-v0"

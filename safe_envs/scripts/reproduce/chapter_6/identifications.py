@@ -22,7 +22,7 @@ from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.estimators import rates
 from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning
-from safe_envs.wrappers.learning.posterior import Posterior
+from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.learning.regression import sigma_map, sigma_samples
 
 STARTS, STEPS, DEGREE = 10, 100, 3

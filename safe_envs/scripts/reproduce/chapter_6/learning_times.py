@@ -16,7 +16,8 @@ from safe_envs.scripts.reproduce.chapter_6.identifications import (
     seeds,
 )
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
-from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
+from safe_envs.wrappers.learning.generator import learn_generator
+from safe_envs.wrappers.learning.models.generator import GeneratorModel
 
 ENV = "safe_envs/ACCGap-v0"
 PRIOR = 1e4

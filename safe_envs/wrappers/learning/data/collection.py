@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from safe_envs.dynamics.codegen import compile_function, stacked
-from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
-from safe_envs.number_text import finite_number
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import Progress
 from safe_envs.wrappers.learning.checks import Purpose, random_stream, require_problem, require_room
+from safe_envs.wrappers.learning.data.steps import Step, period_of, plant_step
 from safe_envs.wrappers.learning.data.transitions import Transitions, numbers
 from safe_envs.wrappers.learning.models.signature import Signature
-
-Step = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]
-"""From states (B, n), physical inputs (B, m) held and a generator to the states (B, n) one dt
-later."""
 
 _AT_ONCE = 1 << 17
 """Transitions that are simulated together: few enough for the cache. The noise that a seed gives
@@ -32,71 +26,8 @@ _TRIES_BEFORE_DESPAIR = 1 << 20
 _SMALLEST_SHARE = 1e-4
 
 
-def plant_step(problem: SafetyProblem, dt: float | None = None) -> Step:
-    """The step of a problem's plant.
-
-    Args:
-        problem: whose plant and number of substeps are taken.
-        dt: length of the step in s; None for the control period.
-
-    Raises:
-        ConfigurationError: dt is no positive number.
-    """
-    integrator = Integrator(problem.plant, _period(problem, dt), problem.substeps, "arrays")
-
-    def step(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        draws = rng.standard_normal((integrator.channels, len(x)))
-        return stacked(
-            integrator.step(
-                tuple(np.ascontiguousarray(x.T)), tuple(np.ascontiguousarray(u.T)), draws
-            ),
-            len(x),
-        )
-
-    return step
-
-
-def env_step(
-    env: gym.Env[Any, Any],
-    set_state: Callable[[gym.Env[Any, Any], np.ndarray], object],
-    get_state: Callable[[gym.Env[Any, Any]], Any],
-    to_action: Callable[[np.ndarray], Any] | None = None,
-) -> Step:
-    """The step of any scalar env whose state can be set. It runs in a Python loop: such an env
-    knows only one state at a time.
-
-    The env is reset, with a seed drawn from the generator, whenever the step is given another
-    generator than before: the env's own randomness is then as reproducible as the generator. One
-    step of the env has to last the dt that is told to `collect`.
-
-    Args:
-        env: to be stepped.
-        set_state: puts the env into a state (n,); also after an episode has ended, of which the
-            step takes no notice.
-        get_state: reads the state (n,) off the env.
-        to_action: from a physical input (m,) to an action of the env; None if they are the same.
-    """
-    known: np.random.Generator | None = None
-
-    def step(x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        nonlocal known
-        if rng is not known:
-            env.reset(seed=int(rng.integers(2**31)))
-            known = rng
-        successors = []
-        for state, held in zip(x, u, strict=True):
-            set_state(env, state.copy())
-            env.step(held.copy() if to_action is None else to_action(held.copy()))
-            # A copy: the env may change the very array in the next step.
-            successors.append(np.array(get_state(env), dtype=float))
-        return np.array(successors)
-
-    return step
-
-
 def draw_states(problem: SafetyProblem, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draw states uniformly from where a problem is explored: its region, where every barrier is
-    positive.
+    """Draw states uniformly from the region that is explored, where every barrier is positive.
 
     Args:
         problem: whose region and barriers are taken.
@@ -141,12 +72,11 @@ def collect(
     dt: float | None = None,
     progress: Progress | None = None,
 ) -> Transitions:
-    """Collect one-step data where a problem is explored: at every state each of some inputs, some
-    times.
+    """Collect one-step data where a problem is explored, under each of some inputs.
 
     With several steps, trajectories are followed. Each goes on with the first successor under one
-    of the inputs, chosen at random, and starts anew from a fresh state where it leaves the region
-    or a barrier is not positive.
+    of the inputs, chosen at random, and restarts from a fresh state where it leaves the region or a
+    barrier is not positive.
 
     Args:
         problem: of what system; its exploration says where and under which inputs.
@@ -157,7 +87,7 @@ def collect(
         seed: of all randomness.
         step: how the system is stepped; None for `plant_step(problem, dt)`.
         dt: length of a step in s; None for the control period.
-        progress: is told which part is done.
+        progress: called with the part that is done.
 
     Returns:
         Data of P = steps * points * J rows: the states at the beginning of all trajectories, then
@@ -175,7 +105,7 @@ def collect(
         require_whole(name, value, 1)
     tried, period = (
         _allowed(problem, problem.exploration.inputs if inputs is None else inputs),
-        _period(problem, dt),
+        period_of(problem, dt),
     )
     n, rows = len(problem.states), points * len(tried)
     require_room(
@@ -186,7 +116,7 @@ def collect(
     )
     # Two generators: the states that are drawn do not depend on how often a step is repeated.
     drawing, noise = random_stream(seed, Purpose.DATA).spawn(2)
-    # The step of somebody else may be that of any plant.
+    # A given step may be that of any plant.
     signature = Signature.of(problem) if step is None else replace(Signature.of(problem), plant=())
     step = plant_step(problem, period) if step is None else step
     x, successors = np.empty((steps, rows, n)), np.empty((steps, rows, repetitions, n))
@@ -242,7 +172,7 @@ def collect_paths(
     """
     require_problem(problem)
     require_whole("steps", steps, 1)
-    held, period = _allowed(problem, inputs), _period(problem, dt)
+    held, period = _allowed(problem, inputs), period_of(problem, dt)
     begin = numbers("states", states)
     if begin.shape != (len(held), len(problem.states)) or not np.isfinite(begin).all():
         raise InvalidInputError(
@@ -263,15 +193,8 @@ def collect_paths(
     return paths
 
 
-def _period(problem: SafetyProblem, dt: float | None) -> float:
-    period = problem.dt if dt is None else finite_number("dt", dt)
-    if not period > 0:
-        raise ConfigurationError(f"dt = {period} s; give a positive length of a step")
-    return period
-
-
 def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
-    """Inputs as an array (J, m), once each is known to be in the box."""
+    """Return inputs as an array (J, m); raise ConfigurationError where one is out of bounds."""
     names = ", ".join(i.symbol.name for i in problem.inputs)
     tried = numbers("inputs", inputs)
     if tried.ndim != 2 or tried.shape[-1] != len(problem.inputs) or not len(tried):
@@ -290,7 +213,7 @@ def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
 
 
 def _explored(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
-    """Whether states (B, n) are in the region and every barrier is positive there, shape (B,)."""
+    """Return whether states (B, n) are in the region with positive barriers, shape (B,)."""
     low, high = np.array(problem.exploration.region).T
     barriers = compile_function(
         problem.plant.states,
@@ -305,8 +228,7 @@ def _explored(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
 def _followed(
     problem: SafetyProblem, successors: np.ndarray, points: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """The next states (points, n) of trajectories, from their successors (points * J, n) under each
-    input."""
+    """Return the next states (points, n) of trajectories, from their successors (points * J, n)."""
     reached = successors.reshape(points, -1, successors.shape[-1])
     states = reached[np.arange(points), rng.integers(reached.shape[1], size=points)]
     left = ~_explored(problem, states)
@@ -334,7 +256,7 @@ def _repeat(
 
 
 def _stepped(step: Step, x: np.ndarray, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """What a step returns, once it is known to be states."""
+    """Return what a step gives; raise an error where these are no states."""
     with np.errstate(all="ignore"):
         successors = np.asarray(step(x, u, rng), dtype=float)
     if successors.shape != x.shape:

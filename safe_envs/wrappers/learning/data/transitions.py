@@ -110,8 +110,7 @@ class Transitions:
     def from_log(
         cls, source: SafetyProblem | Signature, x: Any, u: Any, successors: Any, dt: Any
     ) -> Self:
-        """Data that were logged elsewhere, each step once. Of which plant is not known: their
-        signature says nothing of it.
+        """Make data of a log, each step once; their signature does not tell the plant.
 
         Args:
             source: the problem, or its signature, whose states and inputs they are of.
@@ -168,8 +167,7 @@ class Transitions:
             )
 
     def split(self, share: float, rng: np.random.Generator) -> tuple[Transitions, Transitions]:
-        """Divide the data at random, by start states: rows that start from the same state stay
-        together, in their order.
+        """Divide the data at random by start states; rows from the same state stay together.
 
         Args:
             share: part of the start states that is held out, between 0 and 1; at least one is, and
@@ -187,7 +185,7 @@ class Transitions:
         return self._part(~held), self._part(held)
 
     def held_out(self, share: float, rng: np.random.Generator) -> np.ndarray:
-        """Which rows `split` holds out, shape (P,); arguments and errors are the same."""
+        """Return which rows `split` holds out, shape (P,); see there for arguments and errors."""
         if not 0 < share < 1:
             raise ConfigurationError(
                 f"share = {shown(share)}; give the part of the data to be held out, between 0 and 1"
@@ -214,8 +212,7 @@ class Transitions:
         )
 
     def save(self, path: Path) -> None:
-        """Write the data to a file, without pickle; see
-        `safe_envs.wrappers.learning.models.files.save`.
+        """Write the data to a file; see `safe_envs.wrappers.learning.models.files.save`.
 
         Raises:
             ConfigurationError: it cannot be written there.
@@ -254,7 +251,7 @@ class Transitions:
 
 
 def numbers(name: str, given: Any) -> np.ndarray:
-    """What NumPy reads as an array of floats, with nothing left out.
+    """Return numbers as an array of floats, with nothing left out.
 
     Args:
         name: of what was given, for the message.
@@ -294,8 +291,7 @@ def _require_finite(name: str, values: np.ndarray) -> None:
 
 
 def _labels(rows: np.ndarray) -> np.ndarray:
-    """A number for each row (P, c), from 0 without gaps: the same for rows that are exactly equal,
-    shape (P,)."""
+    """Return a label for each row (P, c), the same for equal rows, from 0 without gaps, (P,)."""
     order = np.lexsort(rows.T)
     ordered = rows[order]
     labels = np.empty(len(rows), dtype=int)

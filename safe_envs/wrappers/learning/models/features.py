@@ -1,4 +1,4 @@
-"""Features on which unknown functions of the state are regressed: monomials of scaled coordinates."""
+"""Features on which unknown functions of the state are regressed: monomials of scaled states."""
 
 from __future__ import annotations
 
@@ -61,8 +61,7 @@ class Features:
 
     @classmethod
     def of(cls, problem: SafetyProblem, degree: int, name: str = "degree") -> Features:
-        """Features over the region in which a problem is explored; its unbounded states are the
-        angles.
+        """Make features over the region that is explored; unbounded states are the angles.
 
         Args:
             problem: whose region and states are taken.
@@ -79,7 +78,13 @@ class Features:
     def from_json(
         cls, states: tuple[sp.Symbol, ...], region: Any, degree: Any, angles: Any
     ) -> Features:
-        """Features as a file describes them.
+        """Make features as a file describes them.
+
+        Args:
+            states: n symbols.
+            region: (low, high) of each state.
+            degree: total degree.
+            angles: names of the states that are angles.
 
         Raises:
             TypeError, ValueError: it describes none.
@@ -95,7 +100,12 @@ class Features:
 
     @classmethod
     def allowed(cls, problem: SafetyProblem, degree: int) -> bool:
-        """Whether `of` takes a degree from 0: whether there are not too many features."""
+        """Return whether there are not too many features for `of` with a degree from 0.
+
+        Args:
+            problem: whose states are taken.
+            degree: total degree.
+        """
         return _count(len(problem.states), len(_angles(problem)), degree) <= _MOST
 
     @cached_property
@@ -129,11 +139,11 @@ class Features:
         return compile_function(self.states, self.expressions, "arrays")
 
     def matrix(self, x: np.ndarray) -> np.ndarray:
-        """The features at states (B, n), shape (B, M)."""
+        """Return the features at states (B, n), shape (B, M)."""
         return stacked(self._compiled(*np.ascontiguousarray(x.T)), len(x))
 
     def combined(self, weights: Sequence[float]) -> sp.Expr:
-        """The function with these M weights, multiplied out."""
+        """Return the function with these M weights, multiplied out."""
         terms = [sp.Float(float(w), 17) * e for w, e in zip(weights, self.expressions, strict=True)]
         return sp.expand(sp.Add(*terms))
 
@@ -143,8 +153,7 @@ def _angles(problem: SafetyProblem) -> tuple[str, ...]:
 
 
 def _count(states: int, angles: int, degree: int) -> int:
-    """Number of features: monomials in as many coordinates as there are states, each times some of
-    the sines."""
+    """Return the number of features: monomials in the states, each times some of the sines."""
     return sum(
         math.comb(angles, k) * math.comb(states + degree - k, states)
         for k in range(min(angles, degree) + 1)

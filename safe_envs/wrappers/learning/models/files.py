@@ -1,4 +1,4 @@
-"""Models, policies and data as files: arrays and JSON in an npz, without pickle, under a checksum."""
+"""Models, policies and data as files: arrays and JSON in an npz, no pickle, under a checksum."""
 
 from __future__ import annotations
 

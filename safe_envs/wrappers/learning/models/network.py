@@ -21,7 +21,7 @@ with other roundings: with one shape alone, a state's outputs are the same to th
 batch. More states would be wasted on small batches."""
 
 _ZERO = np.array(0.0)
-# relu and tanh, which learned conditions ask at every step, work in place; maximum lets NaN through.
+# relu and tanh, which learned conditions need at every step, work in place; maximum keeps NaN.
 _ACTIVATIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "identity": lambda x: x,
     "tanh": lambda x: np.tanh(x, out=x),
@@ -39,8 +39,7 @@ _VECTORS = ("input_mean", "input_scale", "output_mean", "output_scale")
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """Fully connected layers between standardised inputs and outputs; all that it takes and returns
-    is in physical units.
+    """Fully connected layers between standardised inputs and outputs, in physical units outside.
 
     Attributes:
         weights: of each layer, (outputs, inputs) of the layer.
@@ -234,7 +233,12 @@ class Network:
 
 
 def require_activation(name: str, allowed: Iterable[str] = get_args(Activation)) -> None:
-    """Raise ConfigurationError unless an activation is one of the allowed ones."""
+    """Raise ConfigurationError unless an activation is one of the allowed ones.
+
+    Args:
+        name: of the activation.
+        allowed: names.
+    """
     if name not in allowed:
         raise ConfigurationError(f"activation = {shown(name)}; {nearest(str(name), allowed)}")
 

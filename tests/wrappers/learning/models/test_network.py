@@ -7,7 +7,7 @@ import pytest
 
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.wrappers.learning.checks import Purpose, random_stream
-from safe_envs.wrappers.learning.fit import train
+from safe_envs.wrappers.learning.fit import AdamSettings, train
 from safe_envs.wrappers.learning.models.network import Network
 
 pytestmark = pytest.mark.slow
@@ -132,6 +132,12 @@ def test_a_network_that_does_not_fit_is_refused(change):
         Network(**{**fields, **change})
 
 
+def fitted(inputs, targets, *, seed=0, sizes=None, progress=None, **settings):
+    """Train a network with some settings."""
+    adam = AdamSettings(**settings)
+    return train(inputs, targets, adam, seed=seed, sizes=sizes, progress=progress)
+
+
 def data(rows=600):
     x = np.random.default_rng(3).uniform(-1.0, 1.0, (rows, 2))
     return x, np.stack((x[:, 0] * x[:, 1], 1e-7 * x[:, 0] ** 2), axis=1)
@@ -140,7 +146,7 @@ def data(rows=600):
 def test_a_network_learns_functions_of_any_unit_and_says_how_well():
     x, y = data()
     progress = []
-    trained = train(
+    trained = fitted(
         x, y, hidden=(30, 20), epochs=150, batch=64, rate=3e-3, progress=progress.append
     )
     assert trained.heldout.shape == (90, 2)
@@ -158,7 +164,7 @@ def test_the_same_seed_gives_the_same_network_and_leaves_torch_as_it_was():
     x, y = data(200)
     threads, state = torch.get_num_threads(), torch.get_rng_state()
     nets = [
-        train(x, y, hidden=(8,), epochs=5, seed=seed).network.to_arrays("n") for seed in (1, 1, 2)
+        fitted(x, y, hidden=(8,), epochs=5, seed=seed).network.to_arrays("n") for seed in (1, 1, 2)
     ]
     assert torch.get_num_threads() == threads
     assert torch.equal(torch.get_rng_state(), state)
@@ -170,14 +176,14 @@ def test_the_noise_of_a_constant_target_is_not_blown_up():
     x, y = data(300)
     noise = 1e-7 * np.random.default_rng(0).normal(size=300)
     y[:, 1] = -0.78 + noise
-    trained = train(x, y, hidden=(20,), epochs=30)
+    trained = fitted(x, y, hidden=(20,), epochs=30)
     assert trained.heldout[:, 1].max() < 1e-4 * 0.78
     # The noise weighs nothing in the loss: the other target is learned as if it were not there.
-    quiet = train(x, np.stack((y[:, 0], np.full(300, -0.78)), axis=1), hidden=(20,), epochs=30)
+    quiet = fitted(x, np.stack((y[:, 0], np.full(300, -0.78)), axis=1), hidden=(20,), epochs=30)
     assert trained.validation_loss == pytest.approx(quiet.validation_loss, rel=0.01)
     # A size can be told: against 1 the second target here is nothing, although it is all noise by
     # itself.
-    told = train(
+    told = fitted(
         x, np.stack((y[:, 0], noise), axis=1), hidden=(20,), epochs=30, sizes=np.array([1.0, 1.0])
     )
     assert told.network.output_scale[1] == 1e-4
@@ -185,7 +191,7 @@ def test_the_noise_of_a_constant_target_is_not_blown_up():
 
 def test_constant_columns_of_zeros_are_fine():
     x, y = data(50)
-    trained = train(
+    trained = fitted(
         np.hstack((x, np.zeros((50, 1)))), np.hstack((y, np.zeros((50, 1)))), hidden=(5,), epochs=2
     )
     assert trained.network.input_scale[2] == trained.network.output_scale[2] == 1.0
@@ -195,14 +201,14 @@ def test_constant_columns_of_zeros_are_fine():
 def test_a_target_that_is_constant_is_answered_by_the_constant(value):
     x, y = data(60)
     constant = value * (1.0 + 1e-15 * np.arange(60)[:, None] / 60)
-    trained = train(x, constant, hidden=(5,), epochs=3)
+    trained = fitted(x, constant, hidden=(5,), epochs=3)
     (found,) = trained.network.arrays(tuple(x.T))
     np.testing.assert_allclose(found, value, rtol=1e-14, atol=0.0)
     assert not np.any(trained.network.values_and_slopes_arrays(tuple(x.T), 0)[1])
     assert (trained.epochs, trained.validation_loss) == (0, 0.0)
     assert trained.heldout.max() <= 1e-14 * abs(value)
     # Beside another one, which is learned as if it were not there.
-    both = train(x, np.hstack((y[:, :1], constant)), hidden=(5,), epochs=3)
+    both = fitted(x, np.hstack((y[:, :1], constant)), hidden=(5,), epochs=3)
     first, second = both.network.arrays(tuple(x.T))
     np.testing.assert_allclose(second, value, rtol=1e-14, atol=0.0)
     assert np.std(first) > 0.0
@@ -211,7 +217,7 @@ def test_a_target_that_is_constant_is_answered_by_the_constant(value):
 
 def test_training_stops_when_the_validation_loss_does_not_fall():
     rng = np.random.default_rng(0)
-    trained = train(
+    trained = fitted(
         rng.normal(size=(60, 2)), rng.normal(size=(60, 1)), hidden=(60, 30), epochs=2000, rate=1e-2
     )
     assert 60 < trained.epochs < 1000
@@ -221,7 +227,7 @@ def test_the_weights_are_those_of_the_least_validation_loss():
     # Noise cannot be learned: the loss of other rows soon rises.
     rng = np.random.default_rng(0)
     x, y = rng.normal(size=(100, 2)), rng.normal(size=(100, 1))
-    trained = train(x, y, hidden=(20,), rate=0.01, batch=10)
+    trained = fitted(x, y, hidden=(20,), rate=0.01, batch=10)
     assert trained.epochs > 60
     validation = random_stream(0, Purpose.TRAINING).permutation(100)[70:85]
     predicted = trained.network.arrays(tuple(x[validation].T))[0]
@@ -232,7 +238,7 @@ def test_the_weights_are_those_of_the_least_validation_loss():
 
 def test_ten_rows_are_enough_to_run():
     x, y = data(10)
-    trained = train(x, y, hidden=(3,), epochs=2)
+    trained = fitted(x, y, hidden=(3,), epochs=2)
     assert trained.heldout.shape == (2, 2)
 
 
@@ -245,14 +251,14 @@ def test_bad_data_are_refused(rows, spoil):
     if spoil is not None:
         y[3, 1] = spoil
     with pytest.raises(InvalidInputError):
-        train(x, y, epochs=1)
+        fitted(x, y, epochs=1)
 
 
 def test_shapes_that_do_not_fit_are_refused():
     x, y = data(20)
     for inputs, targets in ((x[:, 0], y), (x, y[:10]), (x[:, :0], y), (x, y[:, :0])):
         with pytest.raises(InvalidInputError, match="shapes"):
-            train(inputs, targets, epochs=1)
+            fitted(inputs, targets, epochs=1)
 
 
 @pytest.mark.parametrize(
@@ -269,7 +275,7 @@ def test_shapes_that_do_not_fit_are_refused():
 )
 def test_bad_settings_are_refused(setting):
     with pytest.raises(ConfigurationError):
-        train(*data(20), **{"epochs": 1, **setting})
+        fitted(*data(20), **{"epochs": 1, **setting})
 
 
 @pytest.mark.parametrize(
@@ -282,4 +288,4 @@ def test_bad_settings_are_refused(setting):
 )
 def test_hidden_layers_that_are_none_or_huge_are_refused(hidden, message):
     with pytest.raises(ConfigurationError, match=message):
-        train(np.zeros((20, 2)), np.zeros((20, 1)), hidden=hidden)
+        fitted(np.zeros((20, 2)), np.zeros((20, 1)), hidden=hidden)

@@ -1,5 +1,4 @@
-"""What Bayesian identification knows of a control-affine system: distributions of its drift, input
-matrix and noise."""
+"""The posterior of a control-affine system: distributions of drift, input matrix and noise."""
 
 from __future__ import annotations
 
@@ -10,132 +9,26 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 import sympy as sp
-from scipy.stats import chi2
 
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.features import Features
+from safe_envs.wrappers.learning.models.noise import Diffusion, require_noise
+from safe_envs.wrappers.learning.models.pruning import insignificant, mixed_by_steps, solved
 from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.models.values import (
     LARGEST,
-    LearnedFileError,
     array_of,
     require_finite,
 )
-from safe_envs.wrappers.learning.regression import Gaussian, sigma_map, sigma_samples
-
-_SIGNIFICANT = 0.999
-_POINTS = 256
-_SLOPE = 1e-6
-"""Part of its range by which a state is moved to see how f and g change."""
-
-_ROUNDING = 1e-9
-"""Of the entries of a matrix of correlations."""
-
-_ROUNDED = 1e-3
-"""Part of its mean within which a regressed variance is rounded off towards 0, so that it stays
-positive and smooth."""
-
-
-@dataclass(frozen=True, eq=False)
-class Diffusion:
-    """What is known of the noise: a level for each state, or a variance that varies, and
-    correlations.
-
-    Attributes:
-        squares: S of each state, the sum of xi^2/dt over the residual increments xi, (n,); 0 for a
-            state without noise.
-        count: N, degrees of freedom of each S.
-        correlation: of the noise of the states, (n, n).
-        alpha: shape of the prior of sigma.
-        beta: its scale, in the units of sigma.
-        features: on which the variances per s were regressed; None for constant noise.
-        variance: weights of these variances; None for constant noise.
-    """
-
-    squares: np.ndarray
-    count: float
-    correlation: np.ndarray
-    alpha: float = 1.0
-    beta: float = 1.0
-    features: Features | None = None
-    variance: Gaussian | None = None
-
-    @property
-    def sigma(self) -> np.ndarray:
-        """The most probable constant levels, (n,). A state without any scatter has none, where the
-        prior would say beta/N."""
-        levels = sigma_map(
-            self.squares, np.full(len(self.squares), self.count), self.alpha, self.beta
-        )
-        return np.where(self.squares > 0, levels, 0.0)
-
-    def sigma_intervals(self, delta: float) -> np.ndarray:
-        """Intervals that hold all sigma_i of constant, independent noise but for a probability
-        delta, shape (n, 2).
-
-        They are those of S/sigma^2 ~ chi^2_N: a prior of sigma, whose scale is a guess, would move
-        them off the truth.
-
-        Raises:
-            ConfigurationError: the noise varies with the state, or is correlated.
-        """
-        if self.features is not None or not np.array_equal(
-            self.correlation, np.eye(len(self.squares))
-        ):
-            raise ConfigurationError(
-                "intervals of sigma are known for constant noise of independent states only; ask"
-                " for confidence instead"
-            )
-        tail = 0.5 * delta / len(self.squares)
-        levels = np.array([tail, 1.0 - tail])
-        return np.sqrt(self.squares[:, None] / chi2.isf(levels, self.count))
-
-    def variances(self, x: np.ndarray) -> np.ndarray:
-        """Estimated variances per s at states (B, n), without the prior of sigma, shape (B, n)."""
-        constant = self.squares / self.count
-        if self.features is None or self.variance is None:
-            return np.broadcast_to(constant, x.shape)
-        p, rounding = self.features.matrix(x) @ self.variance.mean.T, _ROUNDED * constant
-        return 0.5 * (p + np.sqrt(p**2 + 4.0 * rounding**2))
-
-    def matrix(self, rng: np.random.Generator | None = None) -> sp.ImmutableMatrix:
-        """sigma(x), (n, n): the most probable one, or one drawn from the posterior."""
-        if self.features is None or self.variance is None:
-            levels = [sp.Float(s, 17) if s else sp.Integer(0) for s in self._levels(rng).tolist()]
-        else:
-            weights = self.variance.mean if rng is None else self.variance.sample(rng)
-            levels = [
-                self._level(p, r)
-                for p, r in zip(
-                    map(self.features.combined, weights), self.squares / self.count, strict=True
-                )
-            ]
-        return sp.ImmutableMatrix(sp.diag(*levels) * _root(self.correlation))
-
-    def _levels(self, rng: np.random.Generator | None) -> np.ndarray:
-        if rng is None:
-            return self.sigma
-        return np.array(
-            [
-                sigma_samples(s, self.count, self.alpha, self.beta, 1, rng)[0] if s > 0 else 0.0
-                for s in self.squares
-            ]
-        )
-
-    def _level(self, p: sp.Expr, constant: float) -> sp.Expr:
-        if not constant:
-            return sp.Integer(0)
-        rounding = sp.Float(2.0 * _ROUNDED * constant, 17)
-        return sp.sqrt((p + sp.sqrt(p**2 + rounding**2)) / 2)
+from safe_envs.wrappers.learning.regression import Gaussian
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior(LearnedModel):
-    """What Bayesian identification knows of f, g and sigma.
+    """The distributions of f, g and sigma of an identified system.
 
     f_i = Phi w_i0 and g_ij = s_j Phi w_ij, with the features Phi and Gaussian weights (w_i0, ..,
     w_im), drawn independently from state to state. Where the noise of the states is correlated, the
@@ -157,8 +50,7 @@ class Posterior(LearnedModel):
             constant, (n,), likewise.
 
     Source: thesis Sec. 6.2, with f and g in one regression on both inputs instead of the pairs of
-        Eq. (6.5): the same posterior,
-    with the right variances.
+        Eq. (6.5): the same posterior, with the right variances.
     """
 
     method: ClassVar[str] = "bayesian"
@@ -176,60 +68,22 @@ class Posterior(LearnedModel):
 
     @cached_property
     def pruned(self) -> np.ndarray:
-        """Whether g_ij is taken for 0, (n, m): it does not differ from 0, or only as the length of
-        the steps makes it.
+        """Which g_ij are taken for 0, (n, m); see `safe_envs.wrappers.learning.models.pruning`.
 
         Such entries would have tiny values, and with them give a relative degree to barriers that
         the input does not reach.
         """
-        return self._insignificant() | self._leaked()
-
-    def _insignificant(self) -> np.ndarray:
-        """Whether w' Cov^-1 w of the weights of g_ij is below the .999 quantile of chi^2_M."""
-        count = self.features.count
-        small = np.empty((len(self.mean), len(self.inputs)), dtype=bool)
-        for j in range(len(self.inputs)):
-            block = slice((j + 1) * count, (j + 2) * count)
-            weights = self.mean[:, block, None]
-            size = (weights * _solved(self.covariance[:, block, block], weights)).sum(axis=(1, 2))
-            small[:, j] = size <= chi2.ppf(_SIGNIFICANT, count)
-        return small
-
-    def _leaked(self) -> np.ndarray:
-        """Whether g_ij is no larger than twice dt/2 (Df g_j + Dg_j f)_i, by which a step of dt
-        mixes it with the others.
-
-        A plant that is integrated finer than dt shows that much: to a position the input comes
-        within a step.
-        """
-        n, parts, _, count = self._blocks
-        low, high = np.array(self.features.region).T
-        x = np.random.default_rng(0).uniform(low, high, (_POINTS, n))
-        reach = np.diag(_SLOPE * (high - low))
-        slopes = np.stack(
-            [
-                (self.features.matrix(x + h) - self.features.matrix(x - h)) / (2.0 * h.sum())
-                for h in reach
-            ],
-            axis=-1,
-        )
-        weights = self.mean.reshape(n, parts, count)
-        values = np.einsum("bk,ipk->bip", self.features.matrix(x), weights)
-        jacobians = np.einsum("bkj,ipk->bipj", slopes, weights, optimize=True)
-        mixed = jacobians[:, :, 0] @ values[:, :, 1:] + np.einsum(
-            "bipj,bj->bip", jacobians[:, :, 1:], values[:, :, 0]
-        )
-        return (values[:, :, 1:] ** 2).mean(axis=0) <= self.dt**2 * (mixed**2).mean(axis=0)
+        zero = insignificant(self.mean, self.covariance, len(self.inputs))
+        return zero | mixed_by_steps(self.features, self.mean, self.dt)
 
     @cached_property
     def weights(self) -> Gaussian:
-        """The weights of `system`: their distribution, given that those of the pruned entries are
-        0."""
+        """The weights of `system`: their distribution where those of the pruned entries are 0."""
         mean, covariance = self.mean.copy(), self.covariance.copy()
         for i, row in enumerate(self.pruned):
             zero = np.flatnonzero(np.repeat([False, *row], self.features.count))
             if zero.size:
-                gain = _solved(covariance[i][np.ix_(zero, zero)], covariance[i][zero]).T
+                gain = solved(covariance[i][np.ix_(zero, zero)], covariance[i][zero]).T
                 mean[i] -= gain @ mean[i][zero]
                 covariance[i] -= gain @ covariance[i][zero]
                 mean[i][zero], covariance[i][zero], covariance[i][:, zero] = 0.0, 0.0, 0.0
@@ -246,7 +100,7 @@ class Posterior(LearnedModel):
         return self._system(self.mean, self.diffusion.matrix())
 
     def sample(self, rng: np.random.Generator) -> ControlAffineSDE:
-        """A system drawn from the posterior. What is pruned stays 0."""
+        """Draw a system from the posterior; what is pruned stays 0."""
         return self._system(self.weights.sample(rng), self.diffusion.matrix(rng))
 
     def _system(self, weights: np.ndarray, diffusion: sp.ImmutableMatrix) -> ControlAffineSDE:
@@ -261,8 +115,10 @@ class Posterior(LearnedModel):
         return ControlAffineSDE(self.features.states, self.inputs, drift, rows, diffusion)
 
     def drift_variance(self, x: np.ndarray) -> np.ndarray:
-        """Covariances of (f_i, g_i1, .., g_im) at states (B, n), shape (B, n, 1 + m, 1 + m); also
-        of what is pruned."""
+        """Return the covariances of (f_i, g_i1, .., g_im) at states, pruned entries included.
+
+        The states are (B, n), the covariances (B, n, 1 + m, 1 + m).
+        """
         phi = self.features.matrix(x)
         return np.einsum(
             "bipqk,bk->bipq", (phi @ self._stretched).reshape(len(x), *self._blocks), phi
@@ -275,8 +131,7 @@ class Posterior(LearnedModel):
 
     @cached_property
     def _split_covariance(self) -> np.ndarray:
-        """The covariance of the weights with the scales of the inputs in it, axes (n, 1 + m, 1 + m,
-        M, M)."""
+        """The covariance of the weights in physical inputs, axes (n, 1 + m, 1 + m, M, M)."""
         n, parts, _, count = self._blocks
         scale = np.array([1.0, *self.input_scale])
         split = self.covariance.reshape(n, parts, count, parts, count).transpose(0, 1, 3, 2, 4)
@@ -284,15 +139,14 @@ class Posterior(LearnedModel):
 
     @cached_property
     def _stretched(self) -> np.ndarray:
-        """The same as one matrix (M, n (1 + m)^2 M), so that a batch costs one product of matrices."""
+        """The same as one matrix (M, n (1 + m)^2 M): a batch costs one product of matrices."""
         return np.ascontiguousarray(
             np.moveaxis(self._split_covariance, 3, 0).reshape(self.features.count, -1)
         )
 
     @property
     def variance_expressions(self) -> tuple[sp.ImmutableMatrix, ...]:
-        """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m) of expressions,
-        multiplied out."""
+        """Covariances of (f_i, g_i1, .., g_im) as n matrices (1 + m) x (1 + m), multiplied out."""
         first, second = np.triu_indices(self.features.count)
         phi = self.features.expressions
         products = [
@@ -382,7 +236,7 @@ class Posterior(LearnedModel):
                 numbers("variance_covariance", n, varying.count, varying.count),
             ),
         )
-        _require_noise(noise)
+        require_noise(noise)
         weights = numbers("mean", n, count), numbers("covariance", n, count, count)
         scale, dt = numbers("input_scale", m), require_finite(details["dt"])
         if not (0 < dt <= LARGEST and (scale > 0).all()):
@@ -400,43 +254,13 @@ class Posterior(LearnedModel):
     def compare(
         self, problem: SafetyProblem, x: np.ndarray
     ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """See `LearnedModel.compare`: f_i and g_ij in the units of the states per s, and the
-        entries of sigma sigma'."""
+        """Return f_i, g_ij and the entries of sigma sigma'; see `LearnedModel.compare`."""
         truth, estimate = _entries(problem.plant, x), _entries(self.system, x)
         return {name: (truth[name], estimate[name]) for name in truth}
 
 
-def _solved(covariance: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """The solution of a system with a covariance of weights; what is learned has a regular one."""
-    try:
-        return np.linalg.solve(covariance, right)
-    except np.linalg.LinAlgError as error:
-        raise LearnedFileError(
-            "the covariance of the weights is singular: the file was altered. Learn again"
-        ) from error
-
-
-def _require_noise(noise: Diffusion) -> None:
-    """Raise ValueError where noise has a variance, a correlation or a prior that there is not."""
-    correlation = noise.correlation
-    fits = (
-        (noise.squares >= 0).all()
-        and 0 < noise.count <= LARGEST
-        and max(noise.alpha, noise.beta) <= LARGEST
-    )
-    fits = fits and min(noise.alpha, noise.beta) >= 0
-    if not (
-        fits
-        and np.allclose(correlation, correlation.T, atol=_ROUNDING)
-        and (abs(correlation) <= 1.0 + _ROUNDING).all()
-    ):
-        raise ValueError(
-            "the noise has a negative variance, a correlation above 1, or no degrees of freedom"
-        )
-
-
 def _entries(system: ControlAffineSDE, x: np.ndarray) -> dict[str, np.ndarray]:
-    """Values of f, g and the upper half of sigma sigma' at states (B, n), by name."""
+    """Return f, g and the upper half of sigma sigma' at states (B, n), by name."""
     covariance = system.diffusion * system.diffusion.T
     named = {f"f[{s}]": system.drift[i] for i, s in enumerate(system.states)}
     named |= {
@@ -454,12 +278,3 @@ def _entries(system: ControlAffineSDE, x: np.ndarray) -> dict[str, np.ndarray]:
         system.states, [system.numeric(e) for e in named.values()], "arrays"
     )
     return dict(zip(named, stacked(compiled(*np.ascontiguousarray(x.T)), len(x)).T, strict=True))
-
-
-def _root(correlation: np.ndarray) -> sp.Matrix:
-    """The symmetric square root of a correlation matrix, which may be singular."""
-    values, vectors = np.linalg.eigh(correlation)
-    root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return sp.Matrix(
-        [[sp.Float(v, 17) if v else sp.Integer(0) for v in row] for row in root.tolist()]
-    )
