@@ -1,4 +1,4 @@
-"""From the world to pixels: a box of a picture that shows a range of two coordinates."""
+"""Axes: a box of a picture that shows a range of each of two coordinates."""
 
 from __future__ import annotations
 
@@ -14,33 +14,52 @@ Range = tuple[float, float]
 
 
 def nice_step(span: float, most: int) -> float:
-    """The smallest of ..., 1, 2, 5, 10, ... that divides a span into at most so many parts."""
+    """Return the smallest of ..., 1, 2, 5, 10, ... that divides a span into few parts.
+
+    Args:
+        span: to divide, above 0.
+        most: parts.
+
+    Returns:
+        The length of a part.
+    """
     rough = span / most
     decade = 10.0 ** math.floor(math.log10(rough))
     return next(m * decade for m in (1.0, 2.0, 5.0, 10.0) if m * decade >= 0.999999 * rough)
 
 
 def ticks(low: float, high: float, most: int = 6) -> list[float]:
-    """Round numbers in a range."""
+    """Return round numbers at equal distances in a range.
+
+    Args:
+        low: end of the range.
+        high: other end.
+        most: parts into which they divide the range.
+
+    Returns:
+        The numbers, in ascending order.
+    """
     step = nice_step(high - low, most)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [step * i for i in range(first, last + 1)]
 
 
 def grown(shown: Range, values: np.ndarray) -> Range:
-    """The range, or one that is 2, 4, 8, ... times as wide around the same middle, so that all
-    finite values are in it.
+    """Return a range widened by a power of 2 around its middle, to contain all finite values.
+
+    Args:
+        shown: the range.
+        values: of any shape.
+
+    Returns:
+        The range itself where it contains them already.
     """
     middle, half = 0.5 * (shown[0] + shown[1]), 0.5 * (shown[1] - shown[0])
     far = np.abs(values[np.isfinite(values)] - middle).max(initial=0.0)
-    return (
-        shown
-        if far <= half
-        else (
-            middle - half * (scale := 2.0 ** math.ceil(math.log2(far / half))),
-            middle + half * scale,
-        )
-    )
+    if far <= half:
+        return shown
+    half *= 2.0 ** math.ceil(math.log2(far / half))
+    return middle - half, middle + half
 
 
 @dataclass(frozen=True)
@@ -50,7 +69,7 @@ class Axes:
     Attributes:
         box: left, top, width and height in pixels.
         x: range from left to right.
-        y: range from below to above.
+        y: range from bottom to top.
     """
 
     box: Box
@@ -59,7 +78,16 @@ class Axes:
 
     @classmethod
     def equal(cls, box: Box, x: Range, y: Range) -> Axes:
-        """Axes with the same scale along both sides: the ranges are widened to fill the box."""
+        """Make axes with the same scale along both sides, by widening a range to fill the box.
+
+        Args:
+            box: left, top, width and height in pixels.
+            x: range from left to right.
+            y: range from bottom to top.
+
+        Returns:
+            The axes.
+        """
         scale = min(box[2] / (x[1] - x[0]), box[3] / (y[1] - y[0]))
         ranges = [
             (0.5 * (low + high), 0.5 * side / scale)
@@ -70,22 +98,43 @@ class Axes:
 
     @property
     def scale(self) -> tuple[float, float]:
-        """Pixels a unit, along x and y."""
+        """Pixels per unit, along x and y."""
         return self.box[2] / (self.x[1] - self.x[0]), self.box[3] / (self.y[1] - self.y[0])
 
     def place(self, x: float, y: float) -> tuple[float, float]:
-        """The pixel of a point of the world."""
-        right, up = self.scale
-        return self.box[0] + right * (x - self.x[0]), self.box[1] + self.box[3] - up * (
-            y - self.y[0]
-        )
+        """Return the pixel of a point.
+
+        Args:
+            x: coordinate to the right.
+            y: coordinate upwards.
+
+        Returns:
+            Pixels from the left and from the top of the picture.
+        """
+        (left, top, _, height), (right, up) = self.box, self.scale
+        return left + right * (x - self.x[0]), top + height - up * (y - self.y[0])
 
     def places(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """The pixels of points of the world, shape (k, 2)."""
+        """Return the pixels of points.
+
+        Args:
+            x: coordinates to the right, shape (k,).
+            y: coordinates upwards, shape (k,).
+
+        Returns:
+            As for `place`, shape (k, 2).
+        """
         return np.stack(self.place(x, y), axis=-1)  # pyright: ignore[reportArgumentType, reportCallIssue]  (arithmetic of arrays)
 
     def furnish(self, canvas: Canvas, x_label: str, y_label: str, grid: bool = True) -> None:
-        """Draw the grid, the ticks with their numbers, the frame and the labels."""
+        """Draw the grid, the ticks with their numbers, the frame and the labels.
+
+        Args:
+            canvas: to draw on.
+            x_label: below the box.
+            y_label: to its left.
+            grid: whether there is one.
+        """
         left, top, width, height = self.box
         bottom = top + height
         for tick in ticks(*self.x, most=max(2, width // 80)):

@@ -9,7 +9,7 @@ import numpy as np
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Box, Canvas
-from safe_envs.rendering.scenes.base import runs
+from safe_envs.rendering.curves import runs, thinned_minima
 from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import (
     EDGE,
@@ -27,7 +27,6 @@ from safe_envs.rendering.style import (
 )
 
 _FIRST_STEPS = 100
-_MOST_POINTS = 400
 
 
 class BarrierChart:
@@ -49,7 +48,7 @@ class BarrierChart:
             canvas: to draw on.
             snapshot: of the episode.
         """
-        times, h = _thinned(snapshot.times, snapshot.h)
+        times, h = thinned_minima(snapshot.times, snapshot.h)
         low, high = min(float(h.min()), 0.0), max(float(h.max()), 0.0)
         room = 0.12 * max(high - low, 1e-9)
         axes = Axes(self._box, self._period(float(times[-1])), (low - room, high + room))
@@ -102,12 +101,3 @@ class BarrierChart:
             return 0.0, first * 2.0 ** max(0, math.ceil(math.log2(max(now, first) / first)))
         end = max(self._problem.horizon, now)
         return end - self._problem.horizon, end
-
-
-def _thinned(times: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return about two points a pixel at most, with the smallest h of each group of points."""
-    stride = 1 + len(h) // _MOST_POINTS
-    if stride == 1:
-        return times, h
-    starts = np.arange(0, len(h), stride)
-    return times[np.minimum(starts + stride - 1, len(h) - 1)], np.minimum.reduceat(h, starts)

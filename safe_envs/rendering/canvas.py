@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import sys
 from collections.abc import Sequence
-from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pygame
 
+from safe_envs.rendering.curves import apart, dash_ends
+from safe_envs.rendering.fonts import cut, text_surface
 from safe_envs.rendering.style import INK, NORMAL, PAPER, Color
 
 Point = Sequence[float]
 Box = tuple[int, int, int, int]
 
 _FAR = 20_000.0
-"""Points further away are drawn at this distance: the coordinates of a surface are 16-bit numbers.
-"""
+"""Points further away are drawn at this distance: a surface has 16-bit coordinates."""
 
 _BRUSHES = {
     1: ((0.0, 0.0),),
@@ -28,44 +26,6 @@ _BRUSHES = {
     3: ((0.0, -0.9), (0.9, 0.0), (0.0, 0.9), (-0.9, 0.0), (0.0, 0.0)),
 }
 """Offsets of the thin lines that make a line of 1, 2 or 3 pixels."""
-
-
-def _font(size: int, bold: bool) -> pygame.font.Font:
-    """DejaVu Sans, which has all the letters and comes with matplotlib: the same picture on every
-    machine.
-    """
-    font = _loaded_font(size, bold)
-    try:
-        font.get_height()
-    except pygame.error:
-        # Gymnasium's own envs quit pygame when they close, after which no font that was loaded
-        # before can be used.
-        _loaded_font.cache_clear()
-        font = _loaded_font(size, bold)
-    return font
-
-
-@lru_cache(maxsize=16)
-def _loaded_font(size: int, bold: bool) -> pygame.font.Font:
-    pygame.font.init()
-    spec = importlib.util.find_spec("matplotlib")
-    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
-    path = Path(spec.origin or "").parent / "mpl-data" / "fonts" / "ttf" / name if spec else Path()
-    return pygame.font.Font(str(path) if path.is_file() else None, size)
-
-
-@lru_cache(maxsize=1024)
-def _text(text: str, size: int, bold: bool, color: Color, turned: bool) -> pygame.Surface:
-    surface = _font(size, bold).render(text, True, color)
-    return pygame.transform.rotate(surface, 90) if turned else surface
-
-
-def _apart(points: np.ndarray) -> np.ndarray:
-    """Indices of points that lie about a pixel and a half apart along a path, the first and the
-    last among them.
-    """
-    steps = np.floor(np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))]) / 1.5)
-    return np.unique(np.concatenate([[0], np.flatnonzero(np.diff(steps)) + 1, [len(points) - 1]]))
 
 
 class Canvas:
@@ -76,19 +36,24 @@ class Canvas:
 
     Args:
         size: width and height in pixels.
-        clear: begin with nothing, to be laid over something else, in place of paper.
+        clear: begin with a transparent surface, to be laid over another, in place of paper.
     """
 
     def __init__(self, size: tuple[int, int], clear: bool = False) -> None:
         self.surface = pygame.Surface(size, pygame.SRCALPHA if clear else 0, 32)
         self.surface.fill((0, 0, 0, 0) if clear else PAPER)
 
-    def lay(self, other: Canvas, at: tuple[int, int] = (0, 0)) -> None:
+    def lay(self, other: Canvas) -> None:
         """Lay another canvas over this one."""
-        self.surface.blit(other.surface, at)
+        self.surface.blit(other.surface, (0, 0))
 
     def photograph(self, pixels: np.ndarray, box: Box) -> None:
-        """Show a picture, uint8 of shape (height, width, 3), as large as it fits into a box."""
+        """Show a picture as large as it fits into a box.
+
+        Args:
+            pixels: uint8 of shape (height, width, 3).
+            box: left, top, width and height.
+        """
         left, top, width, height = box
         shown = pygame.surfarray.make_surface(pixels.swapaxes(0, 1))
         scale = min(width / shown.get_width(), height / shown.get_height())
@@ -99,23 +64,43 @@ class Canvas:
         )
 
     def within(self, box: Box | None) -> None:
-        """Draw only inside a box from now on; None for everywhere."""
+        """Restrict drawing to a box from now on; None removes the restriction."""
         self.surface.set_clip(box)
 
     def fill(self, box: Sequence[float], color: Color, rounded: int = 0) -> None:
-        """Fill a rectangle of left, top, width and height."""
+        """Fill a rectangle.
+
+        Args:
+            box: left, top, width and height.
+            color: of the area.
+            rounded: radius of the corners.
+        """
         pygame.draw.rect(
             self.surface, color, pygame.Rect([round(v) for v in box]), border_radius=rounded
         )
 
     def frame(self, box: Sequence[float], color: Color, width: int = 1, rounded: int = 0) -> None:
-        """Draw the outline of a rectangle."""
+        """Draw the outline of a rectangle.
+
+        Args:
+            box: left, top, width and height.
+            color: of the line.
+            width: of the line.
+            rounded: radius of the corners.
+        """
         pygame.draw.rect(
             self.surface, color, pygame.Rect([round(v) for v in box]), width, border_radius=rounded
         )
 
     def line(self, start: Point, end: Point, color: Color, width: int = 1) -> None:
-        """Draw a straight line."""
+        """Draw a straight line.
+
+        Args:
+            start: (x, y).
+            end: (x, y).
+            color: of the line.
+            width: of the line.
+        """
         length = math.dist(start, end)
         if not all(-_FAR < v < _FAR for v in (*start, *end)) or length < 1e-6:
             return
@@ -136,17 +121,22 @@ class Canvas:
             )
 
     def path(self, points: np.ndarray, color: Color, width: int = 1) -> None:
-        """Draw lines through points, shape (k, 2), up to 3 pixels wide."""
+        """Draw lines through points.
+
+        Args:
+            points: shape (k, 2).
+            color: of the lines.
+            width: of the lines, 3 at most.
+        """
         if len(points) < 2:
             return
         points = np.clip(points, -_FAR, _FAR)
         if len(points) > 200:
-            points = points[_apart(points)]
+            points = points[apart(points)]
         # Wide lines of the library have gaps at their corners: a brush of thin ones has none.
         for offset in _BRUSHES[min(width, 3)]:
             through = (points + offset).tolist()
-            # Of two points the library's `aalines` looks at a third, so that its picture is a
-            # matter of chance.
+            # Given two points, the library's `aalines` reads a third one out of bounds.
             if len(through) == 2:
                 pygame.draw.aaline(self.surface, color, *through)
             else:
@@ -155,22 +145,31 @@ class Canvas:
     def dashes(
         self, points: np.ndarray, color: Color, width: int = 1, period: float = 12.0
     ) -> None:
-        """Draw a dashed line through points, shape (k, 2)."""
+        """Draw a dashed line through points.
+
+        Args:
+            points: shape (k, 2).
+            color: of the dashes.
+            width: of the dashes.
+            period: length of a dash and a gap.
+        """
         if len(points) < 2:
             return
         points = np.clip(points, -_FAR, _FAR)
-        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-        stops = np.arange(0.0, along[-1], period / 2)
-        places = np.stack(
-            [np.interp(stops, along, points[:, i]) for i in range(2)], axis=1
-        ).tolist()
-        for start, end in zip(places[::2], places[1::2], strict=False):
+        for start, end in dash_ends(points, period):
             self.line(start, end, color, width)
 
     def shape(
         self, points: Any, fill: Color | None, outline: Color | None = None, width: int = 1
     ) -> None:
-        """Draw a polygon with smooth edges."""
+        """Draw a polygon with smooth edges.
+
+        Args:
+            points: the corners, shape (k, 2).
+            fill: colour of the area; None for none.
+            outline: colour of the edge; by default that of the area.
+            width: of the edge.
+        """
         vertices = np.clip(np.asarray(points, dtype=float), -_FAR, _FAR)
         if fill is not None:
             pygame.draw.polygon(self.surface, fill, vertices.tolist())
@@ -184,7 +183,15 @@ class Canvas:
         outline: Color | None = None,
         width: int = 2,
     ) -> None:
-        """Draw a circle, filled or not."""
+        """Draw a circle.
+
+        Args:
+            center: (x, y).
+            radius: of the circle.
+            fill: colour of the area; None for none.
+            outline: colour of the edge; None for none.
+            width: of the edge.
+        """
         if not all(-_FAR < v < _FAR for v in (*center, radius)):
             return
         if fill is not None:
@@ -195,14 +202,29 @@ class Canvas:
     def diamond(
         self, center: Point, size: float, fill: Color | None, outline: Color, width: int = 2
     ) -> None:
-        """Draw a square that stands on a corner."""
+        """Draw a square that stands on a corner.
+
+        Args:
+            center: (x, y).
+            size: from the center to a corner.
+            fill: colour of the area; None for none.
+            outline: colour of the edge.
+            width: of the edge.
+        """
         x, y = center
         self.shape(
             [(x, y - size), (x + size, y), (x, y + size), (x - size, y)], fill, outline, width
         )
 
     def cross(self, center: Point, size: float, color: Color, width: int = 3) -> None:
-        """Draw an X."""
+        """Draw an X.
+
+        Args:
+            center: (x, y).
+            size: half of its width and height.
+            color: of the lines.
+            width: of the lines.
+        """
         x, y = center
         for side in (-size, size):
             self.line((x - size, y - side), (x + size, y + side), color, width)
@@ -210,7 +232,15 @@ class Canvas:
     def arrow(
         self, start: Point, end: Point, color: Color, width: int = 2, head: float = 7.0
     ) -> None:
-        """Draw an arrow."""
+        """Draw an arrow.
+
+        Args:
+            start: (x, y).
+            end: (x, y) of the tip.
+            color: of the arrow.
+            width: of the line.
+            head: length of the head.
+        """
         length = math.dist(start, end)
         if length < 1.0:
             return
@@ -243,17 +273,15 @@ class Canvas:
             size: of the letters.
             bold: whether they are bold.
             align: (0, 0) is the left upper corner of the text, (1, 1) the right lower one.
-            turned: write from below to above.
-            widest: in pixels; a longer text is cut.
+            turned: write upwards.
+            widest: most pixels; a longer text is cut.
 
         Returns:
             The width of what was written.
         """
-        if widest is not None and _font(size, bold).size(text)[0] > widest:
-            while text and _font(size, bold).size(text + "…")[0] > widest:
-                text = text[:-1]
-            text += "…"
-        surface = _text(text, size, bold, color, turned)
+        if widest is not None:
+            text = cut(text, size, bold, widest)
+        surface = text_surface(text, size, bold, color, turned)
         width, height = surface.get_size()
         self.surface.blit(
             surface, (round(at[0] - align[0] * width), round(at[1] - align[1] * height))
@@ -261,16 +289,12 @@ class Canvas:
         return width
 
     def pixels(self) -> np.ndarray:
-        """What was drawn, uint8 of shape (height, width, 3), in memory of its own."""
+        """Return a copy of what was drawn, uint8 of shape (height, width, 3)."""
         width, height = self.surface.get_size()
         packed = pygame.surfarray.pixels2d(self.surface).T.view(np.uint8)
         pixels = np.empty((height, width, 3), dtype=np.uint8)
-        # Channel by channel: many times quicker than the conversions of the library.
+        # Channel by channel: many times faster than the conversions of the library.
         for channel, shift in enumerate(self.surface.get_shifts()[:3]):
-            pixels[..., channel] = packed[:, _byte(shift) :: 4]
+            byte = shift // 8 if sys.byteorder == "little" else 3 - shift // 8
+            pixels[..., channel] = packed[:, byte::4]
         return pixels
-
-
-def _byte(shift: int) -> int:
-    """Where in the memory of a pixel a channel is."""
-    return shift // 8 if sys.byteorder == "little" else 3 - shift // 8

@@ -1,4 +1,4 @@
-"""The picture of an instant of an episode: the scene of the problem, and the panel beside it."""
+"""The picture of an instant of an episode: the scene of the problem, and the panel next to it."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from safe_envs.rendering.style import SCENE, SIZE
 
 
 class Picture:
-    """Draws instants of a problem's episodes; it holds no episode, so that one object serves any
-    number of envs.
+    """Draws instants of a problem's episodes; one object serves any number of envs.
 
     Args:
-        problem: that is drawn. A scene of its name is only looked for when it is to be shown.
+        problem: that is drawn. Its scene is looked up when it is first shown.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -36,13 +35,16 @@ class Picture:
     def draw(
         self, snapshot: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None
     ) -> pygame.Surface:
-        """Draw an instant; the surface is drawn over by the next call.
+        """Draw an instant.
 
         Args:
             snapshot: what is drawn.
-            caption: above it.
-            shot: somebody else's picture of it, uint8 of shape (height, width, 3), to show in place
-                of the scene.
+            caption: in the panel.
+            shot: frame of a third-party env, uint8 of shape (height, width, 3), to show in place of
+                the scene.
+
+        Returns:
+            A surface that the next call overwrites.
         """
         self._panel.draw(self._canvas, snapshot, caption)
         if shot is None:
@@ -54,6 +56,15 @@ class Picture:
     def frame(
         self, snapshot: EpisodeSnapshot, caption: str = "", shot: np.ndarray | None = None
     ) -> np.ndarray:
-        """Draw an instant; uint8 of shape (height, width, 3). Arguments as for `draw`."""
+        """Draw an instant as an array.
+
+        Args:
+            snapshot: as for `draw`.
+            caption: as for `draw`.
+            shot: as for `draw`.
+
+        Returns:
+            Pixels, uint8 of shape (height, width, 3).
+        """
         self.draw(snapshot, caption, shot)
         return self._canvas.pixels()

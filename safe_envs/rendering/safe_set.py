@@ -1,6 +1,4 @@
-"""The safe set in a plane of two states: its edge h = 0, its inside tinted less towards the edge,
-its outside hatched.
-"""
+"""The safe set in a plane of two states: its edge h = 0, a tinted inside and a hatched outside."""
 
 from __future__ import annotations
 
@@ -20,19 +18,27 @@ _RESOLUTION = 4
 _NEAREST, _FURTHEST = -4, 96
 
 LEVELS = 4
-"""How many tints the safe set has."""
+"""Number of tints of the safe set."""
 
 STEP = _FURTHEST // LEVELS
-"""Pixels from one tint to the next; the last one goes on for ever."""
+"""Width of a tint in pixels; the innermost one has no end."""
 
 
 def tint(level: int) -> Color:
-    """The colour of the safe set from `level` steps within its edge, to the next level."""
+    """Return the colour of the safe set between `level` and `level + 1` steps from its edge."""
     return mix(GREEN, PAPER, 0.07 + 0.055 * level)
 
 
 def barriers_in(problem: SafetyProblem, states: Sequence[int]) -> list[int]:
-    """Indices of the barriers that depend on none but some states."""
+    """Return the barriers that depend on certain states only.
+
+    Args:
+        problem: with the barriers.
+        states: indices of the states.
+
+    Returns:
+        Indices of the barriers.
+    """
     allowed = {problem.plant.states[i] for i in states}
     return [k for k, b in enumerate(problem.barriers) if b.expression.free_symbols <= allowed]
 
@@ -41,8 +47,8 @@ class Barriers:
     """Barriers over arrays of states.
 
     Args:
-        problem: whose barriers they are.
-        chosen: indices of those that are read; None for all.
+        problem: with the barriers.
+        chosen: indices of those to evaluate; None for all.
     """
 
     def __init__(self, problem: SafetyProblem, chosen: Sequence[int] | None = None) -> None:
@@ -52,8 +58,9 @@ class Barriers:
         )
 
     def __call__(self, components: Sequence[np.ndarray | float]) -> np.ndarray:
-        """Each barrier at states that broadcast against each other, with the barriers in front; NaN
-        counts as unsafe.
+        """Return each barrier at states that broadcast against each other; NaN counts as unsafe.
+
+        The barriers are along the first axis.
         """
         shape = np.broadcast_shapes(*(np.shape(c) for c in components))
         with np.errstate(all="ignore"):
@@ -61,15 +68,32 @@ class Barriers:
         return np.nan_to_num(np.stack([filled(v, shape) for v in values]), nan=-1.0)
 
     def along(self, state: np.ndarray, i: int, values: np.ndarray) -> np.ndarray:
-        """The smallest barrier where one state takes other values, shape (k,); of no barrier,
-        infinite.
+        """Return the smallest barrier where one state takes other values.
+
+        Args:
+            state: shape (n,).
+            i: index of the state that varies.
+            values: of that state, shape (k,).
+
+        Returns:
+            Shape (k,); infinite if there is no barrier.
         """
         if not len(self.chosen):
             return np.full(len(values), np.inf)
         return self([values if j == i else float(v) for j, v in enumerate(state)]).min(axis=0)
 
     def intervals(self, state: np.ndarray, i: int, low: float, high: float) -> list[Range]:
-        """Where one state may be within a range for h >= 0, the others as they are."""
+        """Return where one state may be for h >= 0, with the others as they are.
+
+        Args:
+            state: shape (n,).
+            i: index of the state that varies.
+            low: end of the range that is searched.
+            high: other end.
+
+        Returns:
+            The ends of each interval.
+        """
         values = np.linspace(low, high, 401)
         h = self.along(state, i, values)
         safe = np.concatenate([[False], h >= 0.0, [False]])
@@ -82,7 +106,7 @@ class Barriers:
 
 
 def _crossing(values: np.ndarray, h: np.ndarray, i: int, j: int) -> float:
-    """Where h vanishes between two neighbours, or the end of the range."""
+    """Return where h vanishes between two neighbours, or the end of the range."""
     if i < 0 or j >= len(values) or not np.isfinite(h[i] - h[j]):
         return float(values[min(j, len(values) - 1)])
     return float(values[i] + (values[j] - values[i]) * h[i] / (h[i] - h[j]))
@@ -91,13 +115,13 @@ def _crossing(values: np.ndarray, h: np.ndarray, i: int, j: int) -> float:
 class SafeSet:
     """Draws the safe set onto a box of axes.
 
-    The tint grows in steps of h/|grad h|, the distance from the edge to first order: levels of h
-    that can be compared between barriers, whatever their units.
+    The tint grows in steps of h/|grad h|, the distance from the edge to first order, which can be
+    compared between barriers of different units.
 
     Args:
         barriers: of the set.
         axes: where they are drawn.
-        plane: indices of the states along x and y; -1 for what is no state, the time say.
+        plane: indices of the states along x and y; -1 for an axis of something else, such as time.
     """
 
     def __init__(self, barriers: Barriers, axes: Axes, plane: tuple[int, int]) -> None:
@@ -117,7 +141,12 @@ class SafeSet:
         )
 
     def draw(self, canvas: Canvas, state: np.ndarray) -> None:
-        """Draw the set with all states but the two of the plane as they are."""
+        """Draw the set, with the states outside the plane as they are.
+
+        Args:
+            canvas: to draw on.
+            state: shape (n,).
+        """
         x, y = self._plane
         height, width = self._hatched.shape
         h = self._barriers(
@@ -135,8 +164,10 @@ class SafeSet:
 
 
 def _to_edge(h: np.ndarray) -> np.ndarray:
-    """Distance from the edge in pixels, to first order, the least of all barriers: h has shape
-    (barriers, rows, columns).
+    """Return the distance from the nearest edge in pixels, to first order.
+
+    Args:
+        h: shape (barriers, rows, columns).
     """
     down, across = np.gradient(h, _CELL, axis=(1, 2))
     slope = np.sqrt(np.maximum(down * down + across * across, 1e-24))
@@ -144,7 +175,7 @@ def _to_edge(h: np.ndarray) -> np.ndarray:
 
 
 def _finer(knots: np.ndarray) -> np.ndarray:
-    """Values at the middles of the pixels between knots, along the last axis."""
+    """Return values at the middles of the pixels between knots, along the last axis."""
     share = ((np.arange(_CELL) + 0.5) / _CELL).astype(np.float32)
     between = knots[:, :-1, None] + np.diff(knots)[:, :, None] * share
     return between.reshape(len(knots), -1)
@@ -155,7 +186,7 @@ def _count() -> int:
 
 
 def _colors(hatched: bool) -> list[Color]:
-    """The colour of each distance from the edge, from outside to inside."""
+    """Return the colour of each distance from the edge, from outside to inside."""
     found = []
     for i in range(_count()):
         distance = _NEAREST + i / _RESOLUTION

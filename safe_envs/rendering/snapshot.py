@@ -1,4 +1,4 @@
-"""What has happened in an episode so far, as far as a picture shows it."""
+"""The past of an episode, as far as a picture shows it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _KEPT = 5000
 
 @dataclass(frozen=True)
 class DrawnDecision:
-    """What a filter made of a policy's action: components in physical units."""
+    """A filter's decision as pictures show it: components in physical units."""
 
     nominal: Sequence[float]
     active: bool
@@ -32,8 +32,8 @@ class EpisodeSnapshot:
         times: since the start of the episode in s, shape (k,).
         h: smallest barrier, shape (k,).
         barriers: each barrier now.
-        least: smallest h since the start of the episode, of states that are not kept as well.
-        executed: input that led here, None at the start of an episode.
+        least: minimum h since the start of the episode, states that are not kept included.
+        executed: input of the last step, None at the start of an episode.
         decision: of a filter on that input, None without a filter.
         violated: where h was negative first, shape (n,); None if it never was.
         violated_at: when that was, in s.
@@ -56,7 +56,7 @@ class EpisodeSnapshot:
 
     @property
     def intervening(self) -> bool:
-        """Whether a filter changed the action that led here."""
+        """Whether a filter changed the action of the last step."""
         if self.decision is None or self.executed is None or not self.decision.active:
             return False
         return any(u != v for u, v in zip(self.executed, self.decision.nominal, strict=True))
@@ -68,10 +68,10 @@ class EpisodeSnapshot:
 
 
 class History:
-    """Records an episode; of a very long one the last 5000 states at least.
+    """Records an episode; of a very long one, at least the last 5000 states.
 
     Args:
-        problem: whose barriers are read along the way.
+        problem: with the barriers.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -83,7 +83,12 @@ class History:
         self._count = 0
 
     def restart(self, state: Sequence[float], time: float) -> None:
-        """Forget the past: an episode begins, or goes on from somewhere else."""
+        """Forget the past: an episode begins, or continues from another state.
+
+        Args:
+            state: components of the state now.
+            time: since the start of the episode in s.
+        """
         self._count = 0
         self._least = math.inf
         self._violated: np.ndarray | None = None
@@ -97,7 +102,14 @@ class History:
         executed: Sequence[float] | None,
         decision: DrawnDecision | None,
     ) -> None:
-        """Add a state and what led to it."""
+        """Add a state and what led to it.
+
+        Args:
+            state: components of the state now.
+            time: since the start of the episode in s.
+            executed: components of the input, in physical units.
+            decision: of a filter on that input.
+        """
         if self._count == len(self._rows):
             self._rows[:_KEPT] = self._rows[-_KEPT:]
             self._count = _KEPT
@@ -112,7 +124,7 @@ class History:
 
     @property
     def snapshot(self) -> EpisodeSnapshot:
-        """The instant that was added last."""
+        """The latest instant with its past."""
         rows = self._rows[: self._count]
         barriers, executed, decision = self._latest
         return EpisodeSnapshot(

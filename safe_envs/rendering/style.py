@@ -8,7 +8,7 @@ import sympy as sp
 
 Color = tuple[int, int, int]
 
-# The palette of Okabe and Ito, which colour-blind people tell apart.
+# The palette of Okabe and Ito, which colour-blind people can tell apart.
 BLUE: Color = (0, 114, 178)
 SKY: Color = (86, 180, 233)
 GREEN: Color = (0, 158, 115)
@@ -49,7 +49,16 @@ _SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 def mix(color: Color, background: Color, share: float) -> Color:
-    """A colour laid over another one with an opacity from 0 to 1."""
+    """Return a colour laid over another one.
+
+    Args:
+        color: on top.
+        background: below.
+        share: opacity of the upper one, from 0 to 1.
+
+    Returns:
+        The colour that is seen.
+    """
     r, g, b = (
         round(share * c + (1 - share) * under) for c, under in zip(color, background, strict=True)
     )
@@ -57,33 +66,41 @@ def mix(color: Color, background: Color, share: float) -> Color:
 
 
 def pretty(name: str) -> str:
-    """A name with Greek letters and indices, and rates as such: theta, x_1 and zdot as θ, x₁ and
-    dz/dt.
-    """
+    """Return a name with Greek letters, indices and rates: theta, x_1, zdot as θ, x₁, dz/dt."""
     base = name.removesuffix("dot")
     text = sp.pretty(sp.Symbol(base or name), use_unicode=True)
     return f"d{text}/dt" if base and base != name else text
 
 
 def unit_text(unit: str) -> str:
-    """A unit with raised exponents and a centred dot: rad^2/s^2 as rad²/s², N m as N·m."""
+    """Return a unit with raised exponents and a centred dot: rad^2/s^2 as rad²/s², N m as N·m."""
     head, *powers = unit.replace(" ", "·").split("^")
     return head + "".join(power[:1].translate(_SUPERSCRIPTS) + power[1:] for power in powers)
 
 
 def label(name: str, unit: str = "") -> str:
-    """A name with its unit, for an axis."""
+    """Return a name with its unit, for an axis.
+
+    Args:
+        name: of a variable.
+        unit: of the variable; empty for none.
+
+    Returns:
+        Such as "ω [rad/s]".
+    """
     return f"{pretty(name)} [{unit_text(unit)}]" if unit else pretty(name)
 
 
 def number(value: float, scale: float = 0.0) -> str:
-    """Three digits that count, with a true minus sign; large numbers in whole ones, in groups of
-    three.
+    """Return a number with three significant digits and a true minus sign.
 
     Args:
-        value: to write.
-        scale: what is less than a thousandth of it is written as 0, and the digits count at this
+        value: to write; a large one is rounded to a whole number, in groups of three digits.
+        scale: a value below a thousandth of it is written as 0, and digits are significant at this
             size.
+
+    Returns:
+        The text.
     """
     size = abs(value)
     if size <= 1e-3 * scale:
@@ -101,11 +118,7 @@ def number(value: float, scale: float = 0.0) -> str:
 
 
 def bound(value: float) -> str:
-    """A bound: three digits without zeros behind the point; very small and large ones as `number`
-    writes them.
-    """
-    return (
-        f"{value:.3g}".replace("-", "\u2212")
-        if value == 0.0 or 1e-3 <= abs(value) < 999.5
-        else number(value)
-    )
+    """Return a bound with three significant digits, without zeros at the end."""
+    if value == 0.0 or 1e-3 <= abs(value) < 999.5:
+        return f"{value:.3g}".replace("-", "\u2212")
+    return number(value)

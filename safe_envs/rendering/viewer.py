@@ -1,6 +1,4 @@
-"""What an env keeps in order to be seen: the history of its episodes, and the picture or the window
-that shows them.
-"""
+"""The viewer of an env: the history of its episodes, and the picture or window that shows them."""
 
 from __future__ import annotations
 
@@ -38,7 +36,7 @@ def frames_a_second(problem: SafetyProblem) -> int:
 def open_viewer(
     problem: SafetyProblem, mode: str | None, num_envs: int | None = None
 ) -> Viewer | None:
-    """Return the viewer of an env, None if it is not to be seen.
+    """Return the viewer of an env, or None if it is not to be drawn.
 
     Args:
         problem: of the env.
@@ -62,8 +60,10 @@ def open_viewer(
 
 
 def require_pygame() -> None:
-    """Raise gymnasium.error.DependencyNotInstalled, with what to install, if pygame-ce is missing
-    or the other pygame is in its place.
+    """Check that pygame-ce can be imported.
+
+    Raises:
+        gymnasium.error.DependencyNotInstalled: it is missing, or the other pygame is in its place.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
@@ -82,11 +82,10 @@ def require_pygame() -> None:
 
 
 class Viewer:
-    """Records the episodes of a batch of envs and draws them; nothing is drawn before it is asked
-    for.
+    """Records the episodes of a batch of envs, and draws them on request.
 
     Attributes:
-        caption: what the pictures say above the scene, the name of a filter say.
+        caption: a text in the panel, such as the name of a filter.
 
     Args:
         problem: of the envs.
@@ -104,13 +103,17 @@ class Viewer:
         self._window: Window | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy gets: neither the window nor the canvas, which it makes for itself when it
-        draws.
-        """
+        """Return the state without window and canvas, which a copy makes itself when it draws."""
         return {**vars(self), "_picture": None, "_window": None}
 
     def announce(self, nominal: Rows, active: Rows, feasible: Rows) -> None:
-        """Keep what a filter decided, a row for each env, for the step that comes next."""
+        """Keep what a filter decided for the next step.
+
+        Args:
+            nominal: inputs of the policy, a row for each env.
+            active: whether the filter changed them.
+            feasible: whether the constraints could be met.
+        """
         self._decisions = [
             DrawnDecision(tuple(n), bool(a), bool(f))
             for n, a, f in zip(nominal, active, feasible, strict=True)
@@ -129,9 +132,18 @@ class Viewer:
         self._decisions = [None] * len(self._histories)
         self._go_live()
 
-    def advance(self, states: Rows, times: Rows, executed: Rows, anew: Iterable[int] = ()) -> None:
-        """Record a step of all envs, a row for each, of which those in `anew` begin an episode."""
-        fresh = frozenset(anew)
+    def advance(
+        self, states: Rows, times: Rows, executed: Rows, restarted: Iterable[int] = ()
+    ) -> None:
+        """Record a step of all envs.
+
+        Args:
+            states: after the step.
+            times: since the start of each env's episode, in s.
+            executed: inputs, in physical units.
+            restarted: indices of the envs that begin an episode instead.
+        """
+        fresh = frozenset(restarted)
         for i, history in enumerate(self._histories):
             if i in fresh:
                 history.restart(states[i], float(times[i]))
@@ -141,10 +153,10 @@ class Viewer:
         self._go_live()
 
     def frames(self, shots: Sequence[np.ndarray] | None = None) -> tuple[np.ndarray, ...]:
-        """A picture of each env now, uint8 of shape (height, width, 3).
+        """Draw each env, uint8 of shape (height, width, 3).
 
         Args:
-            shots: somebody else's pictures of the envs, to show in place of the scenes.
+            shots: frames of third-party envs, to show in place of the scenes.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.
@@ -160,7 +172,7 @@ class Viewer:
         )
 
     def render(self) -> Any:
-        """The picture of a single env; in human mode it goes to the window, and None is returned.
+        """Draw a single env; in human mode to the window, and None is returned.
 
         Raises:
             gymnasium.error.DependencyNotInstalled: pygame is missing.

@@ -42,7 +42,7 @@ class Window:
         return window
 
     def show(self, surface: pygame.Surface) -> None:
-        """Show a picture, once the time of the one before is over."""
+        """Show a picture once the time of the previous one is over."""
         try:
             self._show(surface)
         except pygame.error:
@@ -59,9 +59,7 @@ class Window:
         self._window.flip()
 
     def close(self) -> None:
-        """Close the window, and after the last one the display, unless somebody else shows
-        something on it.
-        """
+        """Close the window, and after the last one the display, unless other code uses it."""
         self._window.destroy()
         _OPEN.discard(self)
         if not _OPEN and pygame.display.get_init() and pygame.display.get_surface() is None:
@@ -69,10 +67,10 @@ class Window:
 
 
 def _forget_all() -> None:
-    """Let go of windows that ended with the display.
+    """Destroy the windows that ended with the display.
 
-    SDL gives a new window the address of one of them: an old one that is let go of only then would
-    end the new one.
+    SDL may give a new window the address of an old one: destroying the old one later would end the
+    new one.
     """
     for each in _OPEN:
         each._window.destroy()

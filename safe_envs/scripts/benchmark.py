@@ -1,6 +1,4 @@
-"""`safe-envs benchmark`: the speed of filters, envs and learning, with a hand-written loop as the
-limit.
-"""
+"""`safe-envs benchmark`: the speed of filters, envs and learning."""
 
 from __future__ import annotations
 
@@ -14,22 +12,9 @@ from rich.table import Table
 
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError
-from safe_envs.registry import make_problem
-from safe_envs.scripts.options.console import require_result, say, stdout, write_result
+from safe_envs.scripts.options.app import run_alone
+from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
 from safe_envs.scripts.reports.tables import make_table
-from safe_envs.wrappers import (
-    CBF,
-    DDSCBF,
-    HOCBF,
-    BayesianSCBF,
-    LearnedHOCBF,
-    SafetyFilter,
-    SafetyFilterVectorWrapper,
-    SafetyFilterWrapper,
-    parse_conditions,
-)
-from safe_envs.wrappers.learning import LearnedModel, learner_of
-from safe_envs.wrappers.learning.data.collection import draw_states
 
 _ADVICE = "give what `safe-envs benchmark --json FILE` wrote"
 

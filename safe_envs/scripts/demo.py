@@ -32,8 +32,9 @@ def demo(
     episodes: Annotated[int, typer.Option(min=1, help="Episodes for each filter.")] = 1000,
     json: Json = None,
 ) -> None:
-    """Train PPO briefly without a filter, then show the safety of it and of the nominal controller,
-    bare and filtered.
+    """Train PPO briefly without a filter, then compare it with the nominal controller.
+
+    The safety of both is shown unfiltered and filtered.
     """
     from safe_envs.agents.evaluation.evaluate import evaluate
     from safe_envs.scripts.figures.evaluation_figure import draw

@@ -26,8 +26,10 @@ if TYPE_CHECKING:
 
 
 def doctor(json: Json = None) -> None:
-    """Check the installation: packages and extras, the solvers against known answers, every env
-    with its filter, and the speed.
+    """Check the installation.
+
+    Checked are packages and extras, the solvers on problems with known answers, and every env with
+    its default filter; the speed is measured.
     """
     from safe_envs import __version__
     from safe_envs.scripts.reports import installation

@@ -26,7 +26,7 @@ def list_envs(json: Json = None) -> None:
     table.columns[0].max_width = 50
     rows = []
     for env_id in ENV_IDS:
-        about = (env_class(env_id).__doc__ or "").strip().partition("\n")[0]
+        about = " ".join((env_class(env_id).__doc__ or "").strip().partition("\n\n")[0].split())
         rows.append({"env_id": env_id, "about": about, **_defaults(make_problem(env_id))})
         cells = [_cell(name, rows[-1][name]) for name in _COLUMNS]
         table.add_row(f"[bold]{env_id}[/]\n{escape(about)}\n", *cells)

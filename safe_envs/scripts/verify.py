@@ -1,6 +1,4 @@
-"""`safe-envs verify`: where a filter's conditions can be met, what they promise, and whether that
-is true.
-"""
+"""`safe-envs verify`: where a filter's conditions can be met, and what bounds its safety has."""
 
 from __future__ import annotations
 
@@ -65,47 +63,45 @@ def verify(
         ),
     ] = None,
 ) -> None:
-    """Print where the filter's conditions cannot be met, what bounds on its safety are estimated
-    at, and what a simulation says to that.
+    """Print where a filter's conditions cannot be met, and its bounds next to a simulation.
 
-    The safe set C is sampled, and searched for the worst: where the input has no say, where no
-    action in the box meets the conditions, and the suprema on which the bounds rest. Nothing of
-    this depends on the policy; the simulation does, and a bound that it contradicts is withheld.
+    The safe set C is sampled, and searched for the worst states: where the input has no effect,
+    where no action within the input bounds meets the conditions, and the suprema that the bounds
+    need. None of this depends on the policy; the simulation does, and a bound that it contradicts
+    is withheld.
     """
     from safe_envs.agents.evaluation.bound_check import judged, measure, starts_of
     from safe_envs.agents.policies.registry import make_policy
     from safe_envs.registry import make_problem, title_of
-    from safe_envs.scripts.reports.verify_report import document, print_report
+    from safe_envs.scripts.reports.verify_answer import VerifyAnswer
+    from safe_envs.scripts.reports.verify_report import print_report
     from safe_envs.wrappers import parse_conditions
-    from safe_envs.wrappers.verification.feasibility import verify as find
+    from safe_envs.wrappers.verification import feasibility
 
     require_whole("episodes", episodes, 1)
-    text_options.require_outputs(
-        json, plot, inputs=text_options.inputs_of(env.system, policy, [filter_name or ""])
-    )
+    inputs = text_options.inputs_of(env.system, policy, [filter_name or ""])
+    text_options.require_outputs(json, plot, inputs=inputs)
     known, arguments = env.full_id, env.arguments
-    title = title_of(known, arguments)
     problem = make_problem(known, **arguments)
-    actor = make_policy(
-        policy, problem, trust
-    )  # An unknown one is to show before the search, and without a simulation too.
-    found = find(
-        problem, parse_conditions(filter_name or problem.filter, problem), knowledge, seed=seed
-    )
+    # An unknown policy is an error before the search, and without a simulation too.
+    actor = make_policy(policy, problem, trust)
+    conditions = parse_conditions(filter_name or problem.filter, problem)
+    found = feasibility.verify(problem, conditions, knowledge, seed=seed)
     starts = starts_of(problem, seed)
-    bounds = found.guarantee.applicable_bounds(starts, problem.duration)
-    measurements = []
+    bounds, measurements = found.guarantee.applicable_bounds(starts, problem.duration), []
     if simulate:
         with progress_bar("Simulating") as tell:
             measurements = measure(found, actor, episodes=episodes, seed=seed, progress=tell)
         bounds, measurements = judged(bounds, measurements, found)
-    print_report(stdout(), title, found, starts, bounds, policy, measurements)
     config = {"env_id": known, "options": arguments, "policy": policy, "seed": seed}
-    write_result(json, lambda: document(config, found, bounds, measurements))
+    title = title_of(known, arguments)
+    answer = VerifyAnswer(title, config, policy, found, starts, bounds, measurements)
+    print_report(stdout(), answer)
+    write_result(json, answer.document)
     if plot is not None:
         from safe_envs.scripts.figures.verify_figure import draw
 
-        draw(title, found, starts, plot)
+        draw(answer, plot)
 
 
 if __name__ == "__main__":

@@ -12,8 +12,9 @@ import pytest
 
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.registry import make_problem
-from safe_envs.scripts.identify import SETTINGS, read_settings, settings_of
-from safe_envs.scripts.reports.identify_report import Function, Source, percent, unit_of
+from safe_envs.scripts.options.method_settings import SETTINGS, read_settings, settings_of
+from safe_envs.scripts.reports.identify_answer import Function, Source, unit_of
+from safe_envs.scripts.reports.quantities import relative_text
 from safe_envs.wrappers.learning import METHODS, learner_of, load_learned
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.data.transitions import Transitions
@@ -437,7 +438,7 @@ def test_errors_of_a_function():
     assert Function("f", "", zero, zero).vanishes
     assert Function("f", "", zero, np.ones(2)).relative is None
     assert Function("f", "", 1e-17 * np.ones(2), np.ones(2)).relative is None
-    assert [percent(share) for share in (0.0, 1e-3, 0.2, 12.0)] == [
+    assert [relative_text(share) for share in (0.0, 1e-3, 0.2, 12.0)] == [
         "< 1e-06 %",
         "0.1 %",
         "20 %",

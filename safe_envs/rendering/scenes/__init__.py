@@ -1,4 +1,4 @@
-"""How each kind of problem is drawn."""
+"""Scenes: how each kind of problem is drawn."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SCENES = {
 
 
 def make_scene(problem: SafetyProblem) -> Scene:
-    """The scene that a problem names; by default its plane, or else a bar for each state.
+    """Return the scene that a problem names; by default its plane, or else a bar for each state.
 
     Raises:
         ConfigurationError: there is no such scene, or it shows states that the problem does not
@@ -32,6 +32,5 @@ def make_scene(problem: SafetyProblem) -> Scene:
     if name not in SCENES:
         raise ConfigurationError(f"{problem.name} has scene {name!r}; {nearest(name, SCENES)}")
     module, class_name = SCENES[name].split(":")
-    return getattr(importlib.import_module(f"safe_envs.rendering.scenes.{module}"), class_name)(
-        problem
-    )
+    found = importlib.import_module(f"safe_envs.rendering.scenes.{module}")
+    return getattr(found, class_name)(problem)

@@ -1,9 +1,9 @@
-"""A bar for each state, over its trail where there is room, for any problem without a plane."""
+"""The scene of problems without a plane: a bar for each state, over its trail if there is room."""
 
 from __future__ import annotations
 
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rendering.axes import Axes, Range, grown, ticks
+from safe_envs.rendering.axes import Axes, grown, ticks
 from safe_envs.rendering.canvas import Canvas
 from safe_envs.rendering.safe_set import Barriers, tint
 from safe_envs.rendering.scenes.base import (
@@ -32,14 +32,13 @@ _LEFT, _WIDTH, _TOP, _BOTTOM = 40, 520, 58, 532
 _MOST = 10
 _HIGHEST = 240.0
 _WITH_ENDS, _WITH_TRAIL = 60.0, 100.0
-"""Pixels from one state to the next from which there is room for the ends of its range, and for its
-trail."""
+"""Pixels between states at which there is room for the ends of the range, and for the trail."""
 
 
 class BarsScene(Scene):
-    """Where each state is in its range, and where it may be for h >= 0 with the others as they are.
+    """Shows each state in its range, and where it may be for h >= 0 with the others as they are.
 
-    With up to four states, each one's trail hangs from its bar: the later, the higher.
+    With up to four states, each one's trail is below its bar: the later, the higher.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -107,20 +106,10 @@ class BarsScene(Scene):
                     align=(side, 0.0),
                 )
         if self._pitch >= _WITH_TRAIL:
-            self._draw_trail(
-                canvas,
-                snapshot,
-                i,
-                Axes(
-                    (_LEFT, top + 56, _WIDTH, round(self._pitch) - 72),
-                    (low, high),
-                    self._times(snapshot),
-                ),
-            )
-
-    def _times(self, snapshot: EpisodeSnapshot) -> Range:
-        now = float(snapshot.times[-1])
-        return now - self.problem.horizon, now
+            box = (_LEFT, top + 56, _WIDTH, round(self._pitch) - 72)
+            now = float(snapshot.times[-1])
+            axes = Axes(box, (low, high), (now - self.problem.horizon, now))
+            self._draw_trail(canvas, snapshot, i, axes)
 
     def _draw_trail(self, canvas: Canvas, snapshot: EpisodeSnapshot, i: int, axes: Axes) -> None:
         left, top, width, height = axes.box

@@ -1,6 +1,4 @@
-"""What the scenes share: the states that they show, the part of the world that is seen, and the
-trail.
-"""
+"""Common parts of the scenes: the states that they show, the part that is seen, and the trail."""
 
 from __future__ import annotations
 
@@ -13,6 +11,7 @@ from safe_envs.errors import ConfigurationError, SystemDefinitionError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes, Range
 from safe_envs.rendering.canvas import Canvas
+from safe_envs.rendering.curves import runs, thinned
 from safe_envs.rendering.safe_set import Barriers, barriers_in
 from safe_envs.rendering.scenes.ranges import first_range
 from safe_envs.rendering.snapshot import EpisodeSnapshot
@@ -28,7 +27,6 @@ from safe_envs.rendering.style import (
     mix,
 )
 
-_MOST_POINTS = 1000
 _AGES = 12
 _PADDING = 0.3
 
@@ -46,10 +44,15 @@ class Scene(ABC):
 
     @abstractmethod
     def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
-        """Draw an instant within `style.SCENE`."""
+        """Draw an instant within `style.SCENE`.
+
+        Args:
+            canvas: to draw on.
+            snapshot: of the episode.
+        """
 
     def index(self, name: str) -> int:
-        """The index of a state.
+        """Return the index of a state.
 
         Raises:
             ConfigurationError: the problem has no such state.
@@ -62,12 +65,13 @@ class Scene(ABC):
         return self.names.index(name)
 
     def unit(self, name: str) -> str:
-        """The unit of a state."""
+        """Return the unit of a state."""
         return self.problem.states[self.index(name)].unit
 
     def range_of(self, i: int) -> Range:
-        """The workspace of a state; where that has no end, the range that is explored, or else one
-        around the starts.
+        """Return the workspace of a state, or its sampling range, or a range around the starts.
+
+        The first of these that is finite.
         """
         state = self.problem.states[i]
         if math.isfinite(state.low) and math.isfinite(state.high):
@@ -78,8 +82,14 @@ class Scene(ABC):
             return first_range(self.problem, i)
 
     def window(self, i: int, j: int) -> tuple[Range, Range]:
-        """The part of a plane of two states to look at: around the safe set if that is bounded in
-        it, else the workspace.
+        """Return the part of a plane to show: around the safe set if bounded, else the workspace.
+
+        Args:
+            i: index of the state to the right.
+            j: index of the state upwards.
+
+        Returns:
+            The ranges of both.
         """
         shown = self.range_of(i), self.range_of(j)
         chosen = barriers_in(self.problem, (i, j))
@@ -103,13 +113,20 @@ def _around(values: np.ndarray, limits: Range) -> Range:
 
 
 def warning_color(snapshot: EpisodeSnapshot, usual: Color = EXECUTED) -> Color:
-    """Of what moves: a warning while the filter intervenes or has no feasible action."""
+    """Return a warning colour while the filter intervenes or has no feasible action.
+
+    Args:
+        snapshot: of the episode.
+        usual: colour in other cases.
+
+    Returns:
+        The colour of what moves.
+    """
     return INFEASIBLE if snapshot.infeasible else INTERVENING if snapshot.intervening else usual
 
 
 def draw_trail(canvas: Canvas, axes: Axes, x: np.ndarray, y: np.ndarray, h: np.ndarray) -> None:
-    """Draw where the state was, the darker the later, and in the warning colour where it was not
-    safe.
+    """Draw where the state was: the later the darker, and in the warning colour where unsafe.
 
     Args:
         canvas: to draw on.
@@ -131,22 +148,14 @@ def draw_trail(canvas: Canvas, axes: Axes, x: np.ndarray, y: np.ndarray, h: np.n
     canvas.within(None)
 
 
-def thinned(count: int, most: int = _MOST_POINTS) -> np.ndarray:
-    """Indices of the points of a trail that are drawn: at most so many, the last one among them."""
-    # A power of two: points once drawn stay as the trail grows.
-    stride = 1 << max(0, (count - 1) // most).bit_length()
-    kept = np.arange(0, count, stride)
-    return kept if kept[-1] == count - 1 else np.append(kept, count - 1)
-
-
-def runs(flags: np.ndarray) -> list[slice]:
-    """Where flags are set, with a point before, so that short runs are lines too."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return [slice(max(int(a) - 1, 0), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
 def draw_violation(canvas: Canvas, axes: Axes, where: tuple[float, float]) -> None:
-    """Mark where the first violation was."""
+    """Mark the first violation.
+
+    Args:
+        canvas: to draw on.
+        axes: of the scene.
+        where: coordinates of the violation.
+    """
     canvas.within(axes.box)
     at = axes.place(*where)
     canvas.cross(at, 8, PAPER, 7)
@@ -155,6 +164,12 @@ def draw_violation(canvas: Canvas, axes: Axes, where: tuple[float, float]) -> No
 
 
 def draw_point(canvas: Canvas, at: tuple[float, float], color: Color) -> None:
-    """Mark the state."""
+    """Mark the state.
+
+    Args:
+        canvas: to draw on.
+        at: pixel of the state.
+        color: of the mark.
+    """
     canvas.disk(at, 8, PAPER)
     canvas.disk(at, 7, color, INK, 1)

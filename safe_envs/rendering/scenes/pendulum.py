@@ -1,4 +1,4 @@
-"""A pendulum: the rod with the angles that are safe at its speed, and the plane of angle and speed."""
+"""The scene of a pendulum: the rod with its safe angles, and the plane of angle and speed."""
 
 from __future__ import annotations
 
@@ -19,8 +19,9 @@ _PLANE: Box = (76, 244, 504, 242)
 
 
 class PendulumScene(Scene):
-    """The state theta is the angle from the upright, clockwise; the parameter l, if there is one,
-    the length of the rod in m.
+    """Shows the angle theta from the upright, clockwise.
+
+    The parameter l, if there is one, is the length of the rod in m.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:

@@ -1,4 +1,4 @@
-"""A plane of two states with the safe set in it, for any problem that has such a plane."""
+"""The scene of problems with a plane: two states, with the safe set in their plane."""
 
 from __future__ import annotations
 
@@ -21,28 +21,25 @@ from safe_envs.rendering.snapshot import EpisodeSnapshot
 from safe_envs.rendering.style import label
 
 BOX = (76, 20, 504, 466)
-"""Of a plane that takes the whole scene."""
+"""Of a plane that fills the scene."""
 
 _LONGEST = 4.0
-"""How many times longer than wide a plane may be to be drawn to scale: a longer one would be a
-line."""
+"""Largest ratio of length to width of a plane that is drawn to scale."""
 
 
 class StatePlane:
-    """The safe set, the trail and the state in a box of a scene, the other states held at their
-    values now.
+    """The safe set, the trail and the state in a box of a scene, with the other states as they are.
 
-    What does not change is drawn once: all of it, unless a barrier depends on states that are not
-    in the plane.
+    The background is drawn once, unless a barrier depends on states outside the plane.
 
     Args:
         scene: that it is part of.
         names: of the states along x and y; "" for the time along x.
-        box: where.
-        chosen: indices of the barriers that are shown; None for all.
-        equal: the same scale along both axes.
+        box: left, top, width and height.
+        chosen: indices of the barriers to show; None for all.
+        equal: whether both axes have the same scale.
         shown: the ranges to begin with; by default those of the scene's `window`.
-        decorate: draws what else does not change.
+        decorate: draws more of the background.
     """
 
     def __init__(
@@ -69,7 +66,15 @@ class StatePlane:
         self._views: dict[Axes, tuple[SafeSet | None, Canvas]] = {}
 
     def background(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> Axes:
-        """Draw the safe set and the axes, which grow where the trail leaves them."""
+        """Draw the safe set and the axes, which grow where the trail leaves them.
+
+        Args:
+            canvas: to draw on.
+            snapshot: of the episode.
+
+        Returns:
+            The axes.
+        """
         ranges = [
             grown(r, _values(snapshot, i))
             for r, i in zip(self._shown, (self.x, self.y), strict=True)
@@ -102,7 +107,16 @@ class StatePlane:
         return safe_set if self._changes else None, furniture
 
     def trail(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> tuple[float, float]:
-        """Draw the trail and the first violation; returns the pixel of the state."""
+        """Draw the trail and the first violation.
+
+        Args:
+            canvas: to draw on.
+            axes: of the plane.
+            snapshot: of the episode.
+
+        Returns:
+            The pixel of the state.
+        """
         x, y = _values(snapshot, self.x), _values(snapshot, self.y)
         draw_trail(canvas, axes, x, y, snapshot.h)
         if snapshot.violated is not None:
@@ -111,7 +125,12 @@ class StatePlane:
         return axes.place(float(x[-1]), float(y[-1]))
 
     def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
-        """Draw all of it, with a point for the state."""
+        """Draw all of it, with a point for the state.
+
+        Args:
+            canvas: to draw on.
+            snapshot: of the episode.
+        """
         axes = self.background(canvas, snapshot)
         at = self.trail(canvas, axes, snapshot)
         canvas.within(axes.box)
@@ -120,14 +139,12 @@ class StatePlane:
 
 
 def _values(snapshot: EpisodeSnapshot, i: int) -> np.ndarray:
-    """A state along the episode; the time for -1."""
+    """Return a state along the episode; the time for -1."""
     return snapshot.times if i < 0 else snapshot.states[:, i]
 
 
 class PlaneScene(Scene):
-    """The plane of the problem, for the whole scene; to scale where the units of its axes are the
-    same, and it is no long road.
-    """
+    """Shows the plane of the problem; to scale if its axes have one unit and similar lengths."""
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem)

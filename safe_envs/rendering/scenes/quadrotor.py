@@ -1,4 +1,4 @@
-"""A quadrotor: its altitude over time, or all of it from the side."""
+"""The scenes of a quadrotor: its altitude over time, or its position and attitude from the side."""
 
 from __future__ import annotations
 
@@ -35,8 +35,15 @@ _DIAL = (512, 76, 48)
 
 
 def rotation(phi: float, theta: float, psi: float) -> np.ndarray:
-    """From body to world: yaw after pitch after roll, so that the last column is the direction of
-    the thrust.
+    """Return the rotation from body to world: yaw after pitch after roll.
+
+    Args:
+        phi: roll in rad.
+        theta: pitch in rad.
+        psi: yaw in rad.
+
+    Returns:
+        Shape (3, 3); the last column is the direction of the thrust.
     """
     (a, b), (c, d), (e, f) = ((math.cos(angle), math.sin(angle)) for angle in (phi, theta, psi))
     return np.array(
@@ -51,8 +58,13 @@ def rotation(phi: float, theta: float, psi: float) -> np.ndarray:
 def draw_quadrotor(
     canvas: Canvas, at: tuple[float, float], attitude: np.ndarray, color: Color
 ) -> None:
-    """Draw the symbol of a quadrotor, seen along y from a little above; its size is fixed in
-    pixels.
+    """Draw the symbol of a quadrotor, of a fixed size, seen along y from a little above.
+
+    Args:
+        canvas: to draw on.
+        at: pixel of its centre.
+        attitude: rotation from body to world, shape (3, 3).
+        color: of its body.
     """
 
     def seen(points: np.ndarray) -> np.ndarray:
@@ -73,7 +85,7 @@ def draw_quadrotor(
 
 
 class AltitudeScene(TimeSeriesScene):
-    """The altitude z over time, with a level quadrotor at the right."""
+    """Shows the altitude z over time, with a level quadrotor at the right."""
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem, "z")
@@ -86,8 +98,7 @@ class AltitudeScene(TimeSeriesScene):
 
 
 class SideView(Scene):
-    """The plane of x and z to scale, with the quadrotor at its attitude, enlarged, and a dial of
-    its tilt.
+    """Shows the plane of x and z to scale, the quadrotor, enlarged, and a dial of its tilt.
 
     The plane shows the barriers that depend on the position alone, and the dial those that depend
     on roll and pitch alone.
@@ -111,7 +122,7 @@ class SideView(Scene):
             )
 
     def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
-        """Draw the quadrotor and what it is to follow."""
+        """Draw the quadrotor and its reference."""
         axes = self._plane.background(canvas, snapshot)
         canvas.within(axes.box)
         self._draw_reference(canvas, axes, snapshot)
@@ -144,9 +155,7 @@ class SideView(Scene):
         canvas.text("reference", (at[0], at[1] - 14), ink, SMALL, align=(0.5, 1.0))
 
     def _draw_dial(self, canvas: Canvas, attitude: np.ndarray) -> None:
-        """The angle between the thrust and the vertical, in the plane of both, to the side of the
-        thrust that is seen.
-        """
+        """Draw the angle between thrust and vertical, to the side of the thrust that is seen."""
         x, y, radius = _DIAL
         up = attitude[:, 2]
         tilt = math.copysign(math.acos(min(max(float(up[2]), -1.0), 1.0)), float(up[0]))
@@ -169,7 +178,7 @@ class SideView(Scene):
 def _sector(
     center: tuple[float, float], radius: float, low: float, high: float
 ) -> list[tuple[float, float]]:
-    """Corners of a sector between two angles from the vertical, clockwise."""
+    """Return the corners of a sector between two angles from the vertical, clockwise."""
     angles = np.linspace(low, high, 25).tolist()
     return [
         center,

@@ -1,6 +1,4 @@
-"""The part of a state's axis to look at first, where neither a workspace nor an exploration says
-it.
-"""
+"""The range of a state to show first, where neither workspace nor sampling domain bounds it."""
 
 from __future__ import annotations
 
@@ -12,19 +10,20 @@ from safe_envs.rendering.safe_set import Barriers
 
 _DRAWN = 64
 _HALF_POWERS = range(-16, 27)
-"""The reaches that are tried are 2^(k/2) in the unit of the state: from a few thousandths to some
-thousands."""
+"""Powers k of the reaches 2^(k/2), in the unit of the state, that are tried: .004 to 8192."""
 
 _SPARE = 1.25
 
 
 def first_range(problem: SafetyProblem, i: int) -> Range:
-    """A range with round ends around the starts and the edge of the safe set that is nearest to
-    them along a state.
+    """Return a range around the starts and the nearest edge of the safe set along a state.
 
     Args:
-        problem: whose starts and barriers are looked at.
+        problem: with starts and barriers.
         i: index of the state.
+
+    Returns:
+        A range with round ends.
     """
     starts = problem.starts[problem.start].proposals(_DRAWN)
     low, high, middle = float(starts[:, i].min()), float(starts[:, i].max()), starts.mean(axis=0)

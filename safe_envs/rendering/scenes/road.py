@@ -1,4 +1,4 @@
-"""A car behind its lead: the road to scale, and the gap over time beside the one that is required."""
+"""The scene of a car behind its lead: the road to scale, and actual and required gap over time."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.axes import Axes
 from safe_envs.rendering.canvas import Box, Canvas
+from safe_envs.rendering.curves import thinned
 from safe_envs.rendering.safe_set import STEP, Barriers, tint
 from safe_envs.rendering.scenes.base import (
     Scene,
     draw_point,
     draw_trail,
     draw_violation,
-    thinned,
     warning_color,
 )
 from safe_envs.rendering.snapshot import EpisodeSnapshot
@@ -45,10 +45,10 @@ _MOST = 250
 
 
 class Road(Scene):
-    """The plane of the problem names the own speed and the gap.
+    """Shows the own speed and the gap, which are the plane of the problem.
 
     Distances on the road are to scale, from bumper to bumper; the cars are symbols of a fixed size.
-    What is required is the gap at which the smallest barrier vanishes at the speeds of that snapshot.
+    The required gap is that at which the smallest barrier vanishes at the present speeds.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -59,7 +59,7 @@ class Road(Scene):
         self._lead = self._other_speed()
 
     def _other_speed(self) -> int | float | None:
-        """The lead's speed: another state in the unit of the own one, or else the parameter v_f."""
+        """Return the lead's speed: another state of the same unit, or else the parameter v_f."""
         unit = self.problem.states[self._speed].unit
         others = [
             i for i, s in enumerate(self.problem.states) if s.unit == unit and i != self._speed
@@ -76,9 +76,7 @@ class Road(Scene):
         )
 
     def required(self, states: np.ndarray) -> np.ndarray:
-        """The gap at which the smallest barrier vanishes at the other values of some states, shape
-        (k,), by bisection.
-        """
+        """Return the gap at which the smallest barrier vanishes at states (k, n), by bisection."""
         low, high = (np.full(len(states), bound) for bound in self.range_of(self._gap))
         columns = [states[:, i] for i in range(states.shape[1])]
         for _ in range(_HALVINGS):
@@ -202,16 +200,14 @@ class Road(Scene):
 
 @lru_cache(maxsize=8)
 def _furniture(axes: Axes, y_label: str) -> Canvas:
-    """The grid of the chart, drawn once, of which few are kept: after the horizon each step has
-    another one.
-    """
+    """Return the grid of the chart. Few are kept: after the horizon each step has another one."""
     drawn = Canvas((600, 540), clear=True)
     axes.furnish(drawn, "t [s]", y_label)
     return drawn
 
 
 def _reach(distance: float) -> float:
-    """25, 50, 100, ...: the first in which a distance fits with some space to spare."""
+    """Return the first of 25, 50, 100, ... that is longer than a distance, with some room."""
     return _SHORTEST * 2.0 ** max(0, math.ceil(math.log2(max(1.1 * distance, 1.0) / _SHORTEST)))
 
 

@@ -1,4 +1,4 @@
-"""One state over the time of the episode, with the line that it moves on beside it."""
+"""The scene of a single state: its course over time, next to the line that it moves on."""
 
 from __future__ import annotations
 
@@ -22,8 +22,14 @@ _LINE: Box = (484, 20, 96, 466)
 
 
 def reference_of(problem: SafetyProblem, name: str) -> Callable[[np.ndarray], np.ndarray] | None:
-    """The reference that a state is to follow, over times in s: a feature of its name and "_ref",
-    of the time alone; or None.
+    """Return the reference of a state over time: a feature with its name and "_ref".
+
+    Args:
+        problem: with the features.
+        name: of the state.
+
+    Returns:
+        A function of times in s; None if there is no such feature of the time alone.
     """
     for feature in problem.features:
         if feature.name == f"{name}_ref" and feature.expression.free_symbols <= {TIME}:
@@ -33,8 +39,7 @@ def reference_of(problem: SafetyProblem, name: str) -> Callable[[np.ndarray], np
 
 
 class TimeSeriesScene(Scene):
-    """A state over time to the left, and at the right where it is now on its line, at the same
-    height.
+    """Shows a state over time at the left, and on its line at the right, at the same height.
 
     Args:
         problem: that is drawn.
@@ -77,7 +82,13 @@ class TimeSeriesScene(Scene):
     def draw_marker(
         self, canvas: Canvas, at: tuple[float, float], snapshot: EpisodeSnapshot
     ) -> None:
-        """Draw what moves on the line."""
+        """Draw what moves on the line.
+
+        Args:
+            canvas: to draw on.
+            at: pixel of the state.
+            snapshot: of the episode.
+        """
         draw_point(canvas, at, warning_color(snapshot))
 
     def _draw_reference(self, canvas: Canvas, axes: Axes) -> None:
@@ -91,7 +102,7 @@ class TimeSeriesScene(Scene):
             )
 
     def _line(self, axes: Axes, snapshot: EpisodeSnapshot) -> Canvas:
-        """The line with the safe set on it, drawn once, unless a barrier depends on other states."""
+        """Return the line with the safe set, drawn once if no barrier depends on other states."""
         state = self.problem.plant.states[self._state]
         fixed = all(b.expression.free_symbols <= {state} for b in self.problem.barriers)
         if fixed and axes.y in self._lines:
@@ -107,7 +118,7 @@ class TimeSeriesScene(Scene):
 
 
 class LineScene(TimeSeriesScene):
-    """The first state of a problem, on a line."""
+    """Shows the first state of a problem."""
 
     def __init__(self, problem: SafetyProblem) -> None:
         super().__init__(problem, problem.states[0].symbol.name)

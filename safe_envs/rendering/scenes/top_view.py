@@ -40,15 +40,23 @@ class Circle:
     middle: Callable[..., Any]
 
     def middles(self, states: np.ndarray) -> np.ndarray:
-        """Its middle at each of some states, shape (k, 2)."""
+        """Return its middle at states (k, n), shape (k, 2)."""
         return np.stack(np.broadcast_arrays(*self.middle(*states.T), states[:, 0])[:2], axis=-1)
 
 
 def circle_of(
     problem: SafetyProblem, expression: sp.Expr, x: sp.Symbol, y: sp.Symbol
 ) -> Circle | None:
-    """The circle on which an expression vanishes in the plane of two coordinates; None if it is
-    another curve.
+    """Return the circle on which an expression vanishes in the plane of two coordinates.
+
+    Args:
+        problem: with the states.
+        expression: of the states.
+        x: coordinate to the right.
+        y: coordinate upwards.
+
+    Returns:
+        The circle; None if the expression vanishes on another curve.
     """
     if not expression.is_polynomial(x, y):
         return None
@@ -62,8 +70,7 @@ def circle_of(
         return None
     middle = [-polynomial.coeff_monomial(s) / (2 * square) for s in (x, y)]
     area = middle[0] ** 2 + middle[1] ** 2 - polynomial.coeff_monomial(1) / square
-    # Constant up to cos^2 + sin^2 and rounding, which numbers tell more surely than a
-    # simplification.
+    # Constant up to cos^2 + sin^2 and rounding: numbers decide it more reliably than sympy.
     (areas,) = compile_function(problem.plant.states, [area], "arrays")(
         *np.random.default_rng(0).uniform(-3, 3, (problem.plant.n, 8))
     )
@@ -77,11 +84,11 @@ def circle_of(
 
 
 class TopView(Scene):
-    """The plane of x and y; a triangle points along theta.
+    """Shows the plane of x and y; a triangle points along theta.
 
-    Vehicles are points, so that the triangle has a fixed size in pixels. Obstacles are where a
-    barrier that is positive outside a circle is negative: at their places now, with the way that
-    they came, and after a violation where they were then.
+    Vehicles are points, so that the triangle has a fixed size in pixels. Obstacles are circles
+    inside of which a barrier is negative, drawn with their recent paths; after a violation, also
+    where they were then.
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
@@ -99,7 +106,7 @@ class TopView(Scene):
         )
 
     def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
-        """Draw the vehicle and what is around it."""
+        """Draw the vehicle and its surroundings."""
         axes = self._plane.background(canvas, snapshot)
         canvas.within(axes.box)
         self._draw_obstacles(canvas, axes, snapshot)
@@ -121,18 +128,18 @@ class TopView(Scene):
         canvas.text("goal", (at[0], at[1] - radius - 3), INK, SMALL, align=(0.5, 1.0))
 
     def _draw_obstacles(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
-        ways = [
+        paths = [
             axes.places(*obstacle.middles(snapshot.states[-60:]).T) for obstacle in self._obstacles
         ]
         sizes = [obstacle.radius * axes.scale[0] for obstacle in self._obstacles]
         if self._rings:
-            # What the field of h would show, and much quicker: the circles move.
+            # The same as a field of h, and much faster.
             for level in reversed(range(LEVELS - 1)):
-                for way, size in zip(ways, sizes, strict=True):
-                    canvas.disk(way[-1], size + STEP * (level + 1), tint(level))
-        for obstacle, way, size in zip(self._obstacles, ways, sizes, strict=True):
-            canvas.dashes(way, GREY, 1, 8.0)
-            middle = way[-1]
+                for path, size in zip(paths, sizes, strict=True):
+                    canvas.disk(path[-1], size + STEP * (level + 1), tint(level))
+        for obstacle, path, size in zip(self._obstacles, paths, sizes, strict=True):
+            canvas.dashes(path, GREY, 1, 8.0)
+            middle = path[-1]
             canvas.disk(middle, size, mix(VIOLATION, PAPER, 0.45), VIOLATION, 2)
             canvas.disk(middle, 2, INK)
             if size >= 14.0:
@@ -146,9 +153,7 @@ class TopView(Scene):
                 )
 
     def _draw_hit(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
-        """Outline the obstacles that the vehicle was in at the first violation, where they were
-        then; they may be elsewhere now.
-        """
+        """Outline the obstacles that the vehicle hit at the first violation, as they were then."""
         if snapshot.violated is None:
             return
         vehicle = snapshot.violated[[self.index("x"), self.index("y")]]
@@ -180,7 +185,14 @@ class TopView(Scene):
 def draw_vehicle(
     canvas: Canvas, at: tuple[float, float], heading: float, snapshot: EpisodeSnapshot
 ) -> None:
-    """Draw a triangle that points along a heading, and a line ahead of it."""
+    """Draw a triangle that points along a heading, and a line ahead of it.
+
+    Args:
+        canvas: to draw on.
+        at: pixel of the vehicle.
+        heading: in rad, from the axis to the right.
+        snapshot: of the episode, for the colour.
+    """
     ahead = math.cos(heading), -math.sin(heading)
     aside = -ahead[1], ahead[0]
     canvas.line(at, (at[0] + 2.2 * _LENGTH * ahead[0], at[1] + 2.2 * _LENGTH * ahead[1]), INK)

@@ -1,6 +1,4 @@
-"""The picture of an evaluation: h and the safety rate over time, and trajectories with the safe
-set.
-"""
+"""The picture of an evaluation: h and the safety rate over time, and trajectories."""
 
 from __future__ import annotations
 
@@ -21,8 +19,8 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rate_text import percent
 from safe_envs.scripts.reports.evaluation_report import describe_system
 
-# Okabe and Ito's palette, which the colour-blind can tell apart; the bare env is always the same
-# warm colour.
+# Okabe and Ito's palette, which the colour-blind can tell apart; the unfiltered env always has the
+# same warm colour.
 _BARE_COLOR = "#D55E00"
 COLORS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 UNSAFE = "#B9B9B9"
@@ -42,7 +40,12 @@ STYLE: Any = {
 
 
 def draw(evaluation: Evaluation, path: Path) -> None:
-    """Draw an evaluation that recorded trajectories, and write the picture whole or not at all."""
+    """Draw an evaluation that recorded trajectories, and write the picture whole or not at all.
+
+    Args:
+        evaluation: to draw.
+        path: of the picture; its suffix is the format.
+    """
     problem, config = evaluation.problem, evaluation.config
     colors = _colors(evaluation)
     with mpl.rc_context(STYLE):
@@ -60,13 +63,16 @@ def draw(evaluation: Evaluation, path: Path) -> None:
 
 
 def _policy_name(path: Path) -> str:
-    """That of a file or folder; a file of a policy's folder is called as all others are."""
+    """Return the name of a file or folder; a file in a policy's folder is called by that."""
     return path.parent.name if path.name == POLICY_FILE else path.stem
 
 
 def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
-    """A legend of handles with labels below the panels, in as many columns as fit; a label too long
-    for one is written smaller.
+    """Add a legend below the panels, in as many columns as fit.
+
+    Args:
+        figure: with the panels.
+        handles: with labels; one too long for a column is written smaller.
     """
     size, share = mpl.rcParams["font.size"], 1.0
     for columns in range(min(len(handles), _MOST_COLUMNS), 0, -1):
@@ -88,7 +94,7 @@ def _colors(evaluation: Evaluation) -> dict[str, str]:
 
 
 def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
-    """Median and 5 to 95 % band of h, as long as half of the episodes are under way.
+    """Draw median and 5 to 95 % band of h, as long as half of the episodes are under way.
 
     Later quantiles would be of the survivors, and jump when one ends.
     """
@@ -113,10 +119,10 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
             max(highest, high.max()),
             max(last, time[-1]),
         )
-    # Far below 0 it does not matter how far: what is seen of the filters shall not shrink for that.
+    # Values far below 0 are cut off, so that they do not shrink the rest.
     bottom = max(lowest, -highest) if highest > 0.0 else lowest
     margin = 0.05 * max(highest - bottom, 1e-3)
-    # The unsafe side has room for its name in any case.
+    # The unsafe side always has room for its name.
     bottom = min(bottom - margin, -2.0 * margin)
     axes.set(xlim=(0.0, max(last, evaluation.problem.dt)), ylim=(bottom, highest + margin))
     axes.axhspan(bottom, 0.0, color=UNSAFE, alpha=0.35, linewidth=0, zorder=0)
@@ -126,9 +132,7 @@ def _draw_barrier(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) ->
 
 
 def _draw_curve(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
-    """Rate of the episodes that are safe so far, with its pointwise band, at least until the last
-    violation.
-    """
+    """Draw the rate of episodes that are safe so far, with its band, up to the last violation."""
     for row in evaluation.rows:
         curve, color = row.curve, colors[row.filter]
         low, rate, high = (100 * np.array(v) for v in (curve.ci_low, curve.rate, curve.ci_high))
@@ -144,7 +148,7 @@ def _draw_curve(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> N
 
 
 def _draw_plane(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> None:
-    """Trajectories of the first episodes, the same ones for every filter, over the unsafe region."""
+    """Draw trajectories of the first episodes, the same ones for every filter."""
     problem = evaluation.problem
     names = [s.symbol.name for s in problem.states]
     units = [s.unit for s in problem.states]
@@ -175,7 +179,7 @@ def _draw_plane(axes: Axes, evaluation: Evaluation, colors: dict[str, str]) -> N
 
 
 def _when(problem: SafetyProblem) -> str:
-    """Whether the safe set in the plane changes with the other states."""
+    """Return a remark if the safe set in the plane changes with the other states."""
     used = set().union(*(b.expression.free_symbols for b in problem.barriers))
     return " (at the start)" if {str(s) for s in used} - set(problem.plane or ()) else ""
 
@@ -183,7 +187,7 @@ def _when(problem: SafetyProblem) -> str:
 def _safe_function(
     problem: SafetyProblem, across: int, up: int, start: np.ndarray
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """The smallest barrier as a function of the plane, with the other states as at the start."""
+    """Return the smallest barrier over the plane, with the other states as at the start."""
     barriers = compile_function(
         problem.plant.states, tuple(b.expression for b in problem.barriers), "arrays"
     )
@@ -208,8 +212,9 @@ def _on_grid(
 def _limits(
     safe: Callable[[np.ndarray, np.ndarray], np.ndarray], points: np.ndarray, alike: bool
 ) -> np.ndarray:
-    """Limits (low, high) of both axes: the trajectories, and the whole safe set if it is bounded
-    and not far larger.
+    """Return limits (low, high) of both axes.
+
+    They contain the trajectories, and the whole safe set if it is bounded and not far larger.
     """
     limits = np.stack([np.nanmin(points, axis=0), np.nanmax(points, axis=0)], axis=1)
     width = np.maximum(limits[:, 1] - limits[:, 0], 1e-3)

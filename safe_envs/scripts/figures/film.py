@@ -1,4 +1,4 @@
-"""Pictures one after the other, as a video, an animation or a still."""
+"""Sequences of pictures as a video, an animation or a still."""
 
 from __future__ import annotations
 
@@ -43,13 +43,16 @@ def require_film(path: Path) -> None:
 
 
 def steps_a_frame(path: Path, dt: float, steps: int) -> int:
-    """After how many control periods there is a frame, so that the film runs in real time.
+    """Return the control periods from one frame to the next, for a film in real time.
 
     Args:
         path: of the film: a .gif shows at most 50 frames a second and 600 in all, a .mp4 60 a
             second.
         dt: control period in s.
         steps: of the longest episode.
+
+    Returns:
+        At least 1.
     """
     suffix = path.suffix.lower()
     fewest = math.ceil(1.0 / (_MOST_A_SECOND[suffix] * dt) - 1e-9)
@@ -114,7 +117,7 @@ def _write_video(path: Path, frames: Iterator[np.ndarray], seconds: float) -> No
                 raise stopped from error
     finally:
         writer.close()
-    # The library does not ask how it ended, which may have been after the last frame.
+    # The library does not check how ffmpeg ended, which may have failed after the last frame.
     if process.returncode != 0:
         raise stopped
 
@@ -126,8 +129,8 @@ def _write_animation(path: Path, frames: Iterator[np.ndarray], seconds: float) -
     palette, shown, lengths = _palette(first), _durations(seconds), []
 
     def reduced(pixels: np.ndarray) -> Image.Image:
-        # The library looks up how long a frame is shown after it has taken the frame, of which
-        # nobody knows how many there will be.
+        # The number of frames is unknown: the library looks up how long a frame is shown after it
+        # has taken the frame.
         lengths.append(next(shown))
         return Image.fromarray(pixels).quantize(palette=palette, dither=Image.Dither.NONE)
 
@@ -141,11 +144,11 @@ def _write_animation(path: Path, frames: Iterator[np.ndarray], seconds: float) -
 
 
 def _durations(seconds: float) -> Iterator[int]:
-    """How long each frame of an animation is shown, in ms: a frame ends at the multiple of 10 ms
-    nearest to its true end.
+    """Yield how long each frame of an animation is shown, in ms.
+
+    The format counts in hundredths of a second. The ends of frames are rounded, not their lengths,
+    so that errors do not add up.
     """
-    # The format counts in hundredths of a second. Rounding the ends, not the lengths, carries the
-    # error on to the next frame.
     end = 0
     for k in itertools.count(1):
         start, end = end, max(end + 1, round(100 * k * seconds))
@@ -162,7 +165,7 @@ def _write_still(path: Path, frames: Iterator[np.ndarray], seconds: float) -> No
 
 
 def _palette(frame: np.ndarray) -> Any:
-    """Colours for all frames: those of a frame, with the colours of all that may show up later."""
+    """Return colours for all frames: those of a frame, and all that later ones may have."""
     from PIL import Image
 
     from safe_envs.rendering import style

@@ -1,6 +1,4 @@
-"""The picture of an identification: each learned function against the truth, and what is believed
-of the noise.
-"""
+"""The picture of an identification: learned functions against the truth, and posterior noise."""
 
 from __future__ import annotations
 
@@ -18,7 +16,8 @@ from matplotlib.ticker import MaxNLocator
 
 from safe_envs.atomic_io import write_atomically
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, add_legend
-from safe_envs.scripts.reports.identify_report import Function, Identification, percent
+from safe_envs.scripts.reports.identify_answer import Function, Identification
+from safe_envs.scripts.reports.quantities import relative_text
 from safe_envs.wrappers.learning.models.noise import Diffusion
 from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.learning.regression import sigma_samples
@@ -50,7 +49,7 @@ def draw(found: Identification, path: Path) -> None:
         path: of the picture; its suffix is the format.
     """
     levels = _levels(found)
-    rest = [function for function in found.shown if function.name not in levels]
+    rest = [f for f in found.compared if not f.vanishes and f.name not in levels]
     shown = sorted(rest, key=lambda function: (-function.size, -function.error))[
         : _MOST - len(levels)
     ]
@@ -81,11 +80,11 @@ def draw(found: Identification, path: Path) -> None:
 
 
 def _levels(found: Identification) -> dict[str, tuple[int, Function]]:
-    """The constant variances that are shown as posteriors of sigma, by name, with their state."""
+    """Return the constant variances to show as posteriors of sigma, by name, with their state."""
     diffusion = _constant_noise(found)
-    if diffusion is None or isinstance(found.functions, str):
+    named = {function.name: function for function in found.compared}
+    if diffusion is None or not named:
         return {}
-    named = {function.name: function for function in found.functions}
     names = [f"covariance[{s}, {s}]" for s in found.problem.plant.states]
     noisy = [
         (i, named[name])
@@ -96,7 +95,7 @@ def _levels(found: Identification) -> dict[str, tuple[int, Function]]:
 
 
 def _constant_noise(found: Identification) -> Diffusion | None:
-    """The noise that was learned, if it is constant."""
+    """Return the learned noise if it is constant."""
     learned = found.learned
     return (
         learned.diffusion
@@ -106,10 +105,12 @@ def _constant_noise(found: Identification) -> Diffusion | None:
 
 
 def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
-    """The estimates against a truth that varies, and how often they occur for one that does not;
-    returns what the legend needs.
+    """Draw estimates against a truth that varies, or a histogram for one that does not.
+
+    Returns:
+        The handle for the legend.
     """
-    off = "truth 0" if function.relative is None else f"error {percent(function.relative)}"
+    off = "truth 0" if function.relative is None else f"error {relative_text(function.relative)}"
     axes.set_title(f"{function.name}: {off}")
     power = _power(np.concatenate([function.truth, function.estimate]))
     truth, estimate = function.truth / 10.0**power, function.estimate / 10.0**power
@@ -128,8 +129,7 @@ def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
         _tidy(axes)
         return _COUNTS_HANDLE
     both = np.concatenate([truth, estimate])
-    # Around a single point there is no scale but that of the value itself, unless the error is
-    # larger.
+    # Around a single point the scale is that of the value itself, or of a larger error.
     room = max(np.ptp(both), _AROUND * abs(both).max()) if alone else 0.05 * np.ptp(both)
     limits = (both.min() - room, both.max() + room)
     axes.plot(limits, limits, color=_TRUTH, linewidth=1.0)
@@ -155,7 +155,7 @@ def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
 
 
 def _draw_level(axes: Axes, found: Identification, index: int, function: Function) -> None:
-    """What is believed of the noise of a state, as in Fig. 6.2 of the thesis."""
+    """Draw the posterior of the noise of a state, as in Fig. 6.2 of the thesis."""
     noise, state = _constant_noise(found), found.problem.states[index]
     assert noise is not None
     samples = sigma_samples(
@@ -178,7 +178,7 @@ def _draw_level(axes: Axes, found: Identification, index: int, function: Functio
 
 
 def _tidy(axes: Axes) -> None:
-    """A square panel with few ticks, so that long numbers do not meet."""
+    """Make a panel square, with few ticks, so that long numbers do not overlap."""
     axes.set_box_aspect(1)
     axes.xaxis.set_major_locator(MaxNLocator(3))
     axes.yaxis.set_major_locator(MaxNLocator(4))
@@ -186,7 +186,7 @@ def _tidy(axes: Axes) -> None:
 
 
 def _power(values: np.ndarray) -> int:
-    """The power of ten to be taken out of values that are tiny or huge; 0 for others."""
+    """Return the power of ten to factor out of tiny or huge values; 0 for others."""
     largest = abs(values).max()
     return 0 if not largest or _TINY <= largest < _HUGE else math.floor(math.log10(largest))
 
@@ -198,7 +198,7 @@ def _label(name: str, unit: str, power: int) -> str:
 
 
 def _range(name: str, values: np.ndarray) -> str:
-    """Values in words: the number where they are constant, else from where to where they reach."""
+    """Describe values: the number where they are constant, else their range."""
     return (
         f"{name} {values[0]:.4g}"
         if _constant(values)

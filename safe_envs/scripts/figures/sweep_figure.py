@@ -1,4 +1,4 @@
-"""The picture of a sweep: safety rates over a swept setting, with bands."""
+"""The picture of a sweep: safety rates over a swept setting, with confidence bands."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -26,12 +27,12 @@ _COLUMNS = 3
 
 Row = dict[str, Any]
 Rate = tuple[float, float, float]
-"""Of safe episodes, and the ends of its interval."""
+"""The share of safe episodes, and the ends of its interval."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Which swept setting is where.
+    """The place of each swept setting.
 
     Attributes:
         x: across; None where nothing but seeds was swept.
@@ -51,8 +52,16 @@ class Layout:
         x: str | None = None,
         lines: str | None = None,
     ) -> Layout:
-        """The given settings, or else the one with most numbers across, and the filter, or the one
-        with most values, as lines.
+        """Choose the places of settings that are not given.
+
+        Args:
+            rows: of the cells.
+            swept: names of the settings.
+            x: setting across; by default a number with most values.
+            lines: setting with a line for each value; by default the filter, or that with most.
+
+        Returns:
+            The layout, with all other settings as panels.
         """
         rest = [
             name
@@ -77,11 +86,11 @@ def draw(rows: Sequence[Row], layout: Layout, path: Path) -> int:
 
     Args:
         rows: of `safe_envs.agents.sweeps.store.read`.
-        layout: which setting is where.
+        layout: places of the settings.
         path: of the picture.
 
     Returns:
-        How many panels there was no room for.
+        The number of panels without room.
 
     Raises:
         ConfigurationError: the picture cannot be written.
@@ -110,13 +119,13 @@ def draw(rows: Sequence[Row], layout: Layout, path: Path) -> int:
 
 
 def _common(rows: Sequence[Row]) -> str:
-    """What all cells simulate, if it is one env."""
+    """Return the env of the cells, if all have the same."""
     titles = {json.loads(row["config"])["title"] for row in rows}
     return f"{titles.pop()}: " if len(titles) == 1 else ""
 
 
 def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Sequence[Row]) -> None:
-    """Rates over the setting across: with bands where it is a number, and else with bars."""
+    """Draw rates over the setting across: with bands if it is a number, otherwise with bars."""
     numeric = layout.x is not None and _is_numeric(everything, layout.x)
     places = [None] if layout.x is None else _values(everything, layout.x)
     position: dict[Any, Any] = {value: value if numeric else k for k, value in enumerate(places)}
@@ -126,29 +135,15 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
     )
     for k, kind in enumerate(kinds):
         of_kind = [row for row in rows if layout.lines is None or row[layout.lines] == kind]
-        found = [
-            (position[place], rate)
-            for place in places
-            if (rate := _rate(_at(of_kind, layout.x, place)))
-        ]
-        color = _BARE_COLOR if kind == UNFILTERED else colors[k % len(colors)]
-        label = (
-            None
-            if layout.lines is None
-            else _text(kind)
-            if layout.lines == "filter"
-            else f"{layout.lines} = {_text(kind)}"
-        )
-        if numeric:
-            _draw_band(axes, found, color, label)
-        else:
-            # Beside each other, since they would hide each other.
-            _draw_bars(
-                axes,
-                [(at + 0.12 * (k - (len(kinds) - 1) / 2), rate) for at, rate in found],
-                color,
-                label,
-            )
+        rates = {position[place]: _rate(_at(of_kind, layout.x, place)) for place in places}
+        found = {at: rate for at, rate in rates.items() if rate is not None}
+        color = _BARE_COLOR if kind == BARE else colors[k % len(colors)]
+        label = None if layout.lines is None else _text(kind)
+        if layout.lines not in (None, "filter"):
+            label = f"{layout.lines} = {label}"
+        # Bars are next to each other, since they would hide each other.
+        shift = 0.0 if numeric else 0.12 * (k - (len(kinds) - 1) / 2)
+        _draw_rates(axes, [at + shift for at in found], list(found.values()), numeric, color, label)
     axes.set_xlabel("" if layout.x is None else layout.x)
     if numeric and all(isinstance(place, int) for place in places):
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -160,31 +155,26 @@ def _draw_panel(axes: Axes, rows: Sequence[Row], layout: Layout, everything: Seq
 
 
 def _shades(count: int) -> list[Any]:
-    """Colours in the order of numbers."""
+    """Return colours in the order of numbers."""
     return [mpl.colormaps["viridis"](0.9 * k / max(count - 1, 1)) for k in range(count)]
 
 
-def _draw_band(
-    axes: Axes, found: Sequence[tuple[float, Rate]], color: Any, label: str | None
+def _draw_rates(
+    axes: Axes,
+    at: Sequence[float],
+    rates: Sequence[Rate],
+    band: bool,
+    color: Any,
+    label: str | None,
 ) -> None:
-    at = [place for place, _ in found]
-    rate, low, high = ([100 * each[i] for _, each in found] for i in range(3))
-    axes.fill_between(at, low, high, color=color, alpha=0.2, linewidth=0)
-    axes.plot(at, rate, "o-", color=color, linewidth=1.8, markersize=3.5, label=label)
-
-
-def _draw_bars(
-    axes: Axes, found: Sequence[tuple[float, Rate]], color: Any, label: str | None
-) -> None:
-    at = [place for place, _ in found]
-    rate, low, high = ([100 * each[i] for _, each in found] for i in range(3))
-    lengths = [
-        [r - a for r, a in zip(rate, low, strict=True)],
-        [b - r for r, b in zip(rate, high, strict=True)],
-    ]
-    axes.errorbar(
-        at, rate, yerr=lengths, fmt="o", color=color, markersize=4, capsize=3, label=label
-    )
+    """Draw rates with their intervals, as a band or as bars."""
+    rate, low, high = 100 * np.array(rates).reshape(-1, 3).T
+    if band:
+        axes.fill_between(at, low, high, color=color, alpha=0.2, linewidth=0)
+        axes.plot(at, rate, "o-", color=color, linewidth=1.8, markersize=3.5, label=label)
+    else:
+        style: Any = {"fmt": "o", "markersize": 4, "capsize": 3}
+        axes.errorbar(at, rate, yerr=[rate - low, high - rate], color=color, label=label, **style)
 
 
 def _at(rows: Iterable[Row], name: str | None, value: Any) -> list[Row]:
@@ -192,11 +182,10 @@ def _at(rows: Iterable[Row], name: str | None, value: Any) -> list[Row]:
 
 
 def _rate(rows: Sequence[Row]) -> Rate | None:
-    """The rate of cells that differ in their seeds only, whose episodes are independent; None
-    without any.
+    """Return the rate of cells that differ in their seeds only; None without cells.
 
-    Where each seed learned anew what its filter rests on, its episodes have that in common, and the
-    interval is over both.
+    Their episodes are independent, unless the filter was retrained for each seed: then the interval
+    is over models and episodes.
     """
     if not rows:
         return None
@@ -212,14 +201,12 @@ def _rate(rows: Sequence[Row]) -> Rate | None:
 
 
 def _learned(row: Row) -> tuple[str, ...]:
-    """Checksums of the models on which the filter of a cell rests; none for one that learned
-    nothing.
-    """
+    """Return checksums of the models of a filter; none if it learned nothing."""
     return tuple((json.loads(row["row"])["learning"] or {}).get("sha256", ()))
 
 
 def _values(rows: Sequence[Row], name: str) -> list[Any]:
-    """The values of a setting in the order of the cells, numbers by their size."""
+    """Return the values of a setting in the order of the cells, numbers by their size."""
     values = list(dict.fromkeys(row[name] for row in rows))
     return sorted(values) if _is_numeric(rows, name) else values
 

@@ -54,7 +54,5 @@ def run_alone(name: str, command: Callable[..., None]) -> None:
 
 @cache
 def _command(app: typer.Typer) -> Any:
-    """Build the command with its options; Typer does so at every call, which takes longer than a
-    quick command runs.
-    """
+    """Build the command once: Typer does so at every call, which takes longer than a command."""
     return typer.main.get_command(app)

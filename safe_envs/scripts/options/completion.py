@@ -1,6 +1,4 @@
-"""What a shell offers after a part of a word. Nothing heavy is imported: it answers between two
-keystrokes.
-"""
+"""Completion of words in a shell; no heavy module is imported, so that it answers at once."""
 
 from __future__ import annotations
 
@@ -32,7 +30,7 @@ ALGORITHMS = ("ppo", "a2c", "sac", "td3")
 
 
 def env_ids(incomplete: str) -> list[str]:
-    """Registered ids, with or without their namespace."""
+    """Return the registered ids that begin so, with or without their namespace."""
     return [
         name
         for env_id in ENV_IDS
@@ -42,7 +40,7 @@ def env_ids(incomplete: str) -> list[str]:
 
 
 def words(allowed: Sequence[str]) -> Callable[[str], list[str]]:
-    """Completion by a list of words."""
+    """Return the completion by a list of words."""
 
     def complete(incomplete: str) -> list[str]:
         return [word for word in allowed if word.startswith(incomplete)]
@@ -59,31 +57,14 @@ policies, algorithms = words(POLICIES), words(ALGORITHMS)
 
 
 def artefacts(incomplete: str) -> list[str]:
-    """Tables and figures of the thesis that `reproduce` computes."""
+    """Return the tables and figures of the thesis that begin so."""
     return words(("all", *ARTEFACTS))(incomplete)
 
 
-ARTEFACTS = (
-    *(
-        f"figure-{n}"
-        for n in (
-            "3.1",
-            "3.2a",
-            "3.2b",
-            "3.3",
-            "4.1",
-            "4.2",
-            "4.3",
-            "5.1",
-            "5.2",
-            "5.3a",
-            "5.3b",
-            "5.3c",
-            "5.3d",
-        )
-    ),
-    *(f"figure-6.{n}" for n in range(1, 5)),
-    *(f"table-{n}" for n in ("4.1", "5.1", "5.2", "6.1", "6.2", "6.3", "6.4")),
-    "example-4.2.2",
-)
+_NUMBERS = {
+    "figure": "3.1 3.2a 3.2b 3.3 4.1 4.2 4.3 5.1 5.2 5.3a 5.3b 5.3c 5.3d 6.1 6.2 6.3 6.4",
+    "table": "4.1 5.1 5.2 6.1 6.2 6.3 6.4",
+    "example": "4.2.2",
+}
+ARTEFACTS = tuple(f"{kind}-{n}" for kind, found in _NUMBERS.items() for n in found.split())
 """As `safe_envs.scripts.reproduce.catalogue` has them."""

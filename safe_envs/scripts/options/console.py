@@ -31,8 +31,7 @@ from safe_envs.scripts.options.number_options import strict
 _LEAST_WIDTH = 104
 _PIPE_WIDTH = 240
 _LONGEST = 2000
-"""Characters of an error, at most: what somebody else's code or file says in it may be of any
-length."""
+"""Characters of an error, at most: messages of third-party code or files have any length."""
 
 _TOO_LARGE = (
     "can't allocate memory",
@@ -40,13 +39,13 @@ _TOO_LARGE = (
     "Maximum allowed size exceeded",
     "array is too big",
 )
-"""What PyTorch and NumPy say of sizes beyond the memory, where it is no MemoryError."""
+"""Errors of PyTorch and NumPy about sizes beyond the memory that are no MemoryError."""
 
 _UNWRITABLE = {errno.ENOSPC, errno.EFBIG, errno.EROFS, getattr(errno, "EDQUOT", errno.ENOSPC)}
-"""What the operating system says of a disk that takes no more."""
+"""Errors of the operating system about a full or read-only disk."""
 
 STDOUT = Path("-")
-"""As the file of --json: the standard output, which has nothing else on it then."""
+"""The file of --json that means standard output, where nothing else is printed then."""
 
 Quiet = Annotated[
     bool,
@@ -65,7 +64,7 @@ Json = Annotated[
 
 
 class _Terminal:
-    """How much is printed just now."""
+    """How much is printed at present."""
 
     quiet = False
     silent = False
@@ -81,14 +80,14 @@ class _Tables(Console):
 
 
 class _Trimmed(io.TextIOBase):
-    """A stream without the blanks that fill the lines of a table."""
+    """A stream without the blanks at the ends of the lines of a table."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
 
     @property
     def encoding(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """What decides which characters a table is drawn with."""
+        """The encoding, which decides on the characters that draw tables."""
         return self._stream.encoding
 
     def write(self, text: str, /) -> int:
@@ -107,6 +106,9 @@ def quietly(quiet: bool, silent: bool = False) -> Iterator[None]:
     Args:
         quiet: no progress bar, and of what is printed only the tables.
         silent: nothing on stdout, which is for `write_result`.
+
+    Returns:
+        The context.
     """
     before = (_Terminal.quiet, _Terminal.silent)
     _Terminal.quiet, _Terminal.silent = before[0] or quiet, before[1] or silent
@@ -117,8 +119,9 @@ def quietly(quiet: bool, silent: bool = False) -> Iterator[None]:
 
 
 def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
-    """The function of a command with the option --quiet, strict numbers, and no other output where
-    its --json goes to stdout.
+    """Return the function of a command with the option --quiet and strict numbers.
+
+    Where its --json goes to stdout, it prints nothing else.
     """
 
     @functools.wraps(command)
@@ -138,8 +141,14 @@ def with_quiet(command: Callable[..., None]) -> Callable[..., None]:
 def with_signature(
     function: Callable[..., None], parameters: Sequence[inspect.Parameter]
 ) -> Callable[..., None]:
-    """Let a function have these parameters for typer, which asks its signature and its annotations;
-    returns it.
+    """Give a function the parameters that Typer sees.
+
+    Args:
+        function: to change.
+        parameters: for its signature and its annotations.
+
+    Returns:
+        The function.
     """
     function.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
     function.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
@@ -147,7 +156,7 @@ def with_signature(
 
 
 def stdout() -> Console:
-    """Console for results: wide enough for a table, and on a pipe for whatever is in it."""
+    """Return the console for results, wide enough for tables."""
     kind = _Tables if _Terminal.quiet else Console
     if sys.stdout.isatty():
         return kind(width=max(Console().width, _LEAST_WIDTH), quiet=_Terminal.silent)
@@ -156,24 +165,27 @@ def stdout() -> Console:
 
 
 def say(console: Console, text: str | Text) -> None:
-    """Print a text as it is, in lines of any length."""
+    """Print a text as it is, in lines of any length.
+
+    Args:
+        console: to print on.
+        text: to print; markup in a str is not interpreted.
+    """
     console.print(text, soft_wrap=True, highlight=False, markup=False)
 
 
 def require_result(path: Path | None) -> None:
-    """Raise ConfigurationError if the file of --json cannot be written: asked before a long run,
-    not after it.
-    """
+    """Raise ConfigurationError if the file of --json cannot be written, before a long run."""
     if path is not None and path != STDOUT:
         require_writable(path)
 
 
 def write_result(path: Path | None, document: Callable[[], Any]) -> None:
-    """Write what --json asks for, if it does.
+    """Write the result of a command where --json is given.
 
     Args:
         path: of --json.
-        document: makes what is to be written.
+        document: makes the result.
 
     Raises:
         ConfigurationError: the file cannot be written.
@@ -185,7 +197,7 @@ def write_result(path: Path | None, document: Callable[[], Any]) -> None:
 
 
 def run(command: Callable[[], object]) -> None:
-    """Run a command; an error of the user's making ends it with a message and the exit status 2."""
+    """Run a command; an error of the user ends it with a message and the exit status 2."""
     try:
         with _terminable():
             try:
@@ -195,7 +207,7 @@ def run(command: Callable[[], object]) -> None:
     except SafeEnvsError as error:
         _fail(str(error))
     except BrokenPipeError:
-        # Who reads the output has read enough.
+        # The reader of the output has closed it.
         _drop_output()
         sys.exit(1)
     except OSError as error:
@@ -226,7 +238,7 @@ def run(command: Callable[[], object]) -> None:
 
 
 def _drop_output() -> None:
-    """Forget what could not be written to stdout, which Python would try again when it ends."""
+    """Discard what could not be written to stdout, which Python would retry when it ends."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -235,9 +247,7 @@ def _drop_output() -> None:
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Let a request to terminate, as job managers send it, end like Ctrl-C: with the processes that
-    were started.
-    """
+    """Handle a request to terminate, as job managers send it, like Ctrl-C: child processes end."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -263,8 +273,9 @@ def _fail(message: str) -> NoReturn:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
-    """A progress bar on stderr, if that is a terminal: yields the function to tell which part is
-    done, or None.
+    """Show a progress bar on stderr if that is a terminal.
+
+    Yields the function that takes the part that is done; None without a bar.
     """
     if _Terminal.quiet or not sys.stderr.isatty():
         yield None

@@ -1,4 +1,4 @@
-"""Options that take a number: read as everywhere in this project, by the one reader of numbers."""
+"""Options that take a number, read by the project's one reader of numbers."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from safe_envs.number_text import whole_or_real
 
 
 def strict(parameter: inspect.Parameter) -> inspect.Parameter:
-    """The parameter of a command; where it is an option that takes a number, one that takes no
-    other text than others do.
+    """Return the parameter of a command, with the project's reader if it is a number.
 
-    Typer itself takes for a number whatever Python does: digits of other scripts, and 1_000.
+    Typer itself accepts all that Python does: digits of other scripts, and 1_000.
     """
     if typing.get_origin(parameter.annotation) is not Annotated:
         return parameter

@@ -37,8 +37,7 @@ def require_outputs(
     episodes_out: Path | None = None,
     inputs: Iterable[tuple[str, Path]] = (),
 ) -> None:
-    """Check, before any work, that --out, --json and --plot can be written, each to a file of its
-    own.
+    """Check, before any work, that --out, --json and --plot can be written to different files.
 
     Args:
         json: of --json, if given.
@@ -95,8 +94,17 @@ def inputs_of(
     learned: Iterable[Path] = (),
     filter_spec: str | None = None,
 ) -> Iterator[tuple[str, Path]]:
-    """Options and the files that a command may read: of FILE.py:NAME, of a policy, of --learned,
-    and of filters with file=FILE.
+    """Yield the files that a command may read, each with its option.
+
+    Args:
+        system: of --system, FILE.py:NAME.
+        policy: of --policy.
+        filters: of --filter, with file=FILE.
+        learned: of --learned.
+        filter_spec: of --filter-spec, FILE.py:NAME.
+
+    Returns:
+        Pairs of option and file.
     """
     from safe_envs.agents.policies.registry import policy_file
 

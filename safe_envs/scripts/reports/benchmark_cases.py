@@ -1,4 +1,4 @@
-"""What the benchmark times: filter calls, env steps, and a hand-written loop to compare them with."""
+"""The cases of the benchmark: filter calls, env steps, and a hand-written loop as the limit."""
 
 from __future__ import annotations
 
@@ -56,9 +56,7 @@ def filter_calls() -> dict[str, Case]:
 
 
 def several_constraints() -> dict[str, Case]:
-    """Return filter calls for a point mass in the plane with two inputs, an obstacle, a wall and a
-    speed limit, and for a quadrotor with four rotors.
-    """
+    """Return filter calls with three constraints: of a point mass in the plane, and a quadrotor."""
     x, y, v, w, a, b = sp.symbols("x y v w a b", real=True)
     point = ControlAffineSDE(
         (x, y, v, w), (a, b), [v, w, 0, 0], [[0, 0], [0, 0], [1, 0], [0, 1]], [0, 0, 0, 0]
@@ -131,7 +129,7 @@ def vector_steps() -> dict[str, Case]:
 
 
 def fused_loop() -> Case:
-    """Return a step of the Dubins SCBF, written by hand: no reward, no observation, no info, no reset, no checks."""
+    """Return a step of the Dubins SCBF written by hand, without reward, info, reset and checks."""
     problem = gym.make(ENV_ID).unwrapped.problem  # pyright: ignore[reportAttributeAccessIssue]
     values = {parameter.name: value for parameter, value in problem.plant.parameters.items()}
     v, dt, (low, high) = values["v"], problem.dt, problem.box[0]

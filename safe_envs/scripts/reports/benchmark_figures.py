@@ -137,9 +137,7 @@ def _learned_calls(learned: Mapping[str, LearnedModel]) -> dict[str, Case]:
 
 
 def _vec_envs() -> Figures:
-    """The VecEnv over the native vector env, as a multiple of the speed of DummyVecEnv over 64
-    scalar envs.
-    """
+    """Return the speed of the native VecEnv over that of DummyVecEnv, with 64 envs each."""
     from safe_envs.agents.training.vec_env_speed import speeds
 
     found = {}
@@ -152,9 +150,7 @@ def _vec_envs() -> Figures:
 
 
 def _page_faults(case: Case) -> Figures:
-    """How often a step makes the system find new memory, once all is warm; nothing where the system
-    does not count it.
-    """
+    """Return the page faults of a step after a warm-up; nothing where the system has no count."""
     try:
         import resource
     except ImportError:  # Not on Windows.
@@ -166,8 +162,7 @@ def _page_faults(case: Case) -> Figures:
             call()
         return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
-    # Kernels of some sandboxes report zero, whatever happens: none for new memory means that they
-    # do not count.
+    # Kernels of some sandboxes do not count: they report zero even for new memory.
     if faults_of(lambda: mmap.mmap(-1, _NEW_BYTES).write(bytes(_NEW_BYTES)), 1) == 0:
         return {}
     steps = case.calls or 1

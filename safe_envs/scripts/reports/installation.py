@@ -64,9 +64,7 @@ def packages() -> Iterator[Check]:
 
 
 def _other_pygame() -> Check | None:
-    """Return what is wrong if pygame, or a pygame-ce that is too old, is imported in place of the
-    pygame-ce that draws; else None.
-    """
+    """Return what is wrong if pygame or an old pygame-ce takes the place of pygame-ce; or None."""
     if find_spec("pygame") is None:
         return None
     try:
@@ -78,7 +76,7 @@ def _other_pygame() -> Check | None:
 
 
 def required() -> list[tuple[str, str]]:
-    """Return the packages of the metadata, each with its extra; those of `dev` are not for users."""
+    """Return the packages of the metadata, each with its extra, without those of `dev`."""
     found: dict[str, str] = {}
     for line in requires("safe-envs") or ():
         package = re.match(r"[\w.-]+", line)
@@ -117,7 +115,7 @@ def envs() -> Iterator[Check]:
 
 
 def _step(env_id: str) -> tuple[bool, str]:
-    from safe_envs import SafeEnv
+    from safe_envs.envs.env import SafeEnv
     from safe_envs.registry import make_problem
     from safe_envs.wrappers import SafetyFilterWrapper
 

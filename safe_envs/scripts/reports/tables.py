@@ -35,8 +35,7 @@ def make_table(kinds: str, *titles: str, tight: bool = True, indent: bool = Fals
 
 
 def print_whole(console: Console, table: Table) -> None:
-    """Print a table between blank lines, beyond the width of the console if need be: a number that
-    is cut off would be wrong.
+    """Print a table between blank lines, in full width: a number that is cut off would be wrong.
 
     Args:
         console: to print on; it is widened.

@@ -10,7 +10,6 @@ import numpy as np
 
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
-from safe_envs.number_text import finite_number
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import Progress
 from safe_envs.wrappers.learning.checks import Purpose, random_stream, require_problem, require_room

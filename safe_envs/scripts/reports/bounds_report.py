@@ -1,0 +1,124 @@
+"""Bounds on the safety of a filter, and measurements to compare them with, as a report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+from rich.console import Console
+from rich.markup import escape
+
+from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
+from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.quantities import share_text, state_text
+from safe_envs.scripts.reports.rates import percent_in
+from safe_envs.scripts.reports.tables import make_table
+from safe_envs.scripts.reports.verify_answer import VerifyAnswer
+from safe_envs.wrappers.verification.results import Bound
+
+_NO_BOUND = ("hypothesis fails", "not established")
+_COLORS = {
+    "estimated": "green",
+    "hypothesis fails": "red",
+    "withheld": "red",
+    "no bound": "yellow",
+    "not established": "yellow",
+}
+
+
+def print_bounds(console: Console, answer: VerifyAnswer) -> None:
+    """Print a table of the bounds.
+
+    Args:
+        console: to print on.
+        answer: with the bounds.
+    """
+    problem, starts, bounds = answer.problem, answer.starts, answer.bounds
+    where = (
+        f"at {state_text(problem, starts[0])}"
+        if len(starts) == 1
+        else f"on average over {len(starts)} starts {problem.start!r}"
+    )
+    heading = f"{escape(where)}, T = {problem.duration:g} s"
+    console.print(
+        f"\n[bold]Bounds on the probability of no violation[/] {heading}", highlight=False
+    )
+    titles = ("", "bound", "value", "status with the c and m found", "why")
+    table = make_table("lprp", *titles, indent=True)
+    for i, bound in enumerate(bounds, start=1):
+        empty = bound.status == "estimated" and not bound.value
+        status = f"[{_COLORS[bound.status]}]{bound.status}[/]{', but empty' if empty else ''}"
+        table.add_row(str(i), escape(bound.name), _value(bound), status, escape(bound.reason))
+    console.print(table)
+    if any(bound.status == "estimated" for bound in bounds):
+        say(
+            console,
+            "Estimated: a theorem, with the c and m found. Larger ones that the search missed would"
+            " make the bound smaller.",
+        )
+    if any(_in_brackets(bound) for bound in bounds):
+        say(
+            console,
+            "In brackets: the value of a formula whose hypotheses fail here, or whose proof does;"
+            " that is no bound.",
+        )
+
+
+def print_measurements(console: Console, answer: VerifyAnswer) -> None:
+    """Print a table for each measurement, and which bounds they contradict.
+
+    Args:
+        console: to print on.
+        answer: with bounds and measurements.
+    """
+    numbers = {bound.name: str(i) for i, bound in enumerate(answer.bounds, start=1)}
+    for found in answer.measurements:
+        at = "" if found.state is None else f", {state_text(answer.problem, found.state)}"
+        episodes = f"{found.episodes} episodes of the policy {answer.policy}"
+        heading = escape(f"from {found.start}{at}: {episodes}")
+        console.print(f"\n[bold]Measured[/] {heading}", highlight=False, soft_wrap=True)
+        names = [bound.name for bound in found.horizons[0].bounds]
+        titles = [f"bound {numbers.setdefault(n, str(len(numbers) + 1))}" for n in names]
+        table = make_table("r", "T", "no violation [95 % interval]", *titles, indent=True)
+        for horizon in found.horizons:
+            rate = escape(percent_in(horizon.rate, horizon.ci_low, horizon.ci_high))
+            table.add_row(f"{horizon.time:g} s", rate, *_cells(horizon, names))
+        console.print(table)
+        if found.repeats:
+            say(console, "Nothing is random here: all episodes are one and the same.")
+    if answer.measurements:
+        say(console, f"\n{_verdict(answer.measurements, numbers)}")
+
+
+def _in_brackets(bound: Bound) -> bool:
+    return bound.status in _NO_BOUND and bound.value is not None
+
+
+def _value(bound: Bound) -> str:
+    return f"({share_text(bound.value)})" if _in_brackets(bound) else share_text(bound.value)
+
+
+def _cells(horizon: Horizon, names: Sequence[str]) -> Iterator[str]:
+    bounds = {bound.name: bound for bound in horizon.bounds}
+    for name in names:
+        value = "" if bounds[name].value is None else _value(bounds[name])
+        contradicted = f"[red]{f'contradicted {value}'.strip()}[/]"
+        yield contradicted if name in horizon.contradicted else value or "withheld"
+
+
+def _verdict(measurements: Sequence[Measurement], numbers: Mapping[str, str]) -> str:
+    horizons = [horizon for found in measurements for horizon in found.horizons]
+    bounds = {bound.name: bound for horizon in horizons for bound in horizon.bounds}
+    wrong = {name for horizon in horizons for name in horizon.contradicted}
+    withheld = next((bound.reason for bound in bounds.values() if bound.status == "withheld"), "")
+    if not bounds:
+        return "There is no bound that the measurement could contradict."
+    if not wrong:
+        return f"Withheld: {withheld}" if withheld else "The measurement contradicts no bound."
+    listing = "; ".join(
+        f"{numbers[name]}, {bounds[name].status} ({name})"
+        for name in sorted(wrong, key=lambda name: int(numbers[name]))
+    )
+    return (
+        f"The measurement contradicts bound {listing}. The interval of the rate lies below it,"
+        " with the 5 % of error shared by all comparisons of this report."
+    )

@@ -1,0 +1,259 @@
+"""The answer of `safe-envs identify`: learned functions and the truth, and the same as JSON."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from safe_envs.agents.evaluation.evaluate import package_versions
+from safe_envs.errors import ConfigurationError
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.scripts.reports.evaluation_report import describe_plant, describe_system
+from safe_envs.wrappers.learning import LearnedModel
+from safe_envs.wrappers.learning.data.collection import draw_states
+from safe_envs.wrappers.learning.data.transitions import Transitions
+
+STATES = 1000
+"""States at which truth and estimate are compared."""
+
+_FRESH = 2
+"""Second entry of the seed of these states; see `safe_envs.wrappers.learning.checks.Purpose`."""
+
+_VANISHING = 1e-9
+"""A truth smaller than this part of its estimate's error is 0, but for rounding."""
+
+_NAMED = re.compile(r"(f|g|covariance|C)[\[(](\w+)(?:, (\w+))?[\])]")
+
+
+@dataclass(frozen=True, eq=False)
+class Function:
+    """A learned function at some states.
+
+    Attributes:
+        name: of it.
+        unit: empty if it is not known or 1.
+        truth: values (B,).
+        estimate: values (B,).
+    """
+
+    name: str
+    unit: str
+    truth: np.ndarray
+    estimate: np.ndarray
+
+    @property
+    def size(self) -> float:
+        """Root mean square of the truth."""
+        return _rms(self.truth)
+
+    @property
+    def error(self) -> float:
+        """Root mean square of the error."""
+        return _rms(self.estimate - self.truth)
+
+    @property
+    def largest(self) -> float:
+        """The largest error."""
+        return float(abs(self.estimate - self.truth).max())
+
+    @property
+    def relative(self) -> float | None:
+        """The error as a part of the truth; None where the truth is 0."""
+        return (
+            None
+            if self.size <= _VANISHING * self.error or not self.size
+            else self.error / self.size
+        )
+
+    @property
+    def vanishes(self) -> bool:
+        """Whether truth and estimate are 0 everywhere."""
+        return not (self.truth.any() or self.estimate.any())
+
+
+@dataclass(frozen=True)
+class Source:
+    """A file of data that was learned from.
+
+    Attributes:
+        path: of the file.
+        shortest: of the steps, in s.
+        longest: of the steps, in s.
+        seed: of the data; None for data from elsewhere.
+    """
+
+    path: Path
+    shortest: float
+    longest: float
+    seed: int | None
+
+    @classmethod
+    def of(cls, path: Path, data: Transitions) -> Source:
+        """Describe the data of a file.
+
+        Args:
+            path: of the file.
+            data: of the file.
+
+        Returns:
+            Path, lengths of the steps and seed.
+        """
+        return cls(path, float(data.dt.min()), float(data.dt.max()), data.seed)
+
+    def __str__(self) -> str:
+        steps = (
+            f"{self.shortest:g} s"
+            if self.shortest == self.longest
+            else f"{self.shortest:g} to {self.longest:g} s"
+        )
+        return (
+            f"in steps of {steps},"
+            f" {'from elsewhere' if self.seed is None else f'of the seed {self.seed}'}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Identification:
+    """A learned model and its accuracy.
+
+    Attributes:
+        env_id: of the env.
+        title: of the env in results.
+        problem: that was learned.
+        learned: the model.
+        functions: truth and estimate of each learned function; or why they cannot be compared.
+        options: arguments of `gym.make` that were given.
+        seed: that was given.
+        source: file of data that was learned from, if any.
+        out: where the model was written.
+        use: a command that uses it.
+    """
+
+    env_id: str
+    title: str
+    problem: SafetyProblem
+    learned: LearnedModel
+    functions: tuple[Function, ...] | str
+    options: dict[str, Any]
+    seed: int
+    source: Source | None
+    out: Path
+    use: str
+
+    @property
+    def compared(self) -> tuple[Function, ...]:
+        """The functions that could be compared with the truth."""
+        return () if isinstance(self.functions, str) else self.functions
+
+    @property
+    def setup(self) -> str:
+        """The simulated system; with data from a file, that with which they are compared."""
+        if self.source is None:
+            return describe_system(self.problem)
+        return f"compared with {describe_plant(self.problem)}, at states of the seed {self.seed}"
+
+    @property
+    def notes(self) -> list[str]:
+        """Notes needed to read the numbers."""
+        return [
+            *self.learned.record.warnings,
+            *([self.functions] if isinstance(self.functions, str) else []),
+        ]
+
+    def document(self) -> dict[str, Any]:
+        """Return all as JSON-able data; what is not finite is null."""
+        return {
+            "config": {
+                "env_id": self.env_id,
+                "options": self.options,
+                "method": self.learned.method,
+                "seed": self.seed,
+                "data": None if self.source is None else str(self.source.path),
+            },
+            "versions": package_versions(),
+            "file": str(self.out),
+            "sha256": self.learned.sha256,
+            "record": {
+                **asdict(self.learned.record),
+                "warnings": list(self.learned.record.warnings),
+            },
+            "states": STATES,
+            "functions": [
+                {
+                    "name": function.name,
+                    "unit": function.unit or None,
+                    **{
+                        key: _finite(getattr(function, key))
+                        for key in ("size", "error", "relative", "largest")
+                    },
+                }
+                for function in self.compared
+            ],
+            "notes": self.notes,
+        }
+
+
+def compare(learned: LearnedModel, problem: SafetyProblem, seed: int) -> tuple[Function, ...] | str:
+    """Compare the learned functions with those of the plant, at fresh states.
+
+    Args:
+        learned: the model.
+        problem: with the plant and the sampling domain.
+        seed: of the states.
+
+    Returns:
+        Each function; or a text that says why there is no truth.
+    """
+    x = draw_states(problem, STATES, np.random.default_rng([seed, _FRESH]))
+    try:
+        pairs = learned.compare(problem, x)
+    except ConfigurationError as error:
+        return str(error)
+    units = {v.symbol.name: v.unit for v in (*problem.states, *problem.inputs)}
+    return tuple(
+        Function(name, unit_of(name, units), truth, estimate)
+        for name, (truth, estimate) in pairs.items()
+    )
+
+
+def unit_of(name: str, units: Mapping[str, str]) -> str:
+    """Return the unit of an entry of drift, input matrix or covariance.
+
+    Args:
+        name: such as f[v], g[v, u], covariance[v, z].
+        units: of states and inputs, by name.
+
+    Returns:
+        Empty for other names, of functions of barriers, which have no unit.
+    """
+    match = _NAMED.fullmatch(name)
+    if match is None:
+        return ""
+    kind, first, second = match.groups()
+    parts = [(units[first], 1), ("s", -1)]
+    if second is not None:
+        parts.append((units[second], -1 if kind == "g" else 1))
+    powers: Counter[str] = Counter()
+    for unit, sign in parts:
+        for i, factors in enumerate(unit.split("/")):
+            for factor in factors.split():
+                symbol, _, exponent = factor.partition("^")
+                powers[symbol] += (-sign if i else sign) * int(exponent or 1)
+    above = [f"{s}^{k}" if k > 1 else s for s, k in powers.items() if s != "1" and k > 0]
+    below = [f"/{s}^{-k}" if k < -1 else f"/{s}" for s, k in powers.items() if s != "1" and k < 0]
+    return (" ".join(above) or ("1" if below else "")) + "".join(below)
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,100 @@
+"""The answer of `safe-envs verify`, and the same as JSON."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from safe_envs.agents.evaluation.bound_check import Measurement
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers import spec_of
+from safe_envs.wrappers.verification.feasibility import Part, Verification
+from safe_envs.wrappers.verification.results import Bound
+
+
+@dataclass(frozen=True, eq=False)
+class VerifyAnswer:
+    """What was found about a filter.
+
+    Attributes:
+        title: of the env.
+        config: what was asked for, as JSON.
+        policy: name of the simulated policy.
+        verification: where the conditions can be met.
+        starts: for which the bounds are, shape (B, n).
+        bounds: on the probability of no violation.
+        measurements: of that probability; none without a simulation.
+    """
+
+    title: str
+    config: dict[str, Any]
+    policy: str
+    verification: Verification
+    starts: np.ndarray
+    bounds: Sequence[Bound]
+    measurements: Sequence[Measurement]
+
+    @property
+    def problem(self) -> SafetyProblem:
+        """The problem that was looked at."""
+        return self.verification.formulas.problem
+
+    @property
+    def part(self) -> Part:
+        """The feasibility in the set that becomes invariant; in C if there is none."""
+        return self.verification.invariant_set or self.verification.safe_set
+
+    @property
+    def filter_text(self) -> str:
+        """The conditions of the filter."""
+        return spec_of(self.verification.formulas.conditions)
+
+    def document(self) -> dict[str, Any]:
+        """Return all as strict JSON: what is infinite or not defined is null."""
+        found = self.verification
+        return _plain(
+            {
+                "config": {
+                    **self.config,
+                    "filter": self.filter_text,
+                    "knowledge": found.formulas.knowledge,
+                    "horizon": self.problem.duration,
+                },
+                "states": [s.symbol.name for s in self.problem.states],
+                "drawn": found.drawn,
+                "notes": found.region.notes,
+                "beyond_workspace": found.beyond,
+                "undefined": found.undefined,
+                "safe_set": vars(found.safe_set),
+                "invariant_set": vars(found.invariant_set) if found.invariant_set else None,
+                "barriers": [
+                    {**vars(b), "vanishes": b.vanishes, "unbounded": math.isinf(b.supremum)}
+                    for b in found.barriers
+                ],
+                "bounds": [vars(b) for b in self.bounds],
+                "measurements": [_measured(m) for m in self.measurements],
+            }
+        )
+
+
+def _measured(found: Measurement) -> dict[str, Any]:
+    horizons = [{**vars(h), "bounds": [vars(b) for b in h.bounds]} for h in found.horizons]
+    shown = {key: getattr(found, key) for key in ("start", "state", "episodes", "repeats")}
+    return {**shown, "horizons": horizons}
+
+
+def _plain(value: Any) -> Any:
+    match value:
+        case dict():
+            return {key: _plain(entry) for key, entry in value.items()}
+        case list() | tuple():
+            return [_plain(entry) for entry in value]
+        case np.ndarray() | np.generic():
+            return _plain(value.tolist())
+        case float():
+            return value if math.isfinite(value) else None
+    return value
