@@ -115,7 +115,15 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start an episode from the problem's initial distribution."""
+        """Start an episode from the problem's initial distribution.
+
+        Args:
+            seed: of starts and noise; None goes on with the generator.
+            options: ignored.
+
+        Returns:
+            The observation, float32 (k,), and the info.
+        """
         super().reset(seed=seed)
         if seed is not None:
             self._noise.clear()

@@ -144,6 +144,10 @@ def named_barriers(barriers: Any) -> tuple[Barrier, ...]:
 def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str, Any]:
     """Return noise, gains, filter and plane of a problem as they suit a system.
 
+    Args:
+        system: the dynamics.
+        barriers: what is safe.
+
     Raises:
         RelativeDegreeError: no input reaches a barrier.
     """
@@ -164,7 +168,12 @@ def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str,
 
 
 def law_of(law: Any, system: ControlAffineSDE) -> sp.Expr:
-    """Return a law of the states as a law of the features, which have their own symbols."""
+    """Return a law of the states as a law of the features, which have their own symbols.
+
+    Args:
+        law: of the states and the parameters.
+        system: the dynamics.
+    """
     return formula("nominal", law).subs({s: sp.Symbol(s.name, real=True) for s in system.states})
 
 
