@@ -42,6 +42,16 @@ def real_array(what: str, given: Any) -> np.ndarray:
         ) from error
 
 
+def numbers_in(given: Any) -> np.ndarray:
+    """Return numbers as an array of at least one axis; empty if there are none."""
+    try:
+        found = np.asarray(given)
+        # NumPy would read numbers out of texts.
+        return np.empty(0) if found.dtype.kind in "US" else np.atleast_1d(found.astype(float))
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0)
+
+
 def _shown(given: Any) -> str:
     """Abbreviate a value; Python writes no integers of more than 4300 digits."""
     try:
