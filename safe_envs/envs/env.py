@@ -188,9 +188,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             self.viewer.close()
 
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
-        x = self.components
+        x, episode = self.components, self._episode
         features, barriers, reward, outside, goal = self._simulation.measure(
-            x, u, self._episode.steps * self.problem.dt
+            x, u, episode.steps * self.problem.dt
         )
         h = min(barriers)
         if not math.isfinite(h + sum(x)):
@@ -202,4 +202,4 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         if left:
             features = np.clip(features, self._bounds.low, self._bounds.high)
         observation = np.array(features, dtype=np.float32)
-        return observation, reward, left or goal >= 0.0, self._episode.count(barriers, h)
+        return observation, reward, left or goal >= 0.0, episode.count(barriers, h)

@@ -24,6 +24,8 @@ class Episode:
         cost: sum of the costs.
     """
 
+    __slots__ = ("cost", "h_min", "steps")
+
     def __init__(self) -> None:
         self.restart()
 
