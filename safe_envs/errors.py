@@ -49,7 +49,12 @@ def shown(given: Any) -> str:
 
 
 def shortened(given: Any, most: int = 120) -> str:
-    """Return a value as text, without its middle if it is longer than about `most` characters."""
+    """Return a value as text, without its middle if it is longer than about `most` characters.
+
+    Args:
+        given: a text, a path or an error.
+        most: characters.
+    """
     text = str(given)
     if len(text) <= most:
         return text
@@ -58,7 +63,12 @@ def shortened(given: Any, most: int = 120) -> str:
 
 
 def nearest(name: str, allowed: Iterable[str]) -> str:
-    """Return a phrase that lists the allowed names, the nearest one to `name` first."""
+    """Return a phrase that lists the allowed names, the nearest one to `name` first.
+
+    Args:
+        name: what was given.
+        allowed: names.
+    """
     names = list(allowed)
     close = difflib.get_close_matches(shortened(name), names, n=1, cutoff=0.4)
     listing = ", ".join(names) if names else "none"
@@ -69,6 +79,11 @@ def require_whole(name: str, value: Any, least: int) -> None:
     """Raise ConfigurationError unless a value is a whole number from `least`.
 
     NumPy's integers are whole numbers, truth values are not.
+
+    Args:
+        name: of the argument, for the error.
+        value: what was given.
+        least: smallest allowed number.
     """
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or int(value) < least:
         raise ConfigurationError(f"{name} = {shown(value)}; give a whole number from {least}")

@@ -68,6 +68,11 @@ def place_of(stated: type) -> str:
 def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) -> Any:
     """Call a function that was imported from a place, and return its value.
 
+    Args:
+        function: what was imported.
+        place: FILE.py:NAME or MODULE:NAME of it, for errors.
+        arguments: keyword arguments.
+
     Raises:
         ConfigurationError: an argument is missing or unknown, or the code there ends with an error.
     """

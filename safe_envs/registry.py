@@ -46,7 +46,12 @@ def which_env(env_id: str | None, system: str | None) -> str:
 
 
 def title_of(env_id: str, options: Mapping[str, Any]) -> str:
-    """Return how results call an env: its id, or the place of a system from outside."""
+    """Return how results call an env: its id, or the place of a system from outside.
+
+    Args:
+        env_id: registered id.
+        options: by which its problem was made.
+    """
     return options.get("system") or env_id
 
 

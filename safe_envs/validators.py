@@ -39,3 +39,21 @@ def real_array(what: str, given: Any) -> np.ndarray:
             f"the {what} is {shown(given)}: {error}; give an array of real numbers, such as"
             " np.zeros(2)"
         ) from error
+
+
+def numbers_in(given: Any) -> np.ndarray:
+    """Return numbers as an array of at least one axis; empty if there are none."""
+    try:
+        found = np.asarray(given)
+        # NumPy would read numbers out of texts.
+        return np.empty(0) if found.dtype.kind in "US" else np.atleast_1d(found.astype(float))
+    except (TypeError, ValueError, OverflowError):
+        return np.empty(0)
+
+
+def _shown(given: Any) -> str:
+    """Abbreviate a value; Python writes no integers of more than 4300 digits."""
+    try:
+        return reprlib.repr(given)
+    except ValueError:
+        return f"a {type(given).__name__}"

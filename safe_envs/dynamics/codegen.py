@@ -186,6 +186,13 @@ def in_plain_names(
     A name of the user's may be a keyword, a function, no identifier at all, or one of those that
     common subexpressions get. The new names sort like the old ones, for sympy orders the terms of a
     sum by them, and rounding follows the order.
+
+    Args:
+        arguments: symbols.
+        expressions: formulas of them.
+
+    Returns:
+        The new symbols in the order of the arguments, and the formulas of them.
     """
     ordered = sorted(arguments, key=sp.default_sort_key)
     plain = {s: sp.Symbol(f"a{i:03d}", **s.assumptions0) for i, s in enumerate(ordered)}
@@ -255,12 +262,22 @@ def constants(values: Sequence[float]) -> list[np.ndarray]:
 
 
 def filled(component: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a component as an array of the batch's shape; constants come as floats."""
+    """Return a component as an array of the batch's shape; constants come as floats.
+
+    Args:
+        component: a number, or an array that broadcasts to the shape.
+        shape: of the batch.
+    """
     return component if getattr(component, "shape", None) == shape else np.full(shape, component)
 
 
 def stacked(components: Sequence[Any], size: int) -> np.ndarray:
-    """Return components as columns, shape (size, len(components)), in memory of their own."""
+    """Return components as columns, shape (size, len(components)), in memory of their own.
+
+    Args:
+        components: numbers, or arrays of shape (size,).
+        size: of the batch.
+    """
     table = np.empty((len(components), size))
     for row, component in zip(table, components, strict=True):
         row[:] = component

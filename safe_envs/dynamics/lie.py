@@ -37,7 +37,12 @@ _MOST_TERMS = 200
 
 
 def gradient(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
-    """Return the row of partial derivatives with respect to the states, shape (1, n)."""
+    """Return the row of partial derivatives with respect to the states, shape (1, n).
+
+    Args:
+        system: the dynamics.
+        expression: phi, of the states and the parameters.
+    """
     return _gradient(system.states, expression)
 
 
@@ -48,17 +53,32 @@ def _gradient(states: tuple[sp.Symbol, ...], expression: sp.Expr) -> sp.Immutabl
 
 
 def lie_derivative_f(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
-    """Return L_f phi = grad phi . f, the rate of phi without input and noise."""
+    """Return L_f phi = grad phi . f, the rate of phi without input and noise.
+
+    Args:
+        system: the dynamics.
+        expression: phi, of the states and the parameters.
+    """
     return (gradient(system, expression) * system.drift)[0, 0]
 
 
 def lie_derivative_g(system: ControlAffineSDE, expression: sp.Expr) -> sp.ImmutableMatrix:
-    """Return L_g phi = grad phi . g, shape (1, m): how the input changes the rate of phi."""
+    """Return L_g phi = grad phi . g, shape (1, m): how the input changes the rate of phi.
+
+    Args:
+        system: the dynamics.
+        expression: phi, of the states and the parameters.
+    """
     return sp.ImmutableMatrix(gradient(system, expression) * system.input_matrix)
 
 
 def ito_correction(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
-    """Return 1/2 tr(sigma sigma' phi_xx), the drift that noise gives to a curved function."""
+    """Return 1/2 tr(sigma sigma' phi_xx), the drift that noise gives to a curved function.
+
+    Args:
+        system: the dynamics.
+        expression: phi, of the states and the parameters.
+    """
     covariance = system.diffusion * system.diffusion.T
     total = sp.Integer(0)
     for i, row_state in enumerate(system.states):
@@ -74,7 +94,12 @@ def ito_correction(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
 
 
 def quadratic_variation_rate(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
-    """Return |sigma' grad phi|^2, the variance of phi per s that the noise makes."""
+    """Return |sigma' grad phi|^2, the variance of phi per s that the noise makes.
+
+    Args:
+        system: the dynamics.
+        expression: phi, of the states and the parameters.
+    """
     row = gradient(system, expression) * system.diffusion
     return (row * row.T)[0, 0]
 
@@ -87,6 +112,10 @@ def has_kinks(expression: Any) -> bool:
 def generator(system: ControlAffineSDE, expression: sp.Expr) -> sp.Expr:
     """Return the input-free part of A phi = L_f phi + L_g phi u + 1/2 tr(sigma sigma' phi_xx).
 
+    Args:
+        system: the dynamics.
+        expression: phi, of the states and the parameters.
+
     Source: thesis Eq. (4.4).
     """
     return lie_derivative_f(system, expression) + ito_correction(system, expression)
@@ -97,6 +126,10 @@ def vanishes(system: ControlAffineSDE, expression: Any) -> bool:
 
     Where that can be neither shown nor refuted, the answer is no, which is the safe one: noise that
     may reach h is drawn, and an input that may have a say is not taken for one that has none.
+
+    Args:
+        system: whose parameters' values are used.
+        expression: or matrix, of the states and the parameters.
     """
     return is_zero(system.exact(expression))
 
@@ -104,7 +137,14 @@ def vanishes(system: ControlAffineSDE, expression: Any) -> bool:
 def derivatives(
     system: ControlAffineSDE, expression: sp.Expr, order: int, derivative: Derivative
 ) -> tuple[sp.Expr, ...]:
-    """Return (phi, D phi, ..., D^order phi) for D = `lie_derivative_f` or `generator`."""
+    """Return (phi, D phi, ..., D^order phi) for D = `lie_derivative_f` or `generator`.
+
+    Args:
+        system: along which phi is differentiated.
+        expression: phi.
+        order: of the last derivative.
+        derivative: D.
+    """
     result = [expression]
     for _ in range(order):
         result.append(derivative(system, result[-1]))

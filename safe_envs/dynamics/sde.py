@@ -161,7 +161,13 @@ class ControlAffineSDE:
             self.require_known(name, used, allowed=(*self.states, *self.parameters))
 
     def require_known(self, what: str, used: Iterable[Any], allowed: Sequence[sp.Symbol]) -> None:
-        """Raise SystemDefinitionError if an expression uses a symbol that is not allowed in it."""
+        """Raise SystemDefinitionError if an expression uses a symbol that is not allowed in it.
+
+        Args:
+            what: name of the expression, for errors.
+            used: its symbols.
+            allowed: symbols that may occur.
+        """
         unknown = set(used) - set(allowed)
         if unknown:
             twins = {s.name for s in unknown} & {s.name for s in allowed}

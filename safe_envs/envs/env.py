@@ -115,7 +115,15 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start an episode from the problem's initial distribution."""
+        """Start an episode from the problem's initial distribution.
+
+        Args:
+            seed: of starts and noise; None goes on with the generator.
+            options: ignored.
+
+        Returns:
+            The observation, float32 (k,), and the info.
+        """
         super().reset(seed=seed)
         if seed is not None:
             self._noise.clear()
@@ -180,9 +188,9 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
             self.viewer.close()
 
     def _observe(self, u: Sequence[float]) -> tuple[np.ndarray, float, bool, Info]:
-        x = self.components
+        x, episode = self.components, self._episode
         features, barriers, reward, outside, goal = self._simulation.measure(
-            x, u, self._episode.steps * self.problem.dt
+            x, u, episode.steps * self.problem.dt
         )
         h = min(barriers)
         if not math.isfinite(h + sum(x)):
@@ -194,4 +202,4 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         if left:
             features = np.clip(features, self._bounds.low, self._bounds.high)
         observation = np.array(features, dtype=np.float32)
-        return observation, reward, left or goal >= 0.0, self._episode.count(barriers, h)
+        return observation, reward, left or goal >= 0.0, episode.count(barriers, h)

@@ -12,6 +12,8 @@ import numpy as np
 from safe_envs.envs.info import Info, safety_info
 from safe_envs.errors import ConfigurationError
 
+_COUNTERS = ("steps", "h_min", "episode_cost", "ended")
+
 
 class Episode:
     """Counters of the episode of one env.
@@ -21,6 +23,8 @@ class Episode:
         h_min: smallest barrier value.
         cost: sum of the costs.
     """
+
+    __slots__ = ("cost", "h_min", "steps")
 
     def __init__(self) -> None:
         self.restart()
@@ -53,7 +57,7 @@ class Episodes:
     Attributes:
         steps: control periods, int64 (num_envs,).
         h_min: smallest barrier values, (num_envs,).
-        cost: sums of the costs, (num_envs,).
+        episode_cost: sums of the costs, (num_envs,).
         ended: the envs that are still to be reset, bool (num_envs,).
         begun: the envs whose episode began in the last step, bool (num_envs,).
         everywhere: True for each env; not to be written to.
@@ -62,7 +66,7 @@ class Episodes:
     def __init__(self, num_envs: int) -> None:
         self.steps = np.zeros(num_envs, dtype=np.int64)
         self.h_min = np.full(num_envs, np.inf)
-        self.cost = np.zeros(num_envs)
+        self.episode_cost = np.zeros(num_envs)
         self.ended = np.zeros(num_envs, dtype=bool)
         self.begun = self._nowhere = np.zeros(num_envs, dtype=bool)
         self.everywhere = np.ones(num_envs, dtype=bool)
@@ -103,7 +107,7 @@ class Episodes:
         self._started = True
         self.steps[envs] = 0
         self.h_min[envs] = np.inf
-        self.cost[envs] = 0.0
+        self.episode_cost[envs] = 0.0
         self.ended[envs] = False
 
     def count(self, barriers: np.ndarray, h: np.ndarray, counted: np.ndarray | None = None) -> Info:
@@ -119,20 +123,17 @@ class Episodes:
         """
         violation = h < 0.0
         cost = violation.astype(np.float64)
-        self.cost += cost if counted is None else cost * counted
+        self.episode_cost += cost if counted is None else cost * counted
         # What was counted before cannot lower the smallest value again.
         np.minimum(self.h_min, h, out=self.h_min)
-        return safety_info(violation, cost, barriers, self.h_min.copy(), self.cost.copy())
+        return safety_info(violation, cost, barriers, self.h_min.copy(), self.episode_cost.copy())
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Return copies of the counters, from which `restore` goes on."""
-        return {name: getattr(self, attribute).copy() for name, attribute in _COUNTERS.items()}
+        return {name: getattr(self, name).copy() for name in _COUNTERS}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Take the counters from a snapshot."""
         self._started = True
-        for name, attribute in _COUNTERS.items():
-            setattr(self, attribute, np.array(snapshot[name]))
-
-
-_COUNTERS = {"steps": "steps", "h_min": "h_min", "episode_cost": "cost", "ended": "ended"}
+        for name in _COUNTERS:
+            setattr(self, name, np.array(snapshot[name]))

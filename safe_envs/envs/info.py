@@ -80,7 +80,12 @@ def filter_info(
 
 
 def with_masks(info: Info, present: np.ndarray) -> Info:
-    """Add Gymnasium's `_key` masks, which say for which envs of a batch a key was reported."""
+    """Add Gymnasium's `_key` masks, which say for which envs of a batch a key was reported.
+
+    Args:
+        info: of a batch, changed in place.
+        present: the envs that report it, bool (num_envs,).
+    """
     info.update(dict.fromkeys(_mask_names(tuple(info)), present))
     return info
 

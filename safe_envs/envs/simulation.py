@@ -126,7 +126,12 @@ class NoiseStreams:
 
 
 def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
-    """Return the control periods until an episode is truncated."""
+    """Return the control periods until an episode is truncated.
+
+    Args:
+        problem: whose horizon is the limit.
+        max_episode_steps: a lower limit, if any.
+    """
     if max_episode_steps is None:
         return problem.steps
     if not isinstance(max_episode_steps, int) or max_episode_steps < 1:

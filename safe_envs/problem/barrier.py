@@ -38,6 +38,10 @@ class Barrier:
 def formula(what: str, given: Any) -> sp.Expr:
     """Return a SymPy expression, or a number as one.
 
+    Args:
+        what: name of the argument, for errors.
+        given: of SymPy, or a number.
+
     Raises:
         SystemDefinitionError: it is a text, a function, an inequality or something else.
     """

@@ -16,7 +16,7 @@ from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier, formula
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.problem.signals import Variable
+from safe_envs.problem.signals import Variable, input_bounds
 from safe_envs.problem.validation import degree_of, require_sound
 
 _UNBOUNDED = (-math.inf, math.inf)
@@ -108,7 +108,7 @@ def state_problem(
         states=states,
         inputs=tuple(
             Variable(u, *ends, unit.get(u, ""))
-            for u, ends in zip(system.inputs, _boxes(system, box), strict=True)
+            for u, ends in zip(system.inputs, input_bounds(box, system.m), strict=True)
         ),
         reward=formula("reward", reward),
         nominal=tuple(
@@ -144,6 +144,10 @@ def named_barriers(barriers: Any) -> tuple[Barrier, ...]:
 def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str, Any]:
     """Return noise, gains, filter and plane of a problem as they suit a system.
 
+    Args:
+        system: the dynamics.
+        barriers: what is safe.
+
     Raises:
         RelativeDegreeError: no input reaches a barrier.
     """
@@ -164,7 +168,12 @@ def suitable(system: ControlAffineSDE, barriers: Sequence[Barrier]) -> dict[str,
 
 
 def law_of(law: Any, system: ControlAffineSDE) -> sp.Expr:
-    """Return a law of the states as a law of the features, which have their own symbols."""
+    """Return a law of the states as a law of the features, which have their own symbols.
+
+    Args:
+        law: of the states and the parameters.
+        system: the dynamics.
+    """
     return formula("nominal", law).subs({s: sp.Symbol(s.name, real=True) for s in system.states})
 
 
@@ -231,21 +240,6 @@ def _start(states: Sequence[Variable], barriers: Sequence[Barrier], start: Any) 
         if leaves
     ]
     return Start(state, uniforms, sp.Min(*[b.expression for b in barriers], *within))
-
-
-def _boxes(system: ControlAffineSDE, box: Any) -> list[Range]:
-    given = box.tolist() if isinstance(box, np.ndarray) else box
-    pairs = (
-        list(given)
-        if isinstance(given, list | tuple) and given and isinstance(given[0], list | tuple)
-        else [given] * system.m
-    )
-    if len(pairs) != system.m:
-        raise ConfigurationError(
-            f"box = {shown(box)}; give (low, high), or one such pair for each of the {system.m}"
-            " inputs"
-        )
-    return [_ends(f"box of {u}", pair) for u, pair in zip(system.inputs, pairs, strict=True)]
 
 
 def _ends(what: str, given: Any) -> Range:

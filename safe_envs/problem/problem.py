@@ -19,7 +19,8 @@ from safe_envs.problem.clf import CLF
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.options import ProblemOptions
 from safe_envs.problem.sampling_domain import SamplingDomain
-from safe_envs.problem.signals import TIME, Feature, Variable, excess
+from safe_envs.problem.signals import TIME, Feature, Variable, excess, input_bounds
+from safe_envs.validators import numbers_in
 
 _WIDEST = 1e100
 """Largest bound of a box: its square, an effort, is still a number."""
@@ -215,7 +216,11 @@ class SafetyProblem:
             if getattr(given, name) is not None:
                 changes[name] = getattr(given, name)
         if given.box is not None:
-            changes["inputs"] = self._boxed(given.box)
+            pairs = input_bounds(given.box, len(self.inputs))
+            changes["inputs"] = tuple(
+                replace(i, low=low, high=high)
+                for i, (low, high) in zip(self.inputs, pairs, strict=True)
+            )
         start = given.start
         if isinstance(start, str):
             if start not in self.starts:
@@ -240,7 +245,7 @@ class SafetyProblem:
                 else ""
             )
             raise ConfigurationError(f"{self.name} has no noise channels{advice}")
-        given = _numbers(noise)
+        given = numbers_in(noise)
         if (
             given.shape not in ((1,), (len(self.noise),))
             or not np.isfinite(given).all()
@@ -252,23 +257,9 @@ class SafetyProblem:
             )
         return dict(zip(self.noise, np.broadcast_to(given, len(self.noise)).tolist(), strict=True))
 
-    def _boxed(self, box: Sequence[Any]) -> tuple[Variable, ...]:
-        pairs = _numbers(box)
-        pairs = np.broadcast_to(pairs, (len(self.inputs), 2)) if pairs.shape == (2,) else pairs
-        if pairs.shape != (len(self.inputs), 2):
-            raise ConfigurationError(
-                f"box = {shown(box)}; give (low, high), or one such pair for each of the"
-                f" {len(self.inputs)} inputs"
-            )
-        bounds = [(float(low), float(high)) for low, high in pairs]
-        return tuple(
-            replace(i, low=low, high=high)
-            for i, (low, high) in zip(self.inputs, bounds, strict=True)
-        )
-
     def _fixed(self, start: Sequence[float]) -> Start:
         names = ", ".join(s.symbol.name for s in self.states)
-        given = _numbers(start)
+        given = numbers_in(start)
         if given.shape != (len(self.states),):
             raise ConfigurationError(
                 f"start has {given.size} numbers; the state has {len(self.states)}: {names}"
@@ -283,13 +274,3 @@ class SafetyProblem:
                     f"start of {s.symbol} = {v} is outside the workspace [{s.low}, {s.high}]"
                 )
         return Start.at(values)
-
-
-def _numbers(given: Any) -> np.ndarray:
-    """Return numbers as an array of at least one axis; empty if there are none."""
-    try:
-        found = np.asarray(given)
-        # NumPy would read numbers out of texts.
-        return np.empty(0) if found.dtype.kind in "US" else np.atleast_1d(found.astype(float))
-    except (TypeError, ValueError, OverflowError):
-        return np.empty(0)

@@ -5,8 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
+import numpy as np
 import sympy as sp
+
+from safe_envs.errors import ConfigurationError, shown
+from safe_envs.validators import numbers_in
 
 TIME = sp.Symbol("t", nonnegative=True)
 """Time since the start of the episode, in s: references and rewards may depend on it. No state or
@@ -58,3 +63,22 @@ def excess(variables: tuple[Variable, ...]) -> sp.Expr:
             found += [v.low - v.symbol] * math.isfinite(v.low)
     found += [sp.Max(*sizes) - half for half, sizes in symmetric.items()]
     return sp.Max(*found) if found else sp.Integer(-1)
+
+
+def input_bounds(box: Any, count: int) -> list[tuple[float, float]]:
+    """Return the bounds of each input.
+
+    Args:
+        box: (low, high) for all inputs, or one such pair for each.
+        count: number of inputs.
+
+    Raises:
+        ConfigurationError: They are neither.
+    """
+    pairs = numbers_in(box)
+    pairs = np.broadcast_to(pairs, (count, 2)) if pairs.shape == (2,) else pairs
+    if pairs.shape != (count, 2):
+        raise ConfigurationError(
+            f"box = {shown(box)}; give (low, high), or one such pair for each of the {count} inputs"
+        )
+    return [(float(low), float(high)) for low, high in pairs]

@@ -76,6 +76,10 @@ def require_sound(problem: SafetyProblem) -> None:
 def degree_of(system: ControlAffineSDE, h: sp.Expr) -> int:
     """Return the relative degree: along the Ito generator with noise, along the drift without.
 
+    Args:
+        system: the dynamics.
+        h: a function of the states.
+
     Raises:
         RelativeDegreeError: no input reaches h.
     """

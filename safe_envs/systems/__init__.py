@@ -8,7 +8,7 @@ MODULES = {
     "DubinsDisk": "dubins",
     "DubinsObstacle": "dubins_obstacle",
     "DubinsObstacles": "dubins_obstacles",
-    "StochasticDubins": "dubins",
+    "StochasticDubins": "stochastic_dubins",
     "QuadrotorAltitude": "quadrotor_altitude",
     "Quadrotor": "quadrotor",
     "QuadrotorLimits": "quadrotor_limits",

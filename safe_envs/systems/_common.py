@@ -11,6 +11,10 @@ from safe_envs.number_text import finite_number
 def positive(name: str, value: float) -> float:
     """Return a barrier's argument as a float.
 
+    Args:
+        name: of the argument, for errors.
+        value: what was given.
+
     Raises:
         ConfigurationError: it is not a positive finite number.
     """
@@ -26,11 +30,23 @@ def uniforms(count: int) -> tuple[sp.Symbol, ...]:
 
 
 def around(center: float, half_width: float, uniform: sp.Symbol) -> sp.Expr:
-    """Return the uniform on [center - half_width, center + half_width)."""
+    """Return the uniform on [center - half_width, center + half_width).
+
+    Args:
+        center: midpoint.
+        half_width: distance from it to both ends.
+        uniform: symbol of a uniform on [0, 1).
+    """
     return center + half_width * (2 * uniform - 1)
 
 
 def in_disk(radius: float, area: sp.Symbol, angle: sp.Symbol) -> tuple[sp.Expr, sp.Expr]:
-    """Return a uniform point of the disk around the origin, from two uniforms."""
+    """Return a uniform point of the disk around the origin, from two uniforms.
+
+    Args:
+        radius: of the disk.
+        area: uniform that gives the distance from the origin.
+        angle: uniform that gives the direction.
+    """
     rho = radius * sp.sqrt(area)
     return rho * sp.cos(2 * sp.pi * angle), rho * sp.sin(2 * sp.pi * angle)

@@ -67,7 +67,16 @@ def cruise(
     slack_weight: float,
     **rest: Any,
 ) -> SafetyProblem:
-    """Build what both problems share: the bounds of the force, and the desired speed as goal."""
+    """Build what both problems share: the bounds of the force, and the desired speed as goal.
+
+    Args:
+        name: of the problem.
+        system: plant and model.
+        speed: symbol of the car's speed.
+        rate: wanted decay rate of V, in 1/s.
+        slack_weight: w_d of the goal, whose weight of u^2 is 2/M^2.
+        **rest: other attributes of `SafetyProblem`.
+    """
     clf = CLF(
         (speed - _DESIRED_SPEED) ** 2,
         rate,

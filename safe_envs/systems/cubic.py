@@ -26,6 +26,10 @@ def cubic(diffusion: Any, noise: Mapping[sp.Symbol, float]) -> ControlAffineSDE:
 
     dx_1 = (-a x_1 - x_2) dt + ..., dx_2 = (x_1^3 + x_2 u) dt + ..., with a = .6.
 
+    Args:
+        diffusion: sigma, 2 x d.
+        noise: value of each parameter of it.
+
     Source: thesis Sec. 5.4.2 and 6.3.1. The thesis writes d of the states' derivatives where d of
         the states is meant.
     """

@@ -1,4 +1,4 @@
-"""Dubins vehicle in a disk: at an unknown speed (DubinsDisk) and with noise (StochasticDubins)."""
+"""Dubins vehicle in a disk, at a speed that its designer underestimates (DubinsDisk)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.lie import generator, lie_derivative_f
+from safe_envs.dynamics.lie import lie_derivative_f
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.barrier import Barrier
@@ -23,13 +23,18 @@ v, sigma_1, sigma_2 = sp.symbols("v sigma_1 sigma_2", real=True)
 cos_theta, sin_theta = sp.symbols("cos_theta sin_theta", real=True)
 
 _HEADING_GAIN = 2
-_UNIFORMS = uniforms(3)
+UNIFORMS = uniforms(3)
+"""Of a start anywhere: area, direction and heading."""
 
 
 def vehicle(speed: float, noise: float) -> ControlAffineSDE:
     """Return the vehicle.
 
     dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt.
+
+    Args:
+        speed: v, in m/s.
+        noise: sigma_1 = sigma_2, in m/sqrt(s).
 
     Source: thesis Eq. (3.27) and Sec. 4.3.2.
     """
@@ -47,6 +52,10 @@ def turn_rate_towards(wanted_x: sp.Expr, wanted_y: sp.Expr) -> sp.Expr:
     """Return a law proportional to the angle from the heading to a wanted course.
 
     It takes cosine and sine of the heading.
+
+    Args:
+        wanted_x: x component of the course, of any length.
+        wanted_y: y component of the course.
     """
     return _HEADING_GAIN * sp.atan2(
         cos_theta * wanted_y - sin_theta * wanted_x, cos_theta * wanted_x + sin_theta * wanted_y
@@ -73,7 +82,7 @@ def _patrol(r: float) -> tuple[sp.Expr, sp.Expr]:
     return on_circle * (1 + along) / 2, v / radius + turn_rate_towards(*course)
 
 
-def _disk(
+def disk_problem(
     name: str,
     *,
     plant: ControlAffineSDE,
@@ -83,7 +92,17 @@ def _disk(
     starts: Mapping[str, Start],
     **rest: Any,
 ) -> SafetyProblem:
-    """Build what both problems in the disk share."""
+    """Build what the problems in a disk share.
+
+    Args:
+        name: of the problem.
+        plant: the vehicle.
+        model: the vehicle that the designer believes.
+        r: radius of the disk, in m.
+        h: the barrier.
+        starts: distributions other than the uniform one.
+        **rest: other attributes of `SafetyProblem`.
+    """
     reward, turn_rate = _patrol(r)
     return SafetyProblem(
         name=name,
@@ -103,7 +122,7 @@ def _disk(
         ),
         reward=reward,
         nominal=(turn_rate,),
-        starts={**starts, "uniform": Start(_anywhere(r), _UNIFORMS)},
+        starts={**starts, "uniform": Start(anywhere(r), UNIFORMS)},
         noise=("sigma_1", "sigma_2"),
         plane=("x", "y"),
         scene="top-view",
@@ -112,9 +131,9 @@ def _disk(
     )
 
 
-def _anywhere(r: float) -> tuple[sp.Expr, ...]:
+def anywhere(r: float) -> tuple[sp.Expr, ...]:
     """Return a start with position uniform in the disk and heading uniform."""
-    area, angle, heading = _UNIFORMS
+    area, angle, heading = UNIFORMS
     return (*in_disk(r, area, angle), 2 * sp.pi * heading)
 
 
@@ -131,7 +150,7 @@ def dubins_disk(*, radius: float = 1.0) -> SafetyProblem:
     h = r**2 - x**2 - y**2
     gains = (1.0, 2.0)
     b_1 = plant.numeric(lie_derivative_f(plant, h)) + gains[0] * h
-    return _disk(
+    return disk_problem(
         "DubinsDisk",
         plant=plant,
         model=model,
@@ -139,7 +158,7 @@ def dubins_disk(*, radius: float = 1.0) -> SafetyProblem:
         h=h,
         inputs=(Variable(omega, -math.pi, math.pi, "rad/s"),),
         starts={
-            "feasible": Start(_anywhere(r), _UNIFORMS, b_1),
+            "feasible": Start(anywhere(r), UNIFORMS, b_1),
             "thesis": Start.at((0.9, 0.1, 0.0)),
             "valid": Start.at((0.0, 0.1, 0.0)),
         },
@@ -147,32 +166,6 @@ def dubins_disk(*, radius: float = 1.0) -> SafetyProblem:
         horizon=50.0,
         gains=gains,
         filter="hocbf",
-    )
-
-
-def stochastic_dubins(*, radius: float = 3.0) -> SafetyProblem:
-    """Build the problem in the disk with a vehicle whose position is noisy.
-
-    Args:
-        radius: of the safe disk, in m.
-
-    Source: thesis Sec. 4.3.2.
-    """
-    r = positive("radius", radius)
-    car = vehicle(2.0, noise=0.2)
-    h = r**2 - x**2 - y**2
-    return _disk(
-        "StochasticDubins",
-        plant=car,
-        model=car,
-        r=r,
-        h=h,
-        inputs=(Variable(omega, -10.0, 10.0, "rad/s"),),
-        starts={"inward": Start(_anywhere(r), _UNIFORMS, generator(car, h))},
-        dt=0.05,
-        horizon=5.0,
-        gains=(1.0, 1.0),
-        filter="scbf",
     )
 
 
@@ -240,63 +233,3 @@ class DubinsDisk(SystemEnv):
     """
 
     problem_factory = staticmethod(dubins_disk)
-
-
-class StochasticDubins(SystemEnv):
-    """A vehicle at constant speed, disturbed by noise, is to stay in a disk.
-
-    ## Description
-    As `DubinsDisk`, with a known speed, a larger disk and noise in the position.
-
-    ## Equations
-    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt
-
-    ## States
-    | symbol | meaning | unit | workspace |
-    |---|---|---|---|
-    | `x`, `y` | position | m | [-2 r, 2 r], r = 3 m |
-    | `theta` | heading | rad | unbounded |
-
-    ## Inputs
-    | symbol | meaning | unit | bounds |
-    |---|---|---|---|
-    | `omega` | turn rate | rad/s | [-10, 10] |
-
-    ## Observation
-    x, y, cos(theta), sin(theta).
-
-    ## Barrier
-    h = r^2 - x^2 - y^2, of relative degree 2. Default filter: `scbf`, whose order-2 condition
-    cannot stay feasible on a compact set: with the full box it is met in about four steps of five.
-    Gains for the other conditions: 1, 1.
-
-    ## Noise
-    `sigma_1`, `sigma_2` = .2 m/sqrt(s).
-
-    ## Mismatch
-    None: plant and model have v = 2 m/s.
-
-    ## Reward
-    (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from
-    (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise tangent: the
-    circle alone would reward turning on the spot. Our choice.
-
-    ## Nominal controller
-    Turns towards a course that leads onto that circle and around it. Our choice.
-
-    ## Start
-    `inward`: uniform in the disk and in heading, restricted to where A h > 0 for the model.
-    `uniform`: without that condition.
-
-    ## Episode end
-    Terminated outside the workspace, truncated after 5 s = 100 steps. At a control period of 50 ms
-    some short exits go unseen, so that a safety rate is a little higher than with a smaller one.
-
-    ## Arguments
-    `barrier={"radius": 3.0}`, the radius r in m; for all others see `SystemEnv`.
-
-    ## Source
-    Thesis Sec. 4.3.2, Eq. (4.25).
-    """
-
-    problem_factory = staticmethod(stochastic_dubins)

@@ -54,7 +54,15 @@ def vehicle_among(
 
 
 def way_to(goal_x: float, goal_y: float) -> dict[str, Any]:
-    """Return reward, nominal controller and goal of a vehicle that is to reach a point."""
+    """Return reward, nominal controller and goal of a vehicle that is to reach a point.
+
+    Args:
+        goal_x: of the point, in m.
+        goal_y: of the point, in m.
+
+    Returns:
+        Arguments of `SafetyProblem`.
+    """
     to_goal_x, to_goal_y = goal_x - x, goal_y - y
     distance = sp.sqrt(
         to_goal_x**2 + to_goal_y**2 + 1e-12
@@ -69,7 +77,13 @@ def way_to(goal_x: float, goal_y: float) -> dict[str, Any]:
 
 
 def separation(x_i: sp.Expr, y_i: sp.Expr, distance: float) -> sp.Expr:
-    """Return an expression that is positive where the vehicle is farther than a distance away."""
+    """Return an expression that is positive where the vehicle is farther than a distance away.
+
+    Args:
+        x_i: of the point, in m.
+        y_i: of the point, in m.
+        distance: in m.
+    """
     return (x - x_i) ** 2 + (y - y_i) ** 2 - distance**2
 
 

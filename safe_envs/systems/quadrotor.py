@@ -103,6 +103,10 @@ def rotor_laws(x_wanted: sp.Expr, x_rate_wanted: sp.Expr) -> tuple[sp.Expr, ...]
 
     The position loop asks for a horizontal acceleration, which for small tilts is g times an angle:
     that angle is what the attitude loop, about three times as fast, follows.
+
+    Args:
+        x_wanted: reference of x, in m.
+        x_rate_wanted: its rate, in m/s.
     """
     push_x, push_y = x_wanted - x + 2 * (x_rate_wanted - xdot), -y - 2 * ydot
     wanted_phi = (push_x * sin_psi - push_y * cos_psi) / g
@@ -119,7 +123,12 @@ def rotor_laws(x_wanted: sp.Expr, x_rate_wanted: sp.Expr) -> tuple[sp.Expr, ...]
 
 
 def start_at(known: Mapping[sp.Symbol, Any], spread: Sequence[sp.Symbol] = ()) -> Start:
-    """Return a start with some components of the state, and 0 for all others."""
+    """Return a start with some components of the state, and 0 for all others.
+
+    Args:
+        known: value or expression of each component that is not 0.
+        spread: the uniforms in them.
+    """
     return Start(tuple(sp.sympify(known.get(s.symbol, 0)) for s in _STATES), tuple(spread))
 
 

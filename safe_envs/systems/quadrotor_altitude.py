@@ -69,6 +69,10 @@ def thrust_law() -> sp.Expr:
 def band(center: float, half_width: float) -> Barrier:
     """Return the barrier h = 1 - ((z - c)/p)^4.
 
+    Args:
+        center: c, in m.
+        half_width: p, in m.
+
     Source: thesis Eq. (3.32).
     """
     return Barrier(
@@ -79,7 +83,14 @@ def band(center: float, half_width: float) -> Barrier:
 def altitude_problem(
     name: str, *, reward: sp.Expr = ALTITUDE_REWARD, gains: Any = (2.0, 8.0), **rest: Any
 ) -> SafetyProblem:
-    """Build what all quadrotors share: the task, the timing and the gains."""
+    """Build what all quadrotors share: the task, the timing and the gains.
+
+    Args:
+        name: of the problem.
+        reward: of a step.
+        gains: rates of the conditions, in 1/s.
+        **rest: other attributes of `SafetyProblem`.
+    """
     return SafetyProblem(
         name=name, reward=reward, dt=0.05, horizon=30.0, gains=gains, filter="hocbf", **rest
     )

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
 from safe_envs import ConfigurationError, InvalidInputError, NumericalError
 from safe_envs.envs.simulation import Simulation
-from safe_envs.systems.dubins import StochasticDubins
+from safe_envs.systems.stochastic_dubins import StochasticDubins
 from safe_envs.wrappers import SafetyFilterWrapper
 from tests.conftest import problem_of
 

@@ -43,7 +43,7 @@ _OPTIONS: dict[str, Any] = {
             metavar="FILE.py:NAME",
             help=(
                 "In place of ENV_ID: a SafetyProblem of your own or a function that returns one."
-                " Runs the file."
+                " Runs the file. Or the name of a system that another package installed."
             ),
         ),
     ],

@@ -1,0 +1,97 @@
+"""Dubins vehicle in a disk, with noise (StochasticDubins)."""
+
+from __future__ import annotations
+
+from safe_envs.dynamics.lie import generator
+from safe_envs.envs.system_env import SystemEnv
+from safe_envs.problem.initial_distribution import Start
+from safe_envs.problem.problem import SafetyProblem
+from safe_envs.problem.signals import Variable
+from safe_envs.systems._common import positive
+from safe_envs.systems.dubins import UNIFORMS, anywhere, disk_problem, omega, vehicle, x, y
+
+
+def stochastic_dubins(*, radius: float = 3.0) -> SafetyProblem:
+    """Build the problem in the disk with a vehicle whose position is noisy.
+
+    Args:
+        radius: of the safe disk, in m.
+
+    Source: thesis Sec. 4.3.2.
+    """
+    r = positive("radius", radius)
+    car = vehicle(2.0, noise=0.2)
+    h = r**2 - x**2 - y**2
+    return disk_problem(
+        "StochasticDubins",
+        plant=car,
+        model=car,
+        r=r,
+        h=h,
+        inputs=(Variable(omega, -10.0, 10.0, "rad/s"),),
+        starts={"inward": Start(anywhere(r), UNIFORMS, generator(car, h))},
+        dt=0.05,
+        horizon=5.0,
+        gains=(1.0, 1.0),
+        filter="scbf",
+    )
+
+
+class StochasticDubins(SystemEnv):
+    """A vehicle at constant speed, disturbed by noise, is to stay in a disk.
+
+    ## Description
+    As `DubinsDisk`, with a known speed, a larger disk and noise in the position.
+
+    ## Equations
+    dx = v cos(theta) dt + sigma_1 dW_1, dy = v sin(theta) dt + sigma_2 dW_2, dtheta = omega dt
+
+    ## States
+    | symbol | meaning | unit | workspace |
+    |---|---|---|---|
+    | `x`, `y` | position | m | [-2 r, 2 r], r = 3 m |
+    | `theta` | heading | rad | unbounded |
+
+    ## Inputs
+    | symbol | meaning | unit | bounds |
+    |---|---|---|---|
+    | `omega` | turn rate | rad/s | [-10, 10] |
+
+    ## Observation
+    x, y, cos(theta), sin(theta).
+
+    ## Barrier
+    h = r^2 - x^2 - y^2, of relative degree 2. Default filter: `scbf`, whose order-2 condition
+    cannot stay feasible on a compact set: with the full box it is met in about four steps of five.
+    Gains for the other conditions: 1, 1.
+
+    ## Noise
+    `sigma_1`, `sigma_2` = .2 m/sqrt(s).
+
+    ## Mismatch
+    None: plant and model have v = 2 m/s.
+
+    ## Reward
+    (1 + (d/R) cos(a))/2 / (1 + 4 (d^2/R^2 - 1)^2) a step, at most about 1, for the distance d from
+    (.5 r, 0), R = .75 r and the angle a from the heading to the counterclockwise tangent: the
+    circle alone would reward turning on the spot. Our choice.
+
+    ## Nominal controller
+    Turns towards a course that leads onto that circle and around it. Our choice.
+
+    ## Start
+    `inward`: uniform in the disk and in heading, restricted to where A h > 0 for the model.
+    `uniform`: without that condition.
+
+    ## Episode end
+    Terminated outside the workspace, truncated after 5 s = 100 steps. At a control period of 50 ms
+    some short exits go unseen, so that a safety rate is a little higher than with a smaller one.
+
+    ## Arguments
+    `barrier={"radius": 3.0}`, the radius r in m; for all others see `SystemEnv`.
+
+    ## Source
+    Thesis Sec. 4.3.2, Eq. (4.25).
+    """
+
+    problem_factory = staticmethod(stochastic_dubins)
