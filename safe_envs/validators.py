@@ -49,11 +49,3 @@ def numbers_in(given: Any) -> np.ndarray:
         return np.empty(0) if found.dtype.kind in "US" else np.atleast_1d(found.astype(float))
     except (TypeError, ValueError, OverflowError):
         return np.empty(0)
-
-
-def _shown(given: Any) -> str:
-    """Abbreviate a value; Python writes no integers of more than 4300 digits."""
-    try:
-        return reprlib.repr(given)
-    except ValueError:
-        return f"a {type(given).__name__}"

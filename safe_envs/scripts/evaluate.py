@@ -9,6 +9,7 @@ from typing import Any
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import evaluation_options as of
 from safe_envs.scripts.options import text_options
+from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import progress_bar, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
@@ -97,7 +98,10 @@ def _evaluate(
 ) -> None:
     """Evaluate, print and write."""
     from safe_envs.agents.evaluation import evaluate, refinement
-    from safe_envs.scripts.reports.evaluation_report import print_evaluation, print_refinement
+    from safe_envs.scripts.reports.evaluation_report import (
+        print_evaluation,
+        print_refinement,
+    )
 
     json, episodes_out, plot = outputs
     found: Any

@@ -81,7 +81,11 @@ def identify(
     states of the sampling domain, is that of the plant, with its --noise.
     """
     from safe_envs.registry import make_problem, title_of
-    from safe_envs.scripts.reports.identify_answer import Identification, Source, compare
+    from safe_envs.scripts.reports.identify_answer import (
+        Identification,
+        Source,
+        compare,
+    )
     from safe_envs.scripts.reports.identify_report import print_report
     from safe_envs.wrappers.learning import learner_of
     from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning

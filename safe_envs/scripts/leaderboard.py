@@ -9,10 +9,6 @@ from typing import Annotated
 import typer
 
 from safe_envs import ENV_IDS
-from safe_envs.atomic_io import write_json
-from safe_envs.bounded_reading import read_json
-from safe_envs.errors import ConfigurationError, shown
-from safe_envs.rate_text import percent_in
 from safe_envs.scripts.options import completion
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import (
@@ -72,9 +68,15 @@ def leaderboard(
     training of each kind, and another seed gives another agent.
     """
     from safe_envs.agents.jobs.fingerprint import package_versions
-    from safe_envs.agents.training.leaderboard import LeaderboardOptions, leaderboard_rows
+    from safe_envs.agents.training.leaderboard import (
+        LeaderboardOptions,
+        leaderboard_rows,
+    )
     from safe_envs.registry import full_id
-    from safe_envs.scripts.reports.leaderboard_report import leaderboard_markdown, leaderboard_table
+    from safe_envs.scripts.reports.leaderboard_report import (
+        leaderboard_markdown,
+        leaderboard_table,
+    )
 
     require_result(json_file)
     ids = list(dict.fromkeys(full_id(env_id) for env_id in env_ids or ENV_IDS))

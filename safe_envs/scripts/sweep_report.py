@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from safe_envs.errors import ConfigurationError, nearest
-from safe_envs.rate_text import percent, percent_in
 from safe_envs.scripts.options import text_options
 from safe_envs.scripts.options.app import run_alone
 from safe_envs.scripts.options.console import Json, say, stdout, write_result

@@ -10,12 +10,16 @@ from typing import Annotated
 
 import typer
 
-from safe_envs.errors import ConfigurationError, shortened
-from safe_envs.number_text import real
-from safe_envs.rate_text import percent_in
+from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
+from safe_envs.scripts.options.console import (
+    Json,
+    progress_bar,
+    say,
+    stdout,
+    write_result,
+)
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 from safe_envs.scripts.options.hyperparameter_options import read_hyperparameters
 
@@ -110,7 +114,6 @@ def train(
     cost and smallest h, and violations, interventions and infeasible steps in the training so far.
     The folder is what `safe-envs evaluate --policy DIR` reads.
     """
-    from safe_envs.agents.policies.base import DESCRIPTION
     from safe_envs.agents.training.config import Training
     from safe_envs.scripts.reports.training_report import print_evaluations
 
@@ -137,6 +140,7 @@ def train(
         eval_episodes=eval_episodes,
         threads=threads,
     )
+    from safe_envs.agents.policies.base import POLICY_FILE
     from safe_envs.agents.training.trainer import train as train_agent
 
     # The policy itself is written at the very end.

@@ -12,7 +12,7 @@ from safe_envs.agents.policies.custom import as_policy, policy_name
 from safe_envs.agents.policies.registry import make_policy
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 
 _TOLERANCE = 1e-5
 """Between the actions in a batch and in single episodes, where a network may round differently."""
@@ -48,7 +48,7 @@ def check_policy(
         ConfigurationError: There is no such policy.
     """
     if isinstance(problem, str):
-        problem = load_problem(problem)
+        problem = make_problem(problem)
     actor = (
         make_policy(policy, problem, trust)
         if isinstance(policy, str)

@@ -10,7 +10,12 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.dynamics.lie import generator, ito_correction, lie_derivative_f, lie_derivative_g
+from safe_envs.dynamics.lie import (
+    generator,
+    ito_correction,
+    lie_derivative_f,
+    lie_derivative_g,
+)
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.vector_env import SafeVectorEnv

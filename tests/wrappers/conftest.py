@@ -7,7 +7,10 @@ import pytest
 
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.learning.generator import learn_generator
-from safe_envs.wrappers.learning.models.generator import GeneratorModel, LearnedGenerator
+from safe_envs.wrappers.learning.models.generator import (
+    GeneratorModel,
+    LearnedGenerator,
+)
 from safe_envs.wrappers.learning.models.residual import LearnedResidual, ResidualModel
 from safe_envs.wrappers.learning.models.signature import Signature
 from tests.conftest import problem_of

@@ -88,9 +88,8 @@ def judged(
         measurements: of the same conditions.
         verification: on which the bounds rest.
     """
-    of_all = by_states(
-        from_survey(verification.survey), [visited for m in measurements for visited in m.visited]
-    )
+    visited = [each for m in measurements for each in m.visited]
+    of_all = by_states(verification.guarantee, visited)
     of_each: dict[str, str] = {}
     for m in measurements:
         for h in m.horizons:
@@ -233,7 +232,8 @@ def _horizon(
     curve = answer.rows[0].curve
     i = int(np.searchsorted(curve.time, horizon * (1.0 + 1e-9), side="right")) - 1
     time = curve.time[i]
-    bounds = tuple(b for b in promise(verification, starts, time) if b.value is not None)
+    found = verification.guarantee.applicable_bounds(starts, time)
+    bounds = tuple(bound for bound in found if bound.value is not None)
     return Horizon(time, curve.safe[i], curve.rate[i], curve.ci_low[i], curve.ci_high[i], bounds)
 
 

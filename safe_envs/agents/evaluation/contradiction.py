@@ -15,15 +15,14 @@ from typing import TypeVar
 
 from safe_envs.agents.evaluation.rows import BoundSummary
 from safe_envs.agents.evaluation.visited_states import VisitedStates
-from safe_envs.wrappers.verification.estimated_bound import EstimatedBound
-from safe_envs.wrappers.verification.posterior_bound import PosteriorBound
+from safe_envs.wrappers.verification.guarantee import Guarantee
 
 Bounded = TypeVar("Bounded", bound=BoundSummary)
 
 ADVICE = "bounds are of continuous time: try a smaller dt, or --refine"
 
 
-def by_states(bound: EstimatedBound | PosteriorBound, visited: Sequence[VisitedStates]) -> str:
+def by_states(bound: Guarantee, visited: Sequence[VisitedStates]) -> str:
     """Return how the states of episodes contradict the numbers of a bound; "" if they do not.
 
     Args:

@@ -19,7 +19,12 @@ from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
 from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
 from safe_envs.agents.evaluation.rollout import Env, Progress, play
 from safe_envs.agents.evaluation.rows import EvaluationRow
-from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec, Filter, RunSettings
+from safe_envs.agents.evaluation.spec import (
+    UNFILTERED,
+    EvaluationSpec,
+    Filter,
+    RunSettings,
+)
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.problem.problem import SafetyProblem

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.contradiction import by_states, withheld
-from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorGuarantee
+from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
 from safe_envs.agents.evaluation.statistics import RunningSum, share
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
-from safe_envs.wrappers.verification.guarantee import guarantee_of
+from safe_envs.wrappers.verification.guarantee import Guarantee, guarantee_of
 from safe_envs.wrappers.verification.posterior_guarantee import PosteriorGuarantee
 
 _SIZES = ("delta", "supremum", "shortfall", "bias")
@@ -92,13 +92,13 @@ class GuaranteeAverager:
             outside_rate=share(self._lost, self._starts), estimated_bound=bound, bound_note=note
         )
         if self._of_posterior:
-            of_posterior = isinstance(self._found, PosteriorBound)
+            of_posterior = isinstance(self._found, PosteriorGuarantee)
             sizes = {name: getattr(self._found, name) for name in _SIZES} if of_posterior else {}
             found = replace(
                 found,
                 estimated_bound=None,
                 bound_note="it is learned: see its bound over the posterior",
-                posterior_bound=PosteriorGuarantee(bound, note, **sizes),
+                posterior_bound=PosteriorSummary(bound, note, **sizes),
             )
         reason = (
             ""
@@ -177,5 +177,5 @@ def together(summaries: Sequence[BoundSummary]) -> BoundSummary:
         for key in ("probability", *_SIZES)
         if key == "probability" or all(getattr(c, key) is not None for c in found)
     }
-    merged = replace(first, posterior_bound=PosteriorGuarantee(note=worst.note, **mean))
+    merged = replace(first, posterior_bound=PosteriorSummary(note=worst.note, **mean))
     return withheld(merged, reason) if reason else merged

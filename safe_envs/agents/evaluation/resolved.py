@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -17,9 +16,9 @@ from safe_envs.agents.evaluation.spec import (
     filter_text,
 )
 from safe_envs.agents.evaluation.targets import make_target
+from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.policies.custom import policy_name
-from safe_envs.agents.policies.registry import policy_files
-from safe_envs.bounded_reading import read_bytes
+from safe_envs.agents.policies.registry import policy_file
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import (
@@ -208,7 +207,5 @@ def _describe(problem: SafetyProblem) -> dict[str, Any]:
 def _describe_policy(policy: Any) -> dict[str, Any]:
     if not isinstance(policy, str):
         return {"name": policy_name(policy)}
-    files = policy_files(policy)
-    if not files:
-        return {"name": policy}
-    return {"name": policy, "sha256": hashlib.sha256(read_bytes(files[0])).hexdigest()}
+    file = policy_file(policy)
+    return {"name": policy} | ({} if file is None else {"sha256": file_checksum(file)})

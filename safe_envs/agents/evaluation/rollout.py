@@ -7,8 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, Exponentials, smallest
-from safe_envs.agents.evaluation.episode_batch import EpisodeBatch, EpisodeStatistics, PlayedBatch
+from safe_envs.agents.evaluation.brownian_bridge import (
+    BrownianBridge,
+    Exponentials,
+    smallest,
+)
+from safe_envs.agents.evaluation.episode_batch import (
+    EpisodeBatch,
+    EpisodeStatistics,
+    PlayedBatch,
+)
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.policies.base import Policy

@@ -88,7 +88,7 @@ class EpisodeSummary:
 
 
 @dataclass(frozen=True)
-class PosteriorGuarantee:
+class PosteriorSummary:
     """A bound over the posterior of what was learned, averaged over the starts.
 
     Attributes:
@@ -132,7 +132,7 @@ class BoundSummary:
     outside_rate: float | None = None
     estimated_bound: float | None = None
     bound_note: str | None = None
-    posterior_bound: PosteriorGuarantee | None = None
+    posterior_bound: PosteriorSummary | None = None
 
 
 @dataclass(frozen=True)

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from safe_envs.agents.evaluation.rollout import Env
-from safe_envs.agents.policies.base import Policy
+from safe_envs.agents.policies.base import Policy, saved_policy_file
 from safe_envs.agents.policies.custom import as_policy
-from safe_envs.agents.policies.registry import POLICIES, make_policy, policy_files
+from safe_envs.agents.policies.registry import POLICIES, make_policy
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.registry import full_id, make_problem, title_of
-from safe_envs.wrappers import Condition, FilterSpec, SafetyFilterVectorWrapper, SafetyMonitorVector
+from safe_envs.wrappers import (
+    Condition,
+    FilterSpec,
+    SafetyFilterVectorWrapper,
+    SafetyMonitorVector,
+)
 
 _MOST_ENVS = 64
 """Third-party envs are stepped one by one: more of them at once would only take memory."""
@@ -164,7 +170,7 @@ class ExternalTarget:
             return _ModelPolicy(
                 make_policy(name, self.problem), self.filter_spec, self.problem, self._spaces[1]
             )
-        if is_data(policy_file(name)):
+        if saved_policy_file(Path(name)) is not None:
             raise ConfigurationError(
                 f"{name} holds a policy for envs of this project; give a .zip of Stable-Baselines3"
                 f" for {self.env_id}"

@@ -1,4 +1,4 @@
-"""The interface of a policy, and the names of the files of a saved one."""
+"""The interface of a policy, and the name of the file of a saved one."""
 
 from __future__ import annotations
 
@@ -12,12 +12,8 @@ import numpy as np
 
 from safe_envs.errors import InvalidInputError
 
-TENSORS = "policy.safetensors"
-"""Name of the file with the numbers of a policy that was saved as data; see
-`safe_envs.agents.policies.network`."""
-
-DESCRIPTION = "policy.json"
-"""Name of the file next to it that describes the numbers."""
+POLICY_FILE = "policy.npz"
+"""Name of the file of a policy that was saved as data; see `safe_envs.agents.policies.network`."""
 
 Spaces = tuple[gym.Space[Any], gym.Space[Any]]
 """The spaces of observations and of actions."""
@@ -82,15 +78,13 @@ def checked_observation(observation: Any, width: int) -> np.ndarray:
     return given
 
 
-def saved_policy_files(path: Path) -> list[Path]:
-    """Return the two files of a policy saved as data, numbers first; none where it is no such one.
+def saved_policy_file(path: Path) -> Path | None:
+    """Return the file of a policy that was saved as data; None where the path names no such one.
 
     Args:
-        path: of its folder, or of one of the files in it.
+        path: of its folder, or of the file itself.
     """
     # Unlike a path, os.path takes any text for the name of a file.
     if os.path.isdir(path):
-        return [path / TENSORS, path / DESCRIPTION]
-    if path.name in (TENSORS, DESCRIPTION):
-        return [path.with_name(TENSORS), path.with_name(DESCRIPTION)]
-    return []
+        return path / POLICY_FILE
+    return path if path.suffix == ".npz" else None

@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.policies.base import Policy, checked_observation
-from safe_envs.envs.simulation import center_and_half_width
+from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import ConfigurationError, NumericalError
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.filter_qp import FilterQP, FilterQPSolver, UndefinedConstraintError
+from safe_envs.wrappers.filter_qp import (
+    FilterQP,
+    FilterQPSolver,
+    UndefinedConstraintError,
+)
 
 
 class CLFController(Policy):

@@ -10,7 +10,12 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.agents.policies.base import Policy, Spaces, checked_observation
-from safe_envs.errors import ConfigurationError, InvalidInputError, SafeEnvsError, shortened
+from safe_envs.errors import (
+    ConfigurationError,
+    InvalidInputError,
+    SafeEnvsError,
+    shortened,
+)
 from safe_envs.problem.problem import SafetyProblem
 
 

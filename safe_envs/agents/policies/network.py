@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.policies.base import DESCRIPTION, TENSORS, saved_policy_files
+from safe_envs.agents.policies.base import POLICY_FILE, saved_policy_file
 from safe_envs.agents.policies.fixed_batch import BlockPolicy
-from safe_envs.agents.policies.registry import POLICY_FILE, policy_file
 from safe_envs.agents.policies.sb3 import require_spaces
 from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
@@ -197,7 +196,7 @@ def load_policy(path: str | Path, problem: SafetyProblem) -> NetworkPolicy:
         ConfigurationError: there is no such policy, it is damaged, altered or of an unknown format,
             or belongs to another problem.
     """
-    file = policy_file(str(path)) or Path(path)
+    file = saved_policy_file(Path(path)) or Path(path)
     if not file.exists() and (file.parent / "config.json").exists():
         raise ConfigurationError(
             f"the training in {file.parent} is not finished: go on with it by `{_WRITER}`"

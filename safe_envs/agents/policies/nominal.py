@@ -8,7 +8,7 @@ import numpy as np
 
 from safe_envs.agents.policies.base import Policy, checked_observation
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.envs.simulation import center_and_half_width
+from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import NumericalError
 from safe_envs.problem.problem import SafetyProblem
 

@@ -7,10 +7,19 @@ import re
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.base import DESCRIPTION, TENSORS, Policy, Spaces, saved_policy_files
+from safe_envs.agents.policies.base import (
+    POLICY_FILE,
+    Policy,
+    Spaces,
+    saved_policy_file,
+)
 from safe_envs.agents.policies.clf import CLFController
 from safe_envs.agents.policies.custom import as_policy
-from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
+from safe_envs.agents.policies.nominal import (
+    NominalController,
+    RandomPolicy,
+    ZeroController,
+)
 from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.object_import import load_object, resolved
@@ -60,18 +69,19 @@ def make_policy(
         return as_policy(load_plugin(POLICY_PLUGINS, name), problem, spaces)
     if _is_place(name):
         return as_policy(load_object(name), problem, spaces)
-    files = policy_files(name)
-    if len(files) > 1:
+    if saved_policy_file(Path(name)) is not None:
         from safe_envs.agents.policies.network import load_policy
 
         return load_policy(name, problem)
-    if not os.path.isfile(files[0]):
+    if not os.path.isfile(name):
         known = (*POLICIES, *plugin_names(POLICY_PLUGINS))
         raise ConfigurationError(
             f"unknown policy {shown(name)}; {nearest(name, known)}, FILE.py:NAME, a folder of"
             " `safe-envs train`, or the path of a Stable-Baselines3 .zip: there is no such file"
         )
-    return _make_of_archive(file, spaces or (observation_box(problem), action_box(problem)), trust)
+    return _make_of_archive(
+        Path(name), spaces or (observation_box(problem), action_box(problem)), trust
+    )
 
 
 def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
@@ -87,24 +97,21 @@ def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:
     return SB3Policy(path, *spaces)
 
 
-def policy_files(name: str) -> list[Path]:
-    """Return the files that `make_policy` reads, the one with the numbers first.
-
-    There are none for the name of a policy, and for MODULE:NAME.
-    """
+def policy_file(name: str) -> Path | None:
+    """Return the file that `make_policy` reads; None for the name of a policy and MODULE:NAME."""
     if name in POLICIES or name in plugin_names(POLICY_PLUGINS):
-        return []
+        return None
     if _is_place(name):
         source = name.rpartition(":")[0]
-        return [Path(source)] if source.endswith(".py") else []
-    return saved_policy_files(Path(name)) or [Path(name)]
+        return Path(source) if source.endswith(".py") else None
+    return saved_policy_file(Path(name)) or Path(name)
 
 
 def absolute_policy(name: str) -> str:
     """Return the name of a policy with the whole path of its file, valid in any folder."""
     if _is_place(name):
         return resolved(name)
-    return os.path.realpath(name) if policy_files(name) and os.path.exists(name) else name
+    return os.path.realpath(name) if policy_file(name) and os.path.exists(name) else name
 
 
 def _is_place(name: str) -> bool:

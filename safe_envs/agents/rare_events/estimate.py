@@ -24,7 +24,13 @@ from safe_envs.agents.rare_events.importance_sampling import (
     TiltedNoiseEnv,
     optimal_tilt,
 )
-from safe_envs.agents.rare_events.rows import BETTER, Estimate, PlainEpisodes, RareRow, verdict
+from safe_envs.agents.rare_events.rows import (
+    BETTER,
+    Estimate,
+    PlainEpisodes,
+    RareRow,
+    verdict,
+)
 from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Repetitions, Splitting
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import NumericalError, require_whole

@@ -9,15 +9,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.registry import absolute_policy, policy_files
+from safe_envs.agents.policies.registry import absolute_policy, policy_file
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
-
-_FILE = re.compile(r"(?<=file=)[^:+]+|(?<![^+])[^:+]+\.py(?=:)")
-"""A file in the text of a filter: of what was learned, or of a condition of one's own."""
+from safe_envs.wrappers import files_of, with_absolute_paths
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a cell with paths that mean the same in every process."""
+    """Return the settings of a cell with paths that mean the same in every process."""
     found = {**settings, "filter": with_absolute_paths(settings["filter"])}
     found["policy"] = absolute_policy(settings["policy"])
     if "system" in settings:

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from safe_envs.agents.evaluation.evaluate import UNFILTERED, Evaluation
-from safe_envs.agents.policies.base import DESCRIPTION, TENSORS
+from safe_envs.agents.policies.base import POLICY_FILE
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.problem.problem import SafetyProblem
@@ -21,7 +21,7 @@ from safe_envs.scripts.reports.evaluation_report import describe_system
 
 # Okabe and Ito's palette, which the colour-blind can tell apart; the unfiltered env always has the
 # same warm colour.
-_BARE_COLOR = "#D55E00"
+_UNFILTERED_COLOR = "#D55E00"
 COLORS = ("#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 UNSAFE = "#B9B9B9"
 QUIET = "#444444"
@@ -88,7 +88,7 @@ def add_legend(figure: Figure, handles: Sequence[Any]) -> None:
 
 def _colors(evaluation: Evaluation) -> dict[str, str]:
     others = [row.filter for row in evaluation.rows if row.filter != UNFILTERED]
-    return {UNFILTERED: _BARE_COLOR} | {
+    return {UNFILTERED: _UNFILTERED_COLOR} | {
         name: COLORS[i % len(COLORS)] for i, name in enumerate(others)
     }
 

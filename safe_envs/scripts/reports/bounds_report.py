@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
+from safe_envs.rate_text import percent_in
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.quantities import share_text, state_text
-from safe_envs.scripts.reports.rates import percent_in
 from safe_envs.scripts.reports.tables import make_table
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer
 from safe_envs.wrappers.verification.results import Bound

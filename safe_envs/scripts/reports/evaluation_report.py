@@ -13,6 +13,7 @@ from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rate_text import percent, percent_in
+from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
 from safe_envs.scripts.reports.tables import make_table, print_whole
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -10,7 +9,12 @@ from rich.text import Text
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
 from safe_envs.agents.rare_events.estimate import RareEvaluation
 from safe_envs.agents.rare_events.rows import RareRow
-from safe_envs.scripts.reports.evaluation_report import describe_system, early_end, unsafe_starts
+from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.evaluation_report import (
+    describe_system,
+    early_end,
+    unsafe_starts,
+)
 from safe_envs.scripts.reports.tables import make_table, print_whole
 
 _COLUMNS = (

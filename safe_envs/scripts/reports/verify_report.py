@@ -15,7 +15,12 @@ from safe_envs.scripts.reports.bounds_report import print_bounds, print_measurem
 from safe_envs.scripts.reports.evaluation_report import describe_system
 from safe_envs.scripts.reports.quantities import number_text, share_text, state_text
 from safe_envs.scripts.reports.verify_answer import VerifyAnswer
-from safe_envs.wrappers.verification.feasibility import SMALL, BarrierFindings, Part, Verification
+from safe_envs.wrappers.verification.feasibility import (
+    SMALL,
+    BarrierFindings,
+    Part,
+    Verification,
+)
 
 
 def print_report(console: Console, answer: VerifyAnswer) -> None:

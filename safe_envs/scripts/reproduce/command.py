@@ -70,7 +70,10 @@ def reproduce(
     from safe_envs.scripts.reproduce.framework.artefact import Sample
     from safe_envs.scripts.reproduce.framework.page import write_page
     from safe_envs.scripts.reproduce.framework.store import read, require_same_sample
-    from safe_envs.scripts.reproduce.framework.summary import summary_document, summary_table
+    from safe_envs.scripts.reproduce.framework.summary import (
+        summary_document,
+        summary_table,
+    )
 
     require_result(json_file)
     sample = Sample(episodes, seed, quick)

@@ -12,7 +12,12 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import sympy as sp
 
 from safe_envs.dynamics.identities import pieces_fit
-from safe_envs.dynamics.lie import Derivative, generator, lie_derivative_f, lie_derivative_g
+from safe_envs.dynamics.lie import (
+    Derivative,
+    generator,
+    lie_derivative_f,
+    lie_derivative_g,
+)
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened, shown
 from safe_envs.problem.barrier import Barrier
@@ -22,7 +27,7 @@ from safe_envs.wrappers.conditions.constraint import AffineConstraint
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
     from safe_envs.wrappers.learning.base import LearnedModel
-    from safe_envs.wrappers.learning.posterior import Posterior
+    from safe_envs.wrappers.learning.models.posterior import Posterior
 
 FIRST_ORDER = "first-order"
 

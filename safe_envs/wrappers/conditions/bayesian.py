@@ -25,7 +25,7 @@ from safe_envs.wrappers.conditions.constraint import AffineConstraint
 from safe_envs.wrappers.conditions.learned import LearnedCondition, require_share
 
 if TYPE_CHECKING:
-    from safe_envs.wrappers.learning.posterior import Posterior
+    from safe_envs.wrappers.learning.models.posterior import Posterior
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from safe_envs.object_import import resolved
-from safe_envs.wrappers.conditions.registry import condition_class, condition_names, unknown_filter
+from safe_envs.wrappers.conditions.registry import (
+    condition_class,
+    condition_names,
+    unknown_filter,
+)
 
 _FILE = r"(?:\.{0,2}/[^:]{0,4096}?|[^+:,/][^+:,]{0,4096}?)\.py:[A-Za-z_]\w*"
 """FILE.py:NAME; only a path from / or ./ may hold a "+" or a comma, for these divide conditions."""

@@ -102,7 +102,9 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     ) -> tuple[np.ndarray, Info]:
         """Start episodes in every env, or in those of `options["reset_mask"]`."""
         # Gymnasium's own vector envs take the mask out of the mapping that they are given.
-        restarted = np.array((options or {}).get("reset_mask", self.episodes.everywhere), dtype=bool)
+        restarted = np.array(
+            (options or {}).get("reset_mask", self.episodes.everywhere), dtype=bool
+        )
         observation, info = self.env.reset(
             seed=seed, options=None if options is None else dict(options)
         )

@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import Components, Flavour, compile_function, constants, finite
+from safe_envs.dynamics.codegen import (
+    Components,
+    Flavour,
+    compile_function,
+    constants,
+    finite,
+)
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.filter_qp.decision import UndefinedConstraintError
 from safe_envs.wrappers.filter_qp.qp import FilterQP

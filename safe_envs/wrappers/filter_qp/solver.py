@@ -14,7 +14,11 @@ import numpy as np
 from safe_envs.dynamics.codegen import Components
 from safe_envs.wrappers.filter_qp.compiled import CompiledQP
 from safe_envs.wrappers.filter_qp.decision import FilterDecision
-from safe_envs.wrappers.qp import one_constraint, second_order_batch, second_order_constraint
+from safe_envs.wrappers.qp import (
+    one_constraint,
+    second_order_batch,
+    second_order_constraint,
+)
 from safe_envs.wrappers.qp.majorant import majorant
 
 _FAR = 1e4

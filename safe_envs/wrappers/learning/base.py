@@ -15,7 +15,11 @@ from safe_envs.errors import require_whole, shortened
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.models.files import Content, checksum, save
 from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import LearnedFileError, require_finite, require_text
+from safe_envs.wrappers.learning.models.values import (
+    LearnedFileError,
+    require_finite,
+    require_text,
+)
 
 Progress = Callable[[float], None]
 """Called with the part of the work that is done, from 0 to 1."""

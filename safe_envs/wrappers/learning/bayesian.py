@@ -12,12 +12,21 @@ from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import Progress, Record
 from safe_envs.wrappers.learning.bayesian_fit import Prior, fit
-from safe_envs.wrappers.learning.checks import Purpose, random_stream, require_kind, require_problem
+from safe_envs.wrappers.learning.checks import (
+    Purpose,
+    random_stream,
+    require_kind,
+    require_problem,
+)
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.data.steps import Step
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.drift_checks import region_warnings
-from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning, misfits, weaknesses
+from safe_envs.wrappers.learning.identifiability import (
+    IdentifiabilityWarning,
+    misfits,
+    weaknesses,
+)
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.learning.regression import Gaussian, Rows

@@ -14,7 +14,11 @@ import numpy as np
 from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole, shown
 from safe_envs.wrappers.learning.base import Progress
 from safe_envs.wrappers.learning.checks import Purpose, random_stream
-from safe_envs.wrappers.learning.models.network import Activation, Network, require_activation
+from safe_envs.wrappers.learning.models.network import (
+    Activation,
+    Network,
+    require_activation,
+)
 from safe_envs.wrappers.learning.models.values import LARGEST
 
 LEAST_ROWS = 10

@@ -24,7 +24,11 @@ from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.data.steps import Step
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.diffusion import LearnedDiffusion
-from safe_envs.wrappers.learning.drift_checks import drift_warnings, region_warnings, slack
+from safe_envs.wrappers.learning.drift_checks import (
+    drift_warnings,
+    region_warnings,
+    slack,
+)
 from safe_envs.wrappers.learning.estimators import (
     Estimator,
     in_bulk,

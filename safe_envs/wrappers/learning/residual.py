@@ -17,6 +17,7 @@ import sympy as sp
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import relative_degree
 from safe_envs.errors import ConfigurationError, require_whole
+from safe_envs.number_text import finite_number
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import Progress, Record
 from safe_envs.wrappers.learning.checks import (

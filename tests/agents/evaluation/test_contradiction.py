@@ -14,7 +14,7 @@ from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation import bound_check, refinement
 from safe_envs.agents.evaluation.contradiction import by_rate, judged
 from safe_envs.agents.evaluation.refinement import refine
-from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorGuarantee
+from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.verification import safe_set_analysis
@@ -208,9 +208,9 @@ def test_an_interval_contradicts_a_bound_that_is_wholly_above_it(bound, high, re
 
 
 def test_a_posterior_keeps_its_numbers_where_its_bound_is_withheld():
-    bound = PosteriorGuarantee(0.9, "", delta=0.1)
+    bound = PosteriorSummary(0.9, "", delta=0.1)
     row = BoundSummary(bound_note="learned", posterior_bound=bound)
     found = judged(row, 0.2)
     note = f"withheld: {found.withheld}"
-    assert found.posterior_bound == PosteriorGuarantee(None, note, delta=0.1)
+    assert found.posterior_bound == PosteriorSummary(None, note, delta=0.1)
     assert found.bound_note == "learned"

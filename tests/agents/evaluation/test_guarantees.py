@@ -11,7 +11,7 @@ import sympy as sp
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.guarantees import together
-from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorGuarantee
+from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
 
 
 @pytest.fixture(scope="module")
@@ -60,5 +60,5 @@ def test_of_several_identifications_the_mean_counts():
     rates = [BoundSummary(bound_note="", outside_rate=rate) for rate in (0.25, 0.5)]
     assert together(rates).outside_rate == 0.375
     assert together([rates[0], BoundSummary()]).outside_rate is None
-    robust = [replace(each, posterior_bound=PosteriorGuarantee(0.5, "")) for each in rates]
+    robust = [replace(each, posterior_bound=PosteriorSummary(0.5, "")) for each in rates]
     assert together(robust).outside_rate == 0.375

@@ -12,7 +12,7 @@ from safe_envs import ConfigurationError
 from safe_envs.agents import NominalController, evaluate
 from safe_envs.agents.evaluation.evaluate import run_evaluation
 from safe_envs.agents.evaluation.spec import EvaluationSpec, RunSettings
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 from safe_envs.wrappers import CBF, HOCBF, SCBF, spec_of
 
 SHORT = {"episodes": 5, "bounds": False}
@@ -38,7 +38,7 @@ def test_a_spec_is_json_and_back():
 
 
 def test_objects_without_text_are_no_json():
-    problem = load_problem("Scalar-v0")
+    problem = make_problem("Scalar-v0")
     for change in ({"problem": problem}, {"policy": NominalController(problem)}):
         with pytest.raises(ConfigurationError, match=f"{next(iter(change))} of the evaluation"):
             replace(SPEC, **change).as_dict()
@@ -67,7 +67,7 @@ def test_a_spec_runs_like_its_arguments_however_it_is_run():
 
 
 def test_filters_may_be_conditions():
-    problem = load_problem("StochasticDubins-v0", {"horizon": 0.5, "noise": 0.4})
+    problem = make_problem("StochasticDubins-v0", horizon=0.5, noise=0.4)
     two = HOCBF(p=(1.0, 2.0))
     found = evaluate(problem, filters=["none", two, (SCBF.for_gains((1.0, 1.0)),)], **SHORT)
     texts = evaluate(problem, filters=["none", spec_of(two), "scbf"], **SHORT)

@@ -12,7 +12,7 @@ from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs import plugins as safe_envs_plugins
 from safe_envs.agents import ZeroController, evaluate, make_policy
 from safe_envs.agents.policies.registry import absolute_policy, policy_files
-from safe_envs.registry import load_problem
+from safe_envs.registry import make_problem
 
 SHORT = {"episodes": 6, "bounds": False, "options": {"horizon": 0.2}}
 FILE = """
@@ -62,7 +62,7 @@ def test_a_policy_may_be_a_function_a_class_or_an_object(file):
 
 
 def problem():
-    return load_problem("Scalar-v0", SHORT["options"])
+    return make_problem("Scalar-v0", **SHORT["options"])
 
 
 def test_the_configuration_names_the_policy_and_its_file(file):

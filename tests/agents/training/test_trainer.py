@@ -17,7 +17,11 @@ from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.training.callbacks import ProgressLog, SafetyFigures
 from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.hyperparameters import ALGORITHMS, scheduled, whole_batches
+from safe_envs.agents.training.hyperparameters import (
+    ALGORITHMS,
+    scheduled,
+    whole_batches,
+)
 from safe_envs.agents.training.session import TrainingSession
 from safe_envs.agents.training.trainer import train
 from safe_envs.agents.training.vec_env import make_sb3_env

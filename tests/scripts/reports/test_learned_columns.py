@@ -11,8 +11,8 @@ import pytest
 from rich.console import Console
 
 from safe_envs.agents import evaluate
-from safe_envs.agents.evaluation.rows import LearningSummary, PosteriorGuarantee
-from safe_envs.registry import load_problem
+from safe_envs.agents.evaluation.rows import LearningSummary, PosteriorSummary
+from safe_envs.registry import make_problem
 from safe_envs.scripts.options.evaluation_options import LEARNED_PARAMETERS
 from safe_envs.scripts.reports.evaluation_report import heading, print_evaluation
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
@@ -21,7 +21,7 @@ from safe_envs.wrappers import LEARNED
 NO_BOUND = "no bound for learned filters"
 LEARNING = LearningSummary([], 1, 20, [], [], [], {}, [], [], rates=[0.9])
 OFTEN = replace(LEARNING, repeats=3, rates=[0.9, 0.5, 0.8])
-POSTERIOR_BOUND = PosteriorGuarantee(0.4, "", delta=0.1, shortfall=0.0, bias=0.0, supremum=1.0)
+POSTERIOR_BOUND = PosteriorSummary(0.4, "", delta=0.1, shortfall=0.0, bias=0.0, supremum=1.0)
 
 
 def row(learning=None, bound=None, name="bayesian-scbf"):
@@ -40,7 +40,7 @@ def row(learning=None, bound=None, name="bayesian-scbf"):
             ),
         ),
         ("CubicSDEDisk-v0", [row(LEARNING), row(LEARNING, POSTERIOR_BOUND)], f"{NO_BOUND}."),
-        ("CubicSDEDisk-v0", [row(LEARNING, PosteriorGuarantee(None, "none"))], f"{NO_BOUND}."),
+        ("CubicSDEDisk-v0", [row(LEARNING, PosteriorSummary(None, "none"))], f"{NO_BOUND}."),
         ("StochasticDubins-v0", [row(LEARNING)], f"{NO_BOUND}."),
         ("DubinsObstacles-v0", [row(LEARNING)], f"{NO_BOUND}."),
     ],

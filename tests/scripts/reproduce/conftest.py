@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import pytest
 
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 
 
 @pytest.fixture

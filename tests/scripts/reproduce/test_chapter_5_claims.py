@@ -32,7 +32,7 @@ def made(*safe, episodes=1000):
     safe, trials = int(np.sum(flags)), len(flags) * episodes
     low, high = rate_interval(round(safe / len(flags)), episodes)
     counts = {"safe": safe, "episodes": trials, "violations": trials - safe}
-    row = SimpleNamespace(**counts, safety_rate=safe / trials, ci_low=low, ci_high=high)
+    row: Any = SimpleNamespace(**counts, safety_rate=safe / trials, ci_low=low, ci_high=high)
     return MeasuredFilter(row, [float(np.mean(each)) for each in flags], flags, episodes)
 
 

@@ -14,7 +14,10 @@ from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
 from safe_envs.wrappers.learning.data.steps import plant_step
 from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning, term_names
+from safe_envs.wrappers.learning.identifiability import (
+    IdentifiabilityWarning,
+    term_names,
+)
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.learning.models.signature import Signature

@@ -13,7 +13,12 @@ from matplotlib.patches import Circle
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
+from safe_envs.scripts.figures.evaluation_figure import (
+    COLORS,
+    QUIET,
+    UNSAFE,
+    add_legend,
+)
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     CHAPTER,
     LEARNED_COLOR,
@@ -30,7 +35,13 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     thinned,
     trajectories,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
 
 _SETTINGS = CHAPTER.settings["obstacle"]

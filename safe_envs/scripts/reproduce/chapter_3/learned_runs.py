@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs import ControlAffineSDE, SafetyProblem
-from safe_envs.agents import evaluate, load_problem
+from safe_envs.agents import evaluate, make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS
 from safe_envs.scripts.reproduce.framework.artefact import Number, Sample
 from safe_envs.scripts.reproduce.framework.paired import measure
@@ -146,7 +146,7 @@ def runs(
     found = evaluate(
         problem, policy, filters, knowledge=knowledge, learned=learned, **size
     ).trajectories
-    return [cut(found[name].states[:, 0], found[name].barrier[:, 0]) for name in filters]
+    return [cut(each.states[:, 0], each.barrier[:, 0]) for each in found.values()]
 
 
 def cut(states: np.ndarray, h: np.ndarray) -> Trajectory:

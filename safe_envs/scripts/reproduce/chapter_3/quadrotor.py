@@ -25,7 +25,13 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     smallest_numbers,
     trajectories,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.systems.quadrotor_altitude import g, m, z, zdot
@@ -66,12 +72,7 @@ def printed_run(problem: SafetyProblem, knowledge: str) -> Trajectory:
         problem: with a fixed start.
         knowledge: "model" for the mass of the model, "plant" for the true one.
     """
-    condition = PrintedCondition(printed_hocbf)
-    found = list(periods(problem, condition, "nominal", range(1), 0, knowledge))
-    start = problem.starts[problem.start].state
-    states = np.array([start, *(period.states[0] for period in found)], dtype=float)
-    h = [found[0].before[0], *(period.after[0] for period in found)]
-    return Trajectory(states, np.array(h))
+    return runs(problem, [PrintedCondition(printed_hocbf)], knowledge=knowledge)[0]
 
 
 def compute(sample: Sample) -> Outcome:

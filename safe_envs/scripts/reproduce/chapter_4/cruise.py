@@ -26,9 +26,19 @@ from safe_envs.scripts.reproduce.chapter_4.cruise_setting import (
     CruiseSettings,
     setting_values,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.episodes import violations
-from safe_envs.scripts.reproduce.framework.paired import difference, is_above, with_interval
+from safe_envs.scripts.reproduce.framework.paired import (
+    difference,
+    is_above,
+    with_interval,
+)
 from safe_envs.systems.acc import WEIGHT
 
 COARSE = 0.2  # control period of a quick look at the table, in s

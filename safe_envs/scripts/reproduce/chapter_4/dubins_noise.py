@@ -30,9 +30,19 @@ from safe_envs.scripts.reproduce.chapter_4.dubins_runs import (
     step_of,
     turning_time,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.episodes import Violations
-from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, with_interval
+from safe_envs.scripts.reproduce.framework.paired import (
+    is_above,
+    is_below,
+    with_interval,
+)
 
 NOISES, BEYOND, EPISODES = (SETTINGS[name] for name in ("noises", "beyond", "episodes"))
 BETWEEN = (0.025, 0.075, 0.125, 0.175)  # further noise levels of the curves, in m/sqrt(s)

@@ -29,9 +29,19 @@ from safe_envs.scripts.reproduce.chapter_4.dubins_runs import (
     simulate,
     step_of,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.episodes import Violations, episode_seed
-from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, with_interval
+from safe_envs.scripts.reproduce.framework.paired import (
+    is_above,
+    is_below,
+    with_interval,
+)
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.bounds import theorem_4_2_10_printed, union_bound
 from safe_envs.wrappers.verification.formulas import Formulas

@@ -13,12 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import ndtr
 
-from safe_envs.agents.evaluation.evaluate import evaluate
-from safe_envs.agents.evaluation.rollout import episode_seed
-from safe_envs.agents.evaluation.rows import EvaluationRow
-from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.problem.barrier import Barrier
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
+from safe_envs.agents import rate_interval
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Variable
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
@@ -34,7 +30,13 @@ from safe_envs.scripts.reproduce.chapter_4.reciprocal_inputs import (
     draw_inputs,
     largest_inputs,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.drawing import draw_interval
 from safe_envs.scripts.reproduce.framework.episodes import episode_seed
 from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, measure
@@ -117,6 +119,7 @@ def compute(sample: Sample) -> Outcome:
         [safe_up_to(s, t, step) for s in STARTS] for t, step in ((math.inf, 0.0), (HORIZON, STEP))
     ]
     curves = [each.row.curve for each in attained]
+    note = partial(CHAPTER.note, "example-4.2.2", horizon=HORIZON)
     calm_rate = measure(SCALAR, "rcbf", 1, 0, options=calm).rate
     return Outcome(
         numbers=[
@@ -141,23 +144,17 @@ def compute(sample: Sample) -> Outcome:
             "closed": [[safe_up_to(s, t, STEP) for t in curves[0].time[1:]] for s in STARTS],
         },
         notes=[
-            f"x_0 = {s:g}: h/c = {100 * b:.2f} %, closed form for ever {100 * e:.2f} %, for"
-            f" {HORIZON:g} s looked at every {STEP:g} s {100 * f:.2f} %, simulated"
-            f" {100 * r.safety_rate:.2f} %"
-            for s, b, e, f, r in zip(STARTS, bounds, *closed, attained, strict=True)
-        ]
-        + [_held_note(limited[-1][0])],
+            *(
+                note("attained", start=s, bound=100 * b, ever=100 * e, closed=100 * f, rate=r.rate)
+                for s, b, e, f, r in zip(STARTS, bounds, *closed, attained, strict=True)
+            ),
+            note("held", rate=limited[-1][0].ours),
+        ],
     )
 
 
-def _attained(start: float, episodes: int, seed: int) -> EvaluationRow:
-    return evaluate(
-        attaining_problem(start), filters=["scbf"], episodes=episodes, seed=seed, bounds=False
-    ).rows[0]
-
-
-def _together(row: EvaluationRow) -> Number:
-    """A rate with an interval that holds it at all of `STARTS` with 95 %."""
+def _together(row: Any) -> Number:
+    """Return a rate with an interval that holds it at all of `STARTS` with 95 %."""
     low, high = rate_interval(row.safe, row.episodes, 1.0 - 0.05 / len(STARTS))
     return Number("", 100 * row.safe / row.episodes, 100 * low, 100 * high, unit="%")
 

@@ -16,7 +16,10 @@ from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     models,
     repeated,
 )
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import draw_learning, learning_outcome
+from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
+    draw_learning,
+    learning_outcome,
+)
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     CHAPTER,
     EPISODES,
@@ -25,8 +28,19 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     explain_gap,
     measured,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
-from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, is_above, is_below, safer
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
+from safe_envs.scripts.reproduce.framework.paired import (
+    MeasuredFilter,
+    is_above,
+    is_below,
+    safer,
+)
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.feasibility import verify
 
@@ -173,7 +187,7 @@ def _no_bound(sample: Sample) -> list[str]:
         *notes,
         (
             f"{reason}; no input in its bounds meets the condition on"
-            f" {100 * found.safe.infeasible:.0f} % of C within the workspace"
+            f" {100 * found.safe_set.infeasible:.0f} % of C within the workspace"
         ),
     ]
 

@@ -19,7 +19,10 @@ from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     models,
     repeated,
 )
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import draw_learning, learning_outcome
+from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
+    draw_learning,
+    learning_outcome,
+)
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     CHAPTER,
     EPISODES,
@@ -28,7 +31,12 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     explain_gap,
     measured,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, safer
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
 from safe_envs.wrappers import DDSCBF, SCBF, SafetyFilter
@@ -228,7 +236,8 @@ def _bounds(first: Identification, scbf: MeasuredFilter, sample: Sample) -> list
     notes = [CHAPTER.note("table-5.1", "margin", margin=margin, met=met)]
     if sample.quick:
         return notes
-    bound = promise(verify(problem, (SCBF(),)), starts_of(problem), problem.duration)[0]
+    guarantee = verify(problem, (SCBF(),)).guarantee
+    bound = guarantee.applicable_bounds(starts_of(problem), problem.duration)[0]
     bound = bound.without(by_rate(bound.value, scbf.row.ci_high))
     value = f"none, {bound.reason}" if bound.value is None else f"{100 * bound.value:.1f} %"
     return [

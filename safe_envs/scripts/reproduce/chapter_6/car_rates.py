@@ -30,7 +30,12 @@ from safe_envs.scripts.reproduce.chapter_6.learning_times import (
     generator_work,
     recursion,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.paired import measure
 from safe_envs.wrappers.learning.generator import learn_generator
 

@@ -31,7 +31,13 @@ from safe_envs.scripts.reproduce.chapter_6.identifications import (
     seeds,
     true_drift,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.paired import is_above
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
 from safe_envs.wrappers.learning.data.transitions import Transitions

@@ -30,11 +30,16 @@ from safe_envs.scripts.reproduce.chapter_6.worst_case import (
     at_one_horizon,
     worst_for_ever,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, measure
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
-from safe_envs.wrappers.learning.posterior import Posterior
+from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.verification.bounds import proposition_4_2_8, shortfall_repaired
 from safe_envs.wrappers.verification.feasibility import verify
 
@@ -200,7 +205,7 @@ def compute(sample: Sample) -> Outcome:
     """Compute Table 6.2."""
     world = make_problem(ENV)
     models, found = _Models.learn(world, sample), verify(world, [SCBF()], seed=sample.seed)
-    worst = float(found.survey.suprema[0]), float(found.survey.missed[0])
+    worst = float(found.analysis.suprema[0]), float(found.analysis.max_shortfall[0])
     columns = [_Column.run(i, world, models, worst, sample) for i in range(len(PLACES))]
     # A quick sample learns nothing of what is only compared with the table.
     rough = {

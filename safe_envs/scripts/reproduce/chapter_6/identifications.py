@@ -19,7 +19,7 @@ from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning
-from safe_envs.wrappers.learning.posterior import Posterior
+from safe_envs.wrappers.learning.models.posterior import Posterior
 
 CHAPTER = chapter(6)
 SETTINGS = CHAPTER.settings["identification"]

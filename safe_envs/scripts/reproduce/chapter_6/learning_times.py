@@ -14,9 +14,14 @@ from safe_envs.scripts.reproduce.chapter_6.identifications import (
     predicted,
     seeds,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
-from safe_envs.wrappers.learning.generator import learn_generator
-from safe_envs.wrappers.learning.models.generator import GeneratorModel
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
+from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
 
 SETTINGS = CHAPTER.settings["car"]
 ENV, PRIOR, POINTS, GENERATOR_REPETITIONS = (

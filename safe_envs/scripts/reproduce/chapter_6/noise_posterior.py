@@ -22,7 +22,13 @@ from safe_envs.scripts.reproduce.chapter_6.identifications import (
     parameter,
     seeds,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.estimators import rates
 from safe_envs.wrappers.learning.regression import sigma_map, sigma_samples

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 
+from safe_envs.scripts.reproduce.chapter_6.identifications import CHAPTER
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Number
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
@@ -65,10 +66,5 @@ def at_one_horizon(first: MeasuredFilter, second: MeasuredFilter, printed: Seque
     if both:
         return note("both", both=len(both), first=both[0])
     k = min(range(len(times)), key=lambda k: abs(curves[0][k].ours - printed[0]))
-    return (
-        f"At none of {len(times)} instants up to T = {times[-1]:g} s has the SCBF both printed"
-        f" rates: from the first start it is nearest to {printed[0]:g} % at T = {times[k]:.2f} s,"
-        f" with {curves[0][k].ours:.1f} %, and has {curves[1][k].ours:.1f} % from the second one"
-        f" then, {printed[1]:g} % in the thesis. At longer horizons it has no more than"
-        f" {curves[0][-1].ours:.1f} % from the first start."
-    )
+    rates = {"first": curves[0][k].ours, "second": curves[1][k].ours, "end": curves[0][-1].ours}
+    return note("none", time=times[k], last=times[-1], **rates)

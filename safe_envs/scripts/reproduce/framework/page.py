@@ -14,7 +14,13 @@ from PIL import Image
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.atomic_io import write_atomically
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.verdict import RULES, Judgement, judge
 
 _COLOURS = 64

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from safe_envs import SafetyProblem
+from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.comparison import compare_all
-from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.agents.evaluation.rows import EpisodeSummary
 from safe_envs.errors import RelativeDegreeError
@@ -30,7 +31,7 @@ class MeasuredFilter:
     Attributes:
         row: statistics of `evaluate`, over all identifications.
         rates: safety rate with each identification, from 0 to 1.
-        flags: which episodes were safe, shape (episodes,), with each identification.
+        flags: which episodes were safe, with each identification.
         episodes: of each identification.
     """
 
@@ -100,7 +101,7 @@ def measure(
                 raise
             found.append(evaluate(problem, filters=["none"], **common))
     rows = [each.rows[0] for each in found]
-    flags = [each.safe for run in found for results in run.episodes.values() for each in results]
+    flags = [results.safe for each in found for results in next(iter(each.episodes.values()))]
     rates = [row.safety_rate for row in rows]
     return MeasuredFilter(pooled(rows, _CONFIDENCE), rates, flags, episodes)
 
@@ -118,7 +119,7 @@ def difference(name: str, first: Sequence[np.ndarray], second: Sequence[np.ndarr
         The difference with its 95 % interval over episodes and identifications.
     """
     (found,) = compare_all({"second": second, "first": first}, _CONFIDENCE)
-    middle, low, high = (100 * each for each in (found.difference, found.ci_low, found.ci_high))
+    middle, low, high = (100 * end for end in (found.difference, found.ci_low, found.ci_high))
     return Number(name, middle, low, high, unit="points")
 
 

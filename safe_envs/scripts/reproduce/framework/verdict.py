@@ -9,7 +9,12 @@ from enum import StrEnum
 from itertools import permutations
 
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Number,
+    Outcome,
+    Sample,
+)
 
 
 class Verdict(StrEnum):

@@ -9,10 +9,20 @@ from typing import Any
 import numpy as np
 
 from safe_envs.dynamics.codegen import compile_function, stacked
-from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
+from safe_envs.errors import (
+    ConfigurationError,
+    InvalidInputError,
+    NumericalError,
+    require_whole,
+)
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import Progress
-from safe_envs.wrappers.learning.checks import Purpose, random_stream, require_problem, require_room
+from safe_envs.wrappers.learning.checks import (
+    Purpose,
+    random_stream,
+    require_problem,
+    require_room,
+)
 from safe_envs.wrappers.learning.data.steps import Step, period_of, plant_step
 from safe_envs.wrappers.learning.data.transitions import Transitions, numbers
 from safe_envs.wrappers.learning.models.signature import Signature

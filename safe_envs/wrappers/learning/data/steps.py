@@ -10,8 +10,8 @@ import numpy as np
 
 from safe_envs.dynamics.codegen import stacked
 from safe_envs.dynamics.integrators import Integrator
-from safe_envs.dynamics.sde import finite_number
 from safe_envs.errors import ConfigurationError
+from safe_envs.number_text import finite_number
 from safe_envs.problem.problem import SafetyProblem
 
 Step = Callable[[np.ndarray, np.ndarray, np.random.Generator], np.ndarray]

@@ -16,7 +16,12 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from safe_envs.atomic_io import write_atomically
-from safe_envs.bounded_reading import MOST_BYTES, MOST_BYTES_OF_TEXT, open_archive, open_regular
+from safe_envs.bounded_reading import (
+    MOST_BYTES,
+    MOST_BYTES_OF_TEXT,
+    open_archive,
+    open_regular,
+)
 from safe_envs.errors import ConfigurationError, shortened, shown
 from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.models.values import LearnedFileError, require_text

@@ -16,7 +16,11 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.noise import Diffusion, require_noise
-from safe_envs.wrappers.learning.models.pruning import insignificant, mixed_by_steps, solved
+from safe_envs.wrappers.learning.models.pruning import (
+    insignificant,
+    mixed_by_steps,
+    solved,
+)
 from safe_envs.wrappers.learning.models.signature import Signature
 from safe_envs.wrappers.learning.models.values import (
     LARGEST,

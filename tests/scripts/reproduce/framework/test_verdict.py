@@ -6,7 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Number, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import (
+    Artefact,
+    Claim,
+    Number,
+    Outcome,
+    Sample,
+)
 from safe_envs.scripts.reproduce.framework.verdict import (
     RULES,
     Verdict,
