@@ -18,16 +18,11 @@ from safe_envs.wrappers.conditions import (
     LearnedCondition,
     LearnedHOCBF,
     condition_names,
-    files_of,
-    head_pattern,
-    learned_parts,
     parse_condition,
     parse_conditions,
     power,
-    require_known,
     require_readable,
     spec_of,
-    with_absolute_paths,
 )
 from safe_envs.wrappers.env_wrappers.external_env import ActionMap, FilterSpec
 from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
@@ -65,16 +60,11 @@ __all__ = [
     "SafetyMonitor",
     "SafetyMonitorVector",
     "condition_names",
-    "files_of",
-    "head_pattern",
-    "learned_parts",
     "parse_condition",
     "parse_conditions",
     "power",
-    "require_known",
     "require_readable",
     "spec_of",
-    "with_absolute_paths",
 ]
 
 if __name__ == "wrappers":  # imported through the link at the top level of a checkout

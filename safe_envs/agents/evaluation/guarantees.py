@@ -97,7 +97,7 @@ class GuaranteeAverager:
             found = replace(
                 found,
                 estimated_bound=None,
-                bound_note="it is learned: see its bound over the posterior",
+                bound_note="the condition is learned: see its bound over the posterior",
                 posterior_bound=PosteriorSummary(bound, note, **sizes),
             )
         reason = (

@@ -91,4 +91,4 @@ def require_degrees(problem: SafetyProblem, given: Any) -> None:
 
 def require_problem(problem: Any) -> None:
     """Raise ConfigurationError where an env or its id was given for a problem."""
-    require_kind("problem", problem, SafetyProblem, "load_problem of safe_envs.registry")
+    require_kind("problem", problem, SafetyProblem, "make_problem of safe_envs.registry")

@@ -48,7 +48,7 @@ def test_gaussian_law_of_adaptive_cruise_control(scheme, tolerance):
     # The distribution of the smallest h, from the same law at other levels.
     for key, level in (("min_h_median", 0.5), ("min_h_p05", 0.05)):
         below = 2 * norm.cdf(
-            -(distance - row[key] + 0.5826 * tau * sigma * math.sqrt(dt)) / deviation
+            -(distance - getattr(row, key) + 0.5826 * tau * sigma * math.sqrt(dt)) / deviation
         )
         assert below == pytest.approx(level, abs=4.0 * math.sqrt(level * (1 - level) / 6000))
     if scheme == "filter":

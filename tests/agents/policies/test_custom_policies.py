@@ -11,7 +11,7 @@ import pytest
 from safe_envs import ConfigurationError, InvalidInputError
 from safe_envs import plugins as safe_envs_plugins
 from safe_envs.agents import ZeroController, evaluate, make_policy
-from safe_envs.agents.policies.registry import absolute_policy, policy_files
+from safe_envs.agents.policies.registry import absolute_policy, policy_file
 from safe_envs.registry import make_problem
 
 SHORT = {"episodes": 6, "bounds": False, "options": {"horizon": 0.2}}
@@ -74,8 +74,8 @@ def test_the_configuration_names_the_policy_and_its_file(file):
     found = named("mine.py:Gain")
     assert found["name"] == "mine.py:Gain"
     assert len(found["sha256"]) == 64
-    assert policy_files("mine.py:Gain") == [file.relative_to(file.parent)]
-    assert policy_files("package.module:Gain") == []
+    assert policy_file("mine.py:Gain") == file.relative_to(file.parent)
+    assert policy_file("package.module:Gain") is None
     assert absolute_policy("mine.py:Gain") == f"{file}:Gain"
     assert absolute_policy("nominal") == "nominal"
 

@@ -20,14 +20,12 @@ from safe_envs.wrappers import (
     Condition,
     SafetyFilter,
     condition_names,
-    files_of,
-    learned_parts,
     parse_condition,
     parse_conditions,
     require_readable,
     spec_of,
-    with_absolute_paths,
 )
+from safe_envs.wrappers.conditions import files_of, learned_parts, with_absolute_paths
 from tests.conftest import problem_of
 
 SCALAR = problem_of("safe_envs/Scalar-v0")
@@ -211,7 +209,7 @@ def test_code_that_fails_is_an_error_of_its_condition(stated):
 def test_an_evaluation_names_the_condition_and_where_it_is(stated):
     name = "my_filter.py:Eager:gain=2"
     found = evaluate("Scalar-v0", filters=["none", name], episodes=20, bounds=False)
-    assert [row["filter"] for row in found.rows] == ["none", name]
+    assert [row.filter for row in found.rows] == ["none", name]
     (spec,) = (f["spec"] for f in found.config["filters"] if f["name"] == name)
     assert spec.startswith(f"{stated.resolve()}/my_filter.py:Eager:gain=2.0")
 
