@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
+import sys
+from functools import lru_cache
+from importlib.metadata import EntryPoints, entry_points
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
@@ -12,9 +14,19 @@ POLICIES = "safe_envs.policies"
 SYSTEMS = "safe_envs.systems"
 
 
+def _declared(group: str) -> EntryPoints:
+    return _declared_on(tuple(sys.path), group)
+
+
+@lru_cache
+def _declared_on(_path: tuple[str, ...], group: str) -> EntryPoints:
+    """Return the entry points of a group; a sweep asks for them with every cell."""
+    return entry_points(group=group)
+
+
 def plugin_names(group: str) -> tuple[str, ...]:
     """Return the names that installed packages declare in a group, sorted; nothing is imported."""
-    return tuple(sorted({point.name for point in entry_points(group=group)}))
+    return tuple(sorted({point.name for point in _declared(group)}))
 
 
 def name_of(group: str, extension: type) -> str | None:
@@ -25,7 +37,17 @@ def name_of(group: str, extension: type) -> str | None:
         extension: the class.
     """
     value = f"{extension.__module__}:{extension.__qualname__}"
-    return next((point.name for point in entry_points(group=group) if point.value == value), None)
+    return next((point.name for point in _declared(group) if point.value == value), None)
+
+
+def module_of(group: str, name: str) -> str | None:
+    """Return the module that declares a name, which is not imported; None if no package does.
+
+    Args:
+        group: `CONDITIONS`, `POLICIES` or `SYSTEMS`.
+        name: one of `plugin_names`.
+    """
+    return next((point.module for point in _declared(group) if point.name == name), None)
 
 
 def load_plugin(group: str, name: str) -> Any:
@@ -38,7 +60,7 @@ def load_plugin(group: str, name: str) -> Any:
     Raises:
         ConfigurationError: No package declares the name, more than one does, or its import fails.
     """
-    found = {point.value: point for point in entry_points(group=group, name=name)}
+    found = {point.value: point for point in _declared(group) if point.name == name}
     if not found:
         names = plugin_names(group)
         raise ConfigurationError(f"{group} has no {shown(name)}; {nearest(name, names)}")
@@ -50,7 +72,7 @@ def load_plugin(group: str, name: str) -> Any:
     (point,) = found.values()
     try:
         return point.load()
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ConfigurationError(
             f"{group}: {name!r} ({point.value}) cannot be imported"
             f" ({type(error).__name__}: {shortened(error)}); repair or uninstall its package"

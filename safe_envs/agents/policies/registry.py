@@ -24,7 +24,7 @@ from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.object_import import load_object, resolved
 from safe_envs.plugins import POLICIES as POLICY_PLUGINS
-from safe_envs.plugins import load_plugin, plugin_names
+from safe_envs.plugins import load_plugin, module_of, plugin_names
 from safe_envs.problem.problem import SafetyProblem
 
 _NAMED: dict[str, Any] = {
@@ -105,6 +105,16 @@ def policy_file(name: str) -> Path | None:
         source = name.rpartition(":")[0]
         return Path(source) if source.endswith(".py") else None
     return saved_policy_file(Path(name)) or Path(name)
+
+
+def policy_module(name: str) -> str | None:
+    """Return the module of a policy that is MODULE:NAME or of a package; None for others."""
+    if name in POLICIES:
+        return None
+    if name in plugin_names(POLICY_PLUGINS):
+        return module_of(POLICY_PLUGINS, name)
+    source = name.rpartition(":")[0]
+    return source if _is_place(name) and not source.endswith(".py") else None
 
 
 def absolute_policy(name: str) -> str:

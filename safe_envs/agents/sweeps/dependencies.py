@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import os
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.registry import absolute_policy, policy_file
+from safe_envs.agents.policies.registry import (
+    absolute_policy,
+    policy_file,
+    policy_module,
+)
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
-from safe_envs.wrappers.conditions import files_of, with_absolute_paths
+from safe_envs.wrappers.conditions import files_of, modules_of, with_absolute_paths
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -35,6 +40,26 @@ def read_by(settings: Mapping[str, Any]) -> Iterator[Path]:
     policy = policy_file(settings["policy"])
     if policy is not None and os.path.exists(policy):
         yield policy
+
+
+def installed(settings: Mapping[str, Any]) -> Iterator[Path]:
+    """Yield the Python files of the packages whose conditions and policy a cell uses.
+
+    All files of a package count, but not what it imports from others. Nothing is run.
+    """
+    modules = (*modules_of(settings["filter"]), policy_module(settings["policy"]))
+    for top in dict.fromkeys(module.split(".")[0] for module in modules if module):
+        try:
+            spec = importlib.util.find_spec(top)
+        except ValueError:  # of a script that runs, which has none
+            continue
+        if spec is None or top == "safe_envs":  # the versions of a cell hold its own code
+            continue
+        folders = spec.submodule_search_locations
+        if folders is not None:
+            yield from (path for folder in folders for path in sorted(Path(folder).rglob("*.py")))
+        elif spec.origin is not None and spec.origin.endswith(".py"):
+            yield Path(spec.origin)
 
 
 def with_imported(path: Path) -> list[Path]:

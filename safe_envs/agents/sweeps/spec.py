@@ -13,7 +13,12 @@ from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.sweeps.cell import Cell, versions
-from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_imported
+from safe_envs.agents.sweeps.dependencies import (
+    absolute,
+    installed,
+    read_by,
+    with_imported,
+)
 from safe_envs.agents.sweeps.document import document_in
 from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_of
 from safe_envs.errors import ConfigurationError, SafeEnvsError
@@ -124,12 +129,17 @@ def _equal(settings: Settings) -> str:
 
 def _cells(found: Iterable[Settings], trust: bool) -> Iterable[Cell]:
     digests: dict[Path, dict[str, str]] = {}
+    checksums: dict[Path, str] = {}
     for given in found:
         settings, files = absolute(given), {}
         for path in read_by(settings):
             if path not in digests:
                 digests[path] = {str(each): file_checksum(each) for each in with_imported(path)}
             files |= digests[path]
+        for path in installed(settings):
+            if path not in checksums:
+                checksums[path] = file_checksum(path)
+            files[str(path)] = checksums[path]
         yield Cell(settings, files, versions(), trust)
 
 

@@ -20,6 +20,7 @@ from safe_envs.wrappers.conditions.text_parts import (
     files_of,
     head_pattern,
     learned_parts,
+    modules_of,
     require_known,
     with_absolute_paths,
 )
@@ -46,6 +47,7 @@ __all__ = [
     "files_of",
     "head_pattern",
     "learned_parts",
+    "modules_of",
     "parse_condition",
     "parse_conditions",
     "power",

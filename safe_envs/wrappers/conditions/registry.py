@@ -28,6 +28,11 @@ LEARNED: dict[str, type[LearnedCondition]] = {
 _BUILT_IN: dict[str, type[Condition]] = {**CONDITIONS, **LEARNED}
 
 
+def is_built_in(name: str) -> bool:
+    """Return whether a name is that of a condition of this project."""
+    return name in _BUILT_IN
+
+
 def condition_names() -> tuple[str, ...]:
     """Return the names of all conditions: the built-in ones, then those of installed packages."""
     declared = plugins.plugin_names(plugins.CONDITIONS)

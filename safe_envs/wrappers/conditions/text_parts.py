@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from safe_envs.object_import import resolved
+from safe_envs.plugins import CONDITIONS, module_of
 from safe_envs.wrappers.conditions.registry import (
     condition_class,
     condition_names,
+    is_built_in,
     unknown_filter,
 )
 
@@ -115,6 +117,22 @@ def files_of(text: str) -> tuple[Path, ...]:
             *(value for key, _, value in settings if key == "file"),
         )
     )
+
+
+def modules_of(text: str) -> tuple[str, ...]:
+    """Return the modules of the conditions in a text that are MODULE:NAME or of a package.
+
+    Nothing is imported.
+    """
+    found = (_module_of(part.name) for part in parts_of(text))
+    return tuple(module for module in found if module is not None)
+
+
+def _module_of(name: str) -> str | None:
+    source, colon, _ = name.rpartition(":")
+    if colon:
+        return None if source.endswith(".py") else source
+    return None if is_built_in(name) else module_of(CONDITIONS, name)
 
 
 def with_absolute_paths(text: str) -> str:

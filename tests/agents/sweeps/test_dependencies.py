@@ -83,3 +83,28 @@ def test_a_condition_of_ones_own_is_a_file_of_the_cell(tmp_path: Path, monkeypat
     settings = absolute({"filter": "scbf+mine.py:Eager:gain=2", "policy": "nominal"})
     assert settings["filter"] == f"scbf+{tmp_path / 'mine.py'}:Eager:gain=2"
     assert list(read_by(settings)) == [tmp_path / "mine.py"]
+
+
+def test_the_code_of_installed_conditions_and_policies_counts(tmp_path: Path, monkeypatch):
+    (tmp_path / "my_package").mkdir()
+    (tmp_path / "my_package" / "__init__.py").write_text("")
+    code = tmp_path / "my_package" / "inner.py"
+    alone = tmp_path / "my_policies.py"
+    code.write_text("from safe_envs.wrappers import CBF as Mine")
+    alone.write_text("import numpy\n\n\ndef still(x):\n    return 0 * x")
+    meta = tmp_path / "mine-1.0.dist-info"
+    meta.mkdir()
+    (meta / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    (meta / "entry_points.txt").write_text("[safe_envs.conditions]\nmine = my_package.inner:Mine\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    fixed = {"env": "Scalar-v0", "policy": "my_policies:still"}
+    for text in ("mine:alpha=2", "my_package.inner:Mine:alpha=2"):
+        (cell,) = sweep_of({"fixed": {**fixed, "filter": text}}).cells
+        assert set(cell.files) == {str(code), str(code.parent / "__init__.py"), str(alone)}
+    keys = {cell.key}
+    for file in (code, alone):
+        file.write_text(file.read_text() + "\n")
+        keys |= {each.key for each in sweep_of({"fixed": {**fixed, "filter": text}}).cells}
+    assert len(keys) == 3
+    names = {"fixed": {"env": "Scalar-v0", "filter": "safe_envs.wrappers:CBF"}}
+    assert not sweep_of(names).cells[0].files
