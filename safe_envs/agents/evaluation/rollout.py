@@ -20,9 +20,11 @@ from safe_envs.agents.evaluation.episode_batch import (
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.policies.base import Policy
+from safe_envs.agents.policies.custom import policy_name
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.info import Info
 from safe_envs.envs.vector_env import SafeVectorEnv
+from safe_envs.errors import InvalidInputError, SafeEnvsError, shortened
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyMonitorVector
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
 
@@ -142,7 +144,7 @@ def _play(
         trajectories.note(0, first, batch.alive, h, world.components)
     state, start = None, np.ones(len(h), dtype=bool)
     for k in range(1, steps + 1):
-        actions, state = policy.predict(observation, state, start, deterministic=True)
+        actions, state = _acted(policy, observation, state, start)
         before = world.components
         observation, reward, terminated, truncated, info = env.step(actions)
         h = smallest(info["barrier"])
@@ -159,6 +161,21 @@ def _play(
     if progress:
         progress(first + count)
     return batch
+
+
+def _acted(policy: Any, observation: np.ndarray, state: Any, start: np.ndarray) -> tuple[Any, Any]:
+    """Return the actions and the state of a policy, whose failure is that of what was given."""
+    try:
+        actions, state = policy.predict(observation, state, start, deterministic=True)
+    except SafeEnvsError:
+        raise
+    except Exception as error:
+        raise InvalidInputError(
+            f"the policy {policy_name(policy)} failed on observations of shape {observation.shape}"
+            f" ({type(error).__name__}: {shortened(error)}); predict(observation, state,"
+            " episode_start, deterministic) returns the actions and the next state"
+        ) from error
+    return actions, state
 
 
 def _executed(

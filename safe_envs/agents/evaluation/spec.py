@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import require_monitoring
 from safe_envs.agents.evaluation.statistics import require_confidence
@@ -85,19 +87,38 @@ class EvaluationSpec:
             value = getattr(self, name)
             if value not in allowed:
                 raise ConfigurationError(f"{name} = {shown(value)}; {nearest(value, allowed)}")
+        for name in ("trust", "bounds"):
+            if not isinstance(getattr(self, name), bool | np.bool_):
+                raise ConfigurationError(
+                    f"{name} = {shown(getattr(self, name))}; give True or False"
+                )
         require_confidence(self.confidence)
         require_monitoring(self.monitoring)
+        if not isinstance(self.options or {}, Mapping):
+            raise ConfigurationError(f"options = {shown(self.options)}; give a dictionary")
         filters = (self.filters,) if isinstance(self.filters, str | Condition) else self.filters
+        if not (filters is None or isinstance(filters, Iterable)):
+            raise ConfigurationError(
+                f"filters = {shown(filters)}; give texts such as 'hocbf:p=2,8', and conditions"
+            )
+        filters = None if filters is None else tuple(filters)
+        if filters == ():
+            raise ConfigurationError("filters holds no filter; leave it out, or name 'none'")
         given = {k: v for k, v in (self.options or {}).items() if v is not None}
+        learned = (self.learned,) if isinstance(self.learned, str | Path) else self.learned
         for name, value in (
-            ("filters", None if filters is None else tuple(filters)),
+            ("filters", filters),
             ("options", given),
-            ("learned", tuple(self.learned)),
+            ("learned", tuple(learned)),
+            ("policy", str(self.policy) if isinstance(self.policy, Path) else self.policy),
+            *((name, int(getattr(self, name))) for name in ("episodes", "seed", "repeats")),
+            *((name, bool(getattr(self, name))) for name in ("trust", "bounds")),
+            ("confidence", float(self.confidence)),
         ):
             object.__setattr__(self, name, value)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the spec as JSON-able data, from which `from_dict` makes an equal one.
+        """Return the spec as JSON-able data, from which `from_dict` makes one with the same result.
 
         Raises:
             ConfigurationError: A part is an object that has no text, such as a policy.
@@ -109,7 +130,7 @@ class EvaluationSpec:
         found["learned"] = [str(m) if isinstance(m, Path) else m for m in self.learned]
         for name, value in found.items():
             try:
-                json.dumps(value, allow_nan=False)
+                found[name] = json.loads(json.dumps(value, allow_nan=False, default=_plain))
             except (TypeError, ValueError) as error:
                 raise ConfigurationError(
                     f"{name} of the evaluation cannot be written as text; give the id of an env,"
@@ -164,6 +185,13 @@ class RunSettings:
             )
 
 
+def _plain(value: Any) -> Any:
+    """Return NumPy's numbers and arrays as Python's."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError
+
+
 def filter_text(given: Filter) -> str:
     """Return the text of a filter, which is a text, a condition, or one for each barrier."""
     return given if isinstance(given, str) else spec_of(conditions_in(given))
@@ -175,7 +203,7 @@ def conditions_in(given: Condition | Sequence[Condition]) -> tuple[Condition, ..
     Raises:
         ConfigurationError: Something in it is no condition.
     """
-    found = (given,) if isinstance(given, Condition) else tuple(given)
+    found: tuple[Any, ...] = tuple(given) if isinstance(given, Sequence) else (given,)
     strangers = [each for each in found if not isinstance(each, Condition)]
     if strangers or not found:
         wrong = type(strangers[0]).__name__ if strangers else "an empty tuple"

@@ -6,6 +6,7 @@ import json
 from dataclasses import fields, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from safe_envs import ConfigurationError
@@ -44,6 +45,23 @@ def test_objects_without_text_are_no_json():
             replace(SPEC, **change).as_dict()
 
 
+def test_numbers_of_numpy_and_paths_are_those_of_python():
+    given = {"episodes": np.int64(3), "seed": np.int32(4), "confidence": np.float64(0.9)}
+    options = {"noise": np.float64(0.1), "start": np.array([0.5]), "box": (-1, 1)}
+    spec = EvaluationSpec("Scalar-v0", Path("run"), options=options, learned="m.npz", **given)
+    assert (spec.policy, spec.learned) == ("run", ("m.npz",))
+    data = json.loads(json.dumps(spec.as_dict()))
+    assert data["options"] == {"noise": 0.1, "start": [0.5], "box": [-1, 1]}
+    assert EvaluationSpec.from_dict(data).as_dict() == spec.as_dict() == data
+    evaluate("Scalar-v0", "zero", "none", episodes=np.int64(3), bounds=False)
+
+
+@pytest.mark.parametrize("given", [None, CBF, 3])
+def test_filters_that_are_neither_text_nor_condition_are_refused(given):
+    with pytest.raises(ConfigurationError, match="filters hold"):
+        evaluate("Scalar-v0", filters=[given], **SHORT)
+
+
 @pytest.mark.parametrize(
     ("data", "message"),
     [
@@ -51,6 +69,10 @@ def test_objects_without_text_are_no_json():
         ({"problem": "Scalar-v0", "episode": 3}, "did you mean 'episodes'"),
         ({"problem": "Scalar-v0", "episodes": 0}, "episodes = 0"),
         ({"problem": "Scalar-v0", "monitoring": "never"}, "monitoring = 'never'"),
+        ({"problem": "Scalar-v0", "trust": "false"}, "trust = 'false'; give True or False"),
+        ({"problem": "Scalar-v0", "filters": 3}, "filters = 3"),
+        ({"problem": "Scalar-v0", "filters": []}, "no filter"),
+        ({"problem": "Scalar-v0", "options": [1]}, "give a dictionary"),
     ],
 )
 def test_data_that_is_no_spec_is_refused(data, message):

@@ -33,6 +33,14 @@ number = 3
 class Needy:
     def __init__(self, problem, more):
         pass
+
+class Wordless(Gain):
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return -observation[:, :self.m]
+
+class Deaf(Gain):
+    def predict(self, observation):
+        return -observation[:, :self.m], None
 """
 
 
@@ -96,6 +104,8 @@ def test_functions_go_to_other_processes(file):
         (3, ConfigurationError, "a int is no policy; give an object with predict"),
         (lambda x: x, InvalidInputError, r"returned actions of shape \(6, 4\) for 6"),
         (lambda x: x[:, :1] * np.nan, InvalidInputError, "not finite"),
+        ("mine.py:Wordless", InvalidInputError, r"Wordless failed .* \(ValueError: .* returns the"),
+        ("mine.py:Deaf", InvalidInputError, r"Deaf failed .* \(TypeError: .* returns the actions"),
         (lambda x: x[:, 9], InvalidInputError, r"failed on observations of shape \(6, 4\)"),
         (dict, ConfigurationError, "dict cannot be made with the problem"),
         ("mine.py:number", ConfigurationError, "a int is no policy"),
@@ -113,10 +123,9 @@ def test_what_is_no_policy_is_refused(policy, error, message, file):
 def test_installed_packages_declare_policies(monkeypatch):
     point = EntryPoint("careful", f"{__name__}:function", safe_envs_plugins.POLICIES)
 
-    def entry_points(group, name="careful"):
-        return [point] if (group, name) == (point.group, point.name) else []
-
-    monkeypatch.setattr(safe_envs_plugins, "entry_points", entry_points)
+    monkeypatch.setattr(
+        safe_envs_plugins, "_declared", lambda group: [point][group != point.group :]
+    )
     assert rows("careful") == rows(function)
     with pytest.raises(ConfigurationError, match="did you mean 'careful'"):
         make_policy("carefull", problem())
