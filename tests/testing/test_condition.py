@@ -129,7 +129,7 @@ class Forgetful(Right):
         (WrongRates(2.0), "derivatives: the offset of WrongRates"),
         (HalfOfIto(), "derivatives: the offset of HalfOfIto"),
         (WrongMargin(), "derivatives: the change of WrongMargin"),
-        (TooManyCoefficients(), "coefficients: TooManyCoefficients on h has 2 for 1 inputs"),
+        (TooManyCoefficients(), "derived: TooManyCoefficients .*2 coefficients for 1 inputs"),
         (WithoutChain(), "chain: WithoutChain on h has none"),
         (WithoutValue(), "finite: WithoutValue on h has no value"),
         (WithList(), "parameters: WithList cannot be hashed"),

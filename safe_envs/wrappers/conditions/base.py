@@ -169,13 +169,23 @@ class Condition(ABC):
         return {key: value for key, value in given.items() if value is not None}
 
 
+def _sympified(found: Any, inputs: int) -> AffineConstraint:
+    """Return a constraint whose Python numbers are expressions; raise for anything else."""
+    if not isinstance(found, AffineConstraint):
+        raise TypeError(f"derived returns {type(found).__name__}, no AffineConstraint")
+    if len(found.coefficient) != inputs:
+        raise ValueError(f"{len(found.coefficient)} coefficients for {inputs} inputs")
+    coefficient, chain = (tuple(map(sp.sympify, e)) for e in (found.coefficient, found.chain))
+    return replace(found, coefficient=coefficient, offset=sp.sympify(found.offset), chain=chain)
+
+
 @lru_cache(maxsize=256)
 def _constraint(
     condition: Condition, model: ControlAffineSDE, barrier: Barrier
 ) -> AffineConstraint:
     """Derive a constraint; remembered, since derivatives of long expressions take their time."""
     model = condition.believed(model)
-    found = condition.derived(model, barrier)
+    found = _sympified(condition.derived(model, barrier), model.m)
     # The generator differentiates twice each time; only the last derivative may jump.
     times = len(found.chain) + (condition.sampling_margin == FIRST_ORDER)
     if not pieces_fit(

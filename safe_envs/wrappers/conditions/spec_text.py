@@ -7,6 +7,7 @@ A condition of a user's file is `FILE.py:NAME`, of a module `MODULE:NAME`; param
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -222,6 +223,10 @@ def _value(text: str, parameter: inspect.Parameter, value: str) -> Any:
     if isinstance(default, bool) and value in ("True", "False"):
         return value == "True"
     entry = _entry(value)
+    if parameter.annotation in (float, "float", int, "int") and not (
+        isinstance(entry, int | float) and math.isfinite(entry)
+    ):
+        raise ConfigurationError(f"filter {shown(text)}: {parameter.name} takes a finite number")
     whole = type(default) is int and isinstance(entry, float) and entry.is_integer()
     return int(entry) if whole else entry
 

@@ -80,6 +80,24 @@ class Failing(Condition):
         return barrier.nothing
 
 
+@dataclass(frozen=True)
+class Wordy(Condition):
+    def derived(self, model, barrier):
+        return "a u + b >= 0"
+
+
+@dataclass(frozen=True)
+class Short(Condition):
+    def derived(self, model, barrier):
+        return AffineConstraint((), 1, (barrier.expression,))
+
+
+@dataclass(frozen=True)
+class Constant(Condition):
+    def derived(self, model, barrier):
+        return AffineConstraint((1,) * model.m, 0, (barrier.expression,))
+
+
 instance = Eager()
 """
 
@@ -185,7 +203,8 @@ def test_a_condition_of_a_module_is_known_by_its_place(installed):
         ("my_filter.py:Eager:gain=1:gain=2", "names 'gain' twice"),
         ("my_filter.py:Eager:file=x", "has no parameter 'file'"),
         ("my_filter.py:Picky:gain=10", r"cannot be made \(ValueError: too eager\)"),
-        ("my_filter.py:Picky:order=few", r"cannot be made \(TypeError"),
+        ("my_filter.py:Picky:order=few", "order takes a finite number"),
+        ("my_filter.py:Eager:gain=nan", "gain takes a finite number"),
         ("my_filter.py:Undecorated", r"@dataclass\(frozen=True\)"),
         ("my_filter.py:Unfinished", "does not define derived"),
         ("my_filter.py:instance", "is a Eager, no subclass of safe_envs.wrappers.Condition"),
@@ -201,9 +220,24 @@ def test_text_that_makes_no_condition_is_explained(stated, text, message):
         parse_conditions(text, SCALAR)
 
 
-def test_code_that_fails_is_an_error_of_its_condition(stated):
-    with pytest.raises(ConfigurationError, match="Failing cannot derive its constraint on h"):
-        SafetyFilter.for_problem(SCALAR, "my_filter.py:Failing")
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("Failing", ""),
+        ("Wordy", ".*returns str, no AffineConstraint"),
+        ("Short", ".*0 coefficients for 1 inputs"),
+    ],
+)
+def test_code_that_fails_is_an_error_of_its_condition(stated, name, reason):
+    with pytest.raises(
+        ConfigurationError, match=f"{name} cannot derive its constraint on h{reason}"
+    ):
+        SafetyFilter.for_problem(SCALAR, f"my_filter.py:{name}")
+
+
+def test_a_constraint_may_hold_numbers_of_python(stated):
+    safety_filter = SafetyFilter.for_problem(SCALAR, "my_filter.py:Constant")
+    assert safety_filter.filter([0.5], [-1.0]).action == pytest.approx([0.0])
 
 
 def test_an_evaluation_names_the_condition_and_where_it_is(stated):
