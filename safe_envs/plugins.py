@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from importlib.metadata import entry_points
+import functools
+import sys
+from importlib.metadata import EntryPoints, entry_points
 from typing import Any
 
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
@@ -12,9 +14,20 @@ POLICIES = "safe_envs.policies"
 SYSTEMS = "safe_envs.systems"
 
 
+def declared(group: str) -> EntryPoints:
+    """Return what the packages on `sys.path` declare in a group; nothing is imported."""
+    return _on_path(group, tuple(sys.path))
+
+
+# Every reading of a filter's text asks for the names, and to look through packages takes long.
+@functools.lru_cache(maxsize=16)
+def _on_path(group: str, path: tuple[str, ...]) -> EntryPoints:
+    return entry_points(group=group)
+
+
 def plugin_names(group: str) -> tuple[str, ...]:
     """Return the names that installed packages declare in a group, sorted; nothing is imported."""
-    return tuple(sorted({point.name for point in entry_points(group=group)}))
+    return tuple(sorted(declared(group).names))
 
 
 def name_of(group: str, extension: type) -> str | None:
@@ -25,7 +38,7 @@ def name_of(group: str, extension: type) -> str | None:
         extension: the class.
     """
     value = f"{extension.__module__}:{extension.__qualname__}"
-    return next((point.name for point in entry_points(group=group) if point.value == value), None)
+    return next((point.name for point in declared(group) if point.value == value), None)
 
 
 def load_plugin(group: str, name: str) -> Any:
@@ -38,7 +51,7 @@ def load_plugin(group: str, name: str) -> Any:
     Raises:
         ConfigurationError: No package declares the name, more than one does, or its import fails.
     """
-    found = {point.value: point for point in entry_points(group=group, name=name)}
+    found = {point.value: point for point in declared(group).select(name=name)}
     if not found:
         names = plugin_names(group)
         raise ConfigurationError(f"{group} has no {shown(name)}; {nearest(name, names)}")
