@@ -102,7 +102,7 @@ else:
 @pytest.mark.parametrize(
     ("script", "shown"),
     [
-        (["scripts/evaluate.py", "Scalar-v0", "--episodes", "5", "--quiet"], "scbf"),
+        (["scripts/evaluate.py", "--help"], "Usage"),
         (["-m", "scripts.listing"], "Scalar-v0"),
     ],
 )
