@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import sys
-from functools import lru_cache
 from importlib.metadata import EntryPoints, entry_points
 from typing import Any
 
@@ -14,19 +14,20 @@ POLICIES = "safe_envs.policies"
 SYSTEMS = "safe_envs.systems"
 
 
-def _declared(group: str) -> EntryPoints:
-    return _declared_on(tuple(sys.path), group)
+def declared(group: str) -> EntryPoints:
+    """Return what the packages on `sys.path` declare in a group; nothing is imported."""
+    return _on_path(group, tuple(sys.path))
 
 
-@lru_cache
-def _declared_on(_path: tuple[str, ...], group: str) -> EntryPoints:
-    """Return the entry points of a group; a sweep asks for them with every cell."""
+# Every reading of a filter's text asks for the names, and to look through packages takes long.
+@functools.lru_cache(maxsize=16)
+def _on_path(group: str, path: tuple[str, ...]) -> EntryPoints:
     return entry_points(group=group)
 
 
 def plugin_names(group: str) -> tuple[str, ...]:
     """Return the names that installed packages declare in a group, sorted; nothing is imported."""
-    return tuple(sorted({point.name for point in _declared(group)}))
+    return tuple(sorted(declared(group).names))
 
 
 def name_of(group: str, extension: type) -> str | None:
@@ -37,7 +38,7 @@ def name_of(group: str, extension: type) -> str | None:
         extension: the class.
     """
     value = f"{extension.__module__}:{extension.__qualname__}"
-    return next((point.name for point in _declared(group) if point.value == value), None)
+    return next((point.name for point in declared(group) if point.value == value), None)
 
 
 def module_of(group: str, name: str) -> str | None:
@@ -47,7 +48,7 @@ def module_of(group: str, name: str) -> str | None:
         group: `CONDITIONS`, `POLICIES` or `SYSTEMS`.
         name: one of `plugin_names`.
     """
-    return next((point.module for point in _declared(group) if point.name == name), None)
+    return next((point.module for point in declared(group) if point.name == name), None)
 
 
 def load_plugin(group: str, name: str) -> Any:
@@ -60,7 +61,7 @@ def load_plugin(group: str, name: str) -> Any:
     Raises:
         ConfigurationError: No package declares the name, more than one does, or its import fails.
     """
-    found = {point.value: point for point in _declared(group) if point.name == name}
+    found = {point.value: point for point in declared(group).select(name=name)}
     if not found:
         names = plugin_names(group)
         raise ConfigurationError(f"{group} has no {shown(name)}; {nearest(name, names)}")

@@ -23,7 +23,7 @@ NAMES = {
     "DriftingEnv": "TiltedNoiseEnv",
     "Exploration": "SamplingDomain",
     "FilterResult": "FilterDecision",
-    "Flags": "SafetyBits",
+    "Flags": "pair_counts",
     "ForeignWorld": "ExternalTarget",
     "Moment": "EpisodeSnapshot",
     "OwnWorld": "NativeTarget",
@@ -163,11 +163,15 @@ def pages() -> Iterator[tuple[Path, str]]:
         yield path, path.read_text()
 
 
-def prose() -> Iterator[tuple[Path, int, str]]:
-    """Yield comments, docstrings and texts of the source, and the pages, with their first lines."""
+def prose(phrases: re.Pattern[str]) -> Iterator[tuple[Path, int, str]]:
+    """Yield the pages, and comments, docstrings and texts of the sources that have a phrase, with
+    their first lines."""
     for path, text in pages():
         yield path, 1, text
     for path in sources("safe_envs", "examples", "docs"):
+        # To split a file into tokens takes long.
+        if not phrases.search(re.sub(r"\n *# ?", "\n", path.read_text())):
+            continue
         comments: list[tuple[int, str]] = []
         for token in tokens_of(path):
             if token.type == tokenize.COMMENT:
@@ -197,14 +201,15 @@ def fail_with(found: list[str], rule: str) -> None:
 
 
 def test_retired_names_do_not_occur():
+    names = "|".join(NAMES)
     found = [
         f"{place(path, token.start[0])}: {token.string} -> {NAMES[token.string]}"
         for path in sources("safe_envs", "examples", "docs", "tests")
+        if re.search(rf"\b({names})\b", path.read_text())
         for token in tokens_of(path)
         if token.type == tokenize.NAME and token.string in NAMES
     ]
     # In documentation they count where they are code: most are words of the language as well.
-    names = "|".join(NAMES)
     for path, text in pages():
         for number, line in enumerate(text.splitlines(), 1):
             found += [
@@ -249,7 +254,9 @@ def test_retired_words_do_not_occur():
         for (paths, phrase), word in (everywhere | LOCAL_PHRASES).items()
     ]
     found = []
-    for path, first, text in prose():
+    for path, first, text in prose(
+        re.compile("|".join(rule.pattern for _, rule, _ in rules), re.I)
+    ):
         for paths, phrase, word in rules:
             if not paths.fullmatch(path.relative_to(ROOT).as_posix()):
                 continue
@@ -405,3 +412,65 @@ def test_docstrings_of_functions_begin_with_a_verb():
         if (text := ast.get_docstring(node) or "") and no_verb.match(text)
     ]
     fail_with(found, "docstrings without a verb")
+
+
+# --- names in pages -------------------------------------------------------------------------------
+
+
+@functools.cache
+def definitions() -> set[str]:
+    """Return the names of classes, functions and annotated fields, in classes too."""
+    found = set()
+    for path in sources("safe_envs"):
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.ClassDef | ast.FunctionDef):
+                found.add(node.name)
+            elif isinstance(node, ast.AnnAssign):
+                found.add(ast.unparse(node.target).removeprefix("self."))
+            elif isinstance(node, ast.Assign):
+                found |= {ast.unparse(target).removeprefix("self.") for target in node.targets}
+    return found
+
+
+def exists(module: str) -> bool:
+    path = ROOT / module.replace(".", "/")
+    return path.is_dir() or path.with_suffix(".py").is_file()
+
+
+def spans_of_code(text: str) -> list[str]:
+    return re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+
+
+def test_files_and_attributes_in_pages_exist():
+    found = []
+    for page in ("CONTRIBUTING.md", "README.md", "docs/architecture.md"):
+        for span in spans_of_code((ROOT / page).read_text()):
+            if re.fullmatch(r"(safe_envs|tests|docs|examples|scripts)/[\w/.]+(?<!-v0)", span):
+                known = "NAME" in span or (ROOT / span).exists()
+            elif re.fullmatch(r"[A-Z]\w+[a-z]\.[a-z]\w+(?<!\.md)(?<!\.yaml)", span):
+                owner, attribute = span.split(".")
+                known = owner in classes() and attribute in definitions()
+            else:
+                continue
+            found += [] if known else [f"{page}: {span}"]
+    fail_with(found, "pages name what does not exist")
+
+
+def test_new_names_of_the_log_of_changes_exist():
+    text = (ROOT / LOG_OF_CHANGES).read_text().partition("## 0.1.0")[0]
+    rows = re.findall(r"^\| (`.*) \| (.*) \|$", text, re.MULTILINE)
+    found, full = [], ""
+    for _, new in rows:
+        for span in spans_of_code(new):
+            name = span.partition("(")[0]
+            if name.startswith("safe_envs"):
+                known, full = exists(name), name
+            elif name.startswith("."):
+                # Of the package before it, or of one above.
+                parents = [full[: match.start()] for match in re.finditer(r"\.", full)]
+                known = any(exists(parent + name) for parent in parents)
+            else:
+                known = set(name.split(".")) <= definitions()
+            found += [] if known else [span]
+    assert len(rows) > 30
+    fail_with(found, "new names that do not exist")

@@ -30,11 +30,16 @@ ZERO = {
     "size": sp.Max(x, -x) - sp.Abs(x),
     "size by pieces": sp.Piecewise((x, x > 0), (-x, True)) - sp.Abs(x),
     "step": sp.Heaviside(x - 300) + sp.Heaviside(300 - x) - 1,
-    "pieces": sp.Piecewise((0, sp.Or(x < 500, x > 600)), (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, True)),
-    "conditions": sp.Piecewise((1, sp.And(x > 1, sp.Not(y > 1))), (0, True)) - sp.Heaviside(x - 1) * sp.Heaviside(1 - y),
+    "pieces": sp.Piecewise(
+        (0, sp.Or(x < 500, x > 600)), (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1, True)
+    ),
+    "conditions": sp.Piecewise((1, sp.And(x > 1, sp.Not(y > 1))), (0, True))
+    - sp.Heaviside(x - 1) * sp.Heaviside(1 - y),
     "a product of roots": (sp.sqrt(x**2 + y**2) - 1) * (sp.sqrt(x**2 + y**2) + 1) - x**2 - y**2 + 1,
     "floats": (0.1 * x + 0.2) ** 2 - 0.01 * x**2 - 0.04 * x - 0.04,
-    "beside an unknown function": (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1) * sp.log(1 + x**2) * sp.floor(x),
+    "with an unknown function": (sp.sin(x) ** 2 + sp.cos(x) ** 2 - 1)
+    * sp.log(1 + x**2)
+    * sp.floor(x),
 }  # fmt: skip
 
 NOT_ZERO = {

@@ -1,4 +1,4 @@
-"""Systems of one's own behind `gym.make`: from a file, from a module, and under an id of their own."""
+"""User-defined systems behind `gym.make`: from a file, a module, and under an id of their own."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ x, u, s = sp.symbols("x u s", real=True)
 
 def problem(*, edge: float = 1.0):
     system = ControlAffineSDE((x,), (u,), [x], [1], [s], {s: 0.1})
-    return state_problem(system, SIGN * (edge - x), box=(-5, 5), start=[(-0.5, 0.5)], dt=0.05, horizon=1.0, workspace={x: (-5, 5)})
+    given = dict(box=(-5, 5), start=[(-0.5, 0.5)], dt=0.05, horizon=1.0, workspace={x: (-5, 5)})
+    return state_problem(system, SIGN * (edge - x), **given)
 
 ready = problem()
 number = 3
@@ -123,7 +124,7 @@ def test_modules_beside_the_file_can_be_imported(tmp_path):
         ("number", ("", ""), "is int; give a SafetyProblem"),
         ("wrong", ("", ""), "returned int"),
         ("problem", ("import sympy", "import sympyy"), "in line 2: ModuleNotFoundError"),
-        ("problem", ("SIGN *", "1 / 0 +"), "in line 9: ZeroDivisionError"),
+        ("problem", ("SIGN *", "1 / 0 +"), "in line 10: ZeroDivisionError"),
         ("", ("", ""), "is not a place"),
     ],
 )

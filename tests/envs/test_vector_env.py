@@ -52,7 +52,7 @@ def assert_same(ours, theirs, where):
 
 
 def only_where_present(info):
-    """SyncVectorEnv leaves zeros where an env reported nothing; what is masked out is not compared."""
+    """Leave out what is masked: SyncVectorEnv has zeros where an env reported nothing."""
     result = {}
     for key, value in info.items():
         if key.startswith("_"):

@@ -266,9 +266,8 @@ def main() -> int:
             wrong += bool(_report(name, found, given.write))
             if given.times:
                 print(f"{seconds:6.2f} s  {name}", flush=True)
-    print(
-        f"{len(chosen)} cases {'stored' if given.write else 'compared'}, {wrong} {'broke' if given.write else 'differ'}"
-    )
+    done, failed = ("stored", "broke") if given.write else ("compared", "differ")
+    print(f"{len(chosen)} cases {done}, {wrong} {failed}")
     return int(wrong > 0)
 
 

@@ -66,9 +66,15 @@ def test_names_of_states_are_free(name):
             (state, v), (force,), [sp.sin(v) * rate, 0], [0, 1], [0, sigma], {rate: 2.0, sigma: 0.3}
         )
         problem = state_problem(
-            system, 1 - state**2 - sp.sin(state) ** 2, box=(-1, 1), start=[0.1, 0.2], dt=0.1, horizon=1.0, nominal=-state,
+            system,
+            1 - state**2 - sp.sin(state) ** 2,
+            box=(-1, 1),
+            start=[0.1, 0.2],
+            dt=0.1,
+            horizon=1.0,
+            nominal=-state,
             reward=state * force * sp.cos(TIME),
-        )  # fmt: skip
+        )
         scalar, batch = SafeEnv(problem), SafeVectorEnv(problem, 2)
         scalar.reset(seed=0)
         batch.reset(seed=0)

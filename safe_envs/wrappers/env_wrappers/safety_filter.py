@@ -45,7 +45,7 @@ class SafetyFilterWrapper(
         priorities: of the barriers where not all can be kept: weights of their squared slacks, ones
             by default.
         **view: for a third-party env `model`, `barriers`, `state_fn`, and what else of
-          `FilterSpec` is needed.
+            `FilterSpec` is needed.
 
     Raises:
         ConfigurationError: an argument is unknown or missing, or does not fit the env; or, at a

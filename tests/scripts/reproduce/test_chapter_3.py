@@ -173,7 +173,7 @@ def test_an_outcome_is_drawn_and_judged(name, outcomes, tmp_path, pictures):
 
 @pytest.mark.parametrize("name", ["figure-3.1", "figure-3.2b", "figure-3.3"])
 def test_the_same_seed_gives_the_same_outcome(name, outcomes):
-    """One of each module; figure-3.2a shows the runs of figure-3.2b, and rates as figure-3.3 does."""
+    """One of each module; figure-3.2a has the runs of figure-3.2b, and rates as figure-3.3."""
     if name == "figure-3.2b":
         dubins_obstacle.passages.cache_clear()
     if name == "figure-3.3":

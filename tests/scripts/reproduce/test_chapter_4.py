@@ -306,7 +306,7 @@ def test_printed_zeroing_form() -> None:
 
 
 def test_starts_without_condition_are_the_main_setting() -> None:
-    """Nothing of the numbers is from starts with A h > 0, from which no path without noise leaves."""
+    """No number is from starts with A h > 0, from which no path without noise leaves."""
     assert ours("figure-4.2")["SCBF, sigma = 0"].ours < 90.0
     assert any(
         name.startswith("starts with A h > 0")

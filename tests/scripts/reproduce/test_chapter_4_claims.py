@@ -77,7 +77,7 @@ def test_bound_is_not_attained_off_the_closed_form() -> None:
 
 
 def first(count: int, of: int = 100) -> np.ndarray:
-    """SafetyBits of which the first ones are set."""
+    """Return flags of which the first ones are set."""
     return np.arange(of) < count
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from safe_envs import plugins
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.dynamics.lie import lie_derivative_f
 from safe_envs.errors import ConfigurationError
@@ -186,6 +187,17 @@ def test_an_installed_condition_is_known_by_its_name(installed):
     assert parse_conditions(spec_of(condition), SCALAR) == (condition,)
     with pytest.raises(ConfigurationError, match="did you mean 'eager'"):
         require_readable("eagr", SCALAR)
+
+
+def test_installed_packages_are_looked_through_once(installed, monkeypatch):
+    groups = []
+    look = plugins.entry_points
+    monkeypatch.setattr(
+        plugins, "entry_points", lambda group: groups.append(group) or look(group=group)
+    )
+    for text in ("eager:gain=2", "eager", "scbf"):
+        parse_conditions(text, SCALAR)
+    assert groups == [plugins.CONDITIONS]
 
 
 def test_a_condition_of_a_module_is_known_by_its_place(installed):

@@ -1,4 +1,4 @@
-"""Files of learned models and data: kept exactly, and refused where they are not what was written."""
+"""Files of learned models and data: exact copies, refused where they are not what was written."""
 
 from __future__ import annotations
 
