@@ -84,7 +84,7 @@ def compute_disk(sample: Sample) -> Outcome:
         notes=[
             *(outside(world, start) for start in at),
             *(
-                f"with exact derivatives from {start} the smallest h is {by_rate(_smallest(each))}"
+                CHAPTER.note("figure-3.1", "exact", start=start, smallest=by_rate(_smallest(each)))
                 for start, each in exact.items()
             ),
             binding(world),
@@ -143,12 +143,9 @@ def disk_numbers(found: Learnings, printed: float | None = None) -> list[Number]
 
 def all_safe(found: Learnings) -> Claim:
     """Return the claim of the text about the figure."""
-    return Claim(
-        "All trajectories stay safe under the learned derivatives",
-        min(worst(found)) > 0,
-        f"safe in each learning: {', '.join(map(str, _counts(found)))} of {len(RATES)}; smallest h"
-        f" over all: {by_rate(worst(found))}",
-    )
+    counts, lowest = ", ".join(map(str, _counts(found))), worst(found)
+    values = {"counts": counts, "runs": len(RATES), "smallest": by_rate(lowest)}
+    return CHAPTER.claim("figure-3.1", "safe", min(lowest) > 0, **values)
 
 
 def theory_holds(found: Learnings, nominal: Sequence[Trajectory]) -> Claim:
@@ -158,14 +155,9 @@ def theory_holds(found: Learnings, nominal: Sequence[Trajectory]) -> Claim:
         found: runs of each learning.
         nominal: runs with nominal derivatives.
     """
-    return Claim(
-        f"From {VALID_START}, a start that the theory covers, all stay safe under the learned"
-        " derivatives, none under the nominal",
-        min(worst(found)) > 0 > max(_smallest(nominal)),
-        f"smallest h over the learnings: {by_rate(worst(found))}; nominal:"
-        f" {by_rate(_smallest(nominal))}",
-        printed=False,
-    )
+    learned, other = worst(found), _smallest(nominal)
+    values = {"learned": by_rate(learned), "nominal": by_rate(other)}
+    return CHAPTER.claim("figure-3.1", "theory", min(learned) > 0 > max(other), **values)
 
 
 def worst(found: Learnings) -> list[float]:

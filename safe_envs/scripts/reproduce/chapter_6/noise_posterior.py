@@ -12,16 +12,7 @@ from matplotlib.figure import Figure
 
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
-from safe_envs.scripts.reproduce.chapter_6.identifications import (
-    AT_REST,
-    CHAPTER,
-    CONFIDENCE,
-    REPETITIONS,
-    SETTINGS,
-    identified,
-    parameter,
-    seeds,
-)
+from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
@@ -34,9 +25,9 @@ from safe_envs.wrappers.learning.estimators import rates
 from safe_envs.wrappers.learning.regression import sigma_map, sigma_samples
 
 NOISE_STARTS, NOISE_STEPS, DRAWS = (
-    SETTINGS[name] for name in ("noise_starts", "noise_steps", "draws")
+    bayes.SETTINGS[name] for name in ("noise_starts", "noise_steps", "draws")
 )
-PRIOR_OF_SIGMA = SETTINGS["prior_of_sigma"]
+PRIOR_OF_SIGMA = bayes.SETTINGS["prior_of_sigma"]
 _BINS = 50
 
 
@@ -48,7 +39,7 @@ def credible(name: str, draws: np.ndarray, unit: str) -> Number:
         draws: shape (D,).
         unit: of the draws.
     """
-    low, high = np.quantile(draws, _ends(CONFIDENCE)).tolist()
+    low, high = np.quantile(draws, _ends(bayes.CONFIDENCE)).tolist()
     return Number(name, float(np.median(draws)), low, high, unit=unit)
 
 
@@ -65,16 +56,18 @@ def noise_levels(section: str, unit: tuple[str, ...], sample: Sample) -> Outcome
         unit: of each level.
         sample: how much is simulated.
     """
-    env, prior = (CHAPTER.settings[section][name] for name in ("env", "prior"))
+    env, prior = (bayes.CHAPTER.settings[section][name] for name in ("env", "prior"))
     problem = make_problem(env)
-    first, second, *_ = seeds(sample, 2)
-    learned = identified(problem, REPETITIONS[-1], first, prior)
-    data = collect(problem, sample.work(NOISE_STARTS), 1, AT_REST, steps=NOISE_STEPS, seed=second)
+    first, second, *_ = bayes.seeds(sample, 2)
+    learned = bayes.identified(problem, bayes.REPETITIONS[-1], first, prior)
+    data = collect(
+        problem, sample.work(NOISE_STARTS), 1, bayes.AT_REST, steps=NOISE_STEPS, seed=second
+    )
     left = data.successors[:, 0] - data.x - rates(learned.system, data) * problem.dt
     squares, count = (left**2).sum(axis=0), len(left)
     rng = np.random.default_rng([sample.seed, 63])
     alpha, beta = PRIOR_OF_SIGMA
-    true = [parameter(problem, name) for name in ("sigma_1", "sigma_2")]
+    true = [bayes.parameter(problem, name) for name in ("sigma_1", "sigma_2")]
     numbers, printed, every, shown = [], [], [], {"truth": true}
     for i, (s, at) in enumerate(zip(squares.tolist(), unit, strict=True), start=1):
         draws = sigma_samples(s / problem.dt, count, alpha, beta, DRAWS, rng)
@@ -113,7 +106,7 @@ def gathered(every: Sequence[np.ndarray], true: Sequence[float]) -> Claim:
         every: draws from each posterior.
         true: value of each level.
     """
-    levels = _ends(1 - (1 - CONFIDENCE) / len(every))
+    levels = _ends(1 - (1 - bayes.CONFIDENCE) / len(every))
     found = [tuple(np.quantile(draws, levels).tolist()) for draws in every]
     content = f"{100 * (levels[1] - levels[0]):g} %"
     return Claim(
@@ -176,7 +169,7 @@ def _values(sigma: str, sample: Sample) -> dict[str, Any]:
 
 
 ARTEFACTS: tuple[Artefact, ...] = tuple(
-    CHAPTER.artefact(
+    bayes.CHAPTER.artefact(
         name,
         partial(noise_levels, section, unit),
         partial(_values, sigma),
