@@ -131,6 +131,9 @@ def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
     Args:
         problem: whose horizon is the limit.
         max_episode_steps: a lower limit, if any.
+
+    Raises:
+        ConfigurationError: the limit is no whole number from 1.
     """
     if max_episode_steps is None:
         return problem.steps

@@ -40,7 +40,7 @@ class SafetyProblem:
         reward: of a step, an expression of the state that it reaches, of the executed input and of
             `TIME`.
         nominal: the nominal controller, an expression for each input of the features' symbols and
-            the model's parameters. The box clips it.
+            the model's parameters. The input bounds clip it.
         starts: named initial distributions.
         start: the name of the one in use.
         dt: control period in s.

@@ -46,6 +46,9 @@ class SamplingDomain:
             angles: whether each is an unbounded angle.
             box: (low, high) of each input.
 
+        Returns:
+            The domain without empty parts.
+
         Raises:
             SystemDefinitionError: a part has the wrong length, or a range is infinite or empty.
         """

@@ -48,6 +48,9 @@ def quadrotor_limits(
         floor: lowest safe altitude, in m.
         ceiling: highest safe altitude, in m.
         tilt: largest safe angle between the thrust and the vertical, in rad.
+
+    Raises:
+        ConfigurationError: the limits are not within the workspace, or in the wrong order.
     """
     low, high, angle = (
         finite_number("floor", floor),

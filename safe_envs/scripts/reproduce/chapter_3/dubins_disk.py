@@ -34,9 +34,9 @@ from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_re
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.drawing import SHADED
 from safe_envs.wrappers.learning.residual import ResidualModel
@@ -54,13 +54,13 @@ _NO_MARGIN = [f"{text}:eps=0" for text in _LEARNED]
 Learnings = Sequence[Sequence[Trajectory]]  # one run for each gain, for each learning
 
 
-def disk(sample: Sample) -> SafetyProblem:
+def disk(sample: Workload) -> SafetyProblem:
     """Return the problem, as long as the sample lets it be."""
     world = make_problem(DISK)
     return world.configured(horizon=world.dt * sample.work(world.steps))
 
 
-def compute_disk(sample: Sample) -> Outcome:
+def compute_disk(sample: Workload) -> Findings:
     """Compute the trajectories of the disk for each gain, from both starts."""
     world, models = disk(sample), residuals(DISK, sample)
     at = {start: world.configured(start=start, box=WIDE) for start in (PRINTED_START, VALID_START)}
@@ -75,7 +75,7 @@ def compute_disk(sample: Sample) -> Outcome:
         strict=True,
     )
     by_formula = trajectories(at[PRINTED_START], estimates, _NO_MARGIN)
-    return Outcome(
+    return Findings(
         numbers=disk_numbers(found[PRINTED_START], printed=_SAFE_RUNS),
         claims=[all_safe(found[PRINTED_START]), theory_holds(found[VALID_START], nominal)],
         alternative_settings=_alternatives(at, models, found[VALID_START]),
@@ -108,7 +108,7 @@ def trajectories(
 
 def _alternatives(
     at: dict[tuple[float, ...], SafetyProblem], models: Sequence[ResidualModel], valid: Learnings
-) -> dict[str, Outcome]:
+) -> dict[str, Findings]:
     """Return the outcomes with another start, other input bounds, and without a margin."""
     narrow = {
         start: trajectories(problem.configured(box=NARROW), models) for start, problem in at.items()
@@ -120,7 +120,7 @@ def _alternatives(
         "without the margin of Eq. (3.20)": trajectories(at[PRINTED_START], models, _NO_MARGIN),
     }
     return {
-        name: Outcome(disk_numbers(each, printed=_SAFE_RUNS), [all_safe(each)])
+        name: Findings(disk_numbers(each, printed=_SAFE_RUNS), [all_safe(each)])
         for name, each in found.items()
     }
 
@@ -209,7 +209,7 @@ def _panels(
     }
 
 
-def draw_disk(figure: Figure, outcome: Outcome) -> None:
+def _draw_disk(figure: Figure, outcome: Findings) -> None:
     """Draw panels for the start of the thesis, by both estimates, and for a valid start."""
     colors = dict(zip(RATES, COLORS, strict=False))
     names = ("our estimates", "printed estimates", "our estimates")
@@ -238,7 +238,7 @@ def draw_disk(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, [*handles, nominal])
 
 
-def _values(sample: Sample) -> dict[str, Any]:
+def _values(sample: Workload) -> dict[str, Any]:
     world = disk(sample)
     return {
         **setting_values(world, sample),
@@ -248,5 +248,5 @@ def _values(sample: Sample) -> dict[str, Any]:
 
 
 ARTEFACTS: tuple[Artefact, ...] = (
-    CHAPTER.artefact("figure-3.1", compute_disk, _values, draw_disk, (7.0, 3.2)),
+    CHAPTER.artefact("figure-3.1", compute_disk, _values, _draw_disk, (7.0, 3.2)),
 )

@@ -23,9 +23,9 @@ from safe_envs.scripts.reproduce.chapter_3 import learned_runs
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
 
@@ -39,7 +39,7 @@ _ROUNDING = 1e-9  # m/s
 
 
 @lru_cache(maxsize=2)
-def passages(sample: Sample, **model: float) -> dict[str, list[learned_runs.Trajectory]]:
+def passages(sample: Workload, **model: float) -> dict[str, list[learned_runs.Trajectory]]:
     """Return the trajectories around the obstacle.
 
     Args:
@@ -52,12 +52,12 @@ def passages(sample: Sample, **model: float) -> dict[str, list[learned_runs.Traj
     )
 
 
-def compute_passage(sample: Sample) -> Outcome:
+def compute_passage(sample: Workload) -> Findings:
     """Compute the paths around the obstacle."""
     found, problem = passages(sample), make_problem(OBSTACLE)
     learned, none = found["learned"], found["none"][0]
     times = [run.steps * problem.dt for run in learned]
-    return Outcome(
+    return Findings(
         numbers=[
             Number.mean("path, learned", _paths(learned), "m", 0.0),
             *(
@@ -142,18 +142,18 @@ def _at(run: learned_runs.Trajectory, time: float, dt: float) -> dict[str, Any]:
     return {"time": time, "vehicle": [x, y], "obstacle": [x_o, y_o]}
 
 
-def compute_clearance(sample: Sample) -> Outcome:
+def compute_clearance(sample: Workload) -> Findings:
     """Compute the barrier on the way around the obstacle."""
     found, at_rest, problem = passages(sample), passages(sample, v_o=0.0), make_problem(OBSTACLE)
     true_speed = make_problem(OBSTACLE, start="thesis", model={"v": SPEED, "v_o": 0.0})
     blind = learned_runs.runs(true_speed, [f"hocbf:p={OBSTACLE_RATES}"])[0]
     shown = {**{kind: run for kind, (run, *_) in found.items()}, "printed": blind}
     note = partial(learned_runs.CHAPTER.note, "figure-3.2b")
-    return Outcome(
+    return Findings(
         numbers=_clearance_numbers(found),
         claims=clearance_claims(found, problem),
         alternative_settings={
-            AT_REST: Outcome(_clearance_numbers(at_rest), _printed(at_rest, problem))
+            AT_REST: Findings(_clearance_numbers(at_rest), _printed(at_rest, problem))
         },
         printed_formula=[
             Number("smallest h, nominal", at_rest["nominal"][0].smallest, unit="m^2"),
@@ -206,7 +206,7 @@ def _clearance_numbers(found: learned_runs.Trajectories) -> list[Number]:
     ]
 
 
-def draw_passage(figure: Figure, outcome: Outcome) -> None:
+def _draw_passage(figure: Figure, outcome: Findings) -> None:
     """Draw the paths past the obstacle, with both at three instants."""
     axes, shade = figure.add_subplot(), {"alpha": 0.45, "linewidth": 0}
     axes.add_patch(Circle(GOAL, GOAL_RADIUS, facecolor="#56B4E9", **shade))
@@ -230,7 +230,7 @@ def draw_passage(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
 
-def draw_clearance(figure: Figure, outcome: Outcome) -> None:
+def _draw_clearance(figure: Figure, outcome: Findings) -> None:
     """Draw the barrier over time."""
     axes = figure.add_subplot()
     lines = (
@@ -251,15 +251,15 @@ def draw_clearance(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
 
-def _values(sample: Sample) -> dict[str, Any]:
+def _values(sample: Workload) -> dict[str, Any]:
     return learned_runs.setting_values(make_problem(OBSTACLE), sample)
 
 
 ARTEFACTS: tuple[Artefact, ...] = (
     learned_runs.CHAPTER.artefact(
-        "figure-3.2a", compute_passage, _values, draw_passage, (7.0, 4.9)
+        "figure-3.2a", compute_passage, _values, _draw_passage, (7.0, 4.9)
     ),
     learned_runs.CHAPTER.artefact(
-        "figure-3.2b", compute_clearance, _values, draw_clearance, (7.0, 3.8)
+        "figure-3.2b", compute_clearance, _values, _draw_clearance, (7.0, 3.8)
     ),
 )

@@ -15,9 +15,9 @@ from safe_envs.scripts.reproduce.chapter_3 import learned_runs
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
@@ -62,7 +62,7 @@ def printed_run(problem: SafetyProblem, knowledge: str) -> learned_runs.Trajecto
     return learned_runs.runs(problem, [PrintedCondition(printed_hocbf)], knowledge=knowledge)[0]
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute the altitudes under all filters."""
     problem, models = hover(sample), learned_runs.residuals(QUADROTOR, sample)
     found = learned_runs.trajectories(problem, _GAINS, models)
@@ -73,7 +73,7 @@ def compute(sample: Sample) -> Outcome:
     def time_in_workspace(run: learned_runs.Trajectory) -> Number:
         return Number("time in the workspace, true", run.steps * problem.dt, unit="s")
 
-    return Outcome(
+    return Findings(
         numbers=[
             *learned_runs.smallest_numbers(found),
             time_in_workspace(found["true"][0]),
@@ -92,7 +92,7 @@ def compute(sample: Sample) -> Outcome:
     )
 
 
-def hover(sample: Sample) -> SafetyProblem:
+def hover(sample: Workload) -> SafetyProblem:
     """Return the problem from the start of the thesis, as long as the sample lets it be."""
     problem = make_problem(QUADROTOR, start="thesis")
     return problem.configured(horizon=problem.dt * max(_LEAST_STEPS, sample.work(problem.steps)))
@@ -135,7 +135,7 @@ def _range(each: Sequence[learned_runs.Trajectory]) -> str:
     return f"{heights.min():.2f} to {heights.max():.2f} m"
 
 
-def draw(figure: Figure, outcome: Outcome) -> None:
+def _draw(figure: Figure, outcome: Findings) -> None:
     """Draw the altitude over time."""
     axes = figure.add_subplot()
     time = np.array(outcome.data["learned"]["time"])
@@ -163,7 +163,7 @@ ARTEFACTS: tuple[Artefact, ...] = (
         "figure-3.3",
         compute,
         lambda sample: learned_runs.setting_values(hover(sample), sample),
-        draw,
+        _draw,
         (7.0, 4.0),
     ),
 )

@@ -13,9 +13,9 @@ from safe_envs.scripts.reproduce.chapter_4 import cruise_setting as car
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.episodes import violations
 from safe_envs.scripts.reproduce.framework.paired import (
@@ -68,13 +68,13 @@ def safe_with(
     return violations(problem, text, "nominal", episodes, seed).safe(problem.steps)
 
 
-def outcome_of(safe: Safe) -> Outcome:
+def outcome_of(safe: Safe) -> Findings:
     """Return numbers and claims of the table."""
     rates = [
         Number.rate(name, int(flags.sum()), len(flags), PRINTED[name], car.EPISODES)
         for name, flags in safe.items()
     ]
-    return Outcome(rates, claims_of_table(safe))
+    return Findings(rates, claims_of_table(safe))
 
 
 def claims_of_table(safe: Safe) -> list[Claim]:
@@ -102,7 +102,7 @@ def _change(lost: np.ndarray) -> str:
     return f"{'loses' if points > 0 else 'gains'} {abs(points):.1f} points"
 
 
-def compute_table(sample: Sample) -> Outcome:
+def compute_table(sample: Workload) -> Findings:
     """Compute Table 4.1, also with other settings."""
     episodes, step = sample.size(car.EPISODES), _step(sample)
     settings = {
@@ -121,11 +121,11 @@ def compute_table(sample: Sample) -> Outcome:
     )
 
 
-def _step(sample: Sample) -> float:
+def _step(sample: Workload) -> float:
     return COARSE if sample.quick else car.STEP
 
 
-def _fitted(sample: Sample) -> str:
+def _fitted(sample: Workload) -> str:
     return (
         f"fitted by us, {len(PRINTED)} printed numbers by {car.QUANTITIES} quantities;"
         f" {sample.size(MORE)} episodes"

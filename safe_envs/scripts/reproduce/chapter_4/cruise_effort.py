@@ -20,7 +20,7 @@ from safe_envs.scripts.reproduce.chapter_4.effort_claims import (
     EffortRecords,
     outcome_of,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Findings, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_interval
 from safe_envs.scripts.reproduce.framework.episodes import periods
 from safe_envs.wrappers import SafetyFilter, parse_conditions
@@ -66,7 +66,7 @@ def needed(setting: car.CruiseSettings, text: str) -> np.ndarray:
     return answer.filter(states, wanted).action[:, 0]
 
 
-def compute_figure(sample: Sample) -> Outcome:
+def compute_figure(sample: Workload) -> Findings:
     """Compute the effort over time, and against the distance to the edge."""
     episodes = sample.size(car.EPISODES)
     runs, forces = simulated(car.ASSUMED, episodes, sample.seed)
@@ -90,7 +90,7 @@ def compute_figure(sample: Sample) -> Outcome:
     )
 
 
-def _printed_claims(outcome: Outcome) -> Outcome:
+def _printed_claims(outcome: Findings) -> Findings:
     return replace(outcome, claims=[claim for claim in outcome.claims if claim.printed])
 
 
@@ -131,7 +131,7 @@ def _bands(effort: np.ndarray) -> list[list[float]]:
     return np.maximum(np.nanquantile(largest, (0.05, 0.5, 0.95), axis=1), 1.0).tolist()
 
 
-def draw_figure(figure: Figure, outcome: Outcome) -> None:
+def _draw_figure(figure: Figure, outcome: Findings) -> None:
     """Draw the effort over time, and against h with the edge at the left."""
     left, right = figure.subplots(1, 2, width_ratios=(1.3, 1))
     data = outcome.data
@@ -162,7 +162,7 @@ ARTEFACTS: tuple[Artefact, ...] = (
         "figure-4.1",
         compute_figure,
         lambda sample: car.setting_values(sample, car.STEP),
-        draw_figure,
+        _draw_figure,
         (7.0, 3.8),
     ),
 )

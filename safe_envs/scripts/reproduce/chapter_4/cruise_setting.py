@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.reproduce.framework.artefact import Sample
+from safe_envs.scripts.reproduce.framework.artefact import Workload
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
 from safe_envs.systems.acc import WEIGHT
 
@@ -84,7 +84,7 @@ FITTED_GOAL = (
 BY_PRINTED_QP = "the printed QP, 1/2 (u^2 + d^2) and AV <= d"
 
 
-def setting_values(sample: Sample, step: float) -> dict[str, float]:
+def setting_values(sample: Workload, step: float) -> dict[str, float]:
     """Return what the lines of a setting name.
 
     Args:

@@ -12,9 +12,9 @@ from safe_envs.scripts.reproduce.chapter_4.dubins_pictures import draw_noises
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.episodes import Violations
 from safe_envs.scripts.reproduce.framework.paired import (
@@ -27,7 +27,7 @@ NOISES, BEYOND, EPISODES = (dubins.SETTINGS[name] for name in ("noises", "beyond
 BETWEEN = (0.025, 0.075, 0.125, 0.175)  # further noise levels of the curves, in m/sqrt(s)
 
 
-def compute_noises(sample: Sample) -> Outcome:
+def compute_noises(sample: Workload) -> Findings:
     """Compute the safety against noise, from random starts."""
     episodes, seed = sample.size(EPISODES), sample.seed
     levels = sorted((*NOISES, *(() if sample.quick else BETWEEN)))
@@ -49,7 +49,7 @@ def compute_noises(sample: Sample) -> Outcome:
     }
     named = {dubins.STARTS[start]: _at(runs[start], NOISES) for start in dubins.STARTS}
     alternatives = dubins.alternatives_of(named, printed, claim_on_noises)
-    return Outcome(
+    return Findings(
         numbers=[*_rates(main, NOISES), *_rates(beyond, BEYOND), *_differences(main)],
         claims=[claim_on_noises(named[dubins.STARTS["uniform"]], dubins.HORIZON)],
         alternative_settings=alternatives,

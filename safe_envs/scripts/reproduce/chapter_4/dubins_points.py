@@ -12,9 +12,9 @@ from safe_envs.scripts.reproduce.chapter_4.dubins_pictures import draw_points
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.episodes import Violations, episode_seed
 from safe_envs.scripts.reproduce.framework.paired import (
@@ -30,7 +30,7 @@ POINTS, NOISE = dubins.SETTINGS["points"], dubins.SETTINGS["noise"]
 EPISODES_OF_POINT = dubins.SETTINGS["episodes_of_point"]
 
 
-def compute_points(sample: Sample) -> Outcome:
+def compute_points(sample: Workload) -> Findings:
     """Compute the safety from ten random starts, with many episodes each."""
     episodes = sample.size(EPISODES_OF_POINT)
     seeds = [episode_seed(sample.seed, i) for i in range(POINTS)]
@@ -54,7 +54,7 @@ def compute_points(sample: Sample) -> Outcome:
     ]
     alternatives = dubins.alternatives_of(runs, printed, claim_on_points)
     together, step = pooled(main), dubins.step_of(dubins.HORIZON)
-    return Outcome(
+    return Findings(
         numbers=[
             *(run.rate(f"{name}, all ten starts", step) for name, run in together.items()),
             *(

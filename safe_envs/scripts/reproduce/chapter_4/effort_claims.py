@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from safe_envs.scripts.reproduce.chapter_4.cruise_setting import CHAPTER, STEP
-from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Outcome
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number
 from safe_envs.scripts.reproduce.framework.paired import is_above
 
 DISTANCES = np.logspace(-3, math.log10(30.0), 181)  # h at which the force is shown, in m
@@ -42,7 +42,7 @@ EffortRecords = Mapping[str, EffortRecord]
 """By condition, SRCBF and SCBF, with the same noise."""
 
 
-def outcome_of(runs: EffortRecords, forces: Mapping[str, np.ndarray]) -> Outcome:
+def outcome_of(runs: EffortRecords, forces: Mapping[str, np.ndarray]) -> Findings:
     """Return numbers and claims of the figure.
 
     Args:
@@ -56,7 +56,7 @@ def outcome_of(runs: EffortRecords, forces: Mapping[str, np.ndarray]) -> Outcome
         Number.mean(f"time in which J of SRCBF is the {word} one", 100 * share, "%", 0.0, 100.0)
         for word, share in (("larger", larger), ("smaller", smaller))
     ]
-    return Outcome(
+    return Findings(
         [*shares, *(median_peak(name, r.peaks) for name, r in runs.items())],
         [
             claim_on_time(larger, smaller),

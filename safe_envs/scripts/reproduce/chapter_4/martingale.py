@@ -22,9 +22,9 @@ from safe_envs.scripts.reproduce.chapter_4 import reciprocal_inputs as scalar
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.drawing import draw_interval
 from safe_envs.scripts.reproduce.framework.episodes import episode_seed
@@ -33,9 +33,8 @@ from safe_envs.wrappers.verification.bounds import proposition_4_2_8
 
 LIMITS, STARTS, SCALE = (scalar.SETTINGS[name] for name in ("limits", "starts", "scale"))
 STEP, HORIZON, EPISODES = (scalar.SETTINGS[name] for name in ("step", "horizon", "episodes"))
-_note, _claim = (
-    partial(kind, "example-4.2.2") for kind in (scalar.CHAPTER.note, scalar.CHAPTER.claim)
-)
+_note = partial(scalar.CHAPTER.note, "example-4.2.2")
+_claim = partial(scalar.CHAPTER.claim, "example-4.2.2")
 SHIFT = 0.5826
 """By so many standard deviations of a step a boundary watched at the steps seems further away."""
 
@@ -88,7 +87,7 @@ def safe_up_to(start: float, horizon: float, step: float = 0.0) -> float:
     return 1.0 - float(ndtr((-a - drift) / deviation) + ever * ndtr((-a + drift) / deviation))
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute what the conditions ask for, and how safe they are."""
     episodes = sample.size(EPISODES)
     allowed = {
@@ -112,7 +111,7 @@ def compute(sample: Sample) -> Outcome:
     ]
     curves = [each.row.curve for each in attained]
     calm_rate = measure(scalar.SCALAR, "rcbf", 1, 0, options=calm).rate
-    return Outcome(
+    return Findings(
         numbers=[
             *rates,
             *(number for pair in limited for number in pair),
@@ -224,7 +223,7 @@ def _against(rates: Sequence[Number], others: Sequence[float]) -> str:
     )
 
 
-def draw(figure: Figure, outcome: Outcome) -> None:
+def _draw(figure: Figure, outcome: Findings) -> None:
     """Draw what the conditions allow towards the edge, and safety over time with the bound."""
     left, right = figure.subplots(1, 2)
     scalar.draw_inputs(left, outcome.data)
@@ -255,7 +254,7 @@ ARTEFACTS: tuple[Artefact, ...] = (
         "example-4.2.2",
         compute,
         lambda sample: {"count": sample.size(EPISODES)},
-        draw,
+        _draw,
         (7.0, 4.0),
     ),
 )

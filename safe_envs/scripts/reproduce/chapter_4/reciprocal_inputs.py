@@ -70,7 +70,12 @@ def _claim_on_edge(name: str, allowed: np.ndarray) -> Claim:
 
 
 def draw_inputs(axes: Axes, data: dict[str, Any]) -> None:
-    """Draw the effort that each condition asks for, over h."""
+    """Draw the effort that each condition asks for, over h.
+
+    Args:
+        axes: where.
+        data: of the outcome.
+    """
     near = np.array(data["h"]) < 0.5
     h, what = np.array(data["h"])[near], ("no noise", rf"$\sigma$ = {NOISE:g}")
     for (name, values), color, noise in zip(data["asked"].items(), COLORS[:2], what, strict=True):

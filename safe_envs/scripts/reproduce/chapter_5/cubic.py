@@ -31,9 +31,9 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.paired import (
     MeasuredFilter,
@@ -62,7 +62,7 @@ Levels = Mapping[float, Mapping[str, MeasuredFilter]]
 """By filter at each level."""
 
 
-def compute_table(sample: Sample) -> Outcome:
+def compute_table(sample: Workload) -> Findings:
     """Compute Table 5.2, also from a single start."""
     learned = {k: repeated(ENV, k, sample) for k in LEVELS}
     filters = ["none", CBF, WITHOUT, "scbf"]
@@ -76,11 +76,11 @@ def compute_table(sample: Sample) -> Outcome:
     literal = {
         k: measured(ENV, {"noise": k}, [], models(learned[k], "printed"), sample) for k in LEVELS
     }
-    return Outcome(
+    return Findings(
         numbers=numbers(near, _FILTERS),
         claims=claims(near),
         alternative_settings={
-            f"a single start {FIXED} with h = .25": Outcome(
+            f"a single start {FIXED} with h = .25": Findings(
                 numbers(single, _FILTERS), claims(single)
             )
         },
@@ -141,7 +141,7 @@ def _fall(found: Levels, name: str) -> float:
     return before - after
 
 
-def _falls(sample: Sample) -> str:
+def _falls(sample: Workload) -> str:
     """Return how far the CBF falls between the levels, over rates and horizons, in words."""
     tried = _ALPHAS[:1] if sample.quick else _ALPHAS
     swept = [
@@ -168,7 +168,7 @@ def compare_with_no_filter(found: Levels) -> list[str]:
     return said
 
 
-def _no_bound(sample: Sample) -> list[str]:
+def _no_bound(sample: Workload) -> list[str]:
     """Return why h/sup h says nothing here, in words."""
     problem = make_problem(ENV)
     condition = SCBF().constraint(problem.model, problem.barriers[0])
@@ -197,7 +197,7 @@ def printed_term(x_2: Any) -> Any:
     return -((LEVELS[0] * x_2) ** 2)
 
 
-def _table_values(sample: Sample) -> dict[str, Any]:
+def _table_values(sample: Workload) -> dict[str, Any]:
     return {"count": sample.size(EPISODES), "identifications": identifications(sample)}
 
 

@@ -29,8 +29,8 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
-    Outcome,
-    Sample,
+    Findings,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, safer
 
@@ -66,7 +66,7 @@ class PlaneTrajectories:
 
 
 @lru_cache(maxsize=2)
-def paths(sample: Sample) -> dict[str, PlaneTrajectories]:
+def paths(sample: Workload) -> dict[str, PlaneTrajectories]:
     """Return the trajectories of all four figures."""
     model = repeated(ENV, LEVELS[0], sample)[0].learned["martingale"]
     found = {}
@@ -103,13 +103,16 @@ def alike(found: Mapping[str, PlaneTrajectories]) -> np.ndarray:
     )
 
 
-def compute(key: str, name: str, sample: Sample) -> Outcome:
+def compute(key: str, name: str, sample: Workload) -> Findings:
     """Compute one of the figures.
 
     Args:
         key: its letter.
         name: what it shows.
         sample: how much is simulated.
+
+    Returns:
+        Numbers, claims and notes of the figure, with the trajectories that it shows.
     """
     found = paths(sample)
     path, fitting = found[key], alike(found)
@@ -117,7 +120,7 @@ def compute(key: str, name: str, sample: Sample) -> Outcome:
     order = [shown, *(i for i in range(recorded) if i != shown)][:SHOWN]
     lines = [path.states[::STRIDE, i] for i in order]
     of_these = f"{len(fitting)} of the {recorded} recorded ones are {_SOUGHT}"
-    return Outcome(
+    return Findings(
         numbers=[path.runs.number(_rate_name(name))],
         claims=[_CLAIMS[key](found)],
         alternative_settings=(
@@ -143,10 +146,10 @@ def _rate_name(name: str) -> str:
     return f"safe up to {HORIZON:g} s, {name}"
 
 
-def _unbounded(name: str, sample: Sample) -> Outcome:
+def _unbounded(name: str, sample: Workload) -> Findings:
     """Return the outcome of the CBF without noise, with more input than it ever takes."""
     runs = measured(ENV, {"noise": 0.0, "horizon": HORIZON, "box": WIDE}, [CBF], [], sample)[CBF]
-    return Outcome([runs.number(_rate_name(name))], [kept(runs)])
+    return Findings([runs.number(_rate_name(name))], [all_safe(runs)])
 
 
 def short_of_input(runs: MeasuredFilter) -> str:
@@ -178,7 +181,7 @@ def towards_origin(states: np.ndarray) -> Claim:
     )
 
 
-def kept(runs: MeasuredFilter) -> Claim:
+def all_safe(runs: MeasuredFilter) -> Claim:
     """Return the claim that a CBF without noise keeps all episodes safe."""
     row = runs.row
     return Claim(
@@ -215,13 +218,13 @@ def recovered(ddscbf: MeasuredFilter, cbf: MeasuredFilter) -> Claim:
 
 _CLAIMS: dict[str, Callable[[Mapping[str, PlaneTrajectories]], Claim]] = {
     "a": lambda found: towards_origin(found["a"].states),
-    "b": lambda found: kept(found["b"].runs),
+    "b": lambda found: all_safe(found["b"].runs),
     "c": lambda found: lost(found["b"].runs, found["c"].runs),
     "d": lambda found: recovered(found["d"].runs, found["c"].runs),
 }
 
 
-def draw_paths(figure: Figure, outcome: Outcome) -> None:
+def _draw_paths(figure: Figure, outcome: Findings) -> None:
     """Draw trajectories in the plane, one of them bold, with the unsafe region."""
     problem = make_problem(ENV)
     axes = figure.subplots()
@@ -249,7 +252,7 @@ def draw_paths(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, [*reversed(kinds.values()), Patch(color=UNSAFE, alpha=0.35, label="h < 0")])
 
 
-def _values(sample: Sample) -> dict[str, Any]:
+def _values(sample: Workload) -> dict[str, Any]:
     episodes = sample.size(EPISODES)
     return {"shown": min(SHOWN, episodes), "count": episodes}
 
@@ -263,7 +266,7 @@ _PICTURES = (
 
 ARTEFACTS: tuple[Artefact, ...] = tuple(
     CHAPTER.artefact(
-        f"figure-5.3{key}", partial(compute, key, name), _values, draw_paths, (7.0, 5.2)
+        f"figure-5.3{key}", partial(compute, key, name), _values, _draw_paths, (7.0, 5.2)
     )
     for key, name in _PICTURES
 )

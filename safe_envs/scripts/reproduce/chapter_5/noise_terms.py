@@ -19,16 +19,16 @@ from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legen
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     REPETITIONS,
     VALIDATION,
-    Identification,
+    NoiseIdentification,
     models,
     repeated,
 )
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER
 from safe_envs.scripts.reproduce.framework.artefact import (
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.paired import is_below
 from safe_envs.wrappers.learning.data.collection import draw_states
@@ -67,8 +67,13 @@ class _Errors:
 
 
 def learning_outcome(
-    env_id: str, noise: float, state: int, said: str, formula: Callable[[Any], Any], sample: Sample
-) -> Outcome:
+    env_id: str,
+    noise: float,
+    state: int,
+    said: str,
+    formula: Callable[[Any], Any],
+    sample: Workload,
+) -> Findings:
     """Return how near the learned term is to the true one, which depends on one state alone.
 
     Args:
@@ -92,7 +97,7 @@ def learning_outcome(
     missed = {name: values - term(first.x[:, state])[0] for name, values in first.labels.items()}
     grid = np.linspace(*problem.exploration.region[state], 200)
     unit = f" ({problem.states[state].unit})" if problem.states[state].unit else ""
-    return Outcome(
+    return Findings(
         numbers=[
             root_mean_square("rms of the analytic term", repaired.truth.ravel()),
             repaired.number,
@@ -186,7 +191,7 @@ def near(errors: Sequence[float], truth: np.ndarray) -> Claim:
 
 
 def _why_printed_fails(
-    problem: SafetyProblem, first: Identification, missed: np.ndarray, repetitions: int
+    problem: SafetyProblem, first: NoiseIdentification, missed: np.ndarray, repetitions: int
 ) -> list[str]:
     """Return the printed estimator's error, its bias in closed form, and its noise, in words."""
     plant, h = problem.plant, problem.barriers[0].expression
@@ -210,7 +215,12 @@ def _rms(values: np.ndarray) -> float:
 
 
 def root_mean_square(name: str, values: np.ndarray) -> Number:
-    """Return that of independent values in 1/s, with the normal interval of their mean square."""
+    """Return that of independent values in 1/s, with the normal interval of their mean square.
+
+    Args:
+        name: of the number.
+        values: shape (K,).
+    """
     square = np.square(values)
     mean, half = float(square.mean()), 1.96 * float(square.std(ddof=1)) / math.sqrt(len(square))
     return Number(
@@ -218,8 +228,13 @@ def root_mean_square(name: str, values: np.ndarray) -> Number:
     )
 
 
-def draw_learning(figure: Figure, outcome: Outcome) -> None:
-    """Draw the learned term over its state, by the repaired and by the printed estimator."""
+def draw_learning(figure: Figure, outcome: Findings) -> None:
+    """Draw the learned term over its state, by the repaired and by the printed estimator.
+
+    Args:
+        figure: empty.
+        outcome: of the artefact.
+    """
     data = outcome.data
     panels = list(figure.subplots(1, 2))
     for axes, key in zip(panels, ("repaired", "printed"), strict=True):

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from safe_envs.scripts.reproduce.framework.artefact import Claim, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Workload
 from safe_envs.scripts.reproduce.framework.paired import (
     PRINTED_EPISODES,
     MeasuredFilter,
@@ -28,7 +28,7 @@ def measured(
     options: dict[str, Any],
     filters: Sequence[str],
     models: Sequence[GeneratorModel],
-    sample: Sample,
+    sample: Workload,
 ) -> dict[str, MeasuredFilter]:
     """Return the rates of filters that learn nothing, and of "ddscbf" with several models.
 
@@ -47,7 +47,12 @@ def measured(
 
 
 def apart(first: MeasuredFilter, second: MeasuredFilter) -> str:
-    """Return the first rate less the second one on the same episodes, in words."""
+    """Return the first rate less the second one on the same episodes, in words.
+
+    Args:
+        first: one filter.
+        second: the other.
+    """
     return with_interval(difference("", first.flags, second.flags), " points")
 
 

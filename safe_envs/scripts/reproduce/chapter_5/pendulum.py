@@ -13,7 +13,7 @@ from safe_envs.agents import make_problem
 from safe_envs.agents.evaluation.bound_check import starts_of
 from safe_envs.agents.evaluation.contradiction import by_rate
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
-    Identification,
+    NoiseIdentification,
     identifications,
     learning_values,
     models,
@@ -34,8 +34,8 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
-    Outcome,
-    Sample,
+    Findings,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, safer
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
@@ -72,11 +72,11 @@ class PendulumSetting:
         """Return the text of the CBF."""
         return f"cbf:alpha={self.alpha}"
 
-    def options(self, sample: Sample) -> dict[str, Any]:
+    def options(self, sample: Workload) -> dict[str, Any]:
         """Return the environment's arguments: a quick sample ends after 5 s at the latest."""
         return {"start": self.start, "horizon": sample.work(round(2 * self.horizon)) / 2}
 
-    def describe(self, sample: Sample) -> str:
+    def describe(self, sample: Workload) -> str:
         """Return it in words."""
         where = {"near-origin": "from (.1 rad, .1 rad/s)", "uniform": "uniform in C"}[self.start]
         return (
@@ -90,7 +90,7 @@ A, B = (
 )
 
 
-def compute_table(sample: Sample) -> Outcome:
+def compute_table(sample: Workload) -> Findings:
     """Compute Table 5.1 in both settings."""
     learned = repeated(ENV, NOISE, sample)
     found = {
@@ -103,7 +103,7 @@ def compute_table(sample: Sample) -> Outcome:
         (outcome_of(each, found[each], _quiet(each, sample)), found[each]) for each in (B, A)
     )
     literal = measured(ENV, B.options(sample), [], models(learned, "printed"), sample)["ddscbf"]
-    return Outcome(
+    return Findings(
         numbers=main.numbers,
         claims=main.claims,
         alternative_settings={A.describe(sample): other},
@@ -121,7 +121,7 @@ def compute_table(sample: Sample) -> Outcome:
     )
 
 
-def _quiet(setting: PendulumSetting, sample: Sample) -> MeasuredFilter:
+def _quiet(setting: PendulumSetting, sample: Workload) -> MeasuredFilter:
     """Return the rate of the CBF on the same episodes without noise."""
     return measured(ENV, {**setting.options(sample), "noise": 0.0}, [setting.cbf], [], sample)[
         setting.cbf
@@ -130,7 +130,7 @@ def _quiet(setting: PendulumSetting, sample: Sample) -> MeasuredFilter:
 
 def outcome_of(
     setting: PendulumSetting, runs: dict[str, MeasuredFilter], quiet: MeasuredFilter
-) -> Outcome:
+) -> Findings:
     """Return numbers and claims in a setting.
 
     Args:
@@ -165,10 +165,10 @@ def outcome_of(
         Claim(above, ddscbf.rate > THRESHOLD, f"{ddscbf.rate:.1f} % [{low:.1f}, {high:.1f}]"),
         close(runs, PRINTED["SCBF"], PRINTED["DDSCBF"]),
     ]
-    return Outcome(numbers, claims)
+    return Findings(numbers, claims)
 
 
-def in_other_setting(other: Outcome) -> str:
+def in_other_setting(other: Findings) -> str:
     """Return the verdict's reasons had the other setting been the main one, in words."""
     apart = [text for number in other.numbers if (text := disagreement(number))]
     failed = [
@@ -182,7 +182,7 @@ def in_other_setting(other: Outcome) -> str:
     )
 
 
-def _by_printed_estimator(learned: list[Identification], sample: Sample) -> str:
+def _by_printed_estimator(learned: list[NoiseIdentification], sample: Workload) -> str:
     printed = models(learned, "printed")
     options = ({**A.options(sample), **box} for box in ({}, {"box": _UNBOUNDED}))
     rates = (measured(ENV, each, [], printed, sample)["ddscbf"].rate for each in options)
@@ -190,7 +190,7 @@ def _by_printed_estimator(learned: list[Identification], sample: Sample) -> str:
     return CHAPTER.note("table-5.1", "estimator", bounded=bounded, free=free)
 
 
-def _sampled(sample: Sample) -> str:
+def _sampled(sample: Workload) -> str:
     """Return what the CBF of A loses to the control period alone, in words."""
     ahead = f"{A.cbf}:sampling_margin=first-order"
     said = []
@@ -205,7 +205,7 @@ def _sampled(sample: Sample) -> str:
     return f"the CBF is held for 10 ms; safe in A: {'; '.join(said)}"
 
 
-def _horizons(setting: PendulumSetting, sample: Sample) -> str:
+def _horizons(setting: PendulumSetting, sample: Workload) -> str:
     """Return up to which horizons the printed rates of SCBF and CBF are reproduced, in words."""
     found = measured(
         ENV, {"start": setting.start, "horizon": setting.longest}, [setting.cbf, "scbf"], [], sample
@@ -222,7 +222,7 @@ def _horizons(setting: PendulumSetting, sample: Sample) -> str:
     return f"{setting.name}: the printed rates of SCBF and of CBF are both reproduced at {said}"
 
 
-def _bounds(first: Identification, scbf: MeasuredFilter, sample: Sample) -> list[str]:
+def _bounds(first: NoiseIdentification, scbf: MeasuredFilter, sample: Workload) -> list[str]:
     """Return what Prop. 4.2.8 gives, and what Prop. 5.2.2 asks for at the origin, in words."""
     problem, model = make_problem(ENV, **B.options(sample)), first.learned["martingale"]
     margin = next(iter(model.record.errors.values()))
@@ -254,7 +254,7 @@ def printed_term(theta: Any) -> Any:
     return -math.sqrt(3) * (0.1 * theta) ** 2
 
 
-def _table_values(sample: Sample) -> dict[str, Any]:
+def _table_values(sample: Workload) -> dict[str, Any]:
     return {
         "main": B.describe(sample),
         "count": sample.size(EPISODES),

@@ -14,9 +14,9 @@ from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.paired import is_above
 from safe_envs.wrappers.learning.data.collection import draw_states
@@ -27,7 +27,7 @@ _IDENTIFICATIONS = 10
 _NEAR = 0.1  # relative error up to which we should call an estimate near; the thesis gives none
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute Figure 6.3."""
     problem = make_problem(ENV)
     x = draw_states(problem, FRESH, np.random.default_rng([sample.seed, 64]))
@@ -55,7 +55,7 @@ def compute(sample: Sample) -> Outcome:
     for i in (0, 1):
         parts = {"truth": truth, "estimate": means[0], "deviation": deviations[0]}
         shown |= {f"{name} {i + 1}": values[order, i].tolist() for name, values in parts.items()}
-    return Outcome(
+    return Findings(
         numbers=[
             *(
                 bayes.predicted(f"rms error of f_{i + 1}", errors[:, i], unit=unit)
@@ -109,7 +109,7 @@ def near(name: str, relative: np.ndarray) -> Claim:
     )
 
 
-def _draw_drift(figure: Figure, outcome: Outcome) -> None:
+def _draw_drift(figure: Figure, outcome: Findings) -> None:
     data = outcome.data
     panels = figure.subplots(1, 2)
     for i, (letter, unit, axes) in enumerate(
@@ -121,7 +121,7 @@ def _draw_drift(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, panels[0].get_legend_handles_labels()[0])
 
 
-def _values(sample: Sample) -> dict[str, Any]:
+def _values(sample: Workload) -> dict[str, Any]:
     return {"identifications": len(bayes.seeds(sample, _IDENTIFICATIONS))}
 
 

@@ -32,9 +32,9 @@ from safe_envs.scripts.reproduce.chapter_6.learning_times import (
 )
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.paired import measure
 from safe_envs.wrappers.learning.generator import learn_generator
@@ -59,12 +59,12 @@ def printed_second_generator(problem: SafetyProblem) -> sp.Expr:
     )
 
 
-def _world(sample: Sample) -> SafetyProblem:
+def _world(sample: Workload) -> SafetyProblem:
     problem = make_problem(ENV)
     return replace(problem, horizon=_QUICK_HORIZON) if sample.quick else problem
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute Table 6.3."""
     problem, chosen = _world(sample), seeds(sample, _CONTROLLERS)
     size = sample.size(EPISODES), sample.seed
@@ -88,13 +88,13 @@ def compute(sample: Sample) -> Outcome:
     fewer = None if sample.quick else bayesian(REPETITIONS[0], _FEW_CONTROLLERS)
     blind = measure(problem.configured(model={"sigma_1": 0.0, "sigma_2": 0.0}), "scbf", *size)
     by_recursion = measure(problem, "ddscbf", *size, [recursion(sample)])
-    return Outcome(
+    return Findings(
         numbers=table(found),
         claims=[similar({"": found})],
         alternative_settings={}
         if fewer is None
         else {
-            f"K = {REPETITIONS[0]} in the identification": Outcome(
+            f"K = {REPETITIONS[0]} in the identification": Findings(
                 table(fewer), [similar({"": fewer})]
             )
         },
@@ -120,7 +120,7 @@ def _notes(
     ]
 
 
-def _values(sample: Sample) -> dict[str, Any]:
+def _values(sample: Workload) -> dict[str, Any]:
     systems, short = (
         len(seeds(sample, _CONTROLLERS)),
         ", too short for a car to get near the other one,",

@@ -19,9 +19,9 @@ from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.paired import is_above
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
@@ -69,6 +69,9 @@ def study(
         chosen: seeds of the identifications.
         starts: trajectories of the data.
         steps: states of each.
+
+    Returns:
+        The errors of the identifications.
     """
     truth = bayes.true_drift(problem, x)
     estimates, squares, in_deviations, overconfident = [], [], [], []
@@ -147,7 +150,7 @@ def falls_as_printed(
     )
 
 
-def compute_errors(sample: Sample) -> Outcome:
+def compute_errors(sample: Workload) -> Findings:
     """Compute Table 6.1."""
     problem = make_problem(ENV)
     x = draw_states(problem, POINTS, np.random.default_rng([sample.seed, 61]))
@@ -165,7 +168,7 @@ def compute_errors(sample: Sample) -> Outcome:
     many = found[bayes.REPETITIONS[-1]]
     doubt = f"rms error in standard deviations of the posterior, K = {bayes.REPETITIONS[-1]}"
     widths = [n.high / n.low for n in numbers if n.low and n.high]
-    return Outcome(
+    return Findings(
         numbers=[*numbers, Number.mean(doubt, many.errors_in_deviations, least=0.0)],
         claims=[
             *(falls(name, by) for name, by in squares.items()),
@@ -196,7 +199,7 @@ def _compared_with_law(
     return bayes.CHAPTER.note("table-6.1", "law", ratio=ratio, law=law, followed=share, **counts)
 
 
-def compute_figure(sample: Sample) -> Outcome:
+def compute_figure(sample: Workload) -> Findings:
     """Compute Figure 6.1."""
     problem = make_problem(ENV)
     x = draw_states(problem, SHOWN, np.random.default_rng([sample.seed, 62]))
@@ -215,7 +218,7 @@ def compute_figure(sample: Sample) -> Outcome:
     printed = Number.mean(
         covered.name, np.concatenate([s.overconfident for s in found.values()]), least=0.0
     )
-    return Outcome(
+    return Findings(
         numbers=[*numbers, covered],
         claims=[falls("f_2 = x_1^3", {k: np.sqrt(s.squares[:, 1]) for k, s in found.items()})],
         printed_formula=[printed],
@@ -232,7 +235,7 @@ def compute_figure(sample: Sample) -> Outcome:
     )
 
 
-def _draw_drift(figure: Figure, outcome: Outcome) -> None:
+def _draw_drift(figure: Figure, outcome: Findings) -> None:
     data, line = outcome.data, np.linspace(-1.0, 1.0, 201)
     panels = figure.subplots(1, len(bayes.REPETITIONS), sharey=True)
     for letter, axes, k in zip("abc", panels, bayes.REPETITIONS, strict=True):
@@ -243,7 +246,7 @@ def _draw_drift(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, panels[0].get_legend_handles_labels()[0])
 
 
-def _values(states: int, full: int, sample: Sample) -> dict[str, Any]:
+def _values(states: int, full: int, sample: Workload) -> dict[str, Any]:
     return {"states": states, "identifications": len(bayes.seeds(sample, full))}
 
 

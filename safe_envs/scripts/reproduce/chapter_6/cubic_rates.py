@@ -32,9 +32,9 @@ from safe_envs.scripts.reproduce.chapter_6.worst_case import (
 )
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, measure
 from safe_envs.wrappers import SCBF
@@ -79,7 +79,7 @@ class _Models:
     generators: list[GeneratorModel]
 
     @classmethod
-    def learn(cls, world: SafetyProblem, sample: Sample) -> _Models:
+    def learn(cls, world: SafetyProblem, sample: Workload) -> _Models:
         """Learn all; a quick sample does without what is only compared with the table."""
         chosen = seeds(sample, CONTROLLERS)
         compared = () if sample.quick else chosen
@@ -93,7 +93,7 @@ class _Models:
         )
 
 
-def _generator_work(sample: Sample) -> dict[str, Any]:
+def _generator_work(sample: Workload) -> dict[str, Any]:
     return {name: sample.work(_SETTINGS[f"generator_{name}"]) for name in ("points", "repetitions")}
 
 
@@ -121,7 +121,7 @@ class _Column:
     bayesian: LearnedController
     supremum: float
     shortfall: float
-    sample: Sample
+    sample: Workload
 
     @classmethod
     def run(
@@ -130,7 +130,7 @@ class _Column:
         world: SafetyProblem,
         models: _Models,
         worst: tuple[float, float],
-        sample: Sample,
+        sample: Workload,
     ) -> _Column:
         """Evaluate all controllers from the i-th start; worst: supremum and shortfall."""
         name, start = list(PLACES.items())[i]
@@ -201,7 +201,7 @@ class _Column:
         return [measure(problem, "scbf", *size).rates[0] for problem in systems]
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute Table 6.2."""
     world = make_problem(ENV)
     models, found = _Models.learn(world, sample), verify(world, [SCBF()], seed=sample.seed)
@@ -219,7 +219,7 @@ def compute(sample: Sample) -> Outcome:
     few = [number for each in columns if rough for number in each.numbers(rough[each.name])]
     setting = f"K = {REPETITIONS[0]} in the identification"
     measured = {each.name: (each.numbers(each.bayesian)[:3], each.bound) for each in columns}
-    return Outcome(
+    return Findings(
         numbers=[number for each in columns for number in each.numbers(each.bayesian)],
         claims=[
             similar({each.name: each.bayesian for each in columns}),
@@ -228,7 +228,7 @@ def compute(sample: Sample) -> Outcome:
                 _long(sample), {each.name: (each.late(), each.bound) for each in columns}
             ),
         ],
-        alternative_settings={setting: Outcome(few, [similar(rough)])} if few else {},
+        alternative_settings={setting: Findings(few, [similar(rough)])} if few else {},
         printed_formula=[
             number for each in columns for number in each.by_printed_formulas(dull[each.name])
         ],
@@ -260,11 +260,11 @@ def _notes(columns: Sequence[_Column], dull: Mapping[str, Sequence[float]]) -> l
     ]
 
 
-def _long(sample: Sample) -> int:
+def _long(sample: Workload) -> int:
     return QUICK_LONG if sample.quick else LONG
 
 
-def _values(sample: Sample) -> dict[str, Any]:
+def _values(sample: Workload) -> dict[str, Any]:
     systems = len(seeds(sample, CONTROLLERS))
     return {
         **{f"{name}_used": value for name, value in _generator_work(sample).items()},

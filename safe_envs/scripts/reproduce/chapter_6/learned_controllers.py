@@ -107,13 +107,21 @@ class LearnedController:
             models: one at a time.
             reference: the SCBF that knows the system.
             seed: of the episodes.
+
+        Returns:
+            The rates, with their difference to that of the reference.
         """
         found = measure(problem, text, reference.episodes, seed, models)
         gap = difference("", found.flags, reference.flags)
         return cls(found.rates, found.episodes, gap)
 
     def number(self, name: str, printed: float | None = None) -> Number:
-        """Return `rate_of_one_more`; see there."""
+        """Return `rate_of_one_more` of these rates.
+
+        Args:
+            name: of the number.
+            printed: rate in the thesis, in per cent.
+        """
         return rate_of_one_more(name, self.rates, self.episodes, printed)
 
     def describe(self) -> str:

@@ -17,9 +17,9 @@ from safe_envs.scripts.reproduce.chapter_6.identifications import (
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
 
@@ -34,7 +34,7 @@ _RECURSION, _BAYESIAN = _PRINTED_SECONDS
 _FAR_LESS = 10.0
 
 
-def generator_work(sample: Sample) -> dict[str, Any]:
+def generator_work(sample: Workload) -> dict[str, Any]:
     """Return the amount of data of DDSCBF, as `learn_generator` takes it."""
     return {
         "points": sample.work(POINTS),
@@ -42,13 +42,13 @@ def generator_work(sample: Sample) -> dict[str, Any]:
     }
 
 
-def generator_values(sample: Sample) -> dict[str, int]:
+def generator_values(sample: Workload) -> dict[str, int]:
     """Return the same as the lines of a setting name it."""
     return {f"{name}_used": value for name, value in generator_work(sample).items()}
 
 
 @cache
-def recursion(sample: Sample) -> GeneratorModel:
+def recursion(sample: Workload) -> GeneratorModel:
     """Return DDSCBF's networks by the printed estimate, learned once for both tables."""
     how: dict[str, Any] = {"way": "network", "estimator": "printed", "seed": seeds(sample, 1)[0]}
     return learn_generator(make_problem(ENV), **generator_work(sample), **how)
@@ -73,7 +73,7 @@ def sooner(ratio: float) -> list[Claim]:
     ]
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute Table 6.4."""
     problem, networks = make_problem(ENV), recursion(sample)
     how: dict[str, Any] = {"way": "direct", "seed": seeds(sample, 1)[0]}
@@ -92,7 +92,7 @@ def compute(sample: Sample) -> Outcome:
         "printed": printed / evaluations * 1e3,
     }
     quick = predicted(_BAYESIAN, seconds, _PRINTED_SECONDS[_BAYESIAN], "s")
-    return Outcome(
+    return Findings(
         numbers=[
             slow,
             quick,
@@ -115,7 +115,7 @@ def _one_by_one(networks: GeneratorModel) -> float:
     return (time.perf_counter() - begun) / _ONE_BY_ONE
 
 
-def _values(sample: Sample) -> dict[str, int]:
+def _values(sample: Workload) -> dict[str, int]:
     return {**generator_values(sample), "timed": len(seeds(sample, _TIMED))}
 
 

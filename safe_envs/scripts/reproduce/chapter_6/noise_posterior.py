@@ -16,9 +16,9 @@ from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.estimators import rates
@@ -48,13 +48,16 @@ def _ends(content: float) -> tuple[float, float]:
     return (1 - content) / 2, (1 + content) / 2
 
 
-def noise_levels(section: str, unit: tuple[str, ...], sample: Sample) -> Outcome:
+def noise_levels(section: str, unit: tuple[str, ...], sample: Workload) -> Findings:
     """Sample the posterior of sigma from the residuals of fresh trajectories, given f and g.
 
     Args:
         section: of the settings.
         unit: of each level.
         sample: how much is simulated.
+
+    Returns:
+        Medians and intervals of the levels, by the corrected and by the printed likelihood.
     """
     env, prior = (bayes.CHAPTER.settings[section][name] for name in ("env", "prior"))
     problem = make_problem(env)
@@ -88,7 +91,7 @@ def noise_levels(section: str, unit: tuple[str, ...], sample: Sample) -> Outcome
             f" {100 / np.sqrt(2 * count):.2f} % with N = {count} residuals."
         ),
     ]
-    return Outcome(
+    return Findings(
         numbers=numbers,
         claims=[gathered(every, true)],
         printed_formula=printed,
@@ -119,7 +122,7 @@ def gathered(every: Sequence[np.ndarray], true: Sequence[float]) -> Claim:
     )
 
 
-def draw_levels(figure: Figure, outcome: Outcome) -> None:
+def _draw_levels(figure: Figure, outcome: Findings) -> None:
     """Draw histograms of the draws, and the medians by the printed likelihood."""
     data = outcome.data
     panels = figure.subplots(1, 3)
@@ -137,7 +140,7 @@ def draw_levels(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, [first[0], *second])
 
 
-def _draw_likelihoods(axes: Axes, outcome: Outcome) -> None:
+def _draw_likelihoods(axes: Axes, outcome: Findings) -> None:
     """Draw medians by either likelihood; their intervals are thinner than the points."""
     truth = outcome.data["truth"][0]
     for row, numbers in enumerate((outcome.numbers, outcome.printed_formula)):
@@ -164,7 +167,7 @@ def _pretty(unit: str) -> str:
     return unit.replace("sqrt(s)", "$\\sqrt{\\mathrm{s}}$")
 
 
-def _values(sigma: str, sample: Sample) -> dict[str, Any]:
+def _values(sigma: str, sample: Workload) -> dict[str, Any]:
     return {"trajectories": sample.work(NOISE_STARTS), "sigma": sigma}
 
 
@@ -173,7 +176,7 @@ ARTEFACTS: tuple[Artefact, ...] = tuple(
         name,
         partial(noise_levels, section, unit),
         partial(_values, sigma),
-        draw_levels,
+        _draw_levels,
         (7.0, 3.2),
     )
     for name, section, unit, sigma in (

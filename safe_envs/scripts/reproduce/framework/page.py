@@ -17,9 +17,9 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.verdict import RULES, Judgement, judge
 
@@ -32,7 +32,7 @@ class _Entry:
     """An artefact on the page."""
 
     artefact: Artefact
-    outcome: Outcome
+    outcome: Findings
     seconds: float
     judgement: Judgement
     picture: str
@@ -70,7 +70,7 @@ class _Entry:
 
 
 def write_page(
-    folder: Path, found: Sequence[tuple[Artefact, Outcome, float]], sample: Sample
+    folder: Path, found: Sequence[tuple[Artefact, Findings, float]], sample: Workload
 ) -> None:
     """Write `index.html` and `index.md` of what was found.
 

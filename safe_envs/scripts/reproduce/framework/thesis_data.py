@@ -3,8 +3,8 @@
 A file has `settings` (sections of named values) and `artefacts`. An artefact has a title, the lines
 of its setting, its assumptions and errata, the argument why it cannot be reproduced, if any, notes
 and claims by name, and its printed numbers. A claim has a sentence, its evidence, and `printed: no`
-if it is a check of ours. In these texts {name} is a value of the section that the artefact names, or
-one that its module gives.
+if it is a check of ours. In these texts {name} is a value of the section that the artefact names,
+or one that its module gives.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Findings, Workload
 
 _TEXTS = ("setting", "assumptions", "errata")
 _FIELDS = {"settings", "title", *_TEXTS, "argument", "notes", "claims", "printed"}
@@ -74,9 +74,9 @@ class Chapter:
     def artefact(
         self,
         name: str,
-        compute: Callable[[Sample], Outcome],
-        values: Callable[[Sample], Mapping[str, Any]],
-        draw: Callable[[Figure, Outcome], None] | None = None,
+        compute: Callable[[Workload], Findings],
+        values: Callable[[Workload], Mapping[str, Any]],
+        draw: Callable[[Figure, Findings], None] | None = None,
         size: tuple[float, float] = (7.0, 4.2),
     ) -> Artefact:
         """Return an artefact with the texts of this chapter.

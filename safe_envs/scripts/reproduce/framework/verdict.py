@@ -11,9 +11,9 @@ from itertools import permutations
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 
 
@@ -88,7 +88,7 @@ class Judgement:
         return {Verdict.REPRODUCED: "good", Verdict.NOT: "bad"}.get(self.verdict, "middle")
 
 
-def judge(artefact: Artefact, outcome: Outcome, sample: Sample) -> Judgement:
+def judge(artefact: Artefact, outcome: Findings, sample: Workload) -> Judgement:
     """Return the verdict by `RULES`.
 
     Args:
@@ -134,7 +134,7 @@ def judge(artefact: Artefact, outcome: Outcome, sample: Sample) -> Judgement:
     return Judgement(verdict, bool(wrong), _matches_thesis(outcome), tuple(reasons))
 
 
-def _says_something(outcome: Outcome) -> bool:
+def _says_something(outcome: Findings) -> bool:
     return any(number.printed is not None for number in outcome.numbers) or any(
         claim.printed for claim in outcome.claims
     )
@@ -183,7 +183,7 @@ def _turned(orders: Sequence[tuple[Number, Number]]) -> list[tuple[Number, Numbe
     return [(first, second) for first, second in orders if not first.ours > second.ours]
 
 
-def _reached(found: Outcome, outcome: Outcome, failed: Sequence[str]) -> bool:
+def _reached(found: Findings, outcome: Findings, failed: Sequence[str]) -> bool:
     """Return whether another setting gives all that is printed, and what fails otherwise."""
     claims = {claim.sentence: claim.holds for claim in found.claims if claim.printed}
     names = {number.name for number in found.numbers if number.printed is not None}
@@ -196,7 +196,7 @@ def _reached(found: Outcome, outcome: Outcome, failed: Sequence[str]) -> bool:
     )
 
 
-def _matches_thesis(outcome: Outcome) -> bool:
+def _matches_thesis(outcome: Findings) -> bool:
     """Return whether numbers by the printed formula agree with the printed ones."""
     printed = {number.name: number for number in outcome.numbers}
     both = [
