@@ -208,6 +208,11 @@ class ControlAffineSDE:
         """Whether there is any noise, for the parameters as they are."""
         return bool(self.noise_channels)
 
+    @property
+    def parameter_values(self) -> dict[str, float]:
+        """The values of the parameters, by the names of their symbols."""
+        return {p.name: value for p, value in self.parameters.items()}
+
     def with_parameters(self, **values: float) -> ControlAffineSDE:
         """Return the same system with other parameter values.
 

@@ -149,9 +149,7 @@ class SafetyProblem:
         Raises:
             SystemDefinitionError: a state without a finite range has none in `explored` either.
         """
-        ranges = [(s.low, s.high) for s in self.states]
-        angles = [s.unit == "rad" and math.isinf(s.low) and math.isinf(s.high) for s in self.states]
-        return self.explored.completed(self.plant.states, ranges, angles, self.box)
+        return self.explored.completed(self.states, self.box)
 
     def _check_feature_names(self) -> None:
         """Check that a symbol of the nominal controller means one thing."""

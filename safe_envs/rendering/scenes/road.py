@@ -64,16 +64,7 @@ class Road(Scene):
         others = [
             i for i, s in enumerate(self.problem.states) if s.unit == unit and i != self._speed
         ]
-        if others:
-            return others[0]
-        return next(
-            (
-                float(value)
-                for symbol, value in self.problem.plant.parameters.items()
-                if symbol.name == "v_f"
-            ),
-            None,
-        )
+        return others[0] if others else self.problem.plant.parameter_values.get("v_f")
 
     def required(self, states: np.ndarray) -> np.ndarray:
         """Return the gap at which the smallest barrier vanishes at states (k, n), by bisection."""

@@ -136,10 +136,8 @@ def test_printed_numbers_and_settings_are_those_of_the_thesis():
     assert np.array(starts, dtype=float).tolist() == [[-0.1, 0.7], [-0.1, 0.8], [10.0, 15.0]]
     for problem, sigma in ((disk, 0.2), (car, 0.5)):
         assert problem.dt == 0.01
-        assert [identifications.parameter(problem, name) for name in ("sigma_1", "sigma_2")] == [
-            sigma,
-            sigma,
-        ]
+        levels = [problem.plant.parameter_values[name] for name in ("sigma_1", "sigma_2")]
+        assert levels == [sigma, sigma]
 
 
 @pytest.mark.parametrize("sample", [Workload(), Workload(7), QUICK])

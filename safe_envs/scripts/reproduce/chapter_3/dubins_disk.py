@@ -31,13 +31,7 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     thinned,
 )
 from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED
 from safe_envs.wrappers.learning.residual import ResidualModel
 
@@ -247,6 +241,4 @@ def _values(sample: Workload) -> dict[str, Any]:
     }
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    CHAPTER.artefact("figure-3.1", compute_disk, _values, _draw_disk, (7.0, 3.2)),
-)
+ARTEFACTS = (CHAPTER.artefact("figure-3.1", compute_disk, _values, _draw_disk),)

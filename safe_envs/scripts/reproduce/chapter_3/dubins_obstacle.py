@@ -13,20 +13,9 @@ from matplotlib.patches import Circle
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.evaluation_figure import (
-    COLORS,
-    QUIET,
-    UNSAFE,
-    add_legend,
-)
+from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_3 import learned_runs
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
 
 _SETTINGS = learned_runs.CHAPTER.settings["obstacle"]
@@ -255,11 +244,7 @@ def _values(sample: Workload) -> dict[str, Any]:
     return learned_runs.setting_values(make_problem(OBSTACLE), sample)
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    learned_runs.CHAPTER.artefact(
-        "figure-3.2a", compute_passage, _values, _draw_passage, (7.0, 4.9)
-    ),
-    learned_runs.CHAPTER.artefact(
-        "figure-3.2b", compute_clearance, _values, _draw_clearance, (7.0, 3.8)
-    ),
+ARTEFACTS = (
+    learned_runs.CHAPTER.artefact("figure-3.2a", compute_passage, _values, _draw_passage),
+    learned_runs.CHAPTER.artefact("figure-3.2b", compute_clearance, _values, _draw_clearance),
 )

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs import ControlAffineSDE, SafetyProblem
+from safe_envs import SafetyProblem
 from safe_envs.agents import evaluate, make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS
 from safe_envs.scripts.reproduce.framework.artefact import Number, Workload
@@ -94,8 +94,8 @@ def setting_values(problem: SafetyProblem, sample: Workload) -> dict[str, Any]:
     """
     states, epochs = learning_sizes(sample)
     return {
-        "plant": parameters(problem.plant),
-        "model": parameters(problem.model),
+        "plant": problem.plant.parameter_values,
+        "model": problem.model.parameter_values,
         "dt": problem.dt,
         "horizon": problem.horizon,
         "learnings": len(seeds(sample)),
@@ -103,11 +103,6 @@ def setting_values(problem: SafetyProblem, sample: Workload) -> dict[str, Any]:
         "epochs": epochs,
         "episodes": sample.size(LEARNING["episodes"]),
     }
-
-
-def parameters(system: ControlAffineSDE) -> dict[str, float]:
-    """Return the parameters of a system by name."""
-    return {symbol.name: value for symbol, value in system.parameters.items()}
 
 
 @lru_cache(maxsize=8)

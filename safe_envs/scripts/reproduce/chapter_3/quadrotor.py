@@ -12,13 +12,7 @@ from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_3 import learned_runs
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.systems.quadrotor_altitude import g, m, z, zdot
@@ -158,12 +152,11 @@ def _draw(figure: Figure, outcome: Findings) -> None:
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
+ARTEFACTS = (
     learned_runs.CHAPTER.artefact(
         "figure-3.3",
         compute,
         lambda sample: learned_runs.setting_values(hover(sample), sample),
         _draw,
-        (7.0, 4.0),
     ),
 )

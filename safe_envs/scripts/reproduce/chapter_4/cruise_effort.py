@@ -20,7 +20,7 @@ from safe_envs.scripts.reproduce.chapter_4.effort_claims import (
     EffortRecords,
     outcome_of,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Findings, Workload
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_interval
 from safe_envs.scripts.reproduce.framework.episodes import periods
 from safe_envs.wrappers import SafetyFilter, parse_conditions
@@ -157,12 +157,11 @@ def _mark_step(axes: Axes) -> None:
     axes.text(0.03, 0.2, "within the noise\nof one step", **style)
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
+ARTEFACTS = (
     car.CHAPTER.artefact(
         "figure-4.1",
         compute_figure,
         lambda sample: car.setting_values(sample, car.STEP),
         _draw_figure,
-        (7.0, 3.8),
     ),
 )

@@ -9,19 +9,9 @@ import numpy as np
 
 from safe_envs.scripts.reproduce.chapter_4 import dubins_runs as dubins
 from safe_envs.scripts.reproduce.chapter_4.dubins_pictures import draw_points
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.episodes import Violations, episode_seed
-from safe_envs.scripts.reproduce.framework.paired import (
-    is_above,
-    is_below,
-    with_interval,
-)
+from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, with_interval
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.bounds import theorem_4_2_10_printed, union_bound
 from safe_envs.wrappers.verification.formulas import Formulas
@@ -165,9 +155,7 @@ def printed_and_union_bound(starts: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     Both are 0 where A h <= 0.
     """
     formulas = Formulas(dubins.dubins_problem(NOISE, "uniform"), [SCBF()], "model")
-    speed = next(
-        value for symbol, value in formulas.system.parameters.items() if symbol.name == "v"
-    )
+    speed = formulas.system.parameter_values["v"]
     # A h = -2 v (x cos + y sin) - 2 sigma^2 is largest at the edge, straight inwards.
     suprema = [dubins.RADIUS**2, 2 * speed * dubins.RADIUS - 2 * NOISE**2]
     b = formulas.chain(starts)
@@ -208,12 +196,11 @@ def bound_note(
     )
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
+ARTEFACTS = (
     dubins.CHAPTER.artefact(
         "figure-4.3",
         compute_points,
         lambda sample: {"count": sample.size(EPISODES_OF_POINT)},
         draw_points,
-        (7.0, 4.0),
     ),
 )

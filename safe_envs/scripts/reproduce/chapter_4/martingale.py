@@ -19,13 +19,7 @@ from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Variable
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_4 import reciprocal_inputs as scalar
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import draw_interval
 from safe_envs.scripts.reproduce.framework.episodes import episode_seed
 from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, measure
@@ -249,12 +243,8 @@ def _draw_bound(axes: Axes, data: dict[str, Any]) -> None:
     axes.set(xlabel="time (s)", ylabel="safe so far (%)", title="(b)", **limits)
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
+ARTEFACTS = (
     scalar.CHAPTER.artefact(
-        "example-4.2.2",
-        compute,
-        lambda sample: {"count": sample.size(EPISODES)},
-        _draw,
-        (7.0, 4.0),
+        "example-4.2.2", compute, lambda sample: {"count": sample.size(EPISODES)}, _draw
     ),
 )

@@ -16,10 +16,7 @@ from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     models,
     repeated,
 )
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
-    draw_learning,
-    learning_outcome,
-)
+from safe_envs.scripts.reproduce.chapter_5.noise_terms import draw_learning, learning_outcome
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     CHAPTER,
     EPISODES,
@@ -28,19 +25,8 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     explain_gap,
     measured,
 )
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
-from safe_envs.scripts.reproduce.framework.paired import (
-    MeasuredFilter,
-    is_above,
-    is_below,
-    safer,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
+from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, is_above, is_below, safer
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.feasibility import verify
 
@@ -183,13 +169,8 @@ def _no_bound(sample: Workload) -> list[str]:
         return notes
     found = verify(problem, (SCBF(),), samples=1024)
     reason = found.guarantee.applicable_bounds(np.array([FIXED]), problem.duration)[0].reason
-    return [
-        *notes,
-        (
-            f"{reason}; no input in its bounds meets the condition on"
-            f" {100 * found.safe_set.infeasible:.0f} % of C within the workspace"
-        ),
-    ]
+    share = 100 * found.safe_set.infeasible
+    return [*notes, note("not_met", reason=reason, share=share)]
 
 
 def printed_term(x_2: Any) -> Any:
@@ -203,13 +184,12 @@ def _table_values(sample: Workload) -> dict[str, Any]:
 
 _SIGMA = f"sigma = {LEVELS[0]:g} x_2"
 
-ARTEFACTS: tuple[Artefact, ...] = (
+ARTEFACTS = (
     CHAPTER.artefact(
         "figure-5.2",
         partial(learning_outcome, ENV, LEVELS[0], 1, f"-sigma(x_2)^2 at {_SIGMA}", printed_term),
         partial(learning_values, region="C within [-1, 1]^2", law=_SIGMA),
         draw_learning,
-        (7.5, 3.8),
     ),
     CHAPTER.artefact("table-5.2", compute_table, _table_values),
 )

@@ -24,12 +24,7 @@ from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     repeated,
 )
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import is_below
 from safe_envs.wrappers.learning.data.collection import draw_states
 from safe_envs.wrappers.learning.generator import GeneratorModel
@@ -150,11 +145,8 @@ def as_derived(said: str, term: np.ndarray, printed: np.ndarray) -> Claim:
         printed: by the printed formula, there.
     """
     largest = float(np.abs(term - printed).max())
-    return Claim(
-        f"the analytic term is {said}",
-        bool(np.allclose(printed, term, rtol=1e-9, atol=1e-15)),
-        f"off by {largest:.1g} 1/s at most",
-    )
+    holds = np.allclose(printed, term, rtol=1e-9, atol=1e-15)
+    return CHAPTER.claim("figure-5.1", "derived", holds, said=said, largest=largest)
 
 
 def learnable(errors: Sequence[float], truth: np.ndarray) -> Claim:
@@ -168,14 +160,8 @@ def learnable(errors: Sequence[float], truth: np.ndarray) -> Claim:
     """
     constant = float(np.std(truth))
     found = Number.mean("", errors, least=0.0)
-    holds = is_below(found, constant)
-    evidence = (
-        f"rms error of the network {found.ours:.2g} 1/s [{found.low:.2g}, {found.high:.2g}], of the"
-        f" best constant {constant:.2g} 1/s"
-    )
-    return Claim(
-        "what the noise adds to the generator of h can be learned from data", holds, evidence
-    )
+    values = {"error": found, "constant": constant}
+    return CHAPTER.claim("figure-5.1", "learnable", is_below(found, constant), **values)
 
 
 def near(errors: Sequence[float], truth: np.ndarray) -> Claim:
@@ -186,8 +172,7 @@ def near(errors: Sequence[float], truth: np.ndarray) -> Claim:
         truth: the term at the validation states.
     """
     share = float(np.mean(errors)) / _rms(truth)
-    sentence = f"the rms error of the network is below {_CLOSE:.0%} of the term's rms"
-    return Claim(sentence, share < _CLOSE, f"it is {share:.1%} of it", printed=False)
+    return CHAPTER.claim("figure-5.1", "near", share < _CLOSE, limit=_CLOSE, share=share)
 
 
 def _why_printed_fails(

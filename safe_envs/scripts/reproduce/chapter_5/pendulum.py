@@ -19,10 +19,7 @@ from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     models,
     repeated,
 )
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
-    draw_learning,
-    learning_outcome,
-)
+from safe_envs.scripts.reproduce.chapter_5.noise_terms import draw_learning, learning_outcome
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     CHAPTER,
     EPISODES,
@@ -31,12 +28,7 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     explain_gap,
     measured,
 )
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, safer
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
 from safe_envs.wrappers import DDSCBF, SCBF, SafetyFilter
@@ -146,23 +138,14 @@ def outcome_of(
         ),
         runs[WITHOUT].number("CBF with alpha = 0"),
     ]
-    low, high = (100 * end for end in (ddscbf.row.ci_low, ddscbf.row.ci_high))
-    above = (
-        f"DDSCBF is safe in more than {THRESHOLD:g} % of the episodes, as counted, whatever its"
-        " interval"
-    )
+    ends = {"low": 100 * ddscbf.row.ci_low, "high": 100 * ddscbf.row.ci_high}
+    claim = partial(CHAPTER.claim, "table-5.1")
     claims = [
-        Claim(
-            "every trajectory is unsafe with the CBF",
-            cbf.row.safe == 0,
-            f"{cbf.row.safe} of {cbf.row.episodes} are safe",
-        ),
+        claim("unsafe", cbf.row.safe == 0, row=cbf.row),
         safer(
-            "the noise makes trajectories unsafe with the CBF that are safe without it",
-            quiet,
-            cbf,
+            "the noise makes trajectories unsafe with the CBF that are safe without it", quiet, cbf
         ),
-        Claim(above, ddscbf.rate > THRESHOLD, f"{ddscbf.rate:.1f} % [{low:.1f}, {high:.1f}]"),
+        claim("above", ddscbf.rate > THRESHOLD, rate=ddscbf.rate, **ends),
         close(runs, PRINTED["SCBF"], PRINTED["DDSCBF"]),
     ]
     return Findings(numbers, claims)
@@ -176,10 +159,8 @@ def in_other_setting(other: Findings) -> str:
         for claim in other.claims
         if claim.printed and not claim.holds
     ]
-    return (
-        "A and B had both been computed before B was taken as the main setting; in A:"
-        f" {'; '.join([*apart, *failed]) or 'all as in the thesis'}"
-    )
+    reasons = "; ".join([*apart, *failed]) or "all as in the thesis"
+    return CHAPTER.note("table-5.1", "other", reasons=reasons)
 
 
 def _by_printed_estimator(learned: list[NoiseIdentification], sample: Workload) -> str:
@@ -196,12 +177,8 @@ def _sampled(sample: Workload) -> str:
     said = []
     for where, noise in (("without noise", 0.0), ("with it", NOISE)):
         found = measured(ENV, {**A.options(sample), "noise": noise}, [A.cbf, ahead], [], sample)
-        plain = found[A.cbf]
-        said.append(
-            f"{where} {plain.rate:.1f} % (median of the minimum h {plain.row.min_h_median:.1g}),"
-            " with a margin for it"
-            f" {found[ahead].rate:.1f} %"
-        )
+        runs = {"plain": found[A.cbf], "ahead": found[ahead]}
+        said.append(CHAPTER.note("table-5.1", "sampled", where=where, **runs))
     return f"the CBF is held for 10 ms; safe in A: {'; '.join(said)}"
 
 
@@ -240,13 +217,7 @@ def _bounds(first: NoiseIdentification, scbf: MeasuredFilter, sample: Workload) 
     bound = guarantee.applicable_bounds(starts_of(problem), problem.duration)[0]
     bound = bound.without(by_rate(bound.value, scbf.row.ci_high))
     value = f"none, {bound.reason}" if bound.value is None else f"{100 * bound.value:.1f} %"
-    return [
-        *notes,
-        (
-            f"SCBF knows the noise and needs no margin: {bound.name} = {value} ({bound.status});"
-            " measured: see SCBF"
-        ),
-    ]
+    return [*notes, CHAPTER.note("table-5.1", "bound", bound=bound, value=value)]
 
 
 def printed_term(theta: Any) -> Any:
@@ -262,13 +233,12 @@ def _table_values(sample: Workload) -> dict[str, Any]:
     }
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
+ARTEFACTS = (
     CHAPTER.artefact(
         "figure-5.1",
         partial(learning_outcome, ENV, NOISE, 0, "-sqrt(3) (.1 theta)^2", printed_term),
         partial(learning_values, region="C", law=f"sigma = {NOISE:g} theta"),
         draw_learning,
-        (7.5, 3.8),
     ),
     CHAPTER.artefact("table-5.1", compute_table, _table_values),
 )

@@ -11,13 +11,7 @@ from matplotlib.figure import Figure
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import is_above
 from safe_envs.wrappers.learning.data.collection import draw_states
 
@@ -40,11 +34,11 @@ def compute(sample: Workload) -> Findings:
     errors, size = np.sqrt(((means - truth) ** 2).mean(axis=1)), np.sqrt((truth**2).mean(axis=0))
     errors_in_deviations = np.sqrt((((means - truth) / deviations) ** 2).mean(axis=(1, 2)))
     sigma, time = (
-        bayes.parameter(problem, "sigma_1"),
+        problem.plant.parameter_values["sigma_1"],
         bayes.REPETITIONS[-1] * 2 * bayes.STARTS * bayes.STEPS * problem.dt,
     )
     law = float(np.sqrt(learned[0].features.count * sigma**2 / time))
-    most = problem.box[0][1] / bayes.parameter(problem, "M")
+    most = problem.box[0][1] / problem.plant.parameter_values["M"]
     needed = bayes.REPETITIONS[-1] * (law / (_NEAR * size[0])) ** 2
     note = partial(bayes.CHAPTER.note, "figure-6.3")
     by_data = Number.mean(
@@ -81,13 +75,7 @@ def compute(sample: Workload) -> Findings:
 
 def validated(doubt: Number) -> Claim:
     """Return the claim that the mean error is one that the data leave open."""
-    return Claim(
-        f"The identified f is validated at {FRESH} random states: its errors are no larger than its"
-        " posterior leaves open.",
-        not is_above(doubt, 1.0),
-        f"rms error {doubt.ours:.2f} [{doubt.low:.2f}, {doubt.high:.2f}] standard deviations of the"
-        " posterior",
-    )
+    return bayes.CHAPTER.claim("figure-6.3", "validated", not is_above(doubt, 1.0), doubt=doubt)
 
 
 def near(name: str, relative: np.ndarray) -> Claim:
@@ -98,15 +86,8 @@ def near(name: str, relative: np.ndarray) -> Claim:
         relative: errors of some identifications, shape (R,).
     """
     low, high = np.exp(bayes.one_more(np.log(relative)))
-    evidence = (
-        f"relative rms error of one more identification {100 * low:.2g} to {100 * high:.2g} %"
-    )
-    return Claim(
-        f"The identified {name} is that of the car, to {100 * _NEAR:g} % of its size.",
-        bool(high <= _NEAR),
-        evidence,
-        printed=False,
-    )
+    values = {"component": name, "near": 100 * _NEAR, "low": 100 * low, "high": 100 * high}
+    return bayes.CHAPTER.claim("figure-6.3", "near", high <= _NEAR, **values)
 
 
 def _draw_drift(figure: Figure, outcome: Findings) -> None:
@@ -125,6 +106,4 @@ def _values(sample: Workload) -> dict[str, Any]:
     return {"identifications": len(bayes.seeds(sample, _IDENTIFICATIONS))}
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    bayes.CHAPTER.artefact("figure-6.3", compute, _values, _draw_drift, (7.0, 3.4)),
-)
+ARTEFACTS = (bayes.CHAPTER.artefact("figure-6.3", compute, _values, _draw_drift),)

@@ -30,12 +30,7 @@ from safe_envs.scripts.reproduce.chapter_6.learning_times import (
     generator_work,
     recursion,
 )
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import measure
 from safe_envs.wrappers.learning.generator import learn_generator
 
@@ -49,7 +44,7 @@ PRINTED = CHAPTER.printed("table-6.3")
 
 def printed_second_generator(problem: SafetyProblem) -> sp.Expr:
     """Return b_2 by the formula of Sec. 6.3.2, with the numbers of the plant."""
-    values = {symbol.name: value for symbol, value in problem.plant.parameters.items()}
+    values = problem.plant.parameter_values
     (v, z), (u,), mass = problem.plant.states, problem.plant.inputs, values["M"]
     gap, closing = z - 10, values["v_f"] - v
     drag = values["f_0"] + values["f_1"] * v + values["f_2"] * v**2
@@ -135,4 +130,4 @@ def _values(sample: Workload) -> dict[str, Any]:
     }
 
 
-ARTEFACTS: tuple[Artefact, ...] = (CHAPTER.artefact("table-6.3", compute, _values),)
+ARTEFACTS = (CHAPTER.artefact("table-6.3", compute, _values),)

@@ -16,13 +16,7 @@ from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import is_above
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
 from safe_envs.wrappers.learning.data.transitions import Transitions
@@ -32,6 +26,8 @@ from safe_envs.wrappers.learning.regression import Rows, posterior
 
 _SETTINGS = bayes.CHAPTER.settings["cubic"]
 ENV, PRIOR, POINTS, SHOWN = (_SETTINGS[name] for name in ("env", "prior", "points", "shown"))
+_note = partial(bayes.CHAPTER.note, "table-6.1")
+_claim = partial(bayes.CHAPTER.claim, "table-6.1")
 _IDENTIFICATIONS, _PICTURED = 40, 20  # for Table 6.1 and for Fig. 6.1
 _PRINTED_MSE = bayes.CHAPTER.printed("table-6.1")
 _UNITS = {"f_1": "(x_1/s)^2", "f_2": "(x_2/s)^2"}
@@ -115,9 +111,7 @@ def falls(name: str, squares: Mapping[int, np.ndarray]) -> Claim:
         sure.append(is_above(ratio))
         low, fold, high = np.exp([ratio.low or 0.0, ratio.ours, ratio.high or 0.0])
         evidence.append(f"{fold:.2g}-fold [{low:.2g}, {high:.2g}] on average from K = {a} to {b}")
-    return Claim(
-        f"The error of {name} falls as the repetitions K grow.", all(sure), ", ".join(evidence)
-    )
+    return _claim("falls", all(sure), what=name, each=", ".join(evidence))
 
 
 def falls_as_printed(
@@ -136,18 +130,10 @@ def falls_as_printed(
         ratios = np.log(squares[a] / squares[b])
         low, high = map(math.exp, bayes.one_more(ratios))
         possible.append(low <= by[a] / by[b] <= high)
-        evidence.append(
-            f"from K = {a} to {b} {by[a] / by[b]:.3g}-fold in the thesis,"
-            f" {math.exp(ratios.mean()):.3g}-fold [{low:.2g}, {high:.2g}] here, {b / a:.3g}-fold by"
-            " the law"
-        )
-    fold, first, last = by[min(by)] / by[max(by)], min(by), max(by)
-    return Claim(
-        f"The MSE of {name} falls {fold:.0f}-fold from K = {first} to {last}, in the printed"
-        " steps.",
-        all(possible),
-        "; ".join(evidence),
-    )
+        folds = {"printed": by[a] / by[b], "ours": math.exp(ratios.mean()), "law": b / a}
+        evidence.append(_note("fold", a=a, b=b, low=low, high=high, **folds))
+    ends = {"fold": by[min(by)] / by[max(by)], "first": min(by), "last": max(by)}
+    return _claim("as_printed", all(possible), what=name, each="; ".join(evidence), **ends)
 
 
 def compute_errors(sample: Workload) -> Findings:
@@ -176,7 +162,7 @@ def compute_errors(sample: Workload) -> Findings:
         ],
         printed_formula=[Number.mean(doubt, many.overconfident, least=0.0)],
         notes=[
-            bayes.CHAPTER.note("table-6.1", "span", least=min(widths), largest=max(widths)),
+            _note("span", least=min(widths), largest=max(widths)),
             _compared_with_law(problem, x, chosen, found[bayes.REPETITIONS[0]]),
         ],
     )
@@ -190,13 +176,13 @@ def _compared_with_law(
     They are from states all over the disk and from as many on trajectories.
     """
     spread_out = study(problem, x, bayes.REPETITIONS[0], chosen, bayes.STARTS * bayes.STEPS, 1)
-    sigma = bayes.parameter(problem, "sigma_1")
+    sigma = problem.plant.parameter_values["sigma_1"]
     time = bayes.REPETITIONS[0] * bayes.STARTS * bayes.STEPS * problem.dt
     law = Features.of(problem, bayes.DEGREE).count * sigma**2 / time
     ratio = Number.mean("ratio", spread_out.squares.mean(axis=1) / law, least=0.0)
     counts = {"data": bayes.STARTS * bayes.STEPS, "count": len(chosen)}
     share = followed.squares.mean() / law
-    return bayes.CHAPTER.note("table-6.1", "law", ratio=ratio, law=law, followed=share, **counts)
+    return _note("law", ratio=ratio, law=law, followed=share, **counts)
 
 
 def compute_figure(sample: Workload) -> Findings:
@@ -250,9 +236,9 @@ def _values(states: int, full: int, sample: Workload) -> dict[str, Any]:
     return {"states": states, "identifications": len(bayes.seeds(sample, full))}
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
+ARTEFACTS = (
     bayes.CHAPTER.artefact(
-        "figure-6.1", compute_figure, partial(_values, SHOWN, _PICTURED), _draw_drift, (7.0, 3.2)
+        "figure-6.1", compute_figure, partial(_values, SHOWN, _PICTURED), _draw_drift
     ),
     bayes.CHAPTER.artefact("table-6.1", compute_errors, partial(_values, POINTS, _IDENTIFICATIONS)),
 )

@@ -81,16 +81,6 @@ def true_drift(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
     return np.array([f(row) for row in x.tolist()], dtype=float)
 
 
-def parameter(problem: SafetyProblem, name: str) -> float:
-    """Return a parameter of the plant, such as a noise level.
-
-    Args:
-        problem: with the plant.
-        name: of the parameter.
-    """
-    return {symbol.name: value for symbol, value in problem.plant.parameters.items()}[name]
-
-
 def seeds(sample: Workload, full: int) -> range:
     """Return seeds of identifications, others for each seed of the sample.
 

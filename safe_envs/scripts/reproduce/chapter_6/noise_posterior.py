@@ -13,13 +13,7 @@ from matplotlib.figure import Figure
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.estimators import rates
 from safe_envs.wrappers.learning.regression import sigma_map, sigma_samples
@@ -70,7 +64,7 @@ def noise_levels(section: str, unit: tuple[str, ...], sample: Workload) -> Findi
     squares, count = (left**2).sum(axis=0), len(left)
     rng = np.random.default_rng([sample.seed, 63])
     alpha, beta = PRIOR_OF_SIGMA
-    true = [bayes.parameter(problem, name) for name in ("sigma_1", "sigma_2")]
+    true = [problem.plant.parameter_values[name] for name in ("sigma_1", "sigma_2")]
     numbers, printed, every, shown = [], [], [], {"truth": true}
     for i, (s, at) in enumerate(zip(squares.tolist(), unit, strict=True), start=1):
         draws = sigma_samples(s / problem.dt, count, alpha, beta, DRAWS, rng)
@@ -83,20 +77,14 @@ def noise_levels(section: str, unit: tuple[str, ...], sample: Workload) -> Findi
         shown |= {f"counts {i}": counts.tolist(), f"edges {i}": edges.tolist()}
     modes = sigma_map(squares / problem.dt, np.full(len(squares), count), alpha, beta).tolist()
     sharp = np.mean([draws.std() / draws.mean() for draws in every])
-    notes = [
-        (
-            "Most probable:"
-            f" {', '.join(f'sigma_{i} = {mode:.4f}' for i, mode in enumerate(modes, start=1))}."
-            f" Relative standard deviation {100 * sharp:.2f} %; by the law sqrt(1/(2 N))"
-            f" {100 / np.sqrt(2 * count):.2f} % with N = {count} residuals."
-        ),
-    ]
+    probable = ", ".join(f"sigma_{i} = {mode:.4f}" for i, mode in enumerate(modes, start=1))
+    law = {"deviation": 100 * sharp, "law": 100 / np.sqrt(2 * count), "count": count}
     return Findings(
         numbers=numbers,
         claims=[gathered(every, true)],
         printed_formula=printed,
         data=shown,
-        notes=notes,
+        notes=[bayes.CHAPTER.note("figure-6.2", "modes", modes=probable, **law)],
     )
 
 
@@ -112,14 +100,12 @@ def gathered(every: Sequence[np.ndarray], true: Sequence[float]) -> Claim:
     levels = _ends(1 - (1 - bayes.CONFIDENCE) / len(every))
     found = [tuple(np.quantile(draws, levels).tolist()) for draws in every]
     content = f"{100 * (levels[1] - levels[0]):g} %"
-    return Claim(
-        "The posteriors of sigma_1 and sigma_2 are around the true values.",
-        all(low <= level <= high for (low, high), level in zip(found, true, strict=True)),
-        "; ".join(
-            f"{content} of that of sigma_{i} in [{low:.4f}, {high:.4f}], true {level:g}"
-            for i, ((low, high), level) in enumerate(zip(found, true, strict=True), start=1)
-        ),
+    holds = all(low <= level <= high for (low, high), level in zip(found, true, strict=True))
+    each = "; ".join(
+        f"{content} of that of sigma_{i} in [{low:.4f}, {high:.4f}], true {level:g}"
+        for i, ((low, high), level) in enumerate(zip(found, true, strict=True), start=1)
     )
+    return bayes.CHAPTER.claim("figure-6.2", "gathered", holds, each=each)
 
 
 def _draw_levels(figure: Figure, outcome: Findings) -> None:
@@ -171,13 +157,9 @@ def _values(sigma: str, sample: Workload) -> dict[str, Any]:
     return {"trajectories": sample.work(NOISE_STARTS), "sigma": sigma}
 
 
-ARTEFACTS: tuple[Artefact, ...] = tuple(
+ARTEFACTS = tuple(
     bayes.CHAPTER.artefact(
-        name,
-        partial(noise_levels, section, unit),
-        partial(_values, sigma),
-        _draw_levels,
-        (7.0, 3.2),
+        name, partial(noise_levels, section, unit), partial(_values, sigma), _draw_levels
     )
     for name, section, unit, sigma in (
         ("figure-6.2", "cubic", ("1/sqrt(s)", "1/sqrt(s)"), ".2"),

@@ -1,10 +1,10 @@
 """Settings, printed numbers, assumptions and errata of the thesis: `thesis/chapter_N.yaml`.
 
-A file has `settings` (sections of named values) and `artefacts`. An artefact has a title, the lines
-of its setting, its assumptions and errata, the argument why it cannot be reproduced, if any, notes
-and claims by name, and its printed numbers. A claim has a sentence, its evidence, and `printed: no`
-if it is a check of ours. In these texts {name} is a value of the section that the artefact names,
-or one that its module gives.
+A file has `settings` (sections of named values) and `artefacts`. An artefact has a title, the size
+of its figure in inches, the lines of its setting, its assumptions and errata, the argument why it
+cannot be reproduced, if any, notes and claims by name, and its printed numbers. A claim has a
+sentence, its evidence, and `printed: no` if it is a check of ours. In these texts {name} is a value
+of the section that the artefact names, or one that its module gives.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ from matplotlib.figure import Figure
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Findings, Workload
 
+_SIZE = [7.0, 4.2]
 _TEXTS = ("setting", "assumptions", "errata")
-_FIELDS = {"settings", "title", *_TEXTS, "argument", "notes", "claims", "printed"}
+_FIELDS = {"settings", "title", "size", *_TEXTS, "argument", "notes", "claims", "printed"}
 
 
 @dataclass(frozen=True)
@@ -77,7 +78,6 @@ class Chapter:
         compute: Callable[[Workload], Findings],
         values: Callable[[Workload], Mapping[str, Any]],
         draw: Callable[[Figure, Findings], None] | None = None,
-        size: tuple[float, float] = (7.0, 4.2),
     ) -> Artefact:
         """Return an artefact with the texts of this chapter.
 
@@ -86,7 +86,6 @@ class Chapter:
             compute: does the work.
             values: what the lines of the setting name beyond the section's values, for a sample.
             draw: fills an empty figure from the outcome; None for a table.
-            size: of the figure, in inches.
         """
         text = self.artefacts[name]
         section = self.settings[text["settings"]]
@@ -103,7 +102,7 @@ class Chapter:
             filled("errata"),
             text["argument"].format(**section),
             draw,
-            size,
+            text["size"],
         )
 
 
@@ -147,7 +146,7 @@ def _artefact(given: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str
     lines = {key: tuple(_lines(given.get(key, []))) for key in _TEXTS}
     notes = {key: _text(text) for key, text in given.get("notes", {}).items()}
     named = {key: _values(given.get(key, {})) for key in ("claims", "printed")}
-    return {**single, **lines, "notes": notes, **named}
+    return {**single, **lines, "notes": notes, **named, "size": _value(given.get("size", _SIZE))}
 
 
 def _lines(given: Any) -> list[str]:

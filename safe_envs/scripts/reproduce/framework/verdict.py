@@ -6,15 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from importlib.resources import files
 from itertools import permutations
 
+import yaml
+
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Findings, Number, Workload
 
 
 class Verdict(StrEnum):
@@ -28,30 +26,11 @@ class Verdict(StrEnum):
     NONE = "no verdict, for a quick run"
 
 
-RULES = {
-    Verdict.REPRODUCED: (
-        "every claim of the thesis holds, every printed number agrees, and no order of printed"
-        " numbers is turned. A rate agrees if the 95 % interval of its difference to the printed"
-        " one, at the printed sample size, holds 0, and ours is at most twice as wide as the"
-        " thesis'; another number, if the printed one is inside our 95 % interval. An order"
-        " counts if the printed sample sizes can tell the two numbers apart at 95 %"
-    ),
-    Verdict.ORDERING: (
-        "some number does not agree, but every claim holds, and no order of printed numbers is"
-        " turned"
-    ),
-    Verdict.ALTERNATIVE: (
-        "neither of the above, but with the settings that are named every printed number agrees, no"
-        " order is turned, and the claims that are looked at there hold, among them all that do not"
-        " hold otherwise"
-    ),
-    Verdict.NOT: "none of the above; the argument is given, if one is known",
-    Verdict.WRONG_FORMULA: (
-        "said in addition: a number by the printed formula is outside our interval by the corrected"
-        " one. It gives the thesis' numbers where these agree with them"
-    ),
-    Verdict.NONE: "a twentieth of the work shows that it works, and not what comes out",
-}
+_TEXTS = yaml.safe_load(
+    (files("safe_envs.scripts.reproduce") / "thesis" / "verdicts.yaml").read_text("utf-8")
+)
+RULES = {verdict: _TEXTS[verdict.value] for verdict in Verdict}
+"""By what each verdict is reached, in words."""
 
 _WIDEST = 2.0
 """How many times wider than that of a printed rate our interval may be, to say that the two agree.
