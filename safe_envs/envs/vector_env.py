@@ -16,7 +16,7 @@ from safe_envs.envs.info import Info, with_masks
 from safe_envs.envs.seeding import Generators, Seeds
 from safe_envs.envs.simulation import NoiseStreams, Simulation, steps_until
 from safe_envs.envs.spaces import BatchActions, action_box, observation_box
-from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 
@@ -56,8 +56,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        if not isinstance(num_envs, int) or num_envs < 1:
-            raise ConfigurationError(f"num_envs = {num_envs!r}; give a whole number from 1")
+        require_whole("num_envs", num_envs, 1)
         self.viewer = open_viewer(problem, render_mode, num_envs)
         self.render_mode = render_mode
         self._autoreset = _mode(autoreset_mode)

@@ -12,7 +12,13 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
+from safe_envs.errors import (
+    ConfigurationError,
+    SystemDefinitionError,
+    nearest,
+    require_whole,
+    shown,
+)
 from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
@@ -169,10 +175,7 @@ class SafetyProblem:
                 f"horizon = {self.horizon} s; it must hold at least one control period of"
                 f" {self.dt} s"
             )
-        if not isinstance(self.substeps, int) or self.substeps < 1:
-            raise ConfigurationError(
-                f"substeps = {shown(self.substeps)}; give a whole number from 1"
-            )
+        require_whole("substeps", self.substeps, 1)
 
     def gains_of(self, barrier: int) -> tuple[float, ...]:
         """Return the rates p_1..p_r of a barrier, given by its index."""

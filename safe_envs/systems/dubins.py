@@ -21,6 +21,19 @@ v, sigma_1, sigma_2 = sp.symbols("v sigma_1 sigma_2", real=True)
 cos_theta, sin_theta = sp.symbols("cos_theta sin_theta", real=True)
 
 _HEADING_GAIN = 2
+HEADING = (
+    Feature("cos_theta", sp.cos(theta), -1.0, 1.0),
+    Feature("sin_theta", sp.sin(theta), -1.0, 1.0),
+)
+"""The heading, as it is observed."""
+
+SHOWN: dict[str, Any] = {
+    "noise": ("sigma_1", "sigma_2"),
+    "plane": ("x", "y"),
+    "scene": "top-view",
+}
+"""Attributes of every problem with the vehicle."""
+
 UNIFORMS = uniforms(3)
 """Of a start anywhere: area, direction and heading."""
 
@@ -115,15 +128,12 @@ def disk_problem(
         features=(
             Feature("x", x, -2 * r, 2 * r),
             Feature("y", y, -2 * r, 2 * r),
-            Feature("cos_theta", sp.cos(theta), -1.0, 1.0),
-            Feature("sin_theta", sp.sin(theta), -1.0, 1.0),
+            *HEADING,
         ),
         reward=reward,
         nominal=(turn_rate,),
         starts={**starts, "uniform": Start(anywhere(r), UNIFORMS)},
-        noise=("sigma_1", "sigma_2"),
-        plane=("x", "y"),
-        scene="top-view",
+        **SHOWN,
         explored=SamplingDomain(region=((-r, r), (-r, r), (-math.pi, math.pi))),
         **rest,
     )

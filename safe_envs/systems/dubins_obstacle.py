@@ -14,7 +14,7 @@ from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import around, positive, uniforms
-from safe_envs.systems.dubins import omega, theta, turn_rate_towards, vehicle, x, y
+from safe_envs.systems.dubins import HEADING, SHOWN, omega, theta, turn_rate_towards, vehicle, x, y
 
 x_o, y_o, v_o = sp.symbols("x_o y_o v_o", real=True)
 
@@ -114,8 +114,7 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
         features=(
             Feature("x", x, -5.0, 6.0),
             Feature("y", y, -5.0, 5.0),
-            Feature("cos_theta", sp.cos(theta), -1.0, 1.0),
-            Feature("sin_theta", sp.sin(theta), -1.0, 1.0),
+            *HEADING,
             Feature("ahead_x", x_o - x, -11.0, 25.0),
             Feature("ahead_y", y_o - y, -10.0, 10.0),
         ),
@@ -131,11 +130,9 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
         },
         dt=0.05,
         horizon=15.0,
-        noise=("sigma_1", "sigma_2"),
         gains=(1.0, 1.0),
         filter="hocbf",
-        plane=("x", "y"),
-        scene="top-view",
+        **SHOWN,
         explored=SamplingDomain(
             region=((-3.0, 4.0), (-3.0, 3.0), (-math.pi, math.pi), (-2.0, 7.0), (-1.0, 1.0)),
             coordinates=(sp.cos(theta), sp.sin(theta), x_o - x, y_o - y),

@@ -229,8 +229,8 @@ def test_force_near_the_edge() -> None:
     assert np.allclose(cruise_effort.needed(setting, "scbf"), drag)
     assert np.allclose(cruise_effort.needed(setting, "srcbf")[acting], asked[acting], rtol=1e-6)
     for each in (setting, cruise_setting.FITTED):
-        assert (each.tau * cruise_setting.NOISE) ** 2 / each.stricter_below() == pytest.approx(
-            each.gamma * each.stricter_below() ** 3
+        assert (each.tau * cruise_setting.NOISE) ** 2 / each.stricter_below == pytest.approx(
+            each.gamma * each.stricter_below**3
         )
 
 
@@ -249,9 +249,9 @@ def test_printed_program() -> None:
 
 def test_printed_table_is_out_of_reach_of_the_default() -> None:
     """The Gaussian law, its inverse, and the simulation agree."""
-    assert cruise_setting.ASSUMED.most_unsafe() == pytest.approx(2 * ndtr(-(150 - 15 * 1.8) / 18.0))
-    assert f"at most {cruise_setting.ASSUMED.most_unsafe():.1g}," in ARTEFACTS["table-4.1"].argument
-    assert cruise.headway_for(cruise_setting.FITTED.most_unsafe()) == pytest.approx(
+    assert cruise_setting.ASSUMED.most_unsafe == pytest.approx(2 * ndtr(-(150 - 15 * 1.8) / 18.0))
+    assert f"at most {cruise_setting.ASSUMED.most_unsafe:.1g}," in ARTEFACTS["table-4.1"].argument
+    assert cruise.headway_for(cruise_setting.FITTED.most_unsafe) == pytest.approx(
         cruise_setting.FITTED.tau
     )
     assert ours("table-4.1")["SCBF, unbounded"].ours == 100.0

@@ -140,15 +140,9 @@ def headway_for(unsafe: float) -> float:
 
 def _gaussian_note() -> str:
     unsafe = 1 - PRINTED["SCBF, unbounded"] / 100
-    return car.CHAPTER.note(
-        "table-4.1",
-        "gaussian",
-        most_unsafe=car.ASSUMED.most_unsafe(),
-        most_unsafe_fitted=car.FITTED.most_unsafe(),
-        tau_fitted=car.FITTED.tau,
-        unsafe=100 * unsafe,
-        needed=headway_for(unsafe),
-    )
+    settings = {"assumed": car.ASSUMED, "fitted": car.FITTED}
+    numbers = {"unsafe": 100 * unsafe, "needed": headway_for(unsafe)}
+    return car.CHAPTER.note("table-4.1", "gaussian", **settings, **numbers)
 
 
 def _odd_note() -> str:

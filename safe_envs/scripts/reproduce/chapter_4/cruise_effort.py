@@ -109,8 +109,8 @@ def simulated(
 
 
 def _strict_note() -> str:
-    below = {"assumed": car.ASSUMED.stricter_below(), "fitted": car.FITTED.stricter_below()}
-    return car.CHAPTER.note("figure-4.1", "strict", goal=car.FITTED_GOAL, **below)
+    settings = {"assumed": car.ASSUMED, "fitted": car.FITTED}
+    return car.CHAPTER.note("figure-4.1", "strict", goal=car.FITTED_GOAL, **settings)
 
 
 def _ends_note(runs: EffortRecords) -> str:

@@ -55,6 +55,7 @@ class CruiseSettings:
         """Return the texts of the two conditions."""
         return {"SRCBF": f"srcbf:gamma={self.gamma}", "SCBF": "scbf"}
 
+    @property
     def most_unsafe(self) -> float:
         """Return the largest probability of a violation under any controller with A h >= 0.
 
@@ -63,6 +64,7 @@ class CruiseSettings:
         distance, deviation = START[2] - self.tau * START[0], self.tau * NOISE * math.sqrt(HORIZON)
         return float(2.0 * ndtr(-distance / deviation))
 
+    @property
     def stricter_below(self) -> float:
         """Return the h in m below which the SRCBF asks for more than the SCBF.
 

@@ -116,16 +116,9 @@ def claim_on_points(runs: Sequence[dubins.ByFilter], horizon: float) -> Claim:
         for rival in dubins.ALPHAS
     }
     evidence = [
-        dubins.CHAPTER.note(
-            "figure-4.3",
-            "against",
-            rival=rival,
-            gap=with_interval(gap),
-            above=sum(g > 0 for g in each[rival]),
-            count=len(runs),
-            least=min(each[rival]),
-            most=max(each[rival]),
-        )
+        f"SCBF - {rival}: {with_interval(gap)} points on average, above 0 from"
+        f" {sum(g > 0 for g in each[rival])} of {len(runs)} starts, between {min(each[rival]):.1f}"
+        f" and {max(each[rival]):.1f}"
         for rival, gap in overall.items()
     ]
     holds = all(is_above(gap) for gap in overall.values())
@@ -182,17 +175,11 @@ def bound_note(
     last = [run.rate("", dubins.step_of(max(dubins.HORIZONS))) for run in runs]
     below = sum(is_below(last[i], 100 * product[i]) for i in inside)
     share = 100 * np.mean([run.infeasible for run in runs])
+    counts = {"inside": len(inside), "count": len(runs), "below": below}
+    bounds = {"product": 100 * product.max(), "union": 100 * union.max(), "share": share}
+    longest = max(dubins.HORIZONS)
     return dubins.CHAPTER.note(
-        "figure-4.3",
-        "bounds",
-        name=name,
-        inside=len(inside),
-        count=len(runs),
-        below=below,
-        longest=max(dubins.HORIZONS),
-        product=100 * product.max(),
-        union=100 * union.max(),
-        share=share,
+        "figure-4.3", "bounds", name=name, longest=longest, **counts, **bounds
     )
 
 
