@@ -13,7 +13,7 @@ from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
-from safe_envs.systems._common import around, positive, uniforms
+from safe_envs.systems._common import positive, spread
 from safe_envs.systems.dubins import HEADING, SHOWN, omega, theta, turn_rate_towards, vehicle, x, y
 
 x_o, y_o, v_o = sp.symbols("x_o y_o v_o", real=True)
@@ -97,7 +97,6 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
     """
     r = positive("radius", radius)
     moving = {x_o: v_o, y_o: sp.Integer(0)}
-    spread = uniforms(3)
     return SafetyProblem(
         name="DubinsObstacle",
         plant=vehicle_among(0.8, moving, {v_o: 0.5}),
@@ -119,13 +118,7 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
             Feature("ahead_y", y_o - y, -10.0, 10.0),
         ),
         starts={
-            "spread": Start(
-                (
-                    *(around(s, 0.5, w) for s, w in zip(_START, spread, strict=True)),
-                    *map(sp.Float, _OBSTACLE_START),
-                ),
-                spread,
-            ),
+            "spread": spread((*_START, *_OBSTACLE_START), (0.5, 0.5, 0.5, 0.0, 0.0)),
             "thesis": Start.at((*_START, *_OBSTACLE_START)),
         },
         dt=0.05,

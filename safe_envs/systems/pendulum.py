@@ -9,7 +9,7 @@ from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Variable
-from safe_envs.systems._common import around, positive, uniforms
+from safe_envs.systems._common import positive, spread
 
 theta, thetadot, u = sp.symbols("theta thetadot u", real=True)
 m, ell, g, sigma = sp.symbols("m l g sigma", real=True)
@@ -52,7 +52,6 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         sp.sqrt(c * P.inv().row(0)[0])
     )  # largest angle, and largest speed, in the ellipse
     system = inverted_pendulum()
-    first, second = uniforms(2)
     return SafetyProblem(
         name="Pendulum",
         plant=system,
@@ -63,9 +62,7 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         reward=sp.exp(-((5 * (theta - _TARGET)) ** 2)),
         nominal=(sp.Integer(0),),
         starts={
-            "uniform": Start(
-                (around(0.0, reach, first), around(0.0, reach, second)), (first, second), h
-            ),
+            "uniform": spread((0.0, 0.0), (reach, reach), h),
             "near-origin": Start.at((0.1, 0.1)),
         },
         dt=0.01,

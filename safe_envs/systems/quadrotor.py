@@ -75,7 +75,9 @@ def quadrotor(mass: float) -> ControlAffineSDE:
         input_matrix=by_force * MIXING,
         diffusion=diffusion,
         parameters={
-            m: mass, g: vertical.GRAVITY, **_AIRFRAME,
+            m: mass,
+            g: vertical.GRAVITY,
+            **_AIRFRAME,
             **dict.fromkeys((sigma_x, sigma_y, sigma_z), 0.0),
         },
     )

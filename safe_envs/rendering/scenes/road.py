@@ -118,7 +118,7 @@ class Road(Scene):
         self._draw_dimension(
             canvas, own, edge, top + height + 14, f"required {number(required)} m", EDGE, False
         )
-        self._draw_speeds(canvas, snapshot, own, lead)
+        self._draw_speeds(canvas, snapshot)
 
     def _draw_dimension(
         self,
@@ -138,9 +138,7 @@ class Road(Scene):
             text, at, mix(color, INK, 0.7), SMALL, bold=True, align=(0.5, 1.0 if above else 0.0)
         )
 
-    def _draw_speeds(
-        self, canvas: Canvas, snapshot: EpisodeSnapshot, own: float, lead: float
-    ) -> None:
+    def _draw_speeds(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         y = _ROAD[1] + _ROAD[3] + 34
         speed = float(snapshot.state[self._speed])
         canvas.text(f"own {number(speed)} m/s", (14, y), INK, SMALL)

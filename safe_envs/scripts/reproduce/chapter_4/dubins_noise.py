@@ -37,7 +37,10 @@ def compute_noises(sample: Workload) -> Findings:
         level: dubins.simulate(dubins.SCBF_ONLY, level, "uniform", episodes, seed)
         for level in BEYOND
     }
-    named = {dubins.STARTS[start]: _at(runs[start], NOISES) for start in dubins.STARTS}
+    named = {
+        name: {level: runs[start][level] for level in NOISES}
+        for start, name in dubins.STARTS.items()
+    }
     alternatives = dubins.alternatives_of(named, printed, claim_on_noises)
     return Findings(
         numbers=[*_rates(main, NOISES), *_rates(beyond, BEYOND), *_differences(main)],
@@ -76,12 +79,6 @@ def compute_noises(sample: Workload) -> Findings:
             _infeasible(main),
         ],
     )
-
-
-def _at(
-    runs: Mapping[float, dubins.ByFilter], levels: Sequence[float]
-) -> dict[float, dubins.ByFilter]:
-    return {level: runs[level] for level in levels}
 
 
 def _rates(runs: Mapping[float, dubins.ByFilter], levels: Sequence[float]) -> list[Number]:
