@@ -123,10 +123,9 @@ class Panel:
         canvas.diamond((x, y + 8), 5, None, style.INK)
         x += 11 + canvas.text("nominal", (x + 11, y), style.INK, style.SMALL) + 16
         canvas.fill((x, y + 2, 18, 13), style.UNSAFE)
-        canvas.within((x, y + 2, 18, 13))
-        for offset in range(-12, 18, 6):
-            canvas.line((x + offset, y + 15), (x + offset + 13, y + 2), style.HATCH, 2)
-        canvas.within(None)
+        with canvas.within((x, y + 2, 18, 13)):
+            for offset in range(-12, 18, 6):
+                canvas.line((x + offset, y + 15), (x + offset + 13, y + 2), style.HATCH, 2)
         canvas.frame((x, y + 2, 18, 13), style.EDGE)
         canvas.text("h < 0", (x + 24, y), style.INK, style.SMALL)
 
