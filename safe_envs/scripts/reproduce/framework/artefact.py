@@ -71,6 +71,11 @@ class Number:
     printed_trials: int | None = None
     unit: str = ""
 
+    @property
+    def suffix(self) -> str:
+        """Return the unit as it follows a value."""
+        return f" {self.unit}" if self.unit else ""
+
     @classmethod
     def rate(
         cls,

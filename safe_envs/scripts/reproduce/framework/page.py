@@ -119,34 +119,24 @@ def _picture(folder: Path, artefact: Artefact) -> str:
 
 
 def _value(number: Number) -> str:
-    return _quantity(number.ours, number.unit)
+    form = ".1f" if number.unit == "%" else ".3g"
+    return f"{number.ours:{form}}{number.suffix}"
 
 
 def _range(number: Number) -> str:
     if number.low is None or number.high is None:
         return ""
-    return (
-        f"[{_quantity(number.low, '')}, {_quantity(number.high, '')}]"
-        if number.unit != "%"
-        else f"[{number.low:.1f}, {number.high:.1f}]"
-    )
+    form = ".1f" if number.unit == "%" else ".3g"
+    return f"[{number.low:{form}}, {number.high:{form}}]"
 
 
 def _printed(number: Number) -> str:
     if number.printed is None:
         return "-"
     size = f" (of {number.printed_trials})" if number.printed_trials else ""
-    return f"{number.printed:g}{_unit(number.unit)}{size}"
+    return f"{number.printed:g}{number.suffix}{size}"
 
 
 def _cell(text: str) -> str:
     """Return a text as a cell of a Markdown table."""
     return text.replace("|", "\\|")
-
-
-def _quantity(value: float, unit: str) -> str:
-    return f"{value:.1f} %" if unit == "%" else f"{value:.3g}{_unit(unit)}"
-
-
-def _unit(unit: str) -> str:
-    return f" {unit}" if unit else ""

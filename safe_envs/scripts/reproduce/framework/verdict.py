@@ -109,7 +109,7 @@ def judge(artefact: Artefact, outcome: Findings, sample: Workload) -> Judgement:
             [*reasons, *([artefact.argument] if artefact.argument else [])],
         )
     wrong = [number for number in outcome.printed_formula if not _same(number, outcome.numbers)]
-    reasons += [f"by the printed formula {n.name} is {n.ours:.3g}{_unit(n)}" for n in wrong]
+    reasons += [f"by the printed formula {n.name} is {n.ours:.3g}{n.suffix}" for n in wrong]
     return Judgement(verdict, bool(wrong), _matches_thesis(outcome), tuple(reasons))
 
 
@@ -124,8 +124,8 @@ def disagreement(number: Number) -> str | None:
     if number.printed is None:
         return None
     text = (
-        f"{number.name}: {number.printed:g}{_unit(number)} printed,"
-        f" {number.ours:.3g}{_unit(number)} here"
+        f"{number.name}: {number.printed:g}{number.suffix} printed,"
+        f" {number.ours:.3g}{number.suffix} here"
     )
     low, high = _ends(number)
     if number.printed_trials is None:
@@ -221,7 +221,3 @@ def _difference(
     """
     (a, a_low, a_high), (b, b_low, b_high) = first, second
     return a - b - math.hypot(a - a_low, b_high - b), a - b + math.hypot(a_high - a, b - b_low)
-
-
-def _unit(number: Number) -> str:
-    return f" {number.unit}" if number.unit else ""
