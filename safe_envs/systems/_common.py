@@ -43,7 +43,7 @@ def around(center: float, half_width: float, uniform: sp.Symbol) -> sp.Expr:
     return center + half_width * (2 * uniform - 1)
 
 
-def spread(
+def uniform_box(
     centers: Sequence[float], half_widths: Sequence[float], condition: sp.Expr | None = None
 ) -> Start:
     """Return the start that is uniform in a box of states.

@@ -12,7 +12,7 @@ from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Variable
-from safe_envs.systems._common import in_disk, positive, spread, uniforms
+from safe_envs.systems._common import in_disk, positive, uniform_box, uniforms
 
 x_1, x_2, u = sp.symbols("x_1 x_2 u", real=True)
 a, k, sigma_1, sigma_2 = sp.symbols("a k sigma_1 sigma_2", real=True)
@@ -78,7 +78,7 @@ def cubic_sde(
         states=(Variable(x_1, -6.0, 6.0), Variable(x_2, -6.0, 6.0)),
         nominal=clf.min_norm(system),
         clf=clf,
-        starts={"near-edge": spread((-1.0, 0.0), (2.0, 2.0), sp.Min(h, 0.5 - h))},
+        starts={"near-edge": uniform_box((-1.0, 0.0), (2.0, 2.0), sp.Min(h, 0.5 - h))},
         horizon=2.0,
         noise=("k",),
         explored=SamplingDomain(region=((-1.0, 1.0), (-1.0, 1.0)), inputs=((-1.0,), (1.0,))),

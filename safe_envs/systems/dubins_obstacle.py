@@ -13,7 +13,7 @@ from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
-from safe_envs.systems._common import positive, spread
+from safe_envs.systems._common import positive, uniform_box
 from safe_envs.systems.dubins import HEADING, SHOWN, omega, theta, turn_rate_towards, vehicle, x, y
 
 x_o, y_o, v_o = sp.symbols("x_o y_o v_o", real=True)
@@ -118,7 +118,7 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
             Feature("ahead_y", y_o - y, -10.0, 10.0),
         ),
         starts={
-            "spread": spread((*_START, *_OBSTACLE_START), (0.5, 0.5, 0.5, 0.0, 0.0)),
+            "spread": uniform_box((*_START, *_OBSTACLE_START), (0.5, 0.5, 0.5, 0.0, 0.0)),
             "thesis": Start.at((*_START, *_OBSTACLE_START)),
         },
         dt=0.05,

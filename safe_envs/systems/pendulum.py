@@ -9,7 +9,7 @@ from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Variable
-from safe_envs.systems._common import positive, spread
+from safe_envs.systems._common import positive, uniform_box
 
 theta, thetadot, u = sp.symbols("theta thetadot u", real=True)
 m, ell, g, sigma = sp.symbols("m l g sigma", real=True)
@@ -62,7 +62,7 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         reward=sp.exp(-((5 * (theta - _TARGET)) ** 2)),
         nominal=(sp.Integer(0),),
         starts={
-            "uniform": spread((0.0, 0.0), (reach, reach), h),
+            "uniform": uniform_box((0.0, 0.0), (reach, reach), h),
             "near-origin": Start.at((0.1, 0.1)),
         },
         dt=0.01,

@@ -12,7 +12,7 @@ from safe_envs.number_text import finite_number
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import TIME, Feature, Variable
-from safe_envs.systems._common import positive, spread
+from safe_envs.systems._common import positive, uniform_box
 
 z, zdot, phi, theta = sp.symbols("z zdot phi theta", real=True)
 U_1 = sp.Symbol("U_1", real=True)
@@ -117,7 +117,7 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         features=(*(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in HEIGHT), *FOLLOWED),
         nominal=(thrust_law(),),
         starts={
-            "spread": spread((5.0, 0.0), (0.5, 0.5)),
+            "spread": uniform_box((5.0, 0.0), (0.5, 0.5)),
             "thesis": Start.at((5.0, 0.0)),
         },
         noise=("sigma_z",),

@@ -8,7 +8,7 @@ from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Variable
-from safe_envs.systems._common import positive, spread
+from safe_envs.systems._common import positive, uniform_box
 
 x, u, sigma = sp.symbols("x u sigma", real=True)
 
@@ -48,7 +48,7 @@ def scalar(*, limit: float = 1.0) -> SafetyProblem:
         reward=sp.exp(-((2 * (x / edge - 1)) ** 2)),
         nominal=(-x + edge - x,),
         starts={
-            "spread": spread((0.0,), (0.9 * edge,)),
+            "spread": uniform_box((0.0,), (0.9 * edge,)),
             "origin": Start.at((0.0,)),
         },
         dt=0.01,

@@ -68,7 +68,7 @@ def test_settings_and_numbers_are_those_of_the_thesis(outcomes):
     # Sec. 3.5.1, static case, with Eq. (3.27), (3.28).
     world = dubins_disk.disk(Workload())
     assert (world.dt, world.horizon, world.steps) == (0.05, 50.0, 1000)
-    assert [learned_runs.parameters(system)["v"] for system in (world.plant, world.model)] == [
+    assert [system.parameter_values["v"] for system in (world.plant, world.model)] == [
         0.8,
         0.5,
     ]
@@ -82,8 +82,8 @@ def test_settings_and_numbers_are_those_of_the_thesis(outcomes):
     assert {c["p"] for c in outcome.data["curves"]} == {0.5, 1.0, 5.0}
     # Sec. 3.5.1, moving case, with Fig. 3.2; p_1 = p_2 = 1 are of thesis-notes.
     world = make_problem(dubins_obstacle.OBSTACLE, start="thesis")
-    assert [learned_runs.parameters(world.plant)[name] for name in ("v", "v_o")] == [0.8, 0.5]
-    assert [learned_runs.parameters(world.model)[name] for name in ("v", "v_o")] == [0.5, 0.5]
+    assert [world.plant.parameter_values[name] for name in ("v", "v_o")] == [0.8, 0.5]
+    assert [world.model.parameter_values[name] for name in ("v", "v_o")] == [0.5, 0.5]
     instants = outcomes["figure-3.2a"].data["instants"]
     assert [instant["time"] for instant in instants] == [0.0, 4.0, 7.0]
     assert [instants[0][what] for what in ("vehicle", "obstacle")] == [[-2.0, -2.0], [-1.0, 0.0]]
@@ -95,7 +95,7 @@ def test_settings_and_numbers_are_those_of_the_thesis(outcomes):
     ) == (0.5, 0.8, "1,1")
     # Sec. 3.5.2 with Fig. 3.3.
     world = quadrotor.hover(Workload())
-    assert [learned_runs.parameters(system)["m"] for system in (world.plant, world.model)] == [
+    assert [system.parameter_values["m"] for system in (world.plant, world.model)] == [
         0.6,
         0.4,
     ]
@@ -178,7 +178,7 @@ def test_the_same_seed_gives_the_same_outcome(name, outcomes):
         dubins_obstacle.passages.cache_clear()
     if name == "figure-3.3":
         # This one learns again, too.
-        dubins_obstacle.residuals.cache_clear()
+        learned_runs.residuals.cache_clear()
     assert compute(name).document() == outcomes[name].document()
 
 

@@ -69,7 +69,7 @@ def artefact(request: pytest.FixtureRequest) -> Artefact:
 def test_what_the_thesis_prints() -> None:
     """Every number and setting of the thesis, typed a second time."""
     # Sec. 4.2.2: "we choose gamma = 1".
-    assert martingale.GAMMA == 1.0
+    assert reciprocal_inputs.GAMMA == 1.0
     # thesis-notes, "Closed forms": the shift by watching at steps only.
     assert martingale.SHIFT == 0.5826
     # Table 4.1: 92 and 80 % unbounded, 25 and 70 % bounded, of 50 trajectories.
@@ -211,8 +211,8 @@ def test_bound_is_attained() -> None:
 
 def test_scalar_system_under_scbf_is_brownian() -> None:
     """With A h = 0, h = 1 - sigma W_t."""
-    reach = 1 + martingale.SHIFT * martingale.NOISE * math.sqrt(martingale.STEP)
-    expected = 1 - 2 * float(ndtr(-reach / (martingale.NOISE * math.sqrt(BROWNIAN_HORIZON))))
+    reach = 1 + martingale.SHIFT * reciprocal_inputs.NOISE * math.sqrt(martingale.STEP)
+    expected = 1 - 2 * float(ndtr(-reach / (reciprocal_inputs.NOISE * math.sqrt(BROWNIAN_HORIZON))))
     rate = ours("example-4.2.2")["SCBF, unbounded"].ours / 100
     assert abs(rate - expected) < 4 * math.sqrt(expected * (1 - expected) / 100)
 
