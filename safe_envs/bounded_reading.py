@@ -52,6 +52,9 @@ def open_regular(path: Path | str, most: int = MOST_BYTES) -> BinaryIO:
         path: of the file.
         most: its largest size in bytes.
 
+    Returns:
+        The stream, to be closed by the caller.
+
     Raises:
         OSError: it cannot be read, is no regular file, or is larger.
     """
@@ -74,7 +77,15 @@ def open_regular(path: Path | str, most: int = MOST_BYTES) -> BinaryIO:
 
 
 def read_bytes(path: Path | str, most: int = MOST_BYTES) -> bytes:
-    """Return the content of a regular file; arguments and errors as for `open_regular`."""
+    """Return the content of a regular file.
+
+    Args:
+        path: of the file.
+        most: its largest size in bytes.
+
+    Raises:
+        OSError: see `open_regular`.
+    """
     with open_regular(path, most) as stream:
         # A file may grow, and those of the kernel have no size.
         content = stream.read(most + 1)
@@ -111,6 +122,9 @@ def open_archive(stream: BinaryIO, most: int = MOST_BYTES) -> zipfile.ZipFile:
     Args:
         stream: of the file.
         most: largest size in bytes of all parts, unpacked.
+
+    Returns:
+        The archive.
 
     Raises:
         ValueError: it is damaged, or too large when it is unpacked.

@@ -1,8 +1,8 @@
 """Imports through the top-level links of a checkout.
 
-There `wrappers`, `agents` and `scripts` are links into `safe_envs`. Without this module Python would
-load every file a second time under its short name, and `wrappers.CBF` would be another class than
-`safe_envs.wrappers.CBF`.
+There `wrappers`, `agents` and `scripts` are links into `safe_envs`. Without this module Python
+would load every file a second time under its short name, and `wrappers.CBF` would be another class
+than `safe_envs.wrappers.CBF`.
 """
 
 from __future__ import annotations

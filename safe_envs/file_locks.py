@@ -27,6 +27,9 @@ def locked(path: Path, taken: str) -> Iterator[None]:
         path: of the file.
         taken: what to say if another process holds the lock.
 
+    Returns:
+        A context manager that releases the lock.
+
     Raises:
         ConfigurationError: another process holds the lock, or the file cannot be made.
     """

@@ -17,7 +17,7 @@ def real(text: str) -> float:
 
     Raises:
         ValueError: the text is none. Digits of other scripts and underscores between digits, which
-            Python takes, are refused: they come from slips, and other programs read the same text
+            Python takes, are refused: they come from slips, and other software reads the same text
             as something else.
     """
     return float(_plain(text))

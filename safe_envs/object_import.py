@@ -62,8 +62,10 @@ def resolved(place: str) -> str:
 
 
 def place_of(stated: type) -> str:
-    """Return the place from which `load_object` imports a class: FILE.py:NAME for one of a script or
-    of a file that was loaded by its place, MODULE:NAME for others.
+    """Return the place from which `load_object` imports a class.
+
+    It is FILE.py:NAME for one of a script or of a file that was loaded by its place, MODULE:NAME
+    for others.
     """
     name, place = stated.__module__, f"{stated.__module__}:{stated.__qualname__}"
     path = Path(getattr(sys.modules.get(name), "__file__", None) or "/")
@@ -78,6 +80,9 @@ def called(function: Callable[..., Any], place: str, arguments: dict[str, Any]) 
         function: what was imported.
         place: FILE.py:NAME or MODULE:NAME of it, for errors.
         arguments: keyword arguments.
+
+    Returns:
+        What the function returns.
 
     Raises:
         ConfigurationError: an argument is missing or unknown, or the code there ends with an error.

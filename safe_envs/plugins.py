@@ -58,6 +58,9 @@ def load_plugin(group: str, name: str) -> Any:
         group: `CONDITIONS`, `POLICIES` or `SYSTEMS`.
         name: one of `plugin_names`.
 
+    Returns:
+        The object.
+
     Raises:
         ConfigurationError: No package declares the name, more than one does, or its import fails.
     """

@@ -44,8 +44,8 @@ SUPPORTED = (
     ),
     *(sp.Abs, sp.sign, sp.Heaviside, sp.Piecewise, sp.floor, sp.ceiling, sp.frac, sp.Mod),
 )
-"""Functions that have the same values as floats and as arrays; besides sums, products, powers, Max
-and Min."""
+"""Functions that have the same values as floats and as arrays, in addition to sums, products,
+powers, Max and Min."""
 
 _BASE = sp.Symbol("_base_of_a_power_")
 

@@ -88,6 +88,9 @@ class ControlAffineSDE:
             diffusion: sigma, n x d; none by default.
             parameters: value of every other symbol that occurs.
 
+        Returns:
+            The system with the parts of the rate.
+
         Raises:
             SystemDefinitionError: the rate is not affine in the inputs, or see the class.
         """
@@ -119,7 +122,7 @@ class ControlAffineSDE:
                 )
             if not is_zero(sp.expand(entry)):
                 raise SystemDefinitionError(
-                    f"the rate of {state} is not affine in the inputs: besides f + g u there is"
+                    f"the rate of {state} is not affine in the inputs: next to f + g u there is"
                     f" {entry}. Give f and g themselves where a system has several pieces"
                 )
         return cls(
@@ -204,6 +207,11 @@ class ControlAffineSDE:
     def noisy(self) -> bool:
         """Whether there is any noise, for the parameters as they are."""
         return bool(self.noise_channels)
+
+    @property
+    def parameter_values(self) -> dict[str, float]:
+        """The values of the parameters, by the names of their symbols."""
+        return {p.name: value for p, value in self.parameters.items()}
 
     def with_parameters(self, **values: float) -> ControlAffineSDE:
         """Return the same system with other parameter values.

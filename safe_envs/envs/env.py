@@ -22,7 +22,7 @@ from safe_envs.validators import real_array
 class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
     """Any `SafetyProblem` as a Gymnasium env.
 
-    Actions are in [-1, 1] for every input and stand for the physical box; what lies beyond is
+    Actions are in [-1, 1] for every input and are scaled to the input bounds; what lies beyond is
     clipped. Actions may be given in double precision. The observation holds the problem's features
     as float32, `state` the exact state. The keys of `info` are those of `safe_envs.envs.info`.
 
@@ -84,7 +84,7 @@ class SafeEnv(gym.Env[np.ndarray, np.ndarray]):
         return np.array(self.components)
 
     def physical_action(self, action: Any) -> list[float]:
-        """Map an action in [-1, 1] to the physical box; what lies beyond is clipped.
+        """Map an action in [-1, 1] to the input bounds; what lies beyond is clipped.
 
         Raises:
             InvalidInputError: the action has another shape than (m,), or does not hold finite real

@@ -32,7 +32,7 @@ At reset, before anything is executed, both are the point within the input bound
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 
@@ -42,7 +42,15 @@ Info = dict[str, Any]
 def safety_info(
     violation: Any, cost: Any, barrier: np.ndarray, h_min: Any, episode_cost: Any
 ) -> Info:
-    """Return what every env reports; values as in the table above."""
+    """Return what every env reports; see the table above.
+
+    Args:
+        violation: whether some barrier is negative.
+        cost: 1.0 where it is.
+        barrier: value of each barrier.
+        h_min: smallest value of the episode.
+        episode_cost: sum of the costs of the episode.
+    """
     return {
         "cost": cost,
         "violation": violation,
@@ -52,31 +60,24 @@ def safety_info(
     }
 
 
-def filter_info(
-    nominal_action: np.ndarray,
-    safe_action: np.ndarray,
-    intervention: Any,
-    filter_active: Any,
-    feasible: Any,
-    slack: Any,
-    slacks: np.ndarray,
-    active_barrier: Any,
-    episode_interventions: Any,
-    episode_infeasible: Any,
-) -> Info:
-    """Return what a filter adds; values as in the table above."""
-    return {
-        "nominal_action": nominal_action,
-        "safe_action": safe_action,
-        "intervention": intervention,
-        "filter_active": filter_active,
-        "feasible": feasible,
-        "slack": slack,
-        "slacks": slacks,
-        "active_barrier": active_barrier,
-        "episode_interventions": episode_interventions,
-        "episode_infeasible": episode_infeasible,
-    }
+class FilterInfo(TypedDict):
+    """What a filter adds; see the table above."""
+
+    nominal_action: np.ndarray
+    safe_action: np.ndarray
+    intervention: Any
+    filter_active: Any
+    feasible: Any
+    slack: Any
+    slacks: np.ndarray
+    active_barrier: Any
+    episode_interventions: Any
+    episode_infeasible: Any
+
+
+def filter_info(**values: Unpack[FilterInfo]) -> Info:
+    """Return what a filter adds, all of `FilterInfo`."""
+    return {**values}
 
 
 def with_masks(info: Info, present: np.ndarray) -> Info:
@@ -85,6 +86,9 @@ def with_masks(info: Info, present: np.ndarray) -> Info:
     Args:
         info: of a batch, changed in place.
         present: the envs that report it, bool (num_envs,).
+
+    Returns:
+        The same object.
     """
     info.update(dict.fromkeys(_mask_names(tuple(info)), present))
     return info

@@ -26,7 +26,7 @@ class Generators:
         self.rngs: list[np.random.Generator] = []
         self.seeds: list[int] = []
 
-    def spread(self, seed: Seeds) -> list[int | None]:
+    def for_each_env(self, seed: Seeds) -> list[int | None]:
         """Return a seed, or None, for each env.
 
         Args:

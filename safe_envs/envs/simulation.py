@@ -10,7 +10,7 @@ import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, Flavour, compile_function
 from safe_envs.dynamics.integrators import Integrator
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import require_whole
 from safe_envs.problem.initial_distribution import StartSampler
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME
@@ -131,11 +131,11 @@ def steps_until(problem: SafetyProblem, max_episode_steps: int | None) -> int:
     Args:
         problem: whose horizon is the limit.
         max_episode_steps: a lower limit, if any.
+
+    Raises:
+        ConfigurationError: the limit is no whole number from 1.
     """
     if max_episode_steps is None:
         return problem.steps
-    if not isinstance(max_episode_steps, int) or max_episode_steps < 1:
-        raise ConfigurationError(
-            f"max_episode_steps = {max_episode_steps!r}; give a whole number from 1"
-        )
+    require_whole("max_episode_steps", max_episode_steps, 1)
     return min(problem.steps, max_episode_steps)

@@ -16,7 +16,7 @@ from safe_envs.envs.info import Info, with_masks
 from safe_envs.envs.seeding import Generators, Seeds
 from safe_envs.envs.simulation import NoiseStreams, Simulation, steps_until
 from safe_envs.envs.spaces import BatchActions, action_box, observation_box
-from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 
@@ -56,13 +56,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        if not isinstance(num_envs, int) or num_envs < 1:
-            raise ConfigurationError(f"num_envs = {num_envs!r}; give a whole number from 1")
+        require_whole("num_envs", num_envs, 1)
         self.viewer = open_viewer(problem, render_mode, num_envs)
         self.render_mode = render_mode
         self._autoreset = _mode(autoreset_mode)
-        self.problem = problem
-        self.num_envs = num_envs
+        self.problem, self.num_envs = problem, num_envs
         self.metadata = {
             "render_modes": [*RENDER_MODES[1:]],
             "render_fps": frames_a_second(problem),
@@ -76,9 +74,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._noise = NoiseStreams(num_envs, self._simulation.integrator.channels)
         self._actions = BatchActions(problem, num_envs)
         observed = {f.expression for f in problem.features}
-        self._unobserved = [
-            i for i, state in enumerate(problem.plant.states) if state not in observed
-        ]
+        self._unobserved = [i for i, s in enumerate(problem.plant.states) if s not in observed]
         self._limit = steps_until(problem, max_episode_steps)
         self._generators = Generators(num_envs)
         self.executed: Sequence[Any] = ()
@@ -125,8 +121,11 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Args:
             seed: seed of env 0, with env i seeded by seed + i, or a seed (or None) for each env.
             options: may hold "reset_mask", a bool array of shape (num_envs,).
+
+        Returns:
+            The observations, float32 (num_envs, k), and the info.
         """
-        seeds = self._generators.spread(seed)
+        seeds = self._generators.for_each_env(seed)
         mask = self.episodes.reset_mask((options or {}).get("reset_mask"))
         self._seed([s if m else None for s, m in zip(seeds, mask.tolist(), strict=True)])
         self._restart(np.flatnonzero(mask))
@@ -156,7 +155,7 @@ class SafeVectorEnv(gym.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f"the snapshot has states of shape {shape}; these envs have"
                 f" {(self.num_envs, self.problem.plant.n)}"
             )
-        self._seed(self._generators.spread(seed))
+        self._seed(self._generators.for_each_env(seed))
         self._x = tuple(np.array(snapshot["state"], dtype=float).T.copy())
         self.episodes.restore(snapshot)
         if self.viewer is not None:

@@ -40,7 +40,7 @@ _STATED = (
 Range = tuple[float, float]
 
 
-def state_problem(
+def state_problem(  # noqa: PLR0913  (what a user states, by keyword)
     system: ControlAffineSDE,
     barriers: Any,
     *,

@@ -114,6 +114,9 @@ class ProblemOptions:
             arguments: options, and arguments of the barrier by themselves.
             of_barrier: names of the arguments that the barrier has.
 
+        Returns:
+            The options, with all arguments of the barrier under `barrier`.
+
         Raises:
             ConfigurationError: An argument is unknown or of the wrong kind.
         """

@@ -12,7 +12,13 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import ConfigurationError, SystemDefinitionError, nearest, shown
+from safe_envs.errors import (
+    ConfigurationError,
+    SystemDefinitionError,
+    nearest,
+    require_whole,
+    shown,
+)
 from safe_envs.number_text import finite_number
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
@@ -40,7 +46,7 @@ class SafetyProblem:
         reward: of a step, an expression of the state that it reaches, of the executed input and of
             `TIME`.
         nominal: the nominal controller, an expression for each input of the features' symbols and
-            the model's parameters. The box clips it.
+            the model's parameters. The input bounds clip it.
         starts: named initial distributions.
         start: the name of the one in use.
         dt: control period in s.
@@ -149,9 +155,7 @@ class SafetyProblem:
         Raises:
             SystemDefinitionError: a state without a finite range has none in `explored` either.
         """
-        ranges = [(s.low, s.high) for s in self.states]
-        angles = [s.unit == "rad" and math.isinf(s.low) and math.isinf(s.high) for s in self.states]
-        return self.explored.completed(self.plant.states, ranges, angles, self.box)
+        return self.explored.completed(self.states, self.box)
 
     def _check_feature_names(self) -> None:
         """Check that a symbol of the nominal controller means one thing."""
@@ -171,10 +175,7 @@ class SafetyProblem:
                 f"horizon = {self.horizon} s; it must hold at least one control period of"
                 f" {self.dt} s"
             )
-        if not isinstance(self.substeps, int) or self.substeps < 1:
-            raise ConfigurationError(
-                f"substeps = {shown(self.substeps)}; give a whole number from 1"
-            )
+        require_whole("substeps", self.substeps, 1)
 
     def gains_of(self, barrier: int) -> tuple[float, ...]:
         """Return the rates p_1..p_r of a barrier, given by its index."""

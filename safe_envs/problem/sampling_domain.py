@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import sympy as sp
 
 from safe_envs.errors import SystemDefinitionError
+from safe_envs.problem.signals import Variable
 
 
 @dataclass(frozen=True)
@@ -30,28 +31,26 @@ class SamplingDomain:
     coordinates: tuple[sp.Expr, ...] = ()
 
     def completed(
-        self,
-        states: Sequence[sp.Symbol],
-        ranges: Sequence[tuple[float, float]],
-        angles: Sequence[bool],
-        box: Sequence[tuple[float, float]],
+        self, states: Sequence[Variable], box: Sequence[tuple[float, float]]
     ) -> SamplingDomain:
         """Fill what is empty.
 
         States get their ranges, an angle a whole turn; inputs go halfway to their bounds.
 
         Args:
-            states: symbols.
-            ranges: (low, high) of each, possibly infinite.
-            angles: whether each is an unbounded angle.
+            states: with their ranges, possibly infinite.
             box: (low, high) of each input.
+
+        Returns:
+            The domain without empty parts.
 
         Raises:
             SystemDefinitionError: a part has the wrong length, or a range is infinite or empty.
         """
-        turn = (-math.pi, math.pi)
+        angles = [s.unit == "rad" and math.isinf(s.low) and math.isinf(s.high) for s in states]
         region = self.region or tuple(
-            turn if angle else bounds for bounds, angle in zip(ranges, angles, strict=True)
+            (-math.pi, math.pi) if angle else (s.low, s.high)
+            for s, angle in zip(states, angles, strict=True)
         )
         if len(region) != len(states):
             raise SystemDefinitionError(
@@ -60,8 +59,8 @@ class SamplingDomain:
         for state, (low, high) in zip(states, region, strict=True):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
                 raise SystemDefinitionError(
-                    f"cannot explore {state} in [{low}, {high}]; give SamplingDomain(region=...)"
-                    " finite ranges, or the problem a workspace"
+                    f"cannot explore {state.symbol} in [{low}, {high}]; give"
+                    " SamplingDomain(region=...) finite ranges, or the problem a workspace"
                 )
         if any(len(u) != len(box) or not all(map(math.isfinite, u)) for u in self.inputs):
             raise SystemDefinitionError(
@@ -78,7 +77,7 @@ class SamplingDomain:
         coordinates = self.coordinates or tuple(
             e
             for s, angle in zip(states, angles, strict=True)
-            for e in ((sp.cos(s), sp.sin(s)) if angle else (s,))
+            for e in ((sp.cos(s.symbol), sp.sin(s.symbol)) if angle else (s.symbol,))
         )
         return SamplingDomain(region, inputs, coordinates)
 

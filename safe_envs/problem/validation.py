@@ -40,9 +40,9 @@ def require_sound(problem: SafetyProblem) -> None:
     wrong sign) or the workspace.
 
     Doubtful is what other units than the model's would explain: few of the drawn starts are safe
-    (degrees for radians); the nominal controller asks for a hundred times what the box holds, or a
-    barrier's condition for a hundred times what the box can do, at every start; the box throws a
-    state across its whole workspace within a control period.
+    (degrees for radians); the nominal controller asks for a hundred times what the input bounds
+    hold, or a barrier's condition for a hundred times what they can do, at every start; an input
+    within them throws a state across its whole workspace within a control period.
 
     Raises:
         SystemDefinitionError: something is wrong.
@@ -198,7 +198,7 @@ def _doubt_box_of_nominal(problem: SafetyProblem, x: Components) -> None:
         if least > _OTHER_UNITS * most:
             _doubt(
                 f"the nominal controller asks for |{variable.symbol}| >= {least:.4g} at every"
-                f" start, and the box [{variable.low:g}, {variable.high:g}] ends at {most:.4g}:"
+                f" start, and its bounds [{variable.low:g}, {variable.high:g}] end at {most:.4g}:"
                 f" check that both have the unit {variable.unit or 'of the model'}"
             )
 
@@ -222,10 +222,10 @@ def _doubt_box_of_barriers(problem: SafetyProblem, x: Components) -> None:
         if (without < -_OTHER_UNITS * abs(reach)).all():
             nearest = int((abs(reach) / -without).argmax())
             _doubt(
-                f"the box is too small for {barrier.name} at every start: at"
+                f"the input bounds are too narrow for {barrier.name} at every start: at"
                 f" {_at(problem, x, nearest)} the condition lacks {-without[nearest]:.4g}, of which"
-                f" the inputs make up {reach[nearest]:.4g}: check the units of the box and the"
-                " gains"
+                f" the inputs make up {reach[nearest]:.4g}: check the units of the bounds and"
+                " the gains"
             )
 
 

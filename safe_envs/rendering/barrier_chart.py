@@ -75,12 +75,11 @@ class BarrierChart:
         canvas.fill((left, edge, width, top + height - edge), UNSAFE)
         canvas.line((left, edge), (left + width, edge), EDGE, 2)
         places = axes.places(times, h)
-        canvas.within(self._box)
-        canvas.path(places, INK, 2)
-        for run in runs(h < 0.0):
-            canvas.path(places[run], VIOLATION, 3)
-        canvas.disk(places[-1], 4, VIOLATION if h[-1] < 0.0 else INK)
-        canvas.within(None)
+        with canvas.within(self._box):
+            canvas.path(places, INK, 2)
+            for run in runs(h < 0.0):
+                canvas.path(places[run], VIOLATION, 3)
+            canvas.disk(places[-1], 4, VIOLATION if h[-1] < 0.0 else INK)
         canvas.frame((left - 1, top - 1, width + 2, height + 2), mix(GREY, PANEL, 0.6))
 
     def _write_values(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -63,9 +64,13 @@ class Canvas:
             (left + (width - size[0]) // 2, top + (height - size[1]) // 2),
         )
 
-    def within(self, box: Box | None) -> None:
-        """Restrict drawing to a box from now on; None removes the restriction."""
+    @contextmanager
+    def within(self, box: Box) -> Iterator[None]:
+        """Restrict drawing to a box."""
+        before = self.surface.get_clip()
         self.surface.set_clip(box)
+        yield
+        self.surface.set_clip(before)
 
     def fill(self, box: Sequence[float], color: Color, rounded: int = 0) -> None:
         """Fill a rectangle.
@@ -75,9 +80,7 @@ class Canvas:
             color: of the area.
             rounded: radius of the corners.
         """
-        pygame.draw.rect(
-            self.surface, color, pygame.Rect([round(v) for v in box]), border_radius=rounded
-        )
+        self.frame(box, color, 0, rounded)
 
     def frame(self, box: Sequence[float], color: Color, width: int = 1, rounded: int = 0) -> None:
         """Draw the outline of a rectangle.
@@ -85,7 +88,7 @@ class Canvas:
         Args:
             box: left, top, width and height.
             color: of the line.
-            width: of the line.
+            width: of the line; 0 fills the rectangle.
             rounded: radius of the corners.
         """
         pygame.draw.rect(
@@ -112,8 +115,7 @@ class Canvas:
             self.fill((left - thick, top, width, length), color)
             return
         across = (start[1] - end[1]) / length, (end[0] - start[0]) / length
-        # Side by side, half a pixel apart: a polygon has no smooth edges, and lines a whole pixel
-        # apart have gaps.
+        # Half a pixel apart: with a whole one there are gaps, and a polygon has no smooth edges.
         for k in range(1 - width, width):
             x, y = (0.5 * k * step for step in across)
             pygame.draw.aaline(
@@ -212,9 +214,8 @@ class Canvas:
             width: of the edge.
         """
         x, y = center
-        self.shape(
-            [(x, y - size), (x + size, y), (x, y + size), (x - size, y)], fill, outline, width
-        )
+        corners = [(x, y - size), (x + size, y), (x, y + size), (x - size, y)]
+        self.shape(corners, fill, outline, width)
 
     def cross(self, center: Point, size: float, color: Color, width: int = 3) -> None:
         """Draw an X.
@@ -247,9 +248,8 @@ class Canvas:
         along = (end[0] - start[0]) / length, (end[1] - start[1]) / length
         base = end[0] - head * along[0], end[1] - head * along[1]
         self.line(start, base, color, width)
-        sides = [
-            (base[0] + s * along[1], base[1] - s * along[0]) for s in (0.55 * head, -0.55 * head)
-        ]
+        x, y = 0.55 * head * along[1], 0.55 * head * along[0]
+        sides = [(base[0] + x, base[1] - y), (base[0] - x, base[1] + y)]
         self.shape([end, *sides], color)
 
     def text(

@@ -4,37 +4,13 @@ from __future__ import annotations
 
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Variable
+from safe_envs.rendering import style
 from safe_envs.rendering.barrier_chart import BarrierChart
 from safe_envs.rendering.canvas import Box, Canvas
 from safe_envs.rendering.scenes.base import warning_color
 from safe_envs.rendering.snapshot import EpisodeSnapshot
-from safe_envs.rendering.style import (
-    EDGE,
-    EXECUTED,
-    GREEN,
-    GREY,
-    HATCH,
-    INFEASIBLE,
-    INK,
-    INTERVENING,
-    LARGE,
-    LINE,
-    NORMAL,
-    PANEL,
-    PAPER,
-    SCENE,
-    SIZE,
-    SMALL,
-    UNSAFE,
-    VIOLATION,
-    Color,
-    bound,
-    label,
-    mix,
-    number,
-)
 
-_LEFT, _RIGHT = SCENE[2] + 20, SIZE[0] - 20
+_LEFT, _RIGHT = style.SCENE[2] + 20, style.SIZE[0] - 20
 _WIDTH = _RIGHT - _LEFT
 _BARS = (148, 348)
 _MOST_BARS = 5
@@ -62,18 +38,18 @@ class Panel:
         below = top + round(len(shown) * pitch) + 10
         box = (_LEFT + 56, below + 28, _WIDTH - 56, _BOTTOM - below - 28)
         self._chart = BarrierChart(problem, box, below + 2)
-        self._background = Canvas(SIZE)
+        self._background = Canvas(style.SIZE)
         canvas = self._background
-        canvas.fill((SCENE[2], 0, SIZE[0] - SCENE[2], SIZE[1]), PANEL)
-        canvas.line((SCENE[2], 0), (SCENE[2], SIZE[1]), LINE)
-        canvas.text(problem.name, (_LEFT, 14), INK, LARGE, bold=True, widest=_WIDTH)
+        canvas.fill((style.SCENE[2], 0, style.SIZE[0] - style.SCENE[2], style.SIZE[1]), style.PANEL)
+        canvas.line((style.SCENE[2], 0), (style.SCENE[2], style.SIZE[1]), style.LINE)
+        canvas.text(problem.name, (_LEFT, 14), style.INK, style.LARGE, bold=True, widest=_WIDTH)
         more = len(problem.inputs) - len(shown)
         action = "Action" + (f" (and {more} more)" if more else "")
-        canvas.text(action, (_LEFT, _BARS[0]), INK, NORMAL, bold=True)
+        canvas.text(action, (_LEFT, _BARS[0]), style.INK, style.NORMAL, bold=True)
         for variable, top in self._tracks:
             self._draw_track(variable, top)
         title = "Smallest h" if len(problem.barriers) > 1 else "h"
-        canvas.text(title, (_LEFT, below), INK, NORMAL, bold=True)
+        canvas.text(title, (_LEFT, below), style.INK, style.NORMAL, bold=True)
         self._draw_legend()
 
     def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot, caption: str) -> None:
@@ -86,13 +62,15 @@ class Panel:
         """
         canvas.lay(self._background)
         if caption:
-            canvas.text(caption, (_LEFT, 42), GREY, NORMAL, widest=_WIDTH)
+            canvas.text(caption, (_LEFT, 42), style.GREY, style.NORMAL, widest=_WIDTH)
         time, duration = float(snapshot.times[-1]), self._problem.duration
-        canvas.text(f"t = {time:.2f} s", (_LEFT, 68), INK, NORMAL)
+        canvas.text(f"t = {time:.2f} s", (_LEFT, 68), style.INK, style.NORMAL)
         if not self._endless:
-            canvas.text(f"of {duration:g} s", (_RIGHT, 68), GREY, NORMAL, align=(1.0, 0.0))
-            canvas.fill((_LEFT, 91, _WIDTH, 3), LINE)
-            canvas.fill((_LEFT, 91, _WIDTH * min(time / duration, 1.0), 3), GREY)
+            canvas.text(
+                f"of {duration:g} s", (_RIGHT, 68), style.GREY, style.NORMAL, align=(1.0, 0.0)
+            )
+            canvas.fill((_LEFT, 91, _WIDTH, 3), style.LINE)
+            canvas.fill((_LEFT, 91, _WIDTH * min(time / duration, 1.0), 3), style.GREY)
         half = _WIDTH // 2 - 4
         _draw_status(canvas, (_LEFT, 104, half, 28), *_filter_status(snapshot))
         _draw_status(canvas, (_LEFT + half + 8, 104, half, 28), *_safety_status(snapshot))
@@ -102,13 +80,15 @@ class Panel:
     def _draw_track(self, variable: Variable, top: int) -> None:
         """Draw the empty bar of an input, with its name and its range."""
         canvas = self._background
-        canvas.text(label(variable.symbol.name, variable.unit), (_LEFT, top), INK, SMALL)
+        canvas.text(
+            style.label(variable.symbol.name, variable.unit), (_LEFT, top), style.INK, style.SMALL
+        )
         if self._ranged:
             for value, side in ((variable.low, 0.0), (variable.high, 1.0)):
                 at = (_LEFT + side * _WIDTH, top + 36)
-                canvas.text(bound(value), at, GREY, SMALL - 2, align=(side, 0.0))
-        canvas.fill((_LEFT, top + 20, _WIDTH, 12), PAPER, 2)
-        canvas.frame((_LEFT, top + 20, _WIDTH, 12), mix(GREY, PANEL, 0.6), 1, 2)
+                canvas.text(style.bound(value), at, style.GREY, style.SMALL - 2, align=(side, 0.0))
+        canvas.fill((_LEFT, top + 20, _WIDTH, 12), style.PAPER, 2)
+        canvas.frame((_LEFT, top + 20, _WIDTH, 12), style.mix(style.GREY, style.PANEL, 0.6), 1, 2)
 
     def _draw_actions(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         executed, decision = snapshot.executed, snapshot.decision
@@ -118,60 +98,69 @@ class Panel:
         for j, (variable, top) in enumerate(self._tracks):
             rest, here = _on_track(variable, 0.0), _on_track(variable, executed[j], beyond=True)
             canvas.fill((min(rest, here), top + 21, max(abs(here - rest), 2.0), 10), color)
-            canvas.line((rest, top + 17), (rest, top + 34), INK)
-            canvas.fill((here - 1, top + 18, 3, 16), INK)
+            canvas.line((rest, top + 17), (rest, top + 34), style.INK)
+            canvas.fill((here - 1, top + 18, 3, 16), style.INK)
             right, scale = float(_RIGHT), max(-variable.low, variable.high)
             if decision is not None:
                 nominal = decision.nominal[j]
-                canvas.diamond((_on_track(variable, nominal), top + 26), 7, None, INK)
-                text = number(nominal, scale)
-                right -= canvas.text(text, (right, top), INK, SMALL, align=(1.0, 0.0)) + 10
-                canvas.diamond((right, top + 8), 4, None, INK, 1)
+                canvas.diamond((_on_track(variable, nominal), top + 26), 7, None, style.INK)
+                text = style.number(nominal, scale)
+                right -= (
+                    canvas.text(text, (right, top), style.INK, style.SMALL, align=(1.0, 0.0)) + 10
+                )
+                canvas.diamond((right, top + 8), 4, None, style.INK, 1)
                 right -= 16
-            text = number(executed[j], scale)
-            width = canvas.text(text, (right, top), INK, SMALL, bold=True, align=(1.0, 0.0))
+            text = style.number(executed[j], scale)
+            width = canvas.text(
+                text, (right, top), style.INK, style.SMALL, bold=True, align=(1.0, 0.0)
+            )
             canvas.fill((right - width - 14, top + 3, 9, 9), color)
 
     def _draw_legend(self) -> None:
         canvas, y = self._background, _LEGEND
-        canvas.fill((_LEFT, y + 4, 10, 10), EXECUTED)
-        x = _LEFT + 16 + canvas.text("executed", (_LEFT + 16, y), INK, SMALL) + 16
-        canvas.diamond((x, y + 8), 5, None, INK)
-        x += 11 + canvas.text("nominal", (x + 11, y), INK, SMALL) + 16
-        canvas.fill((x, y + 2, 18, 13), UNSAFE)
-        canvas.within((x, y + 2, 18, 13))
-        for offset in range(-12, 18, 6):
-            canvas.line((x + offset, y + 15), (x + offset + 13, y + 2), HATCH, 2)
-        canvas.within(None)
-        canvas.frame((x, y + 2, 18, 13), EDGE)
-        canvas.text("h < 0", (x + 24, y), INK, SMALL)
+        canvas.fill((_LEFT, y + 4, 10, 10), style.EXECUTED)
+        x = _LEFT + 16 + canvas.text("executed", (_LEFT + 16, y), style.INK, style.SMALL) + 16
+        canvas.diamond((x, y + 8), 5, None, style.INK)
+        x += 11 + canvas.text("nominal", (x + 11, y), style.INK, style.SMALL) + 16
+        canvas.fill((x, y + 2, 18, 13), style.UNSAFE)
+        with canvas.within((x, y + 2, 18, 13)):
+            for offset in range(-12, 18, 6):
+                canvas.line((x + offset, y + 15), (x + offset + 13, y + 2), style.HATCH, 2)
+        canvas.frame((x, y + 2, 18, 13), style.EDGE)
+        canvas.text("h < 0", (x + 24, y), style.INK, style.SMALL)
 
 
-def _filter_status(snapshot: EpisodeSnapshot) -> tuple[str, Color, bool]:
+def _filter_status(snapshot: EpisodeSnapshot) -> tuple[str, style.Color, bool]:
     """Return a text, its colour, and whether it is a warning."""
     if snapshot.infeasible:
-        return "infeasible", INFEASIBLE, True
+        return "infeasible", style.INFEASIBLE, True
     if snapshot.intervening:
-        return "intervening", INTERVENING, True
+        return "intervening", style.INTERVENING, True
     if snapshot.decision is not None:
-        return "action unchanged", GREEN, False
-    return "no step yet" if snapshot.executed is None else "no filter", GREY, False
+        return "action unchanged", style.GREEN, False
+    return "no step yet" if snapshot.executed is None else "no filter", style.GREY, False
 
 
-def _safety_status(snapshot: EpisodeSnapshot) -> tuple[str, Color, bool]:
+def _safety_status(snapshot: EpisodeSnapshot) -> tuple[str, style.Color, bool]:
     """Return a text, its colour, and whether it is a warning."""
     if snapshot.h[-1] < 0.0:
-        return "violation", VIOLATION, True
-    return "safe" if snapshot.violated is None else "safe now, was not", GREEN, False
+        return "violation", style.VIOLATION, True
+    return "safe" if snapshot.violated is None else "safe now, was not", style.GREEN, False
 
 
-def _draw_status(canvas: Canvas, box: Box, text: str, color: Color, loud: bool) -> None:
+def _draw_status(canvas: Canvas, box: Box, text: str, color: style.Color, loud: bool) -> None:
     left, top, width, height = box
-    canvas.fill(box, color if loud else mix(color, PANEL, 0.12), 6)
+    canvas.fill(box, color if loud else style.mix(color, style.PANEL, 0.12), 6)
     canvas.frame(box, color, 1, 6)
-    ink = mix(color, INK, 0.6) if not loud else INK if color == INTERVENING else PAPER
+    ink = (
+        style.mix(color, style.INK, 0.6)
+        if not loud
+        else style.INK
+        if color == style.INTERVENING
+        else style.PAPER
+    )
     middle = (left + width / 2, top + height / 2)
-    canvas.text(text, middle, ink, NORMAL, bold=loud, align=(0.5, 0.5))
+    canvas.text(text, middle, ink, style.NORMAL, bold=loud, align=(0.5, 0.5))
 
 
 def _on_track(variable: Variable, value: float, beyond: bool = False) -> float:

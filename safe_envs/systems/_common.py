@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import sympy as sp
 
 from safe_envs.errors import ConfigurationError
 from safe_envs.number_text import finite_number
+from safe_envs.problem.initial_distribution import Start
 
 
 def positive(name: str, value: float) -> float:
@@ -38,6 +41,23 @@ def around(center: float, half_width: float, uniform: sp.Symbol) -> sp.Expr:
         uniform: symbol of a uniform on [0, 1).
     """
     return center + half_width * (2 * uniform - 1)
+
+
+def uniform_box(
+    centers: Sequence[float], half_widths: Sequence[float], condition: sp.Expr | None = None
+) -> Start:
+    """Return the start that is uniform in a box of states.
+
+    Args:
+        centers: midpoint of each state.
+        half_widths: distance from it to both ends; 0 fixes the state.
+        condition: positive where a start is allowed.
+    """
+    free = uniforms(sum(half > 0 for half in half_widths))
+    left = iter(free)
+    pairs = zip(centers, half_widths, strict=True)
+    state = tuple(around(c, half, next(left)) if half > 0 else sp.Float(c) for c, half in pairs)
+    return Start(state, free, condition)
 
 
 def in_disk(radius: float, area: sp.Symbol, angle: sp.Symbol) -> tuple[sp.Expr, sp.Expr]:

@@ -7,15 +7,12 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs import CLF, Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.envs.system_env import SystemEnv
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.clf import CLF
 from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Variable
-from safe_envs.systems._common import around, in_disk, positive, uniforms
+from safe_envs.systems._common import in_disk, positive, uniform_box, uniforms
 
 x_1, x_2, u = sp.symbols("x_1 x_2 u", real=True)
 a, k, sigma_1, sigma_2 = sp.symbols("a k sigma_1 sigma_2", real=True)
@@ -72,7 +69,6 @@ def cubic_sde(
     """
     system = cubic(diffusion=[0, k * x_2], noise={k: 0.1})
     h = positive("offset", offset) - x_1 - x_2**2
-    first, second = uniforms(2)
     clf = CLF(x_1**2 + x_2**2, rate, slack_weight=positive("slack_weight", slack_weight))
     return _problem(
         "CubicSDE",
@@ -82,13 +78,7 @@ def cubic_sde(
         states=(Variable(x_1, -6.0, 6.0), Variable(x_2, -6.0, 6.0)),
         nominal=clf.min_norm(system),
         clf=clf,
-        starts={
-            "near-edge": Start(
-                (around(-1.0, 2.0, first), around(0.0, 2.0, second)),
-                (first, second),
-                sp.Min(h, 0.5 - h),
-            )
-        },
+        starts={"near-edge": uniform_box((-1.0, 0.0), (2.0, 2.0), sp.Min(h, 0.5 - h))},
         horizon=2.0,
         noise=("k",),
         explored=SamplingDomain(region=((-1.0, 1.0), (-1.0, 1.0)), inputs=((-1.0,), (1.0,))),

@@ -8,12 +8,10 @@ from typing import Any
 
 import sympy as sp
 
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.dynamics.lie import lie_derivative_f
-from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.system_env import SystemEnv
-from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import in_disk, positive, uniforms
@@ -23,6 +21,19 @@ v, sigma_1, sigma_2 = sp.symbols("v sigma_1 sigma_2", real=True)
 cos_theta, sin_theta = sp.symbols("cos_theta sin_theta", real=True)
 
 _HEADING_GAIN = 2
+HEADING = (
+    Feature("cos_theta", sp.cos(theta), -1.0, 1.0),
+    Feature("sin_theta", sp.sin(theta), -1.0, 1.0),
+)
+"""The heading, as it is observed."""
+
+SHOWN: dict[str, Any] = {
+    "noise": ("sigma_1", "sigma_2"),
+    "plane": ("x", "y"),
+    "scene": "top-view",
+}
+"""Attributes of every problem with the vehicle."""
+
 UNIFORMS = uniforms(3)
 """Of a start anywhere: area, direction and heading."""
 
@@ -117,15 +128,12 @@ def disk_problem(
         features=(
             Feature("x", x, -2 * r, 2 * r),
             Feature("y", y, -2 * r, 2 * r),
-            Feature("cos_theta", sp.cos(theta), -1.0, 1.0),
-            Feature("sin_theta", sp.sin(theta), -1.0, 1.0),
+            *HEADING,
         ),
         reward=reward,
         nominal=(turn_rate,),
         starts={**starts, "uniform": Start(anywhere(r), UNIFORMS)},
-        noise=("sigma_1", "sigma_2"),
-        plane=("x", "y"),
-        scene="top-view",
+        **SHOWN,
         explored=SamplingDomain(region=((-r, r), (-r, r), (-math.pi, math.pi))),
         **rest,
     )

@@ -8,15 +8,13 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.envs.system_env import SystemEnv
-from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
-from safe_envs.systems._common import around, positive, uniforms
-from safe_envs.systems.dubins import omega, theta, turn_rate_towards, vehicle, x, y
+from safe_envs.systems._common import positive, uniform_box
+from safe_envs.systems.dubins import HEADING, SHOWN, omega, theta, turn_rate_towards, vehicle, x, y
 
 x_o, y_o, v_o = sp.symbols("x_o y_o v_o", real=True)
 
@@ -99,7 +97,6 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
     """
     r = positive("radius", radius)
     moving = {x_o: v_o, y_o: sp.Integer(0)}
-    spread = uniforms(3)
     return SafetyProblem(
         name="DubinsObstacle",
         plant=vehicle_among(0.8, moving, {v_o: 0.5}),
@@ -116,28 +113,19 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
         features=(
             Feature("x", x, -5.0, 6.0),
             Feature("y", y, -5.0, 5.0),
-            Feature("cos_theta", sp.cos(theta), -1.0, 1.0),
-            Feature("sin_theta", sp.sin(theta), -1.0, 1.0),
+            *HEADING,
             Feature("ahead_x", x_o - x, -11.0, 25.0),
             Feature("ahead_y", y_o - y, -10.0, 10.0),
         ),
         starts={
-            "spread": Start(
-                (
-                    *(around(s, 0.5, w) for s, w in zip(_START, spread, strict=True)),
-                    *map(sp.Float, _OBSTACLE_START),
-                ),
-                spread,
-            ),
+            "spread": uniform_box((*_START, *_OBSTACLE_START), (0.5, 0.5, 0.5, 0.0, 0.0)),
             "thesis": Start.at((*_START, *_OBSTACLE_START)),
         },
         dt=0.05,
         horizon=15.0,
-        noise=("sigma_1", "sigma_2"),
         gains=(1.0, 1.0),
         filter="hocbf",
-        plane=("x", "y"),
-        scene="top-view",
+        **SHOWN,
         explored=SamplingDomain(
             region=((-3.0, 4.0), (-3.0, 3.0), (-math.pi, math.pi), (-2.0, 7.0), (-1.0, 1.0)),
             coordinates=(sp.cos(theta), sp.sin(theta), x_o - x, y_o - y),

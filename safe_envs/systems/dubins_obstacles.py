@@ -6,14 +6,13 @@ import math
 
 import sympy as sp
 
+from safe_envs import Barrier, SafetyProblem
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError, shown
-from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import around, positive, uniforms
-from safe_envs.systems.dubins import omega, theta, x, y
+from safe_envs.systems.dubins import HEADING, SHOWN, omega, theta, x, y
 from safe_envs.systems.dubins_obstacle import separation, vehicle_among, way_to
 
 w_o = sp.Symbol("w_o", real=True)
@@ -85,8 +84,7 @@ def dubins_obstacles(*, num_obstacles: int = 5, radius: float = 0.4) -> SafetyPr
         inputs=(Variable(omega, -math.pi, math.pi, "rad/s"),),
         features=(
             *(Feature(s.name, s, -side, side) for s in (x, y)),
-            Feature("cos_theta", sp.cos(theta), -1.0, 1.0),
-            Feature("sin_theta", sp.sin(theta), -1.0, 1.0),
+            *HEADING,
             *(
                 Feature(f"ahead_{own}_{i}", position - own, -2 * side, 2 * side)
                 for i, place in enumerate(places, start=1)
@@ -106,11 +104,9 @@ def dubins_obstacles(*, num_obstacles: int = 5, radius: float = 0.4) -> SafetyPr
         },
         dt=0.05,
         horizon=math.ceil(4 * edge / _SPEED),
-        noise=("sigma_1", "sigma_2"),
         gains=(3.0, 5.0),
         filter="hocbf",
-        plane=("x", "y"),
-        scene="top-view",
+        **SHOWN,
         **way_to(edge, 0.0),
     )
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.envs.system_env import SystemEnv
-from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Variable
-from safe_envs.systems._common import around, positive, uniforms
+from safe_envs.systems._common import positive, uniform_box
 
 theta, thetadot, u = sp.symbols("theta thetadot u", real=True)
 m, ell, g, sigma = sp.symbols("m l g sigma", real=True)
@@ -54,7 +52,6 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         sp.sqrt(c * P.inv().row(0)[0])
     )  # largest angle, and largest speed, in the ellipse
     system = inverted_pendulum()
-    first, second = uniforms(2)
     return SafetyProblem(
         name="Pendulum",
         plant=system,
@@ -65,9 +62,7 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         reward=sp.exp(-((5 * (theta - _TARGET)) ** 2)),
         nominal=(sp.Integer(0),),
         starts={
-            "uniform": Start(
-                (around(0.0, reach, first), around(0.0, reach, second)), (first, second), h
-            ),
+            "uniform": uniform_box((0.0, 0.0), (reach, reach), h),
             "near-origin": Start.at((0.1, 0.1)),
         },
         dt=0.01,

@@ -8,32 +8,14 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs import ControlAffineSDE, SafetyProblem
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
+from safe_envs.systems import quadrotor_altitude as vertical
 from safe_envs.systems._common import around, uniforms
-from safe_envs.systems.quadrotor_altitude import (
-    CLIMB_RATES,
-    FOLLOWED,
-    GRAVITY,
-    HEIGHT,
-    MODEL_MASS,
-    PLANT_MASS,
-    altitude_problem,
-    band,
-    climb_per_thrust,
-    g,
-    m,
-    phi,
-    sigma_z,
-    theta,
-    thrust_law,
-    z,
-    zdot,
-)
+from safe_envs.systems.quadrotor_altitude import g, m, phi, sigma_z, theta, z, zdot
 
 x, y, psi = sp.symbols("x y psi", real=True)
 xdot, ydot, phidot, thetadot, psidot = sp.symbols("xdot ydot phidot thetadot psidot", real=True)
@@ -50,9 +32,9 @@ LARGEST_TILT = math.pi / 3
 
 _STATES = (
     *(Variable(s, -5.0, 5.0, "m") for s in (x, y)),
-    HEIGHT[0],
+    vertical.HEIGHT[0],
     *(Variable(s, -10.0, 10.0, "m/s") for s in (xdot, ydot)),
-    HEIGHT[1],
+    vertical.HEIGHT[1],
     *(Variable(s, -LARGEST_TILT, LARGEST_TILT, "rad") for s in (phi, theta)),
     Variable(psi, -math.inf, math.inf, "rad"),
     *(Variable(s, -15.0, 15.0, "rad/s") for s in (phidot, thetadot, psidot)),
@@ -82,7 +64,7 @@ def quadrotor(mass: float) -> ControlAffineSDE:
     by_force = sp.zeros(12, 4)
     by_force[3, 0] = (sp.cos(phi) * sp.sin(theta) * sp.cos(psi) + sp.sin(phi) * sp.sin(psi)) / m
     by_force[4, 0] = (sp.cos(phi) * sp.sin(theta) * sp.sin(psi) - sp.sin(phi) * sp.cos(psi)) / m
-    by_force[5, 0] = climb_per_thrust()
+    by_force[5, 0] = vertical.climb_per_thrust()
     by_force[9, 1], by_force[10, 2], by_force[11, 3] = ell / I_x, ell / I_y, 1 / I_z
     diffusion = sp.zeros(12, 3)
     diffusion[3, 0], diffusion[4, 1], diffusion[5, 2] = sigma_x, sigma_y, sigma_z
@@ -92,7 +74,12 @@ def quadrotor(mass: float) -> ControlAffineSDE:
         drift=drift,
         input_matrix=by_force * MIXING,
         diffusion=diffusion,
-        parameters={m: mass, g: GRAVITY, **_AIRFRAME, sigma_x: 0.0, sigma_y: 0.0, sigma_z: 0.0},
+        parameters={
+            m: mass,
+            g: vertical.GRAVITY,
+            **_AIRFRAME,
+            **dict.fromkeys((sigma_x, sigma_y, sigma_z), 0.0),
+        },
     )
 
 
@@ -113,7 +100,7 @@ def rotor_laws(x_wanted: sp.Expr, x_rate_wanted: sp.Expr) -> tuple[sp.Expr, ...]
     wanted_theta = (push_x * cos_psi + push_y * sin_psi) / g
     efforts = sp.Matrix(
         [
-            thrust_law(),
+            vertical.thrust_law(),
             I_x / ell * (36 * (wanted_phi - phi) - 12 * phidot),
             I_y / ell * (36 * (wanted_theta - theta) - 12 * thetadot),
             I_z * (-4 * sp.atan2(sin_psi, cos_psi) - 4 * psidot),
@@ -140,7 +127,7 @@ def rotor_problem(name: str, *, followed: Sequence[Feature] = (), **rest: Any) -
         followed: references other than the altitude's.
         **rest: see `altitude_problem`.
     """
-    return altitude_problem(
+    return vertical.altitude_problem(
         name,
         states=_STATES,
         inputs=tuple(Variable(s, 0.0, _MOST_ROTOR, "rad^2/s^2") for s in rotors),
@@ -148,7 +135,7 @@ def rotor_problem(name: str, *, followed: Sequence[Feature] = (), **rest: Any) -
             *(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in _STATES if s.symbol != psi),
             Feature("cos_psi", sp.cos(psi), -1.0, 1.0),
             Feature("sin_psi", sp.sin(psi), -1.0, 1.0),
-            *FOLLOWED,
+            *vertical.FOLLOWED,
             *followed,
         ),
         noise=("sigma_x", "sigma_y", "sigma_z"),
@@ -170,9 +157,9 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
     height, climb = spread = uniforms(2)
     return rotor_problem(
         "Quadrotor",
-        plant=quadrotor(PLANT_MASS),
-        model=quadrotor(MODEL_MASS),
-        barriers=(band(center, half_width),),
+        plant=quadrotor(vertical.PLANT_MASS),
+        model=quadrotor(vertical.MODEL_MASS),
+        barriers=(vertical.band(center, half_width),),
         nominal=rotor_laws(sp.Integer(0), sp.Integer(0)),
         starts={
             "spread": start_at(
@@ -184,7 +171,7 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
             region=tuple(
                 {
                     z: (center - half_width, center + half_width),
-                    zdot: CLIMB_RATES,
+                    zdot: vertical.CLIMB_RATES,
                     psi: (-math.pi, math.pi),
                 }.get(s.symbol, (s.low, s.high))
                 for s in _STATES

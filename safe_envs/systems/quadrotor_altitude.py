@@ -6,15 +6,13 @@ from typing import Any
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.number_text import finite_number
-from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import TIME, Feature, Variable
-from safe_envs.systems._common import around, positive, uniforms
+from safe_envs.systems._common import positive, uniform_box
 
 z, zdot, phi, theta = sp.symbols("z zdot phi theta", real=True)
 U_1 = sp.Symbol("U_1", real=True)
@@ -109,7 +107,6 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
 
     Source: thesis Sec. 3.5.2, Eq. (3.31), (3.32).
     """
-    height, climb = uniforms(2)
     return altitude_problem(
         "QuadrotorAltitude",
         plant=altitude(PLANT_MASS),
@@ -120,7 +117,7 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         features=(*(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in HEIGHT), *FOLLOWED),
         nominal=(thrust_law(),),
         starts={
-            "spread": Start((around(5.0, 0.5, height), around(0.0, 0.5, climb)), (height, climb)),
+            "spread": uniform_box((5.0, 0.0), (0.5, 0.5)),
             "thesis": Start.at((5.0, 0.0)),
         },
         noise=("sigma_z",),

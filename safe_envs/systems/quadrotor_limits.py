@@ -6,11 +6,10 @@ import math
 
 import sympy as sp
 
+from safe_envs import Barrier, SafetyProblem
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.number_text import finite_number
-from safe_envs.problem.barrier import Barrier
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME, Feature
 from safe_envs.systems._common import around, uniforms
 from safe_envs.systems.quadrotor import (
@@ -48,6 +47,9 @@ def quadrotor_limits(
         floor: lowest safe altitude, in m.
         ceiling: highest safe altitude, in m.
         tilt: largest safe angle between the thrust and the vertical, in rad.
+
+    Raises:
+        ConfigurationError: the limits are not within the workspace, or in the wrong order.
     """
     low, high, angle = (
         finite_number("floor", floor),

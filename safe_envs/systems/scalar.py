@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import sympy as sp
 
-from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.envs.system_env import SystemEnv
-from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.initial_distribution import Start
-from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Variable
-from safe_envs.systems._common import around, positive, uniforms
+from safe_envs.systems._common import positive, uniform_box
 
 x, u, sigma = sp.symbols("x u sigma", real=True)
 
@@ -40,7 +38,6 @@ def scalar(*, limit: float = 1.0) -> SafetyProblem:
     """
     system = scalar_system()
     edge = positive("limit", limit)
-    (spread,) = uniforms(1)
     return SafetyProblem(
         name="Scalar",
         plant=system,
@@ -51,7 +48,7 @@ def scalar(*, limit: float = 1.0) -> SafetyProblem:
         reward=sp.exp(-((2 * (x / edge - 1)) ** 2)),
         nominal=(-x + edge - x,),
         starts={
-            "spread": Start((around(0.0, 0.9 * edge, spread),), (spread,)),
+            "spread": uniform_box((0.0,), (0.9 * edge,)),
             "origin": Start.at((0.0,)),
         },
         dt=0.01,

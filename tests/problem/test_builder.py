@@ -163,7 +163,7 @@ def test_a_rate_that_cannot_be_taken_apart_is_told_so():
     [
         ({"box": (-500.0, 500.0), "workspace": {v: (-3.0, 3.0)}}, "across its whole workspace"),
         ({"nominal": -5000 * (x + 2)}, "check that both have the unit"),
-        ({"box": (-1e-4, 1e-4), "start": [0.9, 0.9]}, "the box is too small for h"),
+        ({"box": (-1e-4, 1e-4), "start": [0.9, 0.9]}, "the input bounds are too narrow for h"),
         ({"start": [(-300.0, 300.0), 0.0]}, "degrees for radians"),
     ],
 )

@@ -37,7 +37,7 @@ def test_what_is_given_is_kept():
 
 def test_an_angle_is_explored_over_a_whole_turn():
     found = SamplingDomain().completed(
-        (x, theta), ((-1.0, 3.0), (-math.inf, math.inf)), (False, True), ((-1.0, 1.0),)
+        (Variable(x, -1.0, 3.0), Variable(theta, -math.inf, math.inf, "rad")), ((-1.0, 1.0),)
     )
     assert found.region == ((-1.0, 3.0), (-math.pi, math.pi))
     assert found.coordinates == (x, sp.cos(theta), sp.sin(theta))
@@ -59,7 +59,7 @@ def test_only_unbounded_radians_are_angles():
 
 
 def test_each_input_goes_halfway_with_the_others_at_the_centre():
-    found = SamplingDomain().completed((x,), ((0.0, 1.0),), (False,), ((-2.0, 2.0), (0.0, 8.0)))
+    found = SamplingDomain().completed((Variable(x, 0.0, 1.0),), ((-2.0, 2.0), (0.0, 8.0)))
     assert found.inputs == ((-1.0, 4.0), (1.0, 4.0), (0.0, 2.0), (0.0, 6.0))
 
 

@@ -137,15 +137,16 @@ def draw_trail(canvas: Canvas, axes: Axes, x: np.ndarray, y: np.ndarray, h: np.n
     """
     kept = thinned(len(x))
     places, unsafe = axes.places(x[kept], y[kept]), np.minimum.reduceat(h, kept) < 0.0
-    canvas.within(axes.box)
-    for age, part in enumerate(np.array_split(np.arange(len(places)), _AGES), start=1):
-        if part.size:
-            canvas.path(
-                places[part[0] : part[-1] + 2], mix(EXECUTED, mix(SKY, PAPER, 0.45), age / _AGES), 2
-            )
-    for run in runs(unsafe):
-        canvas.path(places[run], VIOLATION, 3)
-    canvas.within(None)
+    with canvas.within(axes.box):
+        for age, part in enumerate(np.array_split(np.arange(len(places)), _AGES), start=1):
+            if part.size:
+                canvas.path(
+                    places[part[0] : part[-1] + 2],
+                    mix(EXECUTED, mix(SKY, PAPER, 0.45), age / _AGES),
+                    2,
+                )
+        for run in runs(unsafe):
+            canvas.path(places[run], VIOLATION, 3)
 
 
 def draw_violation(canvas: Canvas, axes: Axes, where: tuple[float, float]) -> None:
@@ -156,11 +157,10 @@ def draw_violation(canvas: Canvas, axes: Axes, where: tuple[float, float]) -> No
         axes: of the scene.
         where: coordinates of the violation.
     """
-    canvas.within(axes.box)
-    at = axes.place(*where)
-    canvas.cross(at, 8, PAPER, 7)
-    canvas.cross(at, 7, VIOLATION, 4)
-    canvas.within(None)
+    with canvas.within(axes.box):
+        at = axes.place(*where)
+        canvas.cross(at, 8, PAPER, 7)
+        canvas.cross(at, 7, VIOLATION, 4)
 
 
 def draw_point(canvas: Canvas, at: tuple[float, float], color: Color) -> None:

@@ -40,14 +40,7 @@ class PendulumScene(Scene):
         self._reach = self.range_of(self._angle)
         self._barriers = Barriers(problem)
         self._plane = StatePlane(self, ("theta", "thetadot"), _PLANE)
-        self._length = next(
-            (
-                float(value)
-                for symbol, value in problem.plant.parameters.items()
-                if symbol.name == "l"
-            ),
-            None,
-        )
+        self._length = problem.plant.parameter_values.get("l")
 
     def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw the rod and the plane."""

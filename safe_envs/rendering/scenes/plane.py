@@ -100,9 +100,8 @@ class StatePlane:
         elif not self._changes:
             safe_set.draw(furniture, snapshot.state)
         if self._decorate is not None:
-            furniture.within(axes.box)
-            self._decorate(furniture, axes)
-            furniture.within(None)
+            with furniture.within(axes.box):
+                self._decorate(furniture, axes)
         axes.furnish(furniture, *self._labels, grid=False)
         return safe_set if self._changes else None, furniture
 
@@ -133,9 +132,8 @@ class StatePlane:
         """
         axes = self.background(canvas, snapshot)
         at = self.trail(canvas, axes, snapshot)
-        canvas.within(axes.box)
-        draw_point(canvas, at, warning_color(snapshot))
-        canvas.within(None)
+        with canvas.within(axes.box):
+            draw_point(canvas, at, warning_color(snapshot))
 
 
 def _values(snapshot: EpisodeSnapshot, i: int) -> np.ndarray:

@@ -124,14 +124,12 @@ class SideView(Scene):
     def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw the quadrotor and its reference."""
         axes = self._plane.background(canvas, snapshot)
-        canvas.within(axes.box)
-        self._draw_reference(canvas, axes, snapshot)
-        at = self._plane.trail(canvas, axes, snapshot)
-        canvas.within(axes.box)
-        attitude = rotation(*(float(snapshot.state[i]) for i in self._angles))
-        draw_quadrotor(canvas, at, attitude, warning_color(snapshot))
-        self._draw_dial(canvas, attitude)
-        canvas.within(None)
+        with canvas.within(axes.box):
+            self._draw_reference(canvas, axes, snapshot)
+            at = self._plane.trail(canvas, axes, snapshot)
+            attitude = rotation(*(float(snapshot.state[i]) for i in self._angles))
+            draw_quadrotor(canvas, at, attitude, warning_color(snapshot))
+            self._draw_dial(canvas, attitude)
 
     def _draw_reference(self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot) -> None:
         now = snapshot.times[-1:]

@@ -64,16 +64,7 @@ class Road(Scene):
         others = [
             i for i, s in enumerate(self.problem.states) if s.unit == unit and i != self._speed
         ]
-        if others:
-            return others[0]
-        return next(
-            (
-                float(value)
-                for symbol, value in self.problem.plant.parameters.items()
-                if symbol.name == "v_f"
-            ),
-            None,
-        )
+        return others[0] if others else self.problem.plant.parameter_values.get("v_f")
 
     def required(self, states: np.ndarray) -> np.ndarray:
         """Return the gap at which the smallest barrier vanishes at states (k, n), by bisection."""
@@ -102,10 +93,9 @@ class Road(Scene):
         own, edge, lead = (axes.place(v, 0.0)[0] for v in (0.0, required, gap))
         lane = (top + 12, height - 24)
         canvas.fill((own, lane[0], edge - own, lane[1]), UNSAFE)
-        canvas.within((round(own), lane[0], max(round(edge - own), 0), lane[1]))
-        for x in np.arange(own - lane[1], edge, 10.0).tolist():
-            canvas.line((x, lane[0] + lane[1]), (x + lane[1], lane[0]), HATCH, 2)
-        canvas.within(None)
+        with canvas.within((round(own), lane[0], max(round(edge - own), 0), lane[1])):
+            for x in np.arange(own - lane[1], edge, 10.0).tolist():
+                canvas.line((x, lane[0] + lane[1]), (x + lane[1], lane[0]), HATCH, 2)
         for level in range(4):
             start = edge + level * STEP / 2
             if start < lead:
@@ -127,7 +117,7 @@ class Road(Scene):
         self._draw_dimension(
             canvas, own, edge, top + height + 14, f"required {number(required)} m", EDGE, False
         )
-        self._draw_speeds(canvas, snapshot, own, lead)
+        self._draw_speeds(canvas, snapshot)
 
     def _draw_dimension(
         self,
@@ -147,9 +137,7 @@ class Road(Scene):
             text, at, mix(color, INK, 0.7), SMALL, bold=True, align=(0.5, 1.0 if above else 0.0)
         )
 
-    def _draw_speeds(
-        self, canvas: Canvas, snapshot: EpisodeSnapshot, own: float, lead: float
-    ) -> None:
+    def _draw_speeds(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         y = _ROAD[1] + _ROAD[3] + 34
         speed = float(snapshot.state[self._speed])
         canvas.text(f"own {number(speed)} m/s", (14, y), INK, SMALL)
@@ -168,34 +156,33 @@ class Road(Scene):
             (0.0, _reach(max(float(gaps.max()), float(required.max())))),
         )
         canvas.fill(_CHART, PAPER)
-        canvas.within(_CHART)
-        edge = axes.places(times, required)
-        if len(edge) > 1:
-            bottom, top = _CHART[1] + _CHART[3], _CHART[1]
-            canvas.shape([(edge[0, 0], top), *edge, (edge[-1, 0], top)], tint(1))
-            canvas.shape([(edge[0, 0], bottom), *edge, (edge[-1, 0], bottom)], UNSAFE)
-        canvas.within(None)
+        with canvas.within(_CHART):
+            edge = axes.places(times, required)
+            if len(edge) > 1:
+                bottom, top = _CHART[1] + _CHART[3], _CHART[1]
+                canvas.shape([(edge[0, 0], top), *edge, (edge[-1, 0], top)], tint(1))
+                canvas.shape([(edge[0, 0], bottom), *edge, (edge[-1, 0], bottom)], UNSAFE)
         canvas.lay(_furniture(axes, label(self.names[self._gap], "m")))
-        canvas.within(_CHART)
-        canvas.path(edge, EDGE, 3)
-        ahead = np.array([edge[-1], (_CHART[0] + _CHART[2], edge[-1, 1])])
-        canvas.dashes(ahead, EDGE, 1)
-        canvas.text(
-            "required now",
-            (ahead[1, 0] - 6, edge[-1, 1] - 3),
-            mix(EDGE, INK, 0.7),
-            SMALL,
-            align=(1.0, 1.0),
-        )
-        canvas.within(None)
+        with canvas.within(_CHART):
+            canvas.path(edge, EDGE, 3)
+            ahead = np.array([edge[-1], (_CHART[0] + _CHART[2], edge[-1, 1])])
+            canvas.dashes(ahead, EDGE, 1)
+            canvas.text(
+                "required now",
+                (ahead[1, 0] - 6, edge[-1, 1] - 3),
+                mix(EDGE, INK, 0.7),
+                SMALL,
+                align=(1.0, 1.0),
+            )
         draw_trail(canvas, axes, snapshot.times, snapshot.states[:, self._gap], snapshot.h)
         if snapshot.violated is not None:
             draw_violation(
                 canvas, axes, (snapshot.violated_at, float(snapshot.violated[self._gap]))
             )
-        canvas.within(_CHART)
-        draw_point(canvas, axes.place(float(times[-1]), float(gaps[-1])), warning_color(snapshot))
-        canvas.within(None)
+        with canvas.within(_CHART):
+            draw_point(
+                canvas, axes.place(float(times[-1]), float(gaps[-1])), warning_color(snapshot)
+            )
 
 
 @lru_cache(maxsize=8)

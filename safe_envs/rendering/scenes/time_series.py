@@ -15,7 +15,7 @@ from safe_envs.rendering.safe_set import Barriers, SafeSet
 from safe_envs.rendering.scenes.base import Scene, draw_point, warning_color
 from safe_envs.rendering.scenes.plane import StatePlane
 from safe_envs.rendering.snapshot import EpisodeSnapshot
-from safe_envs.rendering.style import GOAL, GREY, INK, SMALL, mix
+from safe_envs.rendering.style import GOAL, GREY, INK, SCENE, SMALL, mix
 
 _CHART: Box = (76, 20, 384, 466)
 _LINE: Box = (484, 20, 96, 466)
@@ -66,18 +66,19 @@ class TimeSeriesScene(Scene):
         line = Axes(_LINE, (0.0, 1.0), axes.y)
         canvas.lay(self._line(line, snapshot))
         if self._reference is not None:
-            canvas.within(_LINE)
             wanted = line.place(0.5, float(self._reference(snapshot.times[-1:])[0]))[1]
-            canvas.dashes(np.array([(_LINE[0], wanted), (_LINE[0] + _LINE[2], wanted)]), GOAL, 2)
+            with canvas.within(_LINE):
+                canvas.dashes(
+                    np.array([(_LINE[0], wanted), (_LINE[0] + _LINE[2], wanted)]), GOAL, 2
+                )
         at = self._chart.trail(canvas, axes, snapshot)
         middle = (_LINE[0] + _LINE[2] / 2, at[1])
-        canvas.within((0, 0, 600, 540))
-        canvas.dashes(np.array([at, middle]), GREY, 1, 8.0)
-        canvas.within(axes.box)
-        draw_point(canvas, at, warning_color(snapshot))
-        canvas.within(_LINE)
-        self.draw_marker(canvas, middle, snapshot)
-        canvas.within(None)
+        with canvas.within(SCENE):
+            canvas.dashes(np.array([at, middle]), GREY, 1, 8.0)
+        with canvas.within(axes.box):
+            draw_point(canvas, at, warning_color(snapshot))
+        with canvas.within(_LINE):
+            self.draw_marker(canvas, middle, snapshot)
 
     def draw_marker(
         self, canvas: Canvas, at: tuple[float, float], snapshot: EpisodeSnapshot

@@ -108,15 +108,13 @@ class TopView(Scene):
     def draw(self, canvas: Canvas, snapshot: EpisodeSnapshot) -> None:
         """Draw the vehicle and its surroundings."""
         axes = self._plane.background(canvas, snapshot)
-        canvas.within(axes.box)
-        self._draw_obstacles(canvas, axes, snapshot)
-        self._draw_hit(canvas, axes, snapshot)
-        if self._goal is not None:
-            self._draw_goal(canvas, axes, snapshot, self._goal)
-        at = self._plane.trail(canvas, axes, snapshot)
-        canvas.within(axes.box)
-        draw_vehicle(canvas, at, float(snapshot.state[self._heading]), snapshot)
-        canvas.within(None)
+        with canvas.within(axes.box):
+            self._draw_obstacles(canvas, axes, snapshot)
+            self._draw_hit(canvas, axes, snapshot)
+            if self._goal is not None:
+                self._draw_goal(canvas, axes, snapshot, self._goal)
+            at = self._plane.trail(canvas, axes, snapshot)
+            draw_vehicle(canvas, at, float(snapshot.state[self._heading]), snapshot)
 
     def _draw_goal(
         self, canvas: Canvas, axes: Axes, snapshot: EpisodeSnapshot, goal: Circle

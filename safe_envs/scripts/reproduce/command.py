@@ -13,17 +13,11 @@ import typer
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import (
-    Json,
-    require_result,
-    say,
-    stdout,
-    write_result,
-)
+from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
 from safe_envs.scripts.options.job_progress import run_jobs
 
 if TYPE_CHECKING:
-    from safe_envs.scripts.reproduce.framework.artefact import Artefact, Sample
+    from safe_envs.scripts.reproduce.framework.artefact import Artefact, Workload
 
 _ALL = "all"
 
@@ -67,16 +61,13 @@ def reproduce(
     """
     from safe_envs.agents.jobs.executor import Backend
     from safe_envs.agents.jobs.fingerprint import source_checksum
-    from safe_envs.scripts.reproduce.framework.artefact import Sample
+    from safe_envs.scripts.reproduce.framework.artefact import Workload
     from safe_envs.scripts.reproduce.framework.page import write_page
     from safe_envs.scripts.reproduce.framework.store import read, require_same_sample
-    from safe_envs.scripts.reproduce.framework.summary import (
-        summary_document,
-        summary_table,
-    )
+    from safe_envs.scripts.reproduce.framework.summary import summary_document, summary_table
 
     require_result(json_file)
-    sample = Sample(episodes, seed, quick)
+    sample = Workload(episodes, seed, quick)
     chosen = _chosen(names or [_ALL])
     require_same_sample(out, _chosen([_ALL]), sample)
     missing = [artefact for artefact in chosen if read(out, artefact, sample) is None]
@@ -119,7 +110,7 @@ class ArtefactJob:
     """
 
     key: str
-    sample: Sample
+    sample: Workload
     out: Path
     source: str
 

@@ -110,16 +110,16 @@ class SafetyFilterWrapper(
         self._infeasible += not decision.feasible
         info.update(
             filter_info(
-                np.array(nominal),
-                np.array(executed),
-                differs,
-                active,
-                decision.feasible,
-                max(decision.slack),
-                np.array(decision.slack),
-                decision.cause if differs else -1,
-                self._interventions,
-                self._infeasible,
+                nominal_action=np.array(nominal),
+                safe_action=np.array(executed),
+                intervention=differs,
+                filter_active=active,
+                feasible=decision.feasible,
+                slack=max(decision.slack),
+                slacks=np.array(decision.slack),
+                active_barrier=decision.cause if differs else -1,
+                episode_interventions=self._interventions,
+                episode_infeasible=self._infeasible,
             )
         )
         return observation, reward, terminated, truncated, info

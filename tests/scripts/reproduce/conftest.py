@@ -7,9 +7,9 @@ import pytest
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 
 
@@ -23,10 +23,10 @@ def computed():
 def coin(computed):
     """A table of a fair coin, with a picture."""
 
-    def compute(sample: Sample) -> Outcome:
+    def compute(sample: Workload) -> Findings:
         computed.append("table-0.1")
         trials = sample.size(1000)
-        return Outcome(
+        return Findings(
             [
                 Number.rate("heads", trials // 2, trials, 48.0, 50),
                 Number("edge", 0.25, 0.2, 0.3, unit="s"),

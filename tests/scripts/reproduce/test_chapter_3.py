@@ -18,7 +18,7 @@ from safe_envs.scripts.reproduce.chapter_3 import (
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import runs, thinned
 from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
 from safe_envs.scripts.reproduce.framework import store, verdict
-from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.wrappers import HOCBF
 
@@ -27,7 +27,7 @@ ARTEFACTS = {
     artefact.name: artefact
     for artefact in (*dubins_disk.ARTEFACTS, *dubins_obstacle.ARTEFACTS, *quadrotor.ARTEFACTS)
 }
-QUICK = Sample(episodes=8, quick=True)
+QUICK = Workload(episodes=8, quick=True)
 
 
 def compute(name):
@@ -66,9 +66,9 @@ def test_the_module_has_the_figures_of_the_chapter():
 
 def test_settings_and_numbers_are_those_of_the_thesis(outcomes):
     # Sec. 3.5.1, static case, with Eq. (3.27), (3.28).
-    world = dubins_disk.disk(Sample())
+    world = dubins_disk.disk(Workload())
     assert (world.dt, world.horizon, world.steps) == (0.05, 50.0, 1000)
-    assert [learned_runs.parameters(system)["v"] for system in (world.plant, world.model)] == [
+    assert [system.parameter_values["v"] for system in (world.plant, world.model)] == [
         0.8,
         0.5,
     ]
@@ -82,8 +82,8 @@ def test_settings_and_numbers_are_those_of_the_thesis(outcomes):
     assert {c["p"] for c in outcome.data["curves"]} == {0.5, 1.0, 5.0}
     # Sec. 3.5.1, moving case, with Fig. 3.2; p_1 = p_2 = 1 are of thesis-notes.
     world = make_problem(dubins_obstacle.OBSTACLE, start="thesis")
-    assert [learned_runs.parameters(world.plant)[name] for name in ("v", "v_o")] == [0.8, 0.5]
-    assert [learned_runs.parameters(world.model)[name] for name in ("v", "v_o")] == [0.5, 0.5]
+    assert [world.plant.parameter_values[name] for name in ("v", "v_o")] == [0.8, 0.5]
+    assert [world.model.parameter_values[name] for name in ("v", "v_o")] == [0.5, 0.5]
     instants = outcomes["figure-3.2a"].data["instants"]
     assert [instant["time"] for instant in instants] == [0.0, 4.0, 7.0]
     assert [instants[0][what] for what in ("vehicle", "obstacle")] == [[-2.0, -2.0], [-1.0, 0.0]]
@@ -94,16 +94,16 @@ def test_settings_and_numbers_are_those_of_the_thesis(outcomes):
         dubins_obstacle.OBSTACLE_RATES,
     ) == (0.5, 0.8, "1,1")
     # Sec. 3.5.2 with Fig. 3.3.
-    world = quadrotor.hover(Sample())
-    assert [learned_runs.parameters(system)["m"] for system in (world.plant, world.model)] == [
+    world = quadrotor.hover(Workload())
+    assert [system.parameter_values["m"] for system in (world.plant, world.model)] == [
         0.6,
         0.4,
     ]
     assert (quadrotor.GAINS, quadrotor.HALF_WIDTH) == ((2.0, 8.0), 2.0)
     assert outcomes["figure-3.3"].data["true"]["z"][0] == 5.0
     # Sec. 3.5.1, 3.5.2: 500 epochs; the rest is of thesis-notes, and three learnings are ours.
-    assert learned_runs.learning_sizes(Sample()) == (2000, 500)
-    assert len(learned_runs.seeds(Sample())) == 3
+    assert learned_runs.learning_sizes(Workload()) == (2000, 500)
+    assert len(learned_runs.seeds(Workload())) == 3
 
 
 def test_claims_of_the_thesis_are_apart_from_ours(outcomes):
@@ -120,18 +120,18 @@ def test_claims_of_the_thesis_are_apart_from_ours(outcomes):
 
 def test_settings_are_those_of_the_sample():
     for sample, learnings, long in (
-        (Sample(), "3 learnings from 2000 states", "50 s;"),
+        (Workload(), "3 learnings from 2000 states", "50 s;"),
         (QUICK, "2 learnings from 400 states", "2.5 s;"),
     ):
         for artefact in ARTEFACTS.values():
             assert learnings in " ".join(artefact.setting(sample))
         text = " ".join(ARTEFACTS["figure-3.1"].setting(sample))
         assert f"plant 0.8 m/s, model 0.5 m/s, dt 0.05 s, {long} p_1 = p_2 = 0.5, 1, 5 1/s" in text
-    assert "up to 20 s" in ARTEFACTS["figure-3.1"].setting(Sample())[-1]
+    assert "up to 20 s" in ARTEFACTS["figure-3.1"].setting(Workload())[-1]
     assert "up to 2.5 s" in ARTEFACTS["figure-3.1"].setting(QUICK)[-1]
     assert "rates from 8 starts" in " ".join(ARTEFACTS["figure-3.2a"].setting(QUICK))
-    assert "rates from 1000 starts" in " ".join(ARTEFACTS["figure-3.3"].setting(Sample()))
-    assert ARTEFACTS["figure-3.3"].setting(Sample())[0].endswith("30 s")
+    assert "rates from 1000 starts" in " ".join(ARTEFACTS["figure-3.3"].setting(Workload()))
+    assert ARTEFACTS["figure-3.3"].setting(Workload())[0].endswith("30 s")
     assert ARTEFACTS["figure-3.3"].setting(QUICK)[0].endswith("7 s")
 
 
@@ -160,7 +160,7 @@ def test_what_is_told_of_the_learning_is_so(outcomes):
 @pytest.mark.parametrize("name", ARTEFACTS)
 def test_an_outcome_survives_json(name, outcomes):
     text = json.dumps(outcomes[name].document(), allow_nan=False)
-    assert Outcome.from_document(json.loads(text)).document() == json.loads(text)
+    assert Findings.from_document(json.loads(text)).document() == json.loads(text)
 
 
 @pytest.mark.parametrize("name", ARTEFACTS)
@@ -168,17 +168,17 @@ def test_an_outcome_is_drawn_and_judged(name, outcomes, tmp_path, pictures):
     artefact, outcome = ARTEFACTS[name], outcomes[name]
     store.keep(tmp_path, artefact, QUICK, outcome, 0.0)
     assert (tmp_path / f"{name}.png").stat().st_size > 5000
-    assert verdict.judge(artefact, outcome, Sample()).verdict in verdict.Verdict
+    assert verdict.judge(artefact, outcome, Workload()).verdict in verdict.Verdict
 
 
 @pytest.mark.parametrize("name", ["figure-3.1", "figure-3.2b", "figure-3.3"])
 def test_the_same_seed_gives_the_same_outcome(name, outcomes):
-    """One of each module; figure-3.2a has the runs of figure-3.2b, and rates as figure-3.3."""
+    """One of each module: figure-3.2a shows runs of figure-3.2b, and rates as figure-3.3 does."""
     if name == "figure-3.2b":
         dubins_obstacle.passages.cache_clear()
     if name == "figure-3.3":
-        # This one learns anew, too.
-        dubins_obstacle.residuals.cache_clear()
+        # This one learns again, too.
+        learned_runs.residuals.cache_clear()
     assert compute(name).document() == outcomes[name].document()
 
 
@@ -314,7 +314,7 @@ def test_the_printed_formula_of_the_quadrotor_diverges_and_the_corrected_one_doe
     assert found["smallest h, true"] > 0 > found["smallest h, nominal"]
     assert printed["smallest h, true"] < -10
     assert printed["time in the workspace, true"] < 3.0
-    assert verdict.judge(ARTEFACTS["figure-3.3"], outcome, Sample()).wrong_formula
+    assert verdict.judge(ARTEFACTS["figure-3.3"], outcome, Workload()).wrong_formula
     assert (
         "the state leaves the workspace, of which the altitudes are [0, 10] m, after 1.85 s of 7 s,"
         " at 10.4 m" in outcome.notes[0]

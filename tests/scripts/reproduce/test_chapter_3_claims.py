@@ -15,7 +15,7 @@ from safe_envs.scripts.reproduce.chapter_3 import (
 )
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import Trajectory
 from safe_envs.scripts.reproduce.framework import verdict
-from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload
 
 GOAL = (3.0, 1.5)
 OBSTACLE = make_problem(dubins_obstacle.OBSTACLE)
@@ -61,14 +61,14 @@ def test_all_are_safe_if_they_are_so_in_every_learning(counts, ours):
 
 def test_the_printed_differences_give_the_print_if_all_are_safe_in_every_learning():
     failed = runs_of_the_disk(1, 1, 1)
-    outcome = Outcome(dubins_disk.disk_numbers(failed, 3), [dubins_disk.all_safe(failed)])
+    outcome = Findings(dubins_disk.disk_numbers(failed, 3), [dubins_disk.all_safe(failed)])
     for counts, same in (((3, 3, 3), True), ((3, 3, 2), False)):
-        found = Outcome(
+        found = Findings(
             outcome.numbers,
             outcome.claims,
             printed_formula=dubins_disk.disk_numbers(runs_of_the_disk(*counts)),
         )
-        judged = verdict.judge(dubins_disk.ARTEFACTS[0], found, Sample())
+        judged = verdict.judge(dubins_disk.ARTEFACTS[0], found, Workload())
         assert (judged.wrong_formula, judged.matches_thesis) == (True, same)
 
 
@@ -139,7 +139,7 @@ def test_a_turn_at_full_speed_is_no_slowing_down():
 
 
 def test_what_becomes_of_a_run_is_told_as_it_is():
-    problem = quadrotor.hover(Sample(quick=True))
+    problem = quadrotor.hover(Workload(quick=True))
     whole = [0.5] * (problem.steps + 1)
     assert quadrotor.fate(run_with(*whole), problem) == "smallest h 0.5; h stays at 0 or above"
     assert "h < 0 from t = 0.1 s" in quadrotor.fate(

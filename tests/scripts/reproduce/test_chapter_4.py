@@ -27,7 +27,7 @@ from safe_envs.scripts.reproduce.chapter_4 import (
     reciprocal_inputs,
 )
 from safe_envs.scripts.reproduce.framework import store
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Findings, Workload
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
 from safe_envs.wrappers import SZCBF
@@ -35,14 +35,14 @@ from safe_envs.wrappers import SZCBF
 pytestmark = pytest.mark.slow
 MODULES = (martingale, cruise, cruise_effort, dubins_noise, dubins_points)
 ARTEFACTS = {a.name: a for module in MODULES for a in module.ARTEFACTS}
-QUICK = Sample(quick=True)
+QUICK = Workload(quick=True)
 BROWNIAN_HORIZON = 2.5
 """Of the rates with closed forms, in s: long enough for noise to make a fifth of the episodes
 unsafe."""
-_found: dict[str, Outcome] = {}
+_found: dict[str, Findings] = {}
 
 
-def outcome_of(name: str) -> Outcome:
+def outcome_of(name: str) -> Findings:
     """The quick outcome of shorter episodes, computed once."""
     if name not in _found:
         with pytest.MonkeyPatch.context() as patch:
@@ -67,9 +67,9 @@ def artefact(request: pytest.FixtureRequest) -> Artefact:
 
 
 def test_what_the_thesis_prints() -> None:
-    """Every number and setting of the print, typed a second time."""
+    """Every number and setting of the thesis, typed a second time."""
     # Sec. 4.2.2: "we choose gamma = 1".
-    assert martingale.GAMMA == 1.0
+    assert reciprocal_inputs.GAMMA == 1.0
     # thesis-notes, "Closed forms": the shift by watching at steps only.
     assert martingale.SHIFT == 0.5826
     # Table 4.1: 92 and 80 % unbounded, 25 and 70 % bounded, of 50 trajectories.
@@ -143,8 +143,8 @@ def test_what_the_thesis_prints() -> None:
 def test_settings_say_what_is_simulated(name: str, full: int) -> None:
     """The number of episodes by the sample, and a quick table's control period."""
     for sample, episodes in (
-        (Sample(), full),
-        (Sample(episodes=7), 7),
+        (Workload(), full),
+        (Workload(episodes=7), 7),
         (QUICK, max(full // 20, 10)),
     ):
         assert any(line.endswith(f": {episodes}") for line in ARTEFACTS[name].setting(sample))
@@ -156,9 +156,9 @@ def test_goes_through_json_and_is_judged(artefact: Artefact) -> None:
     the main setting."""
     outcome = outcome_of(artefact.name)
     document = json.loads(json.dumps(outcome.document(), allow_nan=False))
-    again = Outcome.from_document(document)
+    again = Findings.from_document(document)
     assert again.document() == document
-    assert judge(artefact, again, Sample()) == judge(artefact, outcome, Sample())
+    assert judge(artefact, again, Workload()) == judge(artefact, outcome, Workload())
     names = [number.name for number in outcome.numbers]
     assert len(set(names)) == len(names)
     assert {number.name for number in outcome.printed_formula} <= set(names)
@@ -183,7 +183,7 @@ def test_same_seed_same_outcome(artefact: Artefact, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(dubins_noise, "NOISES", (0.0, 0.2))
     monkeypatch.setattr(dubins_noise, "BEYOND", (0.3,))
     monkeypatch.setattr(dubins_points, "POINTS", 2)
-    first, second = (artefact.compute(Sample(episodes=4, quick=True)) for _ in range(2))
+    first, second = (artefact.compute(Workload(episodes=4, quick=True)) for _ in range(2))
     assert first.document() == second.document()
 
 
@@ -211,8 +211,8 @@ def test_bound_is_attained() -> None:
 
 def test_scalar_system_under_scbf_is_brownian() -> None:
     """With A h = 0, h = 1 - sigma W_t."""
-    reach = 1 + martingale.SHIFT * martingale.NOISE * math.sqrt(martingale.STEP)
-    expected = 1 - 2 * float(ndtr(-reach / (martingale.NOISE * math.sqrt(BROWNIAN_HORIZON))))
+    reach = 1 + martingale.SHIFT * reciprocal_inputs.NOISE * math.sqrt(martingale.STEP)
+    expected = 1 - 2 * float(ndtr(-reach / (reciprocal_inputs.NOISE * math.sqrt(BROWNIAN_HORIZON))))
     rate = ours("example-4.2.2")["SCBF, unbounded"].ours / 100
     assert abs(rate - expected) < 4 * math.sqrt(expected * (1 - expected) / 100)
 
@@ -229,8 +229,8 @@ def test_force_near_the_edge() -> None:
     assert np.allclose(cruise_effort.needed(setting, "scbf"), drag)
     assert np.allclose(cruise_effort.needed(setting, "srcbf")[acting], asked[acting], rtol=1e-6)
     for each in (setting, cruise_setting.FITTED):
-        assert (each.tau * cruise_setting.NOISE) ** 2 / each.stricter_below() == pytest.approx(
-            each.gamma * each.stricter_below() ** 3
+        assert (each.tau * cruise_setting.NOISE) ** 2 / each.stricter_below == pytest.approx(
+            each.gamma * each.stricter_below**3
         )
 
 
@@ -249,13 +249,13 @@ def test_printed_program() -> None:
 
 def test_printed_table_is_out_of_reach_of_the_default() -> None:
     """The Gaussian law, its inverse, and the simulation agree."""
-    assert cruise_setting.ASSUMED.most_unsafe() == pytest.approx(2 * ndtr(-(150 - 15 * 1.8) / 18.0))
-    assert f"at most {cruise_setting.ASSUMED.most_unsafe():.1g}," in ARTEFACTS["table-4.1"].argument
-    assert cruise.headway_for(cruise_setting.FITTED.most_unsafe()) == pytest.approx(
+    assert cruise_setting.ASSUMED.most_unsafe == pytest.approx(2 * ndtr(-(150 - 15 * 1.8) / 18.0))
+    assert f"at most {cruise_setting.ASSUMED.most_unsafe:.1g}," in ARTEFACTS["table-4.1"].argument
+    assert cruise.headway_for(cruise_setting.FITTED.most_unsafe) == pytest.approx(
         cruise_setting.FITTED.tau
     )
     assert ours("table-4.1")["SCBF, unbounded"].ours == 100.0
-    assert judge(ARTEFACTS["table-4.1"], outcome_of("table-4.1"), Sample()).verdict in (
+    assert judge(ARTEFACTS["table-4.1"], outcome_of("table-4.1"), Workload()).verdict in (
         Verdict.ALTERNATIVE,
         Verdict.NOT,
     )
@@ -275,7 +275,7 @@ def test_the_fitted_setting_is_told_as_such() -> None:
     )
 
 
-def test_effort_over_time_depends_on_what_the_print_leaves_open() -> None:
+def test_effort_over_time_depends_on_what_the_thesis_leaves_open() -> None:
     """SRCBF's is the lower one most of the time, and the higher one with the settings that were
     fitted to the table."""
     outcome = outcome_of("figure-4.1")

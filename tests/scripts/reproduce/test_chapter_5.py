@@ -15,11 +15,11 @@ from safe_envs.scripts.reproduce.chapter_5 import (
     pendulum,
 )
 from safe_envs.scripts.reproduce.framework import store
-from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload
 from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
 
 pytestmark = pytest.mark.slow
-SAMPLE, FULL = Sample(quick=True), Sample()
+SAMPLE, FULL = Workload(quick=True), Workload()
 ARTEFACTS = {
     artefact.name: artefact
     for artefact in (*pendulum.ARTEFACTS, *cubic.ARTEFACTS, *cubic_paths.ARTEFACTS)
@@ -104,7 +104,7 @@ def test_what_is_printed_and_what_is_taken(outcomes):
 @EACH
 def test_outcome_survives_json(outcomes, name):
     text = json.dumps(outcomes[name].document(), allow_nan=False)
-    assert Outcome.from_document(json.loads(text)).document() == json.loads(text)
+    assert Findings.from_document(json.loads(text)).document() == json.loads(text)
 
 
 @EACH
@@ -142,7 +142,7 @@ OTHERS = {
 @EACH
 def test_setting_is_that_of_the_sample(name):
     full, quick, few = (
-        " ".join(ARTEFACTS[name].setting(sample)) for sample in (FULL, SAMPLE, Sample(episodes=7))
+        " ".join(ARTEFACTS[name].setting(sample)) for sample in (FULL, SAMPLE, Workload(episodes=7))
     )
     if name in ("figure-5.1", "figure-5.2"):
         assert "200 states" in full
@@ -174,7 +174,7 @@ def test_a_quick_run_states_its_horizon():
 def test_is_kept_and_drawn(outcomes, name, tmp_path, pictures):
     artefact, outcome = (
         ARTEFACTS[name],
-        Outcome.from_document(json.loads(json.dumps(outcomes[name].document()))),
+        Findings.from_document(json.loads(json.dumps(outcomes[name].document()))),
     )
     store.keep(tmp_path, artefact, SAMPLE, outcome, 1.0)
     assert (tmp_path / f"{name}.png").exists() == (artefact.draw is not None)
@@ -271,7 +271,11 @@ def test_cubic_table_has_more_safety_with_stricter_filters(outcomes):
 
 def test_no_noise_leaves_no_gap_between_scbf_and_a_cbf_without_class_k_term():
     found = paired_rates.measured(
-        cubic.ENV, {"noise": 0.0, "horizon": 0.5}, [cubic.WITHOUT, "scbf"], [], Sample(episodes=20)
+        cubic.ENV,
+        {"noise": 0.0, "horizon": 0.5},
+        [cubic.WITHOUT, "scbf"],
+        [],
+        Workload(episodes=20),
     )
     assert found["scbf"].row.safe == found[cubic.WITHOUT].row.safe
     assert found["scbf"].row.min_h_median == pytest.approx(
@@ -282,7 +286,7 @@ def test_no_noise_leaves_no_gap_between_scbf_and_a_cbf_without_class_k_term():
 def test_printed_rate_of_the_cbf_is_below_that_without_a_filter():
     # At the larger noise the rate without any filter is above the printed one with the CBF.
     free = paired_rates.measured(
-        cubic.ENV, {"noise": cubic.LEVELS[1]}, ["none"], [], Sample(episodes=400)
+        cubic.ENV, {"noise": cubic.LEVELS[1]}, ["none"], [], Workload(episodes=400)
     )["none"].number("")
     assert free.low is not None
     assert free.low > cubic.PRINTED["CBF"][1]

@@ -15,7 +15,7 @@ from safe_envs.scripts.reproduce.chapter_5 import (
     paired_rates,
     pendulum,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Sample
+from safe_envs.scripts.reproduce.framework.artefact import Workload
 from safe_envs.scripts.reproduce.framework.paired import (
     MeasuredFilter,
     difference,
@@ -93,7 +93,9 @@ def test_claims_about_the_pendulum_can_fail(of, failed):
 
 
 def test_the_print_itself_is_reproduced_in_the_pendulum_table():
-    assert judge(pendulum.ARTEFACTS[1], pendulum_outcome(), Sample()).verdict == Verdict.REPRODUCED
+    assert (
+        judge(pendulum.ARTEFACTS[1], pendulum_outcome(), Workload()).verdict == Verdict.REPRODUCED
+    )
 
 
 def test_the_page_says_what_the_other_setting_would_have_given():
@@ -196,8 +198,8 @@ def test_trajectories_towards_the_origin():
 
 
 def test_claims_about_pictures_can_fail():
-    assert cubic_paths.kept(made(1000)).holds
-    assert not cubic_paths.kept(made(999)).holds
+    assert cubic_paths.all_safe(made(1000)).holds
+    assert not cubic_paths.all_safe(made(999)).holds
     assert cubic_paths.lost(made(1000), made(770)).holds
     assert not cubic_paths.lost(made(1000), made(1000)).holds
     assert not cubic_paths.lost(made(770), made(1000)).holds

@@ -26,7 +26,7 @@ from safe_envs.scripts.reproduce.chapter_6.learned_controllers import (
     LearnedController,
     printed_rate,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload
 from safe_envs.scripts.reproduce.framework.paired import measure
 from safe_envs.scripts.reproduce.framework.store import keep
 from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
@@ -34,7 +34,7 @@ from safe_envs.scripts.reproduce.framework.verdict import Verdict, judge
 pytestmark = pytest.mark.slow
 MODULES = (cubic_drift, noise_posterior, cubic_rates, car_drift, car_rates, learning_times)
 ARTEFACTS = {a.name: a for a in (each for module in MODULES for each in module.ARTEFACTS)}
-QUICK = Sample(quick=True)
+QUICK = Workload(quick=True)
 TIMED = "table-6.4"
 
 
@@ -49,7 +49,7 @@ LESS = (
 of them."""
 
 
-def compute(name: str, sample: Sample) -> Outcome:
+def compute(name: str, sample: Workload) -> Findings:
     with pytest.MonkeyPatch.context() as patch:
         for module, sizes in LESS:
             for size, value in sizes.items():
@@ -58,7 +58,7 @@ def compute(name: str, sample: Sample) -> Outcome:
 
 
 @cache
-def outcome(name: str) -> Outcome:
+def outcome(name: str) -> Findings:
     return compute(name, QUICK)
 
 
@@ -136,13 +136,11 @@ def test_printed_numbers_and_settings_are_those_of_the_thesis():
     assert np.array(starts, dtype=float).tolist() == [[-0.1, 0.7], [-0.1, 0.8], [10.0, 15.0]]
     for problem, sigma in ((disk, 0.2), (car, 0.5)):
         assert problem.dt == 0.01
-        assert [identifications.parameter(problem, name) for name in ("sigma_1", "sigma_2")] == [
-            sigma,
-            sigma,
-        ]
+        levels = [problem.plant.parameter_values[name] for name in ("sigma_1", "sigma_2")]
+        assert levels == [sigma, sigma]
 
 
-@pytest.mark.parametrize("sample", [Sample(), Sample(7), QUICK])
+@pytest.mark.parametrize("sample", [Workload(), Workload(7), QUICK])
 def test_settings_say_what_is_simulated(sample):
     text = {name: " ".join(ARTEFACTS[name].setting(sample)) for name in ARTEFACTS}
     sizes = {
@@ -166,14 +164,14 @@ def test_settings_say_what_is_simulated(sample):
 def test_an_outcome_is_json_is_drawn_and_judged(name, tmp_path, pictures):
     found = outcome(name)
     text = json.dumps(found.document(), allow_nan=False)
-    assert Outcome.from_document(json.loads(text)) == found
+    assert Findings.from_document(json.loads(text)) == found
     keep(tmp_path, ARTEFACTS[name], QUICK, found, 1.0)
     assert (
         (tmp_path / f"{name}.png").exists()
         == (ARTEFACTS[name].draw is not None)
         == name.startswith("figure")
     )
-    assert judge(ARTEFACTS[name], found, Sample()).verdict in Verdict
+    assert judge(ARTEFACTS[name], found, Workload()).verdict in Verdict
     names = [n.name for n in found.numbers]
     assert len(set(names)) == len(names)
     for n in [*found.numbers, *found.printed_formula]:
@@ -185,7 +183,7 @@ def test_an_outcome_is_json_is_drawn_and_judged(name, tmp_path, pictures):
 @pytest.mark.parametrize("name", ["figure-6.1", "figure-6.2", "figure-6.3"])
 def test_a_seed_gives_the_same_outcome_and_another_one_another(name):
     assert compute(name, QUICK) == outcome(name)
-    assert compute(name, Sample(seed=1, quick=True)) != outcome(name)
+    assert compute(name, Workload(seed=1, quick=True)) != outcome(name)
 
 
 def test_the_error_of_the_drift_is_the_law_for_states_over_the_disk():
@@ -207,7 +205,7 @@ def test_errors_fall_and_the_printed_variance_is_overconfident(name):
     assert found.numbers[0].ours > found.numbers[2].ours  # K = 10 and 100
     (printed,) = found.printed_formula
     assert printed.ours > 5 * number(found.numbers, printed.name).ours
-    assert judge(ARTEFACTS[name], found, Sample()).wrong_formula
+    assert judge(ARTEFACTS[name], found, Workload()).wrong_formula
 
 
 @pytest.mark.parametrize(("name", "true"), [("figure-6.2", 0.2), ("figure-6.4", 0.5)])
@@ -282,12 +280,12 @@ def test_a_quick_table_of_the_car_has_all_rows_and_says_that_it_is_short():
     assert [n.name for n in found.numbers] == ["SCBF", "DDSCBF", "Bayesian SCBF"]
     assert {n.name for n in found.printed_formula} == {"SCBF", "DDSCBF"}
     assert any("2 s, too short" in line for line in ARTEFACTS["table-6.3"].setting(QUICK))
-    assert not any("too short" in line for line in ARTEFACTS["table-6.3"].setting(Sample()))
+    assert not any("too short" in line for line in ARTEFACTS["table-6.3"].setting(Workload()))
 
 
 def test_the_recursion_takes_longest():
     found = outcome(TIMED)
-    assert judge(ARTEFACTS[TIMED], found, Sample()).verdict == Verdict.ORDERING
+    assert judge(ARTEFACTS[TIMED], found, Workload()).verdict == Verdict.ORDERING
     assert (
         number(found.numbers, "DDSCBF (thesis: more than)").ours
         > number(found.numbers, "Bayesian SCBF").ours

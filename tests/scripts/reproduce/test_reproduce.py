@@ -20,7 +20,7 @@ from safe_envs.agents.jobs.store import ResultStore
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.reproduce.catalogue import ARTEFACTS
 from safe_envs.scripts.reproduce.command import ArtefactJob
-from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload
 from safe_envs.scripts.reproduce.framework.page import write_page
 from safe_envs.scripts.reproduce.framework.store import keep, read
 from tests.scripts.conftest import strictly
@@ -56,17 +56,17 @@ ALL += (
 def test_every_artefact_of_the_thesis_is_there():
     assert sorted(artefact.name for artefact in ARTEFACTS) == sorted(ALL)
     for artefact in ARTEFACTS:
-        for sample in (Sample(), Sample(7), Sample(quick=True)):
+        for sample in (Workload(), Workload(7), Workload(quick=True)):
             assert all(artefact.setting(sample))
         assert artefact.draw is not None or artefact.name.startswith("table-")
 
 
 def test_results_are_kept_by_configuration_and_version(tmp_path, coin, monkeypatch):
-    sample = Sample(100)
+    sample = Workload(100)
     outcome = coin.compute(sample)
     keep(tmp_path, coin, sample, outcome, 1.5)
     assert read(tmp_path, coin, sample) == (outcome, 1.5)
-    assert read(tmp_path, coin, Sample(101)) is None
+    assert read(tmp_path, coin, Workload(101)) is None
     with monkeypatch.context() as patch:
         patch.setattr(
             "safe_envs.scripts.reproduce.framework.store.source_checksum", lambda: "another"
@@ -79,7 +79,7 @@ def test_results_are_kept_by_configuration_and_version(tmp_path, coin, monkeypat
 def test_equal_outcomes_make_equal_pictures(tmp_path, coin):
     for name in "ab":
         (tmp_path / name).mkdir()
-        keep(tmp_path / name, coin, Sample(100), coin.compute(Sample(100)), 1.0)
+        keep(tmp_path / name, coin, Workload(100), coin.compute(Workload(100)), 1.0)
     for suffix in (".png", ".svg"):
         assert (tmp_path / "a" / f"table-0.1{suffix}").read_bytes() == (
             tmp_path / "b" / f"table-0.1{suffix}"
@@ -87,12 +87,16 @@ def test_equal_outcomes_make_equal_pictures(tmp_path, coin):
 
 
 def test_sizes_follow_what_was_asked_for():
-    assert [Sample().size(1000), Sample(7).size(1000), Sample(quick=True).size(1000)] == [
+    assert [Workload().size(1000), Workload(7).size(1000), Workload(quick=True).size(1000)] == [
         1000,
         7,
         50,
     ]
-    assert [Sample(7).work(200), Sample(7, quick=True).work(200), Sample(quick=True).work(4)] == [
+    assert [
+        Workload(7).work(200),
+        Workload(7, quick=True).work(200),
+        Workload(quick=True).work(4),
+    ] == [
         200,
         10,
         4,
@@ -118,7 +122,7 @@ def test_the_command_leaves_a_page_and_does_nothing_twice(
     assert "| heads | 48 % (of 50) | 50.0 % | [40.4, 59.6] |" in markdown
     assert "a < b" in markdown
     document = strictly("report/table-0.1.json")
-    assert Outcome.from_document(document["outcome"]).numbers[0].ours == 50.0
+    assert Findings.from_document(document["outcome"]).numbers[0].ours == 50.0
     assert safe_envs_command(*arguments)[0] == 0
     assert computed == ["table-0.1"]
 
@@ -184,7 +188,7 @@ def test_an_interrupt_ends_a_single_job_at_once(safe_envs_command, catalogue, co
 
 
 def test_a_result_that_cannot_be_written_leaves_the_one_before(tmp_path, coin, monkeypatch):
-    keep(tmp_path, coin, Sample(100), coin.compute(Sample(100)), 1.0)
+    keep(tmp_path, coin, Workload(100), coin.compute(Workload(100)), 1.0)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
     def full(*_, **__):
@@ -193,12 +197,12 @@ def test_a_result_that_cannot_be_written_leaves_the_one_before(tmp_path, coin, m
     with monkeypatch.context() as patch:
         patch.setattr(Figure, "savefig", full)
         with pytest.raises(ConfigurationError, match=r"cannot write .*table-0.1.png: no room"):
-            keep(tmp_path, coin, Sample(100), coin.compute(Sample(100)), 2.0)
+            keep(tmp_path, coin, Workload(100), coin.compute(Workload(100)), 2.0)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_picture_without_its_numbers_is_not_taken_for_a_result(tmp_path, coin, monkeypatch):
-    keep(tmp_path, coin, Sample(100), coin.compute(Sample(100)), 1.0)
+    keep(tmp_path, coin, Workload(100), coin.compute(Workload(100)), 1.0)
 
     def full(*_):
         raise ConfigurationError("no room")
@@ -209,21 +213,21 @@ def test_a_picture_without_its_numbers_is_not_taken_for_a_result(tmp_path, coin,
             keep(
                 tmp_path,
                 replace(coin, draw=lambda figure, _: figure.subplots()),
-                Sample(100),
-                coin.compute(Sample(100)),
+                Workload(100),
+                coin.compute(Workload(100)),
                 1.0,
             )
     with pytest.raises(
         ConfigurationError,
         match=r"table-0.1.png is another picture.*remove it, and it is computed again",
     ):
-        read(tmp_path, coin, Sample(100))
+        read(tmp_path, coin, Workload(100))
 
 
 @pytest.fixture
 def kept(tmp_path, coin):
     """The file of a result."""
-    keep(tmp_path, coin, Sample(100), coin.compute(Sample(100)), 1.5)
+    keep(tmp_path, coin, Workload(100), coin.compute(Workload(100)), 1.5)
     return tmp_path / "table-0.1.json"
 
 
@@ -268,9 +272,9 @@ def test_a_result_of_another_shape_is_refused_or_shown(data, kept, coin, tmp_pat
     try:
         kept.write_text(with_checksum(document))
         with suppress(ConfigurationError):
-            found = read(tmp_path, coin, Sample(100))
+            found = read(tmp_path, coin, Workload(100))
             if found is not None:
-                write_page(tmp_path, [(coin, *found)], Sample(100))
+                write_page(tmp_path, [(coin, *found)], Workload(100))
     finally:
         kept.write_text(content)
 
@@ -306,14 +310,14 @@ def test_a_picture_that_is_none_is_told(tmp_path, coin, kept):
     document = json.loads(kept.read_text())
     document["pictures"][".png"] = hashlib.sha256(b"no picture").hexdigest()
     kept.write_text(with_checksum(document))
-    found = read(tmp_path, coin, Sample(100))
+    found = read(tmp_path, coin, Workload(100))
     assert found is not None
     with pytest.raises(ConfigurationError, match=r"table-0.1.png cannot be read .*remove it"):
-        write_page(tmp_path, [(coin, *found)], Sample(100))
+        write_page(tmp_path, [(coin, *found)], Workload(100))
 
 
 def test_code_that_changed_during_a_run_is_not_kept(tmp_path, catalogue, computed):
-    job = ArtefactJob("table-0.1", Sample(), tmp_path, "another checksum")
+    job = ArtefactJob("table-0.1", Workload(), tmp_path, "another checksum")
     with pytest.raises(ConfigurationError, match="the code changed during the run"):
         job.compute()
     assert not computed

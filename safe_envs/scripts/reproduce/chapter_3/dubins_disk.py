@@ -31,13 +31,7 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     thinned,
 )
 from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED
 from safe_envs.wrappers.learning.residual import ResidualModel
 
@@ -54,13 +48,13 @@ _NO_MARGIN = [f"{text}:eps=0" for text in _LEARNED]
 Learnings = Sequence[Sequence[Trajectory]]  # one run for each gain, for each learning
 
 
-def disk(sample: Sample) -> SafetyProblem:
+def disk(sample: Workload) -> SafetyProblem:
     """Return the problem, as long as the sample lets it be."""
     world = make_problem(DISK)
     return world.configured(horizon=world.dt * sample.work(world.steps))
 
 
-def compute_disk(sample: Sample) -> Outcome:
+def compute_disk(sample: Workload) -> Findings:
     """Compute the trajectories of the disk for each gain, from both starts."""
     world, models = disk(sample), residuals(DISK, sample)
     at = {start: world.configured(start=start, box=WIDE) for start in (PRINTED_START, VALID_START)}
@@ -75,7 +69,7 @@ def compute_disk(sample: Sample) -> Outcome:
         strict=True,
     )
     by_formula = trajectories(at[PRINTED_START], estimates, _NO_MARGIN)
-    return Outcome(
+    return Findings(
         numbers=disk_numbers(found[PRINTED_START], printed=_SAFE_RUNS),
         claims=[all_safe(found[PRINTED_START]), theory_holds(found[VALID_START], nominal)],
         alternative_settings=_alternatives(at, models, found[VALID_START]),
@@ -84,7 +78,7 @@ def compute_disk(sample: Sample) -> Outcome:
         notes=[
             *(outside(world, start) for start in at),
             *(
-                f"with exact derivatives from {start} the smallest h is {by_rate(_smallest(each))}"
+                CHAPTER.note("figure-3.1", "exact", start=start, smallest=by_rate(_smallest(each)))
                 for start, each in exact.items()
             ),
             binding(world),
@@ -108,7 +102,7 @@ def trajectories(
 
 def _alternatives(
     at: dict[tuple[float, ...], SafetyProblem], models: Sequence[ResidualModel], valid: Learnings
-) -> dict[str, Outcome]:
+) -> dict[str, Findings]:
     """Return the outcomes with another start, other input bounds, and without a margin."""
     narrow = {
         start: trajectories(problem.configured(box=NARROW), models) for start, problem in at.items()
@@ -120,7 +114,7 @@ def _alternatives(
         "without the margin of Eq. (3.20)": trajectories(at[PRINTED_START], models, _NO_MARGIN),
     }
     return {
-        name: Outcome(disk_numbers(each, printed=_SAFE_RUNS), [all_safe(each)])
+        name: Findings(disk_numbers(each, printed=_SAFE_RUNS), [all_safe(each)])
         for name, each in found.items()
     }
 
@@ -143,12 +137,9 @@ def disk_numbers(found: Learnings, printed: float | None = None) -> list[Number]
 
 def all_safe(found: Learnings) -> Claim:
     """Return the claim of the text about the figure."""
-    return Claim(
-        "All trajectories stay safe under the learned derivatives",
-        min(worst(found)) > 0,
-        f"safe in each learning: {', '.join(map(str, _counts(found)))} of {len(RATES)}; smallest h"
-        f" over all: {by_rate(worst(found))}",
-    )
+    counts, lowest = ", ".join(map(str, _counts(found))), worst(found)
+    values = {"counts": counts, "runs": len(RATES), "smallest": by_rate(lowest)}
+    return CHAPTER.claim("figure-3.1", "safe", min(lowest) > 0, **values)
 
 
 def theory_holds(found: Learnings, nominal: Sequence[Trajectory]) -> Claim:
@@ -158,14 +149,9 @@ def theory_holds(found: Learnings, nominal: Sequence[Trajectory]) -> Claim:
         found: runs of each learning.
         nominal: runs with nominal derivatives.
     """
-    return Claim(
-        f"From {VALID_START}, a start that the theory covers, all stay safe under the learned"
-        " derivatives, none under the nominal",
-        min(worst(found)) > 0 > max(_smallest(nominal)),
-        f"smallest h over the learnings: {by_rate(worst(found))}; nominal:"
-        f" {by_rate(_smallest(nominal))}",
-        printed=False,
-    )
+    learned, other = worst(found), _smallest(nominal)
+    values = {"learned": by_rate(learned), "nominal": by_rate(other)}
+    return CHAPTER.claim("figure-3.1", "theory", min(learned) > 0 > max(other), **values)
 
 
 def worst(found: Learnings) -> list[float]:
@@ -217,7 +203,7 @@ def _panels(
     }
 
 
-def draw_disk(figure: Figure, outcome: Outcome) -> None:
+def _draw_disk(figure: Figure, outcome: Findings) -> None:
     """Draw panels for the start of the thesis, by both estimates, and for a valid start."""
     colors = dict(zip(RATES, COLORS, strict=False))
     names = ("our estimates", "printed estimates", "our estimates")
@@ -246,7 +232,7 @@ def draw_disk(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, [*handles, nominal])
 
 
-def _values(sample: Sample) -> dict[str, Any]:
+def _values(sample: Workload) -> dict[str, Any]:
     world = disk(sample)
     return {
         **setting_values(world, sample),
@@ -255,6 +241,4 @@ def _values(sample: Sample) -> dict[str, Any]:
     }
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    CHAPTER.artefact("figure-3.1", compute_disk, _values, draw_disk, (7.0, 3.2)),
-)
+ARTEFACTS = (CHAPTER.artefact("figure-3.1", compute_disk, _values, _draw_disk),)

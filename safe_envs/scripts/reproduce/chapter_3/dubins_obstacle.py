@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -13,38 +13,12 @@ from matplotlib.patches import Circle
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.figures.evaluation_figure import (
-    COLORS,
-    QUIET,
-    UNSAFE,
-    add_legend,
-)
-from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
-    CHAPTER,
-    LEARNED_COLOR,
-    NOMINAL_COLOR,
-    PRINTED_COLOR,
-    TRUE_COLOR,
-    Trajectories,
-    Trajectory,
-    rates_around,
-    residuals,
-    runs,
-    setting_values,
-    smallest_numbers,
-    thinned,
-    trajectories,
-)
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
+from safe_envs.scripts.reproduce.chapter_3 import learned_runs
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
 
-_SETTINGS = CHAPTER.settings["obstacle"]
+_SETTINGS = learned_runs.CHAPTER.settings["obstacle"]
 OBSTACLE, OBSTACLE_RATES, SPEED = (_SETTINGS[name] for name in ("env", "rates", "speed"))
 OBSTACLE_RADIUS, GOAL, GOAL_RADIUS = (
     _SETTINGS[name] for name in ("obstacle_radius", "goal", "goal_radius")
@@ -54,7 +28,7 @@ _ROUNDING = 1e-9  # m/s
 
 
 @lru_cache(maxsize=2)
-def passages(sample: Sample, **model: float) -> dict[str, list[Trajectory]]:
+def passages(sample: Workload, **model: float) -> dict[str, list[learned_runs.Trajectory]]:
     """Return the trajectories around the obstacle.
 
     Args:
@@ -62,15 +36,17 @@ def passages(sample: Sample, **model: float) -> dict[str, list[Trajectory]]:
         model: parameters of the model.
     """
     problem = make_problem(OBSTACLE, start="thesis", model=model or None)
-    return trajectories(problem, OBSTACLE_RATES, residuals(OBSTACLE, sample, **model))
+    return learned_runs.trajectories(
+        problem, OBSTACLE_RATES, learned_runs.residuals(OBSTACLE, sample, **model)
+    )
 
 
-def compute_passage(sample: Sample) -> Outcome:
+def compute_passage(sample: Workload) -> Findings:
     """Compute the paths around the obstacle."""
     found, problem = passages(sample), make_problem(OBSTACLE)
     learned, none = found["learned"], found["none"][0]
     times = [run.steps * problem.dt for run in learned]
-    return Outcome(
+    return Findings(
         numbers=[
             Number.mean("path, learned", _paths(learned), "m", 0.0),
             *(
@@ -80,12 +56,14 @@ def compute_passage(sample: Sample) -> Outcome:
             Number.mean("time to the goal, learned", times, "s", 0.0),
             Number("time to the goal, none", none.steps * problem.dt, unit="s"),
             Number("lowest speed, learned", float(_speeds(learned, problem.dt).min()), unit="m/s"),
-            *rates_around(problem, sample, residuals(OBSTACLE, sample), OBSTACLE_RATES),
+            *learned_runs.rates_around(
+                problem, sample, learned_runs.residuals(OBSTACLE, sample), OBSTACLE_RATES
+            ),
         ],
         claims=passage_claims(found, problem),
         data={
             kind: {
-                name: thinned(found[kind][0].states[:, column])
+                name: learned_runs.thinned(found[kind][0].states[:, column])
                 for column, name in enumerate(("x", "y"))
             }
             for kind in ("learned", "nominal")
@@ -94,7 +72,7 @@ def compute_passage(sample: Sample) -> Outcome:
     )
 
 
-def passage_claims(found: Trajectories, problem: SafetyProblem) -> list[Claim]:
+def passage_claims(found: learned_runs.Trajectories, problem: SafetyProblem) -> list[Claim]:
     """Return the claims of the text about the path, and why it takes longer.
 
     Args:
@@ -102,51 +80,29 @@ def passage_claims(found: Trajectories, problem: SafetyProblem) -> list[Claim]:
         problem: of them.
     """
     learned, unfiltered = found["learned"], _paths(found["none"])[0]
-    paths, misses = _paths(learned), [_miss(run) for run in learned]
+    lengths, miss = _paths(learned), max(map(_miss, learned))
+    lowest, nominal = min(run.smallest for run in learned), found["nominal"][0].smallest
+    longer = min(lengths) > unfiltered and not any(_slows(run, problem) for run in learned)
+    paths = {"shortest": min(lengths), "longest": max(lengths), "unfiltered": unfiltered}
+    claim = partial(learned_runs.CHAPTER.claim, "figure-3.2a")
     return [
-        Claim(
-            "With the learned derivatives the vehicle avoids the moving obstacle",
-            *_stays_positive(learned),
-        ),
-        Claim(
-            "With the learned derivatives it reaches the goal",
-            max(misses) <= GOAL_RADIUS,
-            f"ends {max(misses):.3g} m from its centre",
-        ),
-        Claim(
-            "With the nominal derivatives it collides with the obstacle",
-            *_falls_below(found["nominal"][0]),
-        ),
-        Claim(
-            "With the learned derivatives the path is longer than without a filter, at the same"
-            " speed",
-            min(paths) > unfiltered and not any(_slows(run, problem) for run in learned),
-            f"path {min(paths):.2f} to {max(paths):.2f} m, without a filter {unfiltered:.2f} m;"
-            f" {_describe_speeds(learned, problem)}",
-            printed=False,
-        ),
+        claim("avoids", lowest > 0, h=lowest),
+        claim("arrives", miss <= GOAL_RADIUS, miss=miss),
+        claim("collides", nominal < 0, h=nominal),
+        claim("longer", longer, speeds=_describe_speeds(learned, problem), **paths),
     ]
 
 
-def _stays_positive(learned: Sequence[Trajectory]) -> tuple[bool, str]:
-    lowest = min(run.smallest for run in learned)
-    return lowest > 0, f"smallest h over the learnings {lowest:.3g} m^2"
-
-
-def _falls_below(run: Trajectory) -> tuple[bool, str]:
-    return run.smallest < 0, f"smallest h {run.smallest:.3g} m^2"
-
-
-def _paths(each: Sequence[Trajectory]) -> list[float]:
+def _paths(each: Sequence[learned_runs.Trajectory]) -> list[float]:
     return [float(run.lengths.sum()) for run in each]
 
 
-def _miss(run: Trajectory) -> float:
+def _miss(run: learned_runs.Trajectory) -> float:
     """Return how far from the goal's centre a run ends, in m."""
     return math.dist(run.states[-1, :2], GOAL)
 
 
-def _speeds(each: Sequence[Trajectory], dt: float) -> np.ndarray:
+def _speeds(each: Sequence[learned_runs.Trajectory], dt: float) -> np.ndarray:
     """Return the distance between control instants over the period, in m/s, for all periods."""
     return np.concatenate([run.lengths for run in each]) / dt
 
@@ -156,12 +112,12 @@ def _chord_speed(problem: SafetyProblem) -> float:
     return float(SPEED * np.sinc(problem.box[0][1] * problem.dt / (2 * math.pi)))
 
 
-def _slows(run: Trajectory, problem: SafetyProblem) -> bool:
+def _slows(run: learned_runs.Trajectory, problem: SafetyProblem) -> bool:
     """Return whether a run has a period that is slower than a turn explains."""
     return bool(_speeds([run], problem.dt).min() < _chord_speed(problem) - _ROUNDING)
 
 
-def _describe_speeds(each: Sequence[Trajectory], problem: SafetyProblem) -> str:
+def _describe_speeds(each: Sequence[learned_runs.Trajectory], problem: SafetyProblem) -> str:
     speeds = _speeds(each, problem.dt)
     return (
         f"speed {speeds.min():.4f} to {speeds.max():.4f} m/s, of which a chord of the sharpest turn"
@@ -169,23 +125,24 @@ def _describe_speeds(each: Sequence[Trajectory], problem: SafetyProblem) -> str:
     )
 
 
-def _at(run: Trajectory, time: float, dt: float) -> dict[str, Any]:
+def _at(run: learned_runs.Trajectory, time: float, dt: float) -> dict[str, Any]:
     """Return where vehicle and obstacle are at an instant, or at the end before it."""
     x, y, _, x_o, y_o = run.states[min(round(time / dt), run.steps)].tolist()
     return {"time": time, "vehicle": [x, y], "obstacle": [x_o, y_o]}
 
 
-def compute_clearance(sample: Sample) -> Outcome:
+def compute_clearance(sample: Workload) -> Findings:
     """Compute the barrier on the way around the obstacle."""
     found, at_rest, problem = passages(sample), passages(sample, v_o=0.0), make_problem(OBSTACLE)
     true_speed = make_problem(OBSTACLE, start="thesis", model={"v": SPEED, "v_o": 0.0})
-    blind = runs(true_speed, [f"hocbf:p={OBSTACLE_RATES}"])[0]
+    blind = learned_runs.runs(true_speed, [f"hocbf:p={OBSTACLE_RATES}"])[0]
     shown = {**{kind: run for kind, (run, *_) in found.items()}, "printed": blind}
-    return Outcome(
+    note = partial(learned_runs.CHAPTER.note, "figure-3.2b")
+    return Findings(
         numbers=_clearance_numbers(found),
         claims=clearance_claims(found, problem),
         alternative_settings={
-            AT_REST: Outcome(_clearance_numbers(at_rest), _printed(at_rest, problem))
+            AT_REST: Findings(_clearance_numbers(at_rest), _printed(at_rest, problem))
         },
         printed_formula=[
             Number("smallest h, nominal", at_rest["nominal"][0].smallest, unit="m^2"),
@@ -193,73 +150,59 @@ def compute_clearance(sample: Sample) -> Outcome:
         ],
         data={kind: run.over_time(problem.dt, h=run.h) for kind, run in shown.items()},
         notes=[
-            CHAPTER.note(
-                "figure-3.2b", "blind", blind=blind.smallest, true=found["true"][0].smallest
-            ),
-            (
-                f"of the printed claims hold {_held(found, problem)} here, and"
-                f" {_held(at_rest, problem)} with {AT_REST}"
-            ),
+            note("blind", blind=blind.smallest, true=found["true"][0].smallest),
+            note("held", here=_held(found, problem), there=_held(at_rest, problem), other=AT_REST),
         ],
     )
 
 
-def clearance_claims(found: Trajectories, problem: SafetyProblem) -> list[Claim]:
+def clearance_claims(found: learned_runs.Trajectories, problem: SafetyProblem) -> list[Claim]:
     """Return the claims of the text about the barrier, and its reason for the number of steps.
 
     Args:
         found: all trajectories.
         problem: of them.
     """
-    learned, nominal = found["learned"], found["nominal"][0]
-    steps = [run.steps for run in learned]
+    learned, nominal, none = found["learned"], found["nominal"][0], found["none"][0]
+    steps, lowest = [run.steps for run in learned], min(run.smallest for run in learned)
+    counts = {"least": min(steps), "most": max(steps), "nominal": nominal.steps, "none": none.steps}
+    misses = max(map(_miss, learned)), _miss(nominal), _miss(none)
+    slows = all(_slows(run, problem) for run in learned)
+    claim = partial(learned_runs.CHAPTER.claim, "figure-3.2b")
     return [
-        Claim("With the learned derivatives h is always positive", *_stays_positive(learned)),
-        Claim("With the nominal derivatives h falls below 0", *_falls_below(nominal)),
-        Claim(
-            "The run with the learned derivatives takes more time steps than that with the nominal"
-            " ones",
-            min(steps) > nominal.steps,
-            f"{min(steps)} to {max(steps)} steps, nominal {nominal.steps}, without a filter"
-            f" {found['none'][0].steps}; they end up to {max(map(_miss, learned)):.3g},"
-            f" {_miss(nominal):.3g} and {_miss(found['none'][0]):.3g} m from the goal's centre",
-        ),
-        Claim(
-            "The vehicle slows down with the learned derivatives",
-            all(_slows(run, problem) for run in learned),
-            _describe_speeds(learned, problem),
-            # An error of the thesis, and no result: it is among the errata.
-            printed=False,
-        ),
+        claim("positive", lowest > 0, h=lowest),
+        claim("negative", nominal.smallest < 0, h=nominal.smallest),
+        claim("steps", min(steps) > nominal.steps, misses=misses, **counts),
+        claim("slows", slows, speeds=_describe_speeds(learned, problem)),
     ]
 
 
-def _printed(found: Trajectories, problem: SafetyProblem) -> list[Claim]:
+def _printed(found: learned_runs.Trajectories, problem: SafetyProblem) -> list[Claim]:
     return [claim for claim in clearance_claims(found, problem) if claim.printed]
 
 
-def _held(found: Trajectories, problem: SafetyProblem) -> str:
+def _held(found: learned_runs.Trajectories, problem: SafetyProblem) -> str:
     claims = _printed(found, problem)
     return f"{sum(claim.holds for claim in claims)} of {len(claims)}"
 
 
-def _clearance_numbers(found: Trajectories) -> list[Number]:
+def _clearance_numbers(found: learned_runs.Trajectories) -> list[Number]:
     steps = [float(run.steps) for run in found["learned"]]
     return [
-        *smallest_numbers(found, "m^2"),
+        *learned_runs.smallest_numbers(found, "m^2"),
         Number.mean("time steps, learned", steps, "", 0.0),
         Number("time steps, nominal", float(found["nominal"][0].steps)),
     ]
 
 
-def draw_passage(figure: Figure, outcome: Outcome) -> None:
+def _draw_passage(figure: Figure, outcome: Findings) -> None:
     """Draw the paths past the obstacle, with both at three instants."""
     axes, shade = figure.add_subplot(), {"alpha": 0.45, "linewidth": 0}
     axes.add_patch(Circle(GOAL, GOAL_RADIUS, facecolor="#56B4E9", **shade))
     axes.text(GOAL[0], GOAL[1] + 0.38, "goal", ha="center", color=QUIET)
     lines = (
-        ("nominal", NOMINAL_COLOR, "--", 1.8, "nominal derivatives"),
-        ("learned", LEARNED_COLOR, "-", 1.8, "learned derivatives"),
+        ("nominal", learned_runs.NOMINAL_COLOR, "--", 1.8, "nominal derivatives"),
+        ("learned", learned_runs.LEARNED_COLOR, "-", 1.8, "learned derivatives"),
     )
     draw_lines(axes, outcome.data, lines, "x", "y")
     for instant, color in zip(
@@ -276,14 +219,14 @@ def draw_passage(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
 
-def draw_clearance(figure: Figure, outcome: Outcome) -> None:
+def _draw_clearance(figure: Figure, outcome: Findings) -> None:
     """Draw the barrier over time."""
     axes = figure.add_subplot()
     lines = (
-        ("learned", LEARNED_COLOR, "-", 1.8, "learned derivatives"),
-        ("nominal", NOMINAL_COLOR, "--", 1.8, "nominal derivatives"),
-        ("true", TRUE_COLOR, "-.", 1.8, "true derivatives"),
-        ("printed", PRINTED_COLOR, ":", 1.8, "true speed, printed derivatives"),
+        ("learned", learned_runs.LEARNED_COLOR, "-", 1.8, "learned derivatives"),
+        ("nominal", learned_runs.NOMINAL_COLOR, "--", 1.8, "nominal derivatives"),
+        ("true", learned_runs.TRUE_COLOR, "-.", 1.8, "true derivatives"),
+        ("printed", learned_runs.PRINTED_COLOR, ":", 1.8, "true speed, printed derivatives"),
     )
     draw_lines(axes, outcome.data, lines, "time", "h")
     curves = [outcome.data[kind] for kind, *_ in lines]
@@ -297,11 +240,11 @@ def draw_clearance(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
 
-def _values(sample: Sample) -> dict[str, Any]:
-    return setting_values(make_problem(OBSTACLE), sample)
+def _values(sample: Workload) -> dict[str, Any]:
+    return learned_runs.setting_values(make_problem(OBSTACLE), sample)
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    CHAPTER.artefact("figure-3.2a", compute_passage, _values, draw_passage, (7.0, 4.9)),
-    CHAPTER.artefact("figure-3.2b", compute_clearance, _values, draw_clearance, (7.0, 3.8)),
+ARTEFACTS = (
+    learned_runs.CHAPTER.artefact("figure-3.2a", compute_passage, _values, _draw_passage),
+    learned_runs.CHAPTER.artefact("figure-3.2b", compute_clearance, _values, _draw_clearance),
 )

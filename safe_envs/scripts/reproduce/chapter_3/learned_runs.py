@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs import ControlAffineSDE, SafetyProblem
+from safe_envs import SafetyProblem
 from safe_envs.agents import evaluate, make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS
-from safe_envs.scripts.reproduce.framework.artefact import Number, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import measure
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
 from safe_envs.wrappers import Condition
@@ -57,7 +57,12 @@ class Trajectory:
         return np.hypot(*np.diff(self.states[:, :2], axis=0).T)
 
     def over_time(self, dt: float, **column: np.ndarray) -> dict[str, list[float]]:
-        """Return the instants in s for a control period in s, with a column, both thinned."""
+        """Return the instants with a column, both thinned.
+
+        Args:
+            dt: control period in s.
+            column: name and values.
+        """
         columns = {"time": dt * np.arange(len(self.h)), **column}
         return {name: thinned(values) for name, values in columns.items()}
 
@@ -66,7 +71,7 @@ Trajectories = Mapping[str, Sequence[Trajectory]]
 """By what the filter knows: one for each learning, one each without learning."""
 
 
-def learning_sizes(sample: Sample) -> tuple[int, int]:
+def learning_sizes(sample: Workload) -> tuple[int, int]:
     """Return the number of states to learn from, and of epochs."""
     return (
         max(_LEAST_STATES, sample.work(LEARNING["states"])),
@@ -74,13 +79,13 @@ def learning_sizes(sample: Sample) -> tuple[int, int]:
     )
 
 
-def seeds(sample: Sample) -> list[int]:
+def seeds(sample: Workload) -> list[int]:
     """Return a seed for each repetition of the learning."""
     count = _QUICK_LEARNINGS if sample.quick else LEARNING["repetitions"]
     return np.random.SeedSequence(sample.seed).generate_state(count).tolist()
 
 
-def setting_values(problem: SafetyProblem, sample: Sample) -> dict[str, Any]:
+def setting_values(problem: SafetyProblem, sample: Workload) -> dict[str, Any]:
     """Return what the lines of a setting name.
 
     Args:
@@ -89,8 +94,8 @@ def setting_values(problem: SafetyProblem, sample: Sample) -> dict[str, Any]:
     """
     states, epochs = learning_sizes(sample)
     return {
-        "plant": parameters(problem.plant),
-        "model": parameters(problem.model),
+        "plant": problem.plant.parameter_values,
+        "model": problem.model.parameter_values,
         "dt": problem.dt,
         "horizon": problem.horizon,
         "learnings": len(seeds(sample)),
@@ -100,13 +105,8 @@ def setting_values(problem: SafetyProblem, sample: Sample) -> dict[str, Any]:
     }
 
 
-def parameters(system: ControlAffineSDE) -> dict[str, float]:
-    """Return the parameters of a system by name."""
-    return {symbol.name: value for symbol, value in system.parameters.items()}
-
-
 @lru_cache(maxsize=8)
-def residuals(env_id: str, sample: Sample, **model: float) -> tuple[ResidualModel, ...]:
+def residuals(env_id: str, sample: Workload, **model: float) -> tuple[ResidualModel, ...]:
     """Return what is learned of a problem, once for each repetition.
 
     The results are cached, for two figures show the same.
@@ -181,7 +181,12 @@ def trajectories(
 
 
 def smallest_numbers(found: Trajectories, unit: str = "") -> list[Number]:
-    """Return the smallest h of all trajectories; unit: of h."""
+    """Return the smallest h of all trajectories.
+
+    Args:
+        found: the trajectories.
+        unit: of h.
+    """
     learned = [run.smallest for run in found["learned"]]
     return [
         Number.mean("smallest h, learned", learned, unit),
@@ -193,7 +198,7 @@ def smallest_numbers(found: Trajectories, unit: str = "") -> list[Number]:
 
 
 def rates_around(
-    problem: SafetyProblem, sample: Sample, models: Sequence[ResidualModel], gains: str
+    problem: SafetyProblem, sample: Workload, models: Sequence[ResidualModel], gains: str
 ) -> list[Number]:
     """Return safety rates from starts around that of the thesis.
 

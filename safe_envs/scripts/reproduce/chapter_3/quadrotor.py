@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,34 +11,14 @@ from matplotlib.figure import Figure
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import QUIET, add_legend
-from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
-    CHAPTER,
-    LEARNED_COLOR,
-    NOMINAL_COLOR,
-    PRINTED_COLOR,
-    TRUE_COLOR,
-    Trajectories,
-    Trajectory,
-    rates_around,
-    residuals,
-    runs,
-    setting_values,
-    smallest_numbers,
-    trajectories,
-)
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.chapter_3 import learned_runs
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.systems.quadrotor_altitude import g, m, z, zdot
 from safe_envs.wrappers import AffineConstraint
 
-_SETTINGS = CHAPTER.settings["quadrotor"]
+_SETTINGS = learned_runs.CHAPTER.settings["quadrotor"]
 QUADROTOR = _SETTINGS["env"]
 GAINS = _SETTINGS["gains"]  # p_1, p_2, 1/s
 CENTER, HALF_WIDTH = _SETTINGS["center"], _SETTINGS["half_width"]  # c and p of the band, m
@@ -65,31 +46,32 @@ def printed_hocbf(model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint
     return AffineConstraint((cubed / m,), offset, (h, slope + first * h))
 
 
-def printed_run(problem: SafetyProblem, knowledge: str) -> Trajectory:
+def printed_run(problem: SafetyProblem, knowledge: str) -> learned_runs.Trajectory:
     """Return the trajectory under the printed formula.
 
     Args:
         problem: with a fixed start.
         knowledge: "model" for the mass of the model, "plant" for the true one.
     """
-    return runs(problem, [PrintedCondition(printed_hocbf)], knowledge=knowledge)[0]
+    return learned_runs.runs(problem, [PrintedCondition(printed_hocbf)], knowledge=knowledge)[0]
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute the altitudes under all filters."""
-    problem, models = hover(sample), residuals(QUADROTOR, sample)
-    found = trajectories(problem, _GAINS, models)
+    problem, models = hover(sample), learned_runs.residuals(QUADROTOR, sample)
+    found = learned_runs.trajectories(problem, _GAINS, models)
     printed = {"nominal": printed_run(problem, "model"), "true": printed_run(problem, "plant")}
     shown = {**{kind: run for kind, (run, *_) in found.items()}, "printed": printed["true"]}
+    note = partial(learned_runs.CHAPTER.note, "figure-3.3")
 
-    def time_in_workspace(run: Trajectory) -> Number:
+    def time_in_workspace(run: learned_runs.Trajectory) -> Number:
         return Number("time in the workspace, true", run.steps * problem.dt, unit="s")
 
-    return Outcome(
+    return Findings(
         numbers=[
-            *smallest_numbers(found),
+            *learned_runs.smallest_numbers(found),
             time_in_workspace(found["true"][0]),
-            *rates_around(problem, sample, models, _GAINS),
+            *learned_runs.rates_around(problem, sample, models, _GAINS),
         ],
         printed_formula=[
             *(Number(f"smallest h, {kind}", run.smallest) for kind, run in printed.items()),
@@ -98,39 +80,29 @@ def compute(sample: Sample) -> Outcome:
         claims=altitude_claims(found),
         data={kind: run.over_time(problem.dt, z=run.states[:, 0]) for kind, run in shown.items()},
         notes=[
-            f"by the printed Eq. (3.33), with the true mass: {fate(printed['true'], problem)}",
-            (
-                f"without a filter the altitude goes from {_range(found['none'])}, for the thrust"
-                " law, too, uses the wrong mass"
-            ),
+            note("formula", fate=fate(printed["true"], problem)),
+            note("none", range=_range(found["none"])),
         ],
     )
 
 
-def hover(sample: Sample) -> SafetyProblem:
+def hover(sample: Workload) -> SafetyProblem:
     """Return the problem from the start of the thesis, as long as the sample lets it be."""
     problem = make_problem(QUADROTOR, start="thesis")
     return problem.configured(horizon=problem.dt * max(_LEAST_STEPS, sample.work(problem.steps)))
 
 
-def altitude_claims(found: Trajectories) -> list[Claim]:
+def altitude_claims(found: learned_runs.Trajectories) -> list[Claim]:
     """Return the claims of the text about the figure."""
     nominal, lowest = found["nominal"][0].smallest, min(run.smallest for run in found["learned"])
+    claim = partial(learned_runs.CHAPTER.claim, "figure-3.3")
     return [
-        Claim(
-            "With the nominal derivatives the altitude leaves the band",
-            nominal < 0,
-            f"smallest h {nominal:.3g}, altitude {_range(found['nominal'])}",
-        ),
-        Claim(
-            "With the learned derivatives the altitude stays in the band",
-            lowest > 0,
-            f"smallest h over the learnings {lowest:.3g}, altitude {_range(found['learned'])}",
-        ),
+        claim("nominal", nominal < 0, h=nominal, range=_range(found["nominal"])),
+        claim("learned", lowest > 0, h=lowest, range=_range(found["learned"])),
     ]
 
 
-def fate(run: Trajectory, problem: SafetyProblem) -> str:
+def fate(run: learned_runs.Trajectory, problem: SafetyProblem) -> str:
     """Return when a run leaves the band and the workspace, if it does, in words.
 
     Args:
@@ -152,12 +124,12 @@ def fate(run: Trajectory, problem: SafetyProblem) -> str:
     )
 
 
-def _range(each: Sequence[Trajectory]) -> str:
+def _range(each: Sequence[learned_runs.Trajectory]) -> str:
     heights = np.concatenate([run.states[:, 0] for run in each])
     return f"{heights.min():.2f} to {heights.max():.2f} m"
 
 
-def draw(figure: Figure, outcome: Outcome) -> None:
+def _draw(figure: Figure, outcome: Findings) -> None:
     """Draw the altitude over time."""
     axes = figure.add_subplot()
     time = np.array(outcome.data["learned"]["time"])
@@ -165,10 +137,10 @@ def draw(figure: Figure, outcome: Outcome) -> None:
     axes.plot(time, reference, color=QUIET, linewidth=0.9, alpha=0.7, label="reference")
     # The true derivatives lie below the learned ones: the two are nearly the same.
     lines = (
-        ("true", TRUE_COLOR, "-", 3.2, "true derivatives"),
-        ("learned", LEARNED_COLOR, "-", 1.3, "learned derivatives"),
-        ("nominal", NOMINAL_COLOR, "--", 1.8, "nominal derivatives"),
-        ("printed", PRINTED_COLOR, ":", 2.2, "true mass, printed Eq. (3.33)"),
+        ("true", learned_runs.TRUE_COLOR, "-", 3.2, "true derivatives"),
+        ("learned", learned_runs.LEARNED_COLOR, "-", 1.3, "learned derivatives"),
+        ("nominal", learned_runs.NOMINAL_COLOR, "--", 1.8, "nominal derivatives"),
+        ("printed", learned_runs.PRINTED_COLOR, ":", 2.2, "true mass, printed Eq. (3.33)"),
     )
     draw_lines(axes, outcome.data, lines, "time", "z")
     low, high = 1.5, 8.5
@@ -180,12 +152,11 @@ def draw(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, axes.get_legend_handles_labels()[0])
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    CHAPTER.artefact(
+ARTEFACTS = (
+    learned_runs.CHAPTER.artefact(
         "figure-3.3",
         compute,
-        lambda sample: setting_values(hover(sample), sample),
-        draw,
-        (7.0, 4.0),
+        lambda sample: learned_runs.setting_values(hover(sample), sample),
+        _draw,
     ),
 )

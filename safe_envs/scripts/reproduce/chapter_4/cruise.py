@@ -9,48 +9,22 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import ndtri
 
-from safe_envs.scripts.reproduce.chapter_4.cruise_setting import (
-    ASSUMED,
-    BY_PRINTED_QP,
-    CHAPTER,
-    EPISODES,
-    FITTED,
-    FITTED_GOAL,
-    HORIZON,
-    NOISE,
-    PRINTED_QP,
-    QUANTITIES,
-    START,
-    STEP,
-    UNBOUNDED,
-    CruiseSettings,
-    setting_values,
-)
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.chapter_4 import cruise_setting as car
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.episodes import violations
-from safe_envs.scripts.reproduce.framework.paired import (
-    difference,
-    is_above,
-    with_interval,
-)
+from safe_envs.scripts.reproduce.framework.paired import difference, is_above, with_interval
 from safe_envs.systems.acc import WEIGHT
 
 COARSE = 0.2  # control period of a quick look at the table, in s
 MORE = 1000  # episodes with the fitted setting, which is to be told from its neighbours
 SWEEP = (0.25, 0.4)  # further limits of the force, in M g
 GAMMAS = (0.01, 100.0)  # further gammas, in 1/(m^2 s)
-PRINTED = CHAPTER.printed("table-4.1")
+PRINTED = car.CHAPTER.printed("table-4.1")
 Safe = Mapping[str, np.ndarray]
 """Which episodes are safe in each cell, by the cell's name."""
 
 
-def cells(setting: CruiseSettings, episodes: int, seed: int, step: float) -> Safe:
+def cells(setting: car.CruiseSettings, episodes: int, seed: int, step: float) -> Safe:
     """Return which episodes are safe in the four cells of the table.
 
     Args:
@@ -59,7 +33,7 @@ def cells(setting: CruiseSettings, episodes: int, seed: int, step: float) -> Saf
         seed: of all of them.
         step: control period, in s.
     """
-    limits = {"unbounded": UNBOUNDED, "bounded": setting.limit}
+    limits = {"unbounded": car.UNBOUNDED, "bounded": setting.limit}
     return {
         f"{condition}, {control}": safe_with(setting, text, limit, episodes, seed, step)
         for control, limit in limits.items()
@@ -68,7 +42,7 @@ def cells(setting: CruiseSettings, episodes: int, seed: int, step: float) -> Saf
 
 
 def safe_with(
-    setting: CruiseSettings, text: str, limit: float, episodes: int, seed: int, step: float
+    setting: car.CruiseSettings, text: str, limit: float, episodes: int, seed: int, step: float
 ) -> np.ndarray:
     """Return which episodes are safe to the end, shape (episodes,).
 
@@ -84,13 +58,13 @@ def safe_with(
     return violations(problem, text, "nominal", episodes, seed).safe(problem.steps)
 
 
-def outcome_of(safe: Safe) -> Outcome:
+def outcome_of(safe: Safe) -> Findings:
     """Return numbers and claims of the table."""
     rates = [
-        Number.rate(name, int(flags.sum()), len(flags), PRINTED[name], EPISODES)
+        Number.rate(name, int(flags.sum()), len(flags), PRINTED[name], car.EPISODES)
         for name, flags in safe.items()
     ]
-    return Outcome(rates, claims_of_table(safe))
+    return Findings(rates, claims_of_table(safe))
 
 
 def claims_of_table(safe: Safe) -> list[Claim]:
@@ -104,22 +78,10 @@ def claims_of_table(safe: Safe) -> list[Claim]:
     }
     more = Number.mean("", 100 * (lost["SRCBF"] - lost["SCBF"]), "points", -200.0, 200.0)
     each = ", ".join(f"{name} {_change(values)}" for name, values in lost.items())
+    gaps = {"unbounded": unbounded, "bounded": bounded, "saturation": more}
     return [
-        Claim(
-            "with unbounded control SRCBF is the safer one (Sec. 4.3.1, 4.2.3)",
-            is_above(unbounded),
-            _by(unbounded, "SRCBF - SCBF"),
-        ),
-        Claim(
-            "with bounded control SCBF is the safer one",
-            is_above(bounded),
-            _by(bounded, "SCBF - SRCBF"),
-        ),
-        Claim(
-            "saturation costs SRCBF more safety than SCBF",
-            is_above(more),
-            f"{each}; {_by(more, 'a difference')}",
-        ),
+        car.CHAPTER.claim("table-4.1", name, is_above(gap), gap=with_interval(gap), each=each)
+        for name, gap in gaps.items()
     ]
 
 
@@ -130,16 +92,12 @@ def _change(lost: np.ndarray) -> str:
     return f"{'loses' if points > 0 else 'gains'} {abs(points):.1f} points"
 
 
-def _by(number: Number, what: str) -> str:
-    return f"{what} of {with_interval(number)} points on the same episodes"
-
-
-def compute_table(sample: Sample) -> Outcome:
+def compute_table(sample: Workload) -> Findings:
     """Compute Table 4.1, also with other settings."""
-    episodes, step = sample.size(EPISODES), _step(sample)
+    episodes, step = sample.size(car.EPISODES), _step(sample)
     settings = {
-        BY_PRINTED_QP: (PRINTED_QP, episodes),
-        _fitted(sample): (FITTED, sample.size(MORE)),
+        car.BY_PRINTED_QP: (car.PRINTED_QP, episodes),
+        _fitted(sample): (car.FITTED, sample.size(MORE)),
     }
     found = {
         name: cells(setting, count, sample.seed, step)
@@ -147,19 +105,19 @@ def compute_table(sample: Sample) -> Outcome:
     }
     notes = [_gaussian_note(), _odd_note(), _fitted_note(found[_fitted(sample)])]
     return replace(
-        outcome_of(cells(ASSUMED, episodes, sample.seed, step)),
+        outcome_of(cells(car.ASSUMED, episodes, sample.seed, step)),
         alternative_settings={name: outcome_of(safe) for name, safe in found.items()},
         notes=[*notes, *([] if sample.quick else _sweep(episodes, sample.seed, step))],
     )
 
 
-def _step(sample: Sample) -> float:
-    return COARSE if sample.quick else STEP
+def _step(sample: Workload) -> float:
+    return COARSE if sample.quick else car.STEP
 
 
-def _fitted(sample: Sample) -> str:
+def _fitted(sample: Workload) -> str:
     return (
-        f"fitted by us, {len(PRINTED)} printed numbers by {QUANTITIES} quantities;"
+        f"fitted by us, {len(PRINTED)} printed numbers by {car.QUANTITIES} quantities;"
         f" {sample.size(MORE)} episodes"
     )
 
@@ -168,57 +126,53 @@ def _fitted_note(safe: Safe) -> str:
     before, after = (
         100 * float(safe[f"SCBF, {control}"].mean()) for control in ("unbounded", "bounded")
     )
-    numbers = {"count": len(PRINTED), "quantities": QUANTITIES, "goal": FITTED_GOAL}
+    numbers = {"count": len(PRINTED), "quantities": car.QUANTITIES, "goal": car.FITTED_GOAL}
     rates = {"before": before, "after": after, "printed": PRINTED}
-    return CHAPTER.note("table-4.1", "fitted", fitted=FITTED, **numbers, **rates)
+    return car.CHAPTER.note("table-4.1", "fitted", fitted=car.FITTED, **numbers, **rates)
 
 
 def headway_for(unsafe: float) -> float:
     """Return the tau in s at which `CruiseSettings.most_unsafe` is a given probability."""
-    return START[2] / (START[0] - float(ndtri(unsafe / 2.0)) * NOISE * math.sqrt(HORIZON))
+    return car.START[2] / (
+        car.START[0] - float(ndtri(unsafe / 2.0)) * car.NOISE * math.sqrt(car.HORIZON)
+    )
 
 
 def _gaussian_note() -> str:
     unsafe = 1 - PRINTED["SCBF, unbounded"] / 100
-    return CHAPTER.note(
-        "table-4.1",
-        "gaussian",
-        most_unsafe=ASSUMED.most_unsafe(),
-        most_unsafe_fitted=FITTED.most_unsafe(),
-        tau_fitted=FITTED.tau,
-        unsafe=100 * unsafe,
-        needed=headway_for(unsafe),
-    )
+    settings = {"assumed": car.ASSUMED, "fitted": car.FITTED}
+    numbers = {"unsafe": 100 * unsafe, "needed": headway_for(unsafe)}
+    return car.CHAPTER.note("table-4.1", "gaussian", **settings, **numbers)
 
 
 def _odd_note() -> str:
     printed = PRINTED["SRCBF, bounded"]
-    return CHAPTER.note("table-4.1", "odd", printed=printed, runs=printed * EPISODES / 100)
+    return car.CHAPTER.note("table-4.1", "odd", printed=printed, runs=printed * car.EPISODES / 100)
 
 
 def _sweep(episodes: int, seed: int, step: float) -> list[str]:
     """Return the rates with other limits of the force, and with other gammas, in words."""
 
     def rate(text: str, limit: float) -> str:
-        return f"{100 * safe_with(ASSUMED, text, limit, episodes, seed, step).mean():.0f} %"
+        return f"{100 * safe_with(car.ASSUMED, text, limit, episodes, seed, step).mean():.0f} %"
 
     limits = [
         f"|u| <= {share:g} M g: "
         + ", ".join(
-            f"{name} {rate(text, share * WEIGHT)}" for name, text in ASSUMED.filters.items()
+            f"{name} {rate(text, share * WEIGHT)}" for name, text in car.ASSUMED.filters.items()
         )
         for share in SWEEP
     ]
     gammas = [
-        f"SRCBF with gamma = {gamma:g}: {rate(text, UNBOUNDED)} unbounded,"
-        f" {rate(text, ASSUMED.limit)} bounded"
+        f"SRCBF with gamma = {gamma:g}: {rate(text, car.UNBOUNDED)} unbounded,"
+        f" {rate(text, car.ASSUMED.limit)} bounded"
         for gamma, text in ((gamma, f"srcbf:gamma={gamma}") for gamma in GAMMAS)
     ]
     return [*limits, *gammas]
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    CHAPTER.artefact(
-        "table-4.1", compute_table, lambda sample: setting_values(sample, _step(sample))
+ARTEFACTS = (
+    car.CHAPTER.artefact(
+        "table-4.1", compute_table, lambda sample: car.setting_values(sample, _step(sample))
     ),
 )

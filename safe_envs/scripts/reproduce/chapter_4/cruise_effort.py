@@ -13,28 +13,14 @@ from matplotlib.figure import Figure
 
 from safe_envs.agents import NominalController
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legend
-from safe_envs.scripts.reproduce.chapter_4.cruise_setting import (
-    ASSUMED,
-    BY_PRINTED_QP,
-    CHAPTER,
-    EPISODES,
-    FITTED,
-    FITTED_GOAL,
-    HORIZON,
-    NOISE,
-    PRINTED_QP,
-    STEP,
-    UNBOUNDED,
-    CruiseSettings,
-    setting_values,
-)
+from safe_envs.scripts.reproduce.chapter_4 import cruise_setting as car
 from safe_envs.scripts.reproduce.chapter_4.effort_claims import (
     DISTANCES,
     EffortRecord,
     EffortRecords,
     outcome_of,
 )
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_interval
 from safe_envs.scripts.reproduce.framework.episodes import periods
 from safe_envs.wrappers import SafetyFilter, parse_conditions
@@ -43,7 +29,7 @@ NEAR = 20.0  # speed of both cars at which the force is shown against h, in m/s
 _BLOCK = 10  # control instants of which the figure shows the largest effort
 
 
-def run(setting: CruiseSettings, text: str, episodes: int, seed: int) -> EffortRecord:
+def run(setting: car.CruiseSettings, text: str, episodes: int, seed: int) -> EffortRecord:
     """Return what a filter over the goal's controller does.
 
     Args:
@@ -52,7 +38,7 @@ def run(setting: CruiseSettings, text: str, episodes: int, seed: int) -> EffortR
         episodes: how many.
         seed: of all of them.
     """
-    problem = setting.problem(UNBOUNDED)
+    problem = setting.problem(car.UNBOUNDED)
     effort, acting, barrier = (np.full((problem.steps, episodes), np.nan) for _ in range(3))
     safe = np.ones(episodes, dtype=bool)
     for k, period in enumerate(periods(problem, text, "nominal", range(episodes), seed)):
@@ -65,28 +51,28 @@ def run(setting: CruiseSettings, text: str, episodes: int, seed: int) -> EffortR
     return EffortRecord(effort, acting, barrier)
 
 
-def needed(setting: CruiseSettings, text: str) -> np.ndarray:
+def needed(setting: car.CruiseSettings, text: str) -> np.ndarray:
     """Return the force that a condition needs at equal speeds, at each of `DISTANCES`, in N.
 
     Args:
         setting: of the car.
         text: of the condition.
     """
-    problem = setting.problem(UNBOUNDED)
+    problem = setting.problem(car.UNBOUNDED)
     speed = np.full_like(DISTANCES, NEAR)
     states = np.stack([speed, speed, setting.tau * NEAR + DISTANCES], axis=1)
-    wanted = NominalController(problem).predict(states)[0] * UNBOUNDED
+    wanted = NominalController(problem).predict(states)[0] * car.UNBOUNDED
     answer = SafetyFilter.for_problem(problem, parse_conditions(text, problem))
     return answer.filter(states, wanted).action[:, 0]
 
 
-def compute_figure(sample: Sample) -> Outcome:
+def compute_figure(sample: Workload) -> Findings:
     """Compute the effort over time, and against the distance to the edge."""
-    episodes = sample.size(EPISODES)
-    runs, forces = simulated(ASSUMED, episodes, sample.seed)
+    episodes = sample.size(car.EPISODES)
+    runs, forces = simulated(car.ASSUMED, episodes, sample.seed)
     others = {
-        BY_PRINTED_QP: PRINTED_QP,
-        "the goal, tau and gamma that we fitted to Table 4.1, not to this figure": FITTED,
+        car.BY_PRINTED_QP: car.PRINTED_QP,
+        "the goal, tau and gamma that we fitted to Table 4.1, not to this figure": car.FITTED,
     }
     return replace(
         outcome_of(runs, forces),
@@ -95,7 +81,7 @@ def compute_figure(sample: Sample) -> Outcome:
             for name, setting in others.items()
         },
         data={
-            "time": (np.arange(len(runs["SCBF"].effort) // _BLOCK) * _BLOCK * STEP).tolist(),
+            "time": (np.arange(len(runs["SCBF"].effort) // _BLOCK) * _BLOCK * car.STEP).tolist(),
             "h": DISTANCES.tolist(),
             "effort": {name: _bands(r.effort) for name, r in runs.items()},
             "forces": {name: values.tolist() for name, values in forces.items()},
@@ -104,12 +90,12 @@ def compute_figure(sample: Sample) -> Outcome:
     )
 
 
-def _printed_claims(outcome: Outcome) -> Outcome:
+def _printed_claims(outcome: Findings) -> Findings:
     return replace(outcome, claims=[claim for claim in outcome.claims if claim.printed])
 
 
 def simulated(
-    setting: CruiseSettings, episodes: int, seed: int
+    setting: car.CruiseSettings, episodes: int, seed: int
 ) -> tuple[EffortRecords, Mapping[str, np.ndarray]]:
     """Return runs of both conditions, and the forces that they need at the edge.
 
@@ -123,8 +109,8 @@ def simulated(
 
 
 def _strict_note() -> str:
-    below = {"assumed": ASSUMED.stricter_below(), "fitted": FITTED.stricter_below()}
-    return CHAPTER.note("figure-4.1", "strict", goal=FITTED_GOAL, **below)
+    settings = {"assumed": car.ASSUMED, "fitted": car.FITTED}
+    return car.CHAPTER.note("figure-4.1", "strict", goal=car.FITTED_GOAL, **settings)
 
 
 def _ends_note(runs: EffortRecords) -> str:
@@ -133,7 +119,7 @@ def _ends_note(runs: EffortRecords) -> str:
         for name, r in runs.items()
     )
     first, other = (float(np.median(runs[name].effort[0])) for name in ("SRCBF", "SCBF"))
-    return CHAPTER.note("figure-4.1", "ends", running=running, first=first, other=other)
+    return car.CHAPTER.note("figure-4.1", "ends", running=running, first=first, other=other)
 
 
 def _bands(effort: np.ndarray) -> list[list[float]]:
@@ -145,7 +131,7 @@ def _bands(effort: np.ndarray) -> list[list[float]]:
     return np.maximum(np.nanquantile(largest, (0.05, 0.5, 0.95), axis=1), 1.0).tolist()
 
 
-def draw_figure(figure: Figure, outcome: Outcome) -> None:
+def _draw_figure(figure: Figure, outcome: Findings) -> None:
     """Draw the effort over time, and against h with the edge at the left."""
     left, right = figure.subplots(1, 2, width_ratios=(1.3, 1))
     data = outcome.data
@@ -155,9 +141,9 @@ def draw_figure(figure: Figure, outcome: Outcome) -> None:
         draw_interval(left, data["time"], ends, color, 0.2, linewidth=1.3, label=label)
         right.plot(data["h"], np.square(data["forces"][name]), color=color, linewidth=2)
     for axes, label in ((left, "|u| = .3 M g"), (right, None)):
-        axes.axhline(ASSUMED.limit**2, color=QUIET, linestyle=":", label=label)
+        axes.axhline(car.ASSUMED.limit**2, color=QUIET, linestyle=":", label=label)
     labels: dict[str, Any] = {"xlabel": "time (s)", "ylabel": r"effort J = u$^2$ (N$^2$)"}
-    left.set(yscale="log", xlim=(0, HORIZON), title="(a)", **labels)
+    left.set(yscale="log", xlim=(0, car.HORIZON), title="(a)", **labels)
     right.set(xscale="log", yscale="log", xlim=(DISTANCES[0], DISTANCES[-1]), title="(b)")
     right.set_xlabel("barrier h (m), edge at the left")
     _mark_step(right)
@@ -166,17 +152,16 @@ def draw_figure(figure: Figure, outcome: Outcome) -> None:
 
 def _mark_step(axes: Axes) -> None:
     """Shade the distances that the noise of one control period crosses."""
-    axes.axvspan(DISTANCES[0], ASSUMED.tau * NOISE * math.sqrt(STEP), **SHADED)
+    axes.axvspan(DISTANCES[0], car.ASSUMED.tau * car.NOISE * math.sqrt(car.STEP), **SHADED)
     style: dict[str, Any] = {"transform": axes.transAxes, "color": QUIET, "fontsize": 8}
     axes.text(0.03, 0.2, "within the noise\nof one step", **style)
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    CHAPTER.artefact(
+ARTEFACTS = (
+    car.CHAPTER.artefact(
         "figure-4.1",
         compute_figure,
-        lambda sample: setting_values(sample, STEP),
-        draw_figure,
-        (7.0, 3.8),
+        lambda sample: car.setting_values(sample, car.STEP),
+        _draw_figure,
     ),
 )

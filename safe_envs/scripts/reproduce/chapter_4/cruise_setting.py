@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
-from safe_envs.scripts.reproduce.framework.artefact import Sample
+from safe_envs.scripts.reproduce.framework.artefact import Workload
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
 from safe_envs.systems.acc import WEIGHT
 
@@ -55,6 +55,7 @@ class CruiseSettings:
         """Return the texts of the two conditions."""
         return {"SRCBF": f"srcbf:gamma={self.gamma}", "SCBF": "scbf"}
 
+    @property
     def most_unsafe(self) -> float:
         """Return the largest probability of a violation under any controller with A h >= 0.
 
@@ -63,6 +64,7 @@ class CruiseSettings:
         distance, deviation = START[2] - self.tau * START[0], self.tau * NOISE * math.sqrt(HORIZON)
         return float(2.0 * ndtr(-distance / deviation))
 
+    @property
     def stricter_below(self) -> float:
         """Return the h in m below which the SRCBF asks for more than the SCBF.
 
@@ -84,7 +86,7 @@ FITTED_GOAL = (
 BY_PRINTED_QP = "the printed QP, 1/2 (u^2 + d^2) and AV <= d"
 
 
-def setting_values(sample: Sample, step: float) -> dict[str, float]:
+def setting_values(sample: Workload, step: float) -> dict[str, float]:
     """Return what the lines of a setting name.
 
     Args:

@@ -10,14 +10,9 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from safe_envs.scripts.figures.evaluation_figure import (
-    COLORS,
-    QUIET,
-    UNSAFE,
-    add_legend,
-)
+from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_4.dubins_runs import ALPHAS, FILTERS, RADIUS
-from safe_envs.scripts.reproduce.framework.artefact import Outcome
+from safe_envs.scripts.reproduce.framework.artefact import Findings
 from safe_envs.scripts.reproduce.framework.drawing import draw_interval
 
 _COLOR = dict(zip(FILTERS, COLORS, strict=False))
@@ -27,10 +22,14 @@ _LABEL = {
 }
 
 
-def draw_noises(figure: Figure, outcome: Outcome) -> None:
+def draw_noises(figure: Figure, outcome: Findings) -> None:
     """Draw safety against noise, and over time at the largest noise.
 
     Full lines are of all starts, dashed ones of those with A h > 0.
+
+    Args:
+        figure: empty.
+        outcome: of the artefact.
     """
     left, right = figure.subplots(1, 2, sharey=True)
     data, dots = outcome.data, {"marker": "o", "markersize": 3}
@@ -62,8 +61,13 @@ def draw_noises(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, left.get_legend_handles_labels()[0])
 
 
-def draw_points(figure: Figure, outcome: Outcome) -> None:
-    """Draw the starts and the safety from each, hollow at the long horizon."""
+def draw_points(figure: Figure, outcome: Findings) -> None:
+    """Draw the starts and the safety from each, hollow at the long horizon.
+
+    Args:
+        figure: empty.
+        outcome: of the artefact.
+    """
     left, right = figure.subplots(1, 2, width_ratios=(1.7, 1))
     data = outcome.data
     index = np.arange(1, len(data["starts"]) + 1)

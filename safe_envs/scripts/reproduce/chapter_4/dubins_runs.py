@@ -11,12 +11,8 @@ import numpy as np
 from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, SafeVectorEnv
 from safe_envs.agents import make_problem
 from safe_envs.dynamics.lie import generator
-from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Outcome
-from safe_envs.scripts.reproduce.framework.episodes import (
-    Violations,
-    episode_seed,
-    violations,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number
+from safe_envs.scripts.reproduce.framework.episodes import Violations, episode_seed, violations
 from safe_envs.scripts.reproduce.framework.paired import difference
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
@@ -150,7 +146,7 @@ def scbf_of(runs: ByFilter) -> dict[str, Violations]:
 
 def alternatives_of(
     named: Mapping[str, Any], printed: Any, claim: Callable[[Any, float], Claim]
-) -> dict[str, Outcome]:
+) -> dict[str, Findings]:
     """Return the claim by the printed SZCBF, for the other horizons, and from the other starts.
 
     Args:
@@ -161,7 +157,7 @@ def alternatives_of(
     horizons = (HORIZON, *(t for t in HORIZONS if t != HORIZON))
     found = {BY_PRINTED_FORM: printed, **named}
     claims = {
-        f"{name}, T = {t:g} s": Outcome(claims=[claim(runs, t)])
+        f"{name}, T = {t:g} s": Findings(claims=[claim(runs, t)])
         for name, runs in found.items()
         for t in horizons
     }
@@ -169,7 +165,7 @@ def alternatives_of(
     return claims
 
 
-def holds_note(alternatives: Mapping[str, Outcome]) -> str:
+def holds_note(alternatives: Mapping[str, Findings]) -> str:
     """Return in which of the other settings all holds, in words."""
     yes, no = (
         [

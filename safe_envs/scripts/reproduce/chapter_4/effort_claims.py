@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from safe_envs.scripts.reproduce.chapter_4.cruise_setting import STEP
-from safe_envs.scripts.reproduce.framework.artefact import Claim, Number, Outcome
+from safe_envs.scripts.reproduce.chapter_4.cruise_setting import CHAPTER, STEP
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number
 from safe_envs.scripts.reproduce.framework.paired import is_above
 
 DISTANCES = np.logspace(-3, math.log10(30.0), 181)  # h at which the force is shown, in m
+_claim = partial(CHAPTER.claim, "figure-4.1")
 _CLOSE, _FAR = 0.25, 1.0  # h below and above which the effort is compared, in m
 
 
@@ -40,7 +42,7 @@ EffortRecords = Mapping[str, EffortRecord]
 """By condition, SRCBF and SCBF, with the same noise."""
 
 
-def outcome_of(runs: EffortRecords, forces: Mapping[str, np.ndarray]) -> Outcome:
+def outcome_of(runs: EffortRecords, forces: Mapping[str, np.ndarray]) -> Findings:
     """Return numbers and claims of the figure.
 
     Args:
@@ -54,7 +56,7 @@ def outcome_of(runs: EffortRecords, forces: Mapping[str, np.ndarray]) -> Outcome
         Number.mean(f"time in which J of SRCBF is the {word} one", 100 * share, "%", 0.0, 100.0)
         for word, share in (("larger", larger), ("smaller", smaller))
     ]
-    return Outcome(
+    return Findings(
         [*shares, *(median_peak(name, r.peaks) for name, r in runs.items())],
         [
             claim_on_time(larger, smaller),
@@ -102,35 +104,21 @@ def claim_on_time(larger: np.ndarray, smaller: np.ndarray) -> Claim:
         smaller: share in which it is smaller.
     """
     ahead = Number.mean("", 100 * (larger - smaller), "points", -100.0, 100.0)
-    return Claim(
-        "SRCBF requires the higher control effort J = u^2 over time",
-        is_above(ahead),
-        "on average over the pairs with the same noise its J is the larger one in"
-        f" {100 * larger.mean():.1f} % of the time and the smaller one in"
-        f" {100 * smaller.mean():.1f} %; it is the larger one most of the time in"
-        f" {(larger > smaller).sum()} of {larger.size} pairs",
-    )
+    means = {"larger": 100 * larger.mean(), "smaller": 100 * smaller.mean()}
+    counts = {"pairs": (larger > smaller).sum(), "count": larger.size}
+    return _claim("time", is_above(ahead), **means, **counts)
 
 
 def claim_on_edge(force: np.ndarray) -> Claim:
     """Return the claim of Sec. 4.2.1 about reciprocal functions, shown by the experiments."""
     power = _power(force)
-    return Claim(
-        "SRCBF's effort has no bound towards the edge (Sec. 4.2.1)",
-        round(power) < 0,
-        _growth(power, force),
-    )
+    return _claim("edge", round(power) < 0, **_growth(power, force))
 
 
 def claim_on_bounded(force: np.ndarray) -> Claim:
     """Return the claim of a bound, where the thesis calls the SCBF milder."""
     power = _power(force)
-    return Claim(
-        "SCBF's effort has a bound towards the edge",
-        round(power) == 0,
-        _growth(power, force),
-        printed=False,
-    )
+    return _claim("bounded", round(power) == 0, **_growth(power, force))
 
 
 def _power(force: np.ndarray) -> float:
@@ -139,11 +127,8 @@ def _power(force: np.ndarray) -> float:
     return float(np.polyfit(np.log(DISTANCES[near]), np.log(force[near] ** 2), 1)[0])
 
 
-def _growth(power: float, force: np.ndarray) -> str:
-    return (
-        f"at equal speeds J goes like h^{round(power, 2) + 0.0:.2f}, and |u| is {abs(force[0]):.3g}"
-        f" N at h = {DISTANCES[0]:g} m"
-    )
+def _growth(power: float, force: np.ndarray) -> dict[str, float]:
+    return {"power": round(power, 2) + 0.0, "force": abs(force[0]), "h": DISTANCES[0]}
 
 
 def claim_on_total(runs: EffortRecords) -> Claim:
@@ -152,14 +137,7 @@ def claim_on_total(runs: EffortRecords) -> Claim:
     srcbf, scbf = (
         np.where(both, runs[name].effort, 0.0).sum(axis=0) * STEP for name in ("SRCBF", "SCBF")
     )
-    larger = srcbf > scbf
-    return Claim(
-        "SRCBF's effort is the higher one as an integral over time",
-        bool(larger.mean() > 0.5),
-        f"in {larger.sum()} of {larger.size} pairs; median {np.median(srcbf):.2g} against"
-        f" {np.median(scbf):.2g} N^2 s",
-        printed=False,
-    )
+    return _claim("total", (srcbf > scbf).mean() > 0.5, **_compared(srcbf, scbf))
 
 
 def claim_on_peaks(srcbf: np.ndarray, scbf: np.ndarray) -> Claim:
@@ -169,15 +147,13 @@ def claim_on_peaks(srcbf: np.ndarray, scbf: np.ndarray) -> Claim:
         srcbf: largest effort of each episode in N^2, shape (episodes,).
         scbf: the same with the SCBF.
     """
-    larger = srcbf > scbf
-    return Claim(
-        "SRCBF's effort has the higher peak where it acts",
-        bool(larger.mean() > 0.5),
-        f"in {larger.sum()} of {larger.size} pairs; median {np.median(srcbf):.2g} against"
-        f" {np.median(scbf):.2g} N^2, largest of all {srcbf.max():.2g} against"
-        f" {scbf.max():.2g} N^2",
-        printed=False,
-    )
+    largest = {"largest": srcbf.max(), "largest_scbf": scbf.max()}
+    return _claim("peaks", (srcbf > scbf).mean() > 0.5, **_compared(srcbf, scbf), **largest)
+
+
+def _compared(srcbf: np.ndarray, scbf: np.ndarray) -> dict[str, float]:
+    pairs = {"pairs": (srcbf > scbf).sum(), "count": srcbf.size}
+    return {**pairs, "srcbf": np.median(srcbf), "scbf": np.median(scbf)}
 
 
 def claim_on_growth(srcbf: EffortRecord) -> Claim:
@@ -191,9 +167,4 @@ def claim_on_growth(srcbf: EffortRecord) -> Claim:
         f"median J {np.median(part):.2g} N^2 {where}" if part.size else f"never {where}"
         for part, where in ((close, f"below h = {_CLOSE} m"), (away, f"above h = {_FAR} m"))
     ]
-    return Claim(
-        "SRCBF's effort grows as the edge is neared",
-        grows,
-        "where it acts: " + ", ".join(each),
-        printed=False,
-    )
+    return _claim("growth", grows, each=", ".join(each))

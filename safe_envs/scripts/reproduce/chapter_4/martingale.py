@@ -18,32 +18,17 @@ from safe_envs.agents import rate_interval
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Variable
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
-from safe_envs.scripts.reproduce.chapter_4.reciprocal_inputs import (
-    CHAPTER,
-    DISTANCES,
-    GAMMA,
-    NOISE,
-    SCALAR,
-    SETTINGS,
-    UNBOUNDED,
-    claims_on_inputs,
-    draw_inputs,
-    largest_inputs,
-)
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.chapter_4 import reciprocal_inputs as scalar
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import draw_interval
 from safe_envs.scripts.reproduce.framework.episodes import episode_seed
 from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, measure
 from safe_envs.wrappers.verification.bounds import proposition_4_2_8
 
-LIMITS, STARTS, SCALE = (SETTINGS[name] for name in ("limits", "starts", "scale"))
-STEP, HORIZON, EPISODES = (SETTINGS[name] for name in ("step", "horizon", "episodes"))
+LIMITS, STARTS, SCALE = (scalar.SETTINGS[name] for name in ("limits", "starts", "scale"))
+STEP, HORIZON, EPISODES = (scalar.SETTINGS[name] for name in ("step", "horizon", "episodes"))
+_note = partial(scalar.CHAPTER.note, "example-4.2.2")
+_claim = partial(scalar.CHAPTER.claim, "example-4.2.2")
 SHIFT = 0.5826
 """By so many standard deviations of a step a boundary watched at the steps seems further away."""
 
@@ -96,14 +81,14 @@ def safe_up_to(start: float, horizon: float, step: float = 0.0) -> float:
     return 1.0 - float(ndtr((-a - drift) / deviation) + ever * ndtr((-a + drift) / deviation))
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute what the conditions ask for, and how safe they are."""
     episodes = sample.size(EPISODES)
     allowed = {
-        "RCBF": largest_inputs(f"rcbf:gamma={GAMMA}", 0.0),
-        "SRCBF": largest_inputs(f"srcbf:gamma={GAMMA}", NOISE),
+        "RCBF": scalar.largest_inputs(f"rcbf:gamma={scalar.GAMMA}", 0.0),
+        "SRCBF": scalar.largest_inputs(f"srcbf:gamma={scalar.GAMMA}", scalar.NOISE),
     }
-    limits = (*LIMITS[: 1 if sample.quick else None], UNBOUNDED)
+    limits = (*LIMITS[: 1 if sample.quick else None], scalar.UNBOUNDED)
     limited = [_limited(limit, episodes, sample.seed) for limit in limits]
     calm = {"noise": 0.0, "box": [-LIMITS[0], LIMITS[0]]}
     attained = [
@@ -119,22 +104,21 @@ def compute(sample: Sample) -> Outcome:
         [safe_up_to(s, t, step) for s in STARTS] for t, step in ((math.inf, 0.0), (HORIZON, STEP))
     ]
     curves = [each.row.curve for each in attained]
-    note = partial(CHAPTER.note, "example-4.2.2", horizon=HORIZON)
-    calm_rate = measure(SCALAR, "rcbf", 1, 0, options=calm).rate
-    return Outcome(
+    calm_rate = measure(scalar.SCALAR, "rcbf", 1, 0, options=calm).rate
+    return Findings(
         numbers=[
             *rates,
             *(number for pair in limited for number in pair),
             Number(f"RCBF without noise, |u| <= {LIMITS[0]:g}", calm_rate, unit="%"),
         ],
         claims=[
-            *claims_on_inputs(allowed),
+            *scalar.claims_on_inputs(allowed),
             claim_on_limits(limited[0][0], limited[-1][0]),
             claim_on_bound(rates, bounds),
             claim_on_attaining([_together(each.row) for each in attained], closed[1]),
         ],
         data={
-            "h": DISTANCES.tolist(),
+            "h": scalar.DISTANCES.tolist(),
             "asked": {name: values.tolist() for name, values in allowed.items()},
             "curves": [
                 {key: getattr(curve, key) for key in ("time", "rate", "ci_low", "ci_high")}
@@ -145,10 +129,18 @@ def compute(sample: Sample) -> Outcome:
         },
         notes=[
             *(
-                note("attained", start=s, bound=100 * b, ever=100 * e, closed=100 * f, rate=r.rate)
+                _note(
+                    "attained",
+                    start=s,
+                    bound=100 * b,
+                    ever=100 * e,
+                    closed=100 * f,
+                    rate=r.rate,
+                    horizon=HORIZON,
+                )
                 for s, b, e, f, r in zip(STARTS, bounds, *closed, attained, strict=True)
             ),
-            note("held", rate=limited[-1][0].ours),
+            _note("held", rate=limited[-1][0].ours),
         ],
     )
 
@@ -162,10 +154,12 @@ def _together(row: Any) -> Number:
 def _limited(limit: float, episodes: int, seed: int) -> list[Number]:
     """Return the safety of both conditions in the scalar system with a bound on the input."""
     box = [-limit, limit]
-    options = {"noise": NOISE, "start": [0.0], "box": box, "dt": STEP, "horizon": HORIZON}
-    where = "unbounded" if limit == UNBOUNDED else f"|u| <= {limit:g}"
+    options = {"noise": scalar.NOISE, "start": [0.0], "box": box, "dt": STEP, "horizon": HORIZON}
+    where = "unbounded" if limit == scalar.UNBOUNDED else f"|u| <= {limit:g}"
     return [
-        measure(SCALAR, name.lower(), episodes, seed, options=options).number(f"{name}, {where}")
+        measure(scalar.SCALAR, name.lower(), episodes, seed, options=options).number(
+            f"{name}, {where}"
+        )
         for name in ("SRCBF", "SCBF")
     ]
 
@@ -179,13 +173,9 @@ def claim_on_limits(bounded: Number, unbounded: Number) -> Claim:
         bounded: rate with a bound on the input.
         unbounded: rate without one.
     """
-    return Claim(
-        "with bounded control the SRCBF is less safe",
-        is_below(bounded, unbounded.low or 0.0),
-        f"{bounded.ours:.1f} % with {bounded.name.split(', ')[1]}, {unbounded.ours:.1f} % without a"
-        " bound",
-        printed=False,
-    )
+    values = {"bounded": bounded.ours, "unbounded": unbounded.ours}
+    holds, limit = is_below(bounded, unbounded.low or 0.0), bounded.name.split(", ")[1]
+    return _claim("limits", holds, limit=limit, **values)
 
 
 def claim_on_bound(attained: Sequence[Number], bounds: Sequence[float]) -> Claim:
@@ -198,12 +188,8 @@ def claim_on_bound(attained: Sequence[Number], bounds: Sequence[float]) -> Claim
         bounds: h/c at each start, from 0 to 1.
     """
     below = sum(is_below(n, 100 * b) for n, b in zip(attained, bounds, strict=True))
-    return Claim(
-        "Prop. 4.2.8: P(safe for ever) >= h/c",
-        below == 0,
-        f"up to {HORIZON:g} s: {_against(attained, bounds)}; below it by more than chance at"
-        f" {below} of {len(bounds)} starts",
-    )
+    values = {"below": below, "rates": _against(attained, bounds), "count": len(bounds)}
+    return _claim("bound", below == 0, horizon=HORIZON, **values)
 
 
 def claim_on_attaining(attained: Sequence[Number], closed: Sequence[float]) -> Claim:
@@ -220,15 +206,8 @@ def claim_on_attaining(attained: Sequence[Number], closed: Sequence[float]) -> C
         not is_above(n, 100 * p) and not is_below(n, 100 * p)
         for n, p in zip(attained, closed, strict=True)
     )
-    return Claim(
-        "h/c is the worst case: on this system it is attained",
-        inside == len(closed),
-        f"1 - x_0^2 = h/c is its probability for ever. The same form for {HORIZON:g} s, looked at"
-        f" every {STEP:g} s, is inside the interval of the simulation at {inside} of {len(closed)}"
-        " starts, by intervals that hold all of them with 95 %:"
-        f" {_against(attained, closed)}",
-        printed=False,
-    )
+    values = {"inside": inside, "rates": _against(attained, closed), "count": len(closed)}
+    return _claim("attained", inside == len(closed), horizon=HORIZON, **values)
 
 
 def _against(rates: Sequence[Number], others: Sequence[float]) -> str:
@@ -238,10 +217,10 @@ def _against(rates: Sequence[Number], others: Sequence[float]) -> str:
     )
 
 
-def draw(figure: Figure, outcome: Outcome) -> None:
+def _draw(figure: Figure, outcome: Findings) -> None:
     """Draw what the conditions allow towards the edge, and safety over time with the bound."""
     left, right = figure.subplots(1, 2)
-    draw_inputs(left, outcome.data)
+    scalar.draw_inputs(left, outcome.data)
     _draw_bound(right, outcome.data)
     handles = [axes.get_legend_handles_labels()[0] for axes in (left, right)]
     add_legend(figure, [handle for each in handles for handle in each])
@@ -264,12 +243,8 @@ def _draw_bound(axes: Axes, data: dict[str, Any]) -> None:
     axes.set(xlabel="time (s)", ylabel="safe so far (%)", title="(b)", **limits)
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    CHAPTER.artefact(
-        "example-4.2.2",
-        compute,
-        lambda sample: {"count": sample.size(EPISODES)},
-        draw,
-        (7.0, 4.0),
+ARTEFACTS = (
+    scalar.CHAPTER.artefact(
+        "example-4.2.2", compute, lambda sample: {"count": sample.size(EPISODES)}, _draw
     ),
 )

@@ -51,40 +51,31 @@ def claims_on_inputs(allowed: Mapping[str, np.ndarray]) -> list[Claim]:
         for name, law in printed.items()
     )
     return [
-        Claim(
-            "both inequalities on u are right",
-            largest < _ROUNDING,
-            f"largest relative difference {largest:.1e}",
-        ),
-        _claim_on_edge(
-            "without noise the RCBF asks for bounded control at the edge",
-            allowed["RCBF"],
-            bounded=True,
-        ),
-        _claim_on_edge(
-            "under noise the SRCBF asks for unbounded control at the edge",
-            allowed["SRCBF"],
-            bounded=False,
-        ),
+        CHAPTER.claim("example-4.2.2", "inputs", largest < _ROUNDING, largest=largest),
+        _claim_on_edge("bounded", allowed["RCBF"]),
+        _claim_on_edge("unbounded", allowed["SRCBF"]),
     ]
 
 
-def _claim_on_edge(sentence: str, allowed: np.ndarray, bounded: bool) -> Claim:
+def _claim_on_edge(name: str, allowed: np.ndarray) -> Claim:
     """Return the claim by the power of h, to the nearest integer, with which the effort goes.
 
     It is 0 where the effort is bounded, and less where it is not.
     """
     near, effort = np.log(DISTANCES[-20:]), np.log(np.abs(allowed[-20:]))
     power = float(np.polyfit(near, effort, 1)[0])
-    evidence = (
-        f"it allows u = {allowed[-1]:.6g} at h = {DISTANCES[-1]:g}; |u| goes like"
-        f" h^{round(power, 3) + 0.0:.3f} there"
-    )
-    return Claim(sentence, (round(power) >= 0) == bounded, evidence)
+    holds = (round(power) >= 0) == (name == "bounded")
+    values = {"allowed": allowed[-1], "h": DISTANCES[-1], "power": round(power, 3) + 0.0}
+    return CHAPTER.claim("example-4.2.2", name, holds, **values)
 
 
 def draw_inputs(axes: Axes, data: dict[str, Any]) -> None:
-    """Draw the effort that each condition asks for, over h."""
+    """Draw the effort that each condition asks for, over h.
+
+    Args:
+        axes: where.
+        data: of the outcome.
+    """
     near = np.array(data["h"]) < 0.5
     h, what = np.array(data["h"])[near], ("no noise", rf"$\sigma$ = {NOISE:g}")
     for (name, values), color, noise in zip(data["asked"].items(), COLORS[:2], what, strict=True):

@@ -16,10 +16,7 @@ from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     models,
     repeated,
 )
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
-    draw_learning,
-    learning_outcome,
-)
+from safe_envs.scripts.reproduce.chapter_5.noise_terms import draw_learning, learning_outcome
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     CHAPTER,
     EPISODES,
@@ -28,19 +25,8 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     explain_gap,
     measured,
 )
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Number,
-    Outcome,
-    Sample,
-)
-from safe_envs.scripts.reproduce.framework.paired import (
-    MeasuredFilter,
-    is_above,
-    is_below,
-    safer,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
+from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, is_above, is_below, safer
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.feasibility import verify
 
@@ -62,7 +48,7 @@ Levels = Mapping[float, Mapping[str, MeasuredFilter]]
 """By filter at each level."""
 
 
-def compute_table(sample: Sample) -> Outcome:
+def compute_table(sample: Workload) -> Findings:
     """Compute Table 5.2, also from a single start."""
     learned = {k: repeated(ENV, k, sample) for k in LEVELS}
     filters = ["none", CBF, WITHOUT, "scbf"]
@@ -76,11 +62,11 @@ def compute_table(sample: Sample) -> Outcome:
     literal = {
         k: measured(ENV, {"noise": k}, [], models(learned[k], "printed"), sample) for k in LEVELS
     }
-    return Outcome(
+    return Findings(
         numbers=numbers(near, _FILTERS),
         claims=claims(near),
         alternative_settings={
-            f"a single start {FIXED} with h = .25": Outcome(
+            f"a single start {FIXED} with h = .25": Findings(
                 numbers(single, _FILTERS), claims(single)
             )
         },
@@ -141,7 +127,7 @@ def _fall(found: Levels, name: str) -> float:
     return before - after
 
 
-def _falls(sample: Sample) -> str:
+def _falls(sample: Workload) -> str:
     """Return how far the CBF falls between the levels, over rates and horizons, in words."""
     tried = _ALPHAS[:1] if sample.quick else _ALPHAS
     swept = [
@@ -168,7 +154,7 @@ def compare_with_no_filter(found: Levels) -> list[str]:
     return said
 
 
-def _no_bound(sample: Sample) -> list[str]:
+def _no_bound(sample: Workload) -> list[str]:
     """Return why h/sup h says nothing here, in words."""
     problem = make_problem(ENV)
     condition = SCBF().constraint(problem.model, problem.barriers[0])
@@ -183,13 +169,8 @@ def _no_bound(sample: Sample) -> list[str]:
         return notes
     found = verify(problem, (SCBF(),), samples=1024)
     reason = found.guarantee.applicable_bounds(np.array([FIXED]), problem.duration)[0].reason
-    return [
-        *notes,
-        (
-            f"{reason}; no input in its bounds meets the condition on"
-            f" {100 * found.safe_set.infeasible:.0f} % of C within the workspace"
-        ),
-    ]
+    share = 100 * found.safe_set.infeasible
+    return [*notes, note("not_met", reason=reason, share=share)]
 
 
 def printed_term(x_2: Any) -> Any:
@@ -197,19 +178,18 @@ def printed_term(x_2: Any) -> Any:
     return -((LEVELS[0] * x_2) ** 2)
 
 
-def _table_values(sample: Sample) -> dict[str, Any]:
+def _table_values(sample: Workload) -> dict[str, Any]:
     return {"count": sample.size(EPISODES), "identifications": identifications(sample)}
 
 
 _SIGMA = f"sigma = {LEVELS[0]:g} x_2"
 
-ARTEFACTS: tuple[Artefact, ...] = (
+ARTEFACTS = (
     CHAPTER.artefact(
         "figure-5.2",
         partial(learning_outcome, ENV, LEVELS[0], 1, f"-sigma(x_2)^2 at {_SIGMA}", printed_term),
         partial(learning_values, region="C within [-1, 1]^2", law=_SIGMA),
         draw_learning,
-        (7.5, 3.8),
     ),
     CHAPTER.artefact("table-5.2", compute_table, _table_values),
 )

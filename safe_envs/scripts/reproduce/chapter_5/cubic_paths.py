@@ -13,36 +13,20 @@ from matplotlib.patches import Patch
 
 from safe_envs.agents import evaluate, make_problem
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.scripts.figures.evaluation_figure import (
-    COLORS,
-    QUIET,
-    UNSAFE,
-    add_legend,
-)
+from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, UNSAFE, add_legend
 from safe_envs.scripts.reproduce.chapter_5.cubic import CBF, ENV, LEVELS, SETTINGS
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import repeated
-from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
-    CHAPTER,
-    EPISODES,
-    measured,
-)
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER, EPISODES, measured
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Workload
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, safer
 
 HORIZON, WIDE = SETTINGS["horizon"], SETTINGS["wide"]
+_note = partial(CHAPTER.note, "figure-5.3a")
+_claim = partial(CHAPTER.claim, "figure-5.3a")
 SHOWN, STRIDE = 12, 2  # trajectories in a figure, and which of their instants
 
 _KINDS = {"a": ("none", 0.0), "b": (CBF, 0.0), "c": (CBF, LEVELS[0]), "d": ("ddscbf", LEVELS[0])}
 _WANTED = {"a": False, "b": True, "c": False, "d": True}
-_SOUGHT = (
-    "unsafe with the CLF alone, safe with the CBF without noise, unsafe with the CBF under noise,"
-    " and safe with DDSCBF"
-)
 
 
 @dataclass(frozen=True)
@@ -66,7 +50,7 @@ class PlaneTrajectories:
 
 
 @lru_cache(maxsize=2)
-def paths(sample: Sample) -> dict[str, PlaneTrajectories]:
+def paths(sample: Workload) -> dict[str, PlaneTrajectories]:
     """Return the trajectories of all four figures."""
     model = repeated(ENV, LEVELS[0], sample)[0].learned["martingale"]
     found = {}
@@ -103,21 +87,24 @@ def alike(found: Mapping[str, PlaneTrajectories]) -> np.ndarray:
     )
 
 
-def compute(key: str, name: str, sample: Sample) -> Outcome:
+def compute(key: str, name: str, sample: Workload) -> Findings:
     """Compute one of the figures.
 
     Args:
         key: its letter.
         name: what it shows.
         sample: how much is simulated.
+
+    Returns:
+        Numbers, claims and notes of the figure, with the trajectories that it shows.
     """
     found = paths(sample)
     path, fitting = found[key], alike(found)
     shown, recorded = int(fitting[0]) if len(fitting) else 0, path.states.shape[1]
     order = [shown, *(i for i in range(recorded) if i != shown)][:SHOWN]
     lines = [path.states[::STRIDE, i] for i in order]
-    of_these = f"{len(fitting)} of the {recorded} recorded ones are {_SOUGHT}"
-    return Outcome(
+    counts = {"fitting": len(fitting), "recorded": recorded, "shown": shown}
+    return Findings(
         numbers=[path.runs.number(_rate_name(name))],
         claims=[_CLAIMS[key](found)],
         alternative_settings=(
@@ -130,10 +117,7 @@ def compute(key: str, name: str, sample: Sample) -> Outcome:
             "paths": [line[np.isfinite(line).all(axis=1)].tolist() for line in lines],
         },
         notes=[
-            (
-                f"drawn bold in all four figures is an episode chosen by how it ends: {of_these};"
-                f" it is the first of {'these' if len(fitting) else 'all'}, number {shown}"
-            ),
+            _note("bold", which="these" if len(fitting) else "all", **counts),
             *([short_of_input(path.runs)] if key == "b" else []),
         ],
     )
@@ -143,18 +127,15 @@ def _rate_name(name: str) -> str:
     return f"safe up to {HORIZON:g} s, {name}"
 
 
-def _unbounded(name: str, sample: Sample) -> Outcome:
+def _unbounded(name: str, sample: Workload) -> Findings:
     """Return the outcome of the CBF without noise, with more input than it ever takes."""
     runs = measured(ENV, {"noise": 0.0, "horizon": HORIZON, "box": WIDE}, [CBF], [], sample)[CBF]
-    return Outcome([runs.number(_rate_name(name))], [kept(runs)])
+    return Findings([runs.number(_rate_name(name))], [all_safe(runs)])
 
 
 def short_of_input(runs: MeasuredFilter) -> str:
     """Return how often the input bounds are too narrow for the CBF, in words."""
-    return (
-        "no input within 10 1/s meets the condition of the CBF at"
-        f" {runs.row.infeasible_rate:.2%} of the steps up to a first violation"
-    )
+    return _note("short", share=runs.row.infeasible_rate)
 
 
 def towards_origin(states: np.ndarray) -> Claim:
@@ -166,26 +147,13 @@ def towards_origin(states: np.ndarray) -> Claim:
     last = np.isfinite(states).all(axis=2).sum(axis=0) - 1
     ends = states[last, np.arange(states.shape[1])]
     left = np.linalg.norm(ends, axis=1) / np.linalg.norm(states[0], axis=1)
-    evidence = (
-        f"up to {HORIZON:g} s {np.sum(left < 1.0)} of {len(left)} trajectories come nearer;"
-        f" {np.median(left):.0%} of the first distance is left in the median, {left.max():.0%} at"
-        " most"
-    )
-    return Claim(
-        "the CLF steers the state towards the origin, without noise",
-        bool((left < 1.0).all()),
-        evidence,
-    )
+    values = {"nearer": np.sum(left < 1.0), "median": np.median(left), "most": left.max()}
+    return _claim("towards", (left < 1.0).all(), count=len(left), **values)
 
 
-def kept(runs: MeasuredFilter) -> Claim:
+def all_safe(runs: MeasuredFilter) -> Claim:
     """Return the claim that a CBF without noise keeps all episodes safe."""
-    row = runs.row
-    return Claim(
-        "the CBF guarantees safe trajectories without noise",
-        row.violations == 0,
-        f"{row.safe} of {row.episodes} are safe",
-    )
+    return _claim("safe", runs.row.violations == 0, row=runs.row)
 
 
 def lost(quiet: MeasuredFilter, noisy: MeasuredFilter) -> Claim:
@@ -215,13 +183,13 @@ def recovered(ddscbf: MeasuredFilter, cbf: MeasuredFilter) -> Claim:
 
 _CLAIMS: dict[str, Callable[[Mapping[str, PlaneTrajectories]], Claim]] = {
     "a": lambda found: towards_origin(found["a"].states),
-    "b": lambda found: kept(found["b"].runs),
+    "b": lambda found: all_safe(found["b"].runs),
     "c": lambda found: lost(found["b"].runs, found["c"].runs),
     "d": lambda found: recovered(found["d"].runs, found["c"].runs),
 }
 
 
-def draw_paths(figure: Figure, outcome: Outcome) -> None:
+def _draw_paths(figure: Figure, outcome: Findings) -> None:
     """Draw trajectories in the plane, one of them bold, with the unsafe region."""
     problem = make_problem(ENV)
     axes = figure.subplots()
@@ -249,7 +217,7 @@ def draw_paths(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, [*reversed(kinds.values()), Patch(color=UNSAFE, alpha=0.35, label="h < 0")])
 
 
-def _values(sample: Sample) -> dict[str, Any]:
+def _values(sample: Workload) -> dict[str, Any]:
     episodes = sample.size(EPISODES)
     return {"shown": min(SHOWN, episodes), "count": episodes}
 
@@ -261,9 +229,7 @@ _PICTURES = (
     ("d", f"CLF and DDSCBF, k = {LEVELS[0]:g}"),
 )
 
-ARTEFACTS: tuple[Artefact, ...] = tuple(
-    CHAPTER.artefact(
-        f"figure-5.3{key}", partial(compute, key, name), _values, draw_paths, (7.0, 5.2)
-    )
+ARTEFACTS = tuple(
+    CHAPTER.artefact(f"figure-5.3{key}", partial(compute, key, name), _values, _draw_paths)
     for key, name in _PICTURES
 )

@@ -13,7 +13,7 @@ from safe_envs.agents import make_problem
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER
-from safe_envs.scripts.reproduce.framework.artefact import Sample
+from safe_envs.scripts.reproduce.framework.artefact import Workload
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.estimators import Estimator, ito_part, rates
 from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
@@ -23,7 +23,7 @@ VALIDATION = 400  # states at which the errors of an identification are measured
 
 
 @dataclass(frozen=True)
-class Identification:
+class NoiseIdentification:
     """What an identification learned.
 
     Attributes:
@@ -42,7 +42,7 @@ class Identification:
 @lru_cache(maxsize=16)
 def identification(
     env_id: str, noise: float, points: int, repetitions: int, seed: int, whole: bool
-) -> Identification:
+) -> NoiseIdentification:
     """Follow Algorithm 2 at one noise level, by the repaired and by the printed estimator.
 
     Args:
@@ -52,6 +52,9 @@ def identification(
         repetitions: one-step transitions from each.
         seed: of the data.
         whole: add the labels of all estimators.
+
+    Returns:
+        What was learned, without labels unless they were asked for.
     """
     problem = make_problem(env_id, noise=noise)
     data = collect(problem, points, repetitions, [[0.0]], seed=seed)
@@ -60,7 +63,7 @@ def identification(
         name: learn_generator(problem, data=data, estimator=name, seed=seed) for name in estimators
     }
     if not whole:
-        return Identification(seed, learned, data.x, {})
+        return NoiseIdentification(seed, learned, data.x, {})
     h, plant = problem.barriers[0].expression, problem.plant
     value, slopes = (
         compile_function(plant.states, tuple(plant.numeric(e) for e in part), "arrays")
@@ -71,15 +74,15 @@ def identification(
         e: ito_part(data, rate, lambda x: value(*x)[0], lambda x: slopes(*x), e).values
         for e in get_args(Estimator)
     }
-    return Identification(seed, learned, data.x, labels)
+    return NoiseIdentification(seed, learned, data.x, labels)
 
 
-def identifications(sample: Sample) -> int:
+def identifications(sample: Workload) -> int:
     """Return the number of identifications; at least two, since intervals are over them."""
     return 2 if sample.quick else 3
 
 
-def repeated(env_id: str, noise: float, sample: Sample) -> list[Identification]:
+def repeated(env_id: str, noise: float, sample: Workload) -> list[NoiseIdentification]:
     """Return several identifications, the first of them with labels.
 
     Args:
@@ -99,13 +102,18 @@ def repeated(env_id: str, noise: float, sample: Sample) -> list[Identification]:
 
 
 def models(
-    learned: Sequence[Identification], estimator: Estimator = "martingale"
+    learned: Sequence[NoiseIdentification], estimator: Estimator = "martingale"
 ) -> list[GeneratorModel]:
-    """Return what was learned by an estimator."""
+    """Return what was learned by an estimator.
+
+    Args:
+        learned: the identifications.
+        estimator: its name.
+    """
     return [each.learned[estimator] for each in learned]
 
 
-def learning_values(sample: Sample, region: str, law: str) -> dict[str, Any]:
+def learning_values(sample: Workload, region: str, law: str) -> dict[str, Any]:
     """Return what the lines of a setting name.
 
     Args:

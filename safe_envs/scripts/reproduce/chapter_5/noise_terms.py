@@ -19,17 +19,12 @@ from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, add_legen
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     REPETITIONS,
     VALIDATION,
-    Identification,
+    NoiseIdentification,
     models,
     repeated,
 )
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import is_below
 from safe_envs.wrappers.learning.data.collection import draw_states
 from safe_envs.wrappers.learning.generator import GeneratorModel
@@ -67,8 +62,13 @@ class _Errors:
 
 
 def learning_outcome(
-    env_id: str, noise: float, state: int, said: str, formula: Callable[[Any], Any], sample: Sample
-) -> Outcome:
+    env_id: str,
+    noise: float,
+    state: int,
+    said: str,
+    formula: Callable[[Any], Any],
+    sample: Workload,
+) -> Findings:
     """Return how near the learned term is to the true one, which depends on one state alone.
 
     Args:
@@ -92,7 +92,7 @@ def learning_outcome(
     missed = {name: values - term(first.x[:, state])[0] for name, values in first.labels.items()}
     grid = np.linspace(*problem.exploration.region[state], 200)
     unit = f" ({problem.states[state].unit})" if problem.states[state].unit else ""
-    return Outcome(
+    return Findings(
         numbers=[
             root_mean_square("rms of the analytic term", repaired.truth.ravel()),
             repaired.number,
@@ -145,11 +145,8 @@ def as_derived(said: str, term: np.ndarray, printed: np.ndarray) -> Claim:
         printed: by the printed formula, there.
     """
     largest = float(np.abs(term - printed).max())
-    return Claim(
-        f"the analytic term is {said}",
-        bool(np.allclose(printed, term, rtol=1e-9, atol=1e-15)),
-        f"off by {largest:.1g} 1/s at most",
-    )
+    holds = np.allclose(printed, term, rtol=1e-9, atol=1e-15)
+    return CHAPTER.claim("figure-5.1", "derived", holds, said=said, largest=largest)
 
 
 def learnable(errors: Sequence[float], truth: np.ndarray) -> Claim:
@@ -163,14 +160,8 @@ def learnable(errors: Sequence[float], truth: np.ndarray) -> Claim:
     """
     constant = float(np.std(truth))
     found = Number.mean("", errors, least=0.0)
-    holds = is_below(found, constant)
-    evidence = (
-        f"rms error of the network {found.ours:.2g} 1/s [{found.low:.2g}, {found.high:.2g}], of the"
-        f" best constant {constant:.2g} 1/s"
-    )
-    return Claim(
-        "what the noise adds to the generator of h can be learned from data", holds, evidence
-    )
+    values = {"error": found, "constant": constant}
+    return CHAPTER.claim("figure-5.1", "learnable", is_below(found, constant), **values)
 
 
 def near(errors: Sequence[float], truth: np.ndarray) -> Claim:
@@ -181,12 +172,11 @@ def near(errors: Sequence[float], truth: np.ndarray) -> Claim:
         truth: the term at the validation states.
     """
     share = float(np.mean(errors)) / _rms(truth)
-    sentence = f"the rms error of the network is below {_CLOSE:.0%} of the term's rms"
-    return Claim(sentence, share < _CLOSE, f"it is {share:.1%} of it", printed=False)
+    return CHAPTER.claim("figure-5.1", "near", share < _CLOSE, limit=_CLOSE, share=share)
 
 
 def _why_printed_fails(
-    problem: SafetyProblem, first: Identification, missed: np.ndarray, repetitions: int
+    problem: SafetyProblem, first: NoiseIdentification, missed: np.ndarray, repetitions: int
 ) -> list[str]:
     """Return the printed estimator's error, its bias in closed form, and its noise, in words."""
     plant, h = problem.plant, problem.barriers[0].expression
@@ -210,7 +200,12 @@ def _rms(values: np.ndarray) -> float:
 
 
 def root_mean_square(name: str, values: np.ndarray) -> Number:
-    """Return that of independent values in 1/s, with the normal interval of their mean square."""
+    """Return that of independent values in 1/s, with the normal interval of their mean square.
+
+    Args:
+        name: of the number.
+        values: shape (K,).
+    """
     square = np.square(values)
     mean, half = float(square.mean()), 1.96 * float(square.std(ddof=1)) / math.sqrt(len(square))
     return Number(
@@ -218,8 +213,13 @@ def root_mean_square(name: str, values: np.ndarray) -> Number:
     )
 
 
-def draw_learning(figure: Figure, outcome: Outcome) -> None:
-    """Draw the learned term over its state, by the repaired and by the printed estimator."""
+def draw_learning(figure: Figure, outcome: Findings) -> None:
+    """Draw the learned term over its state, by the repaired and by the printed estimator.
+
+    Args:
+        figure: empty.
+        outcome: of the artefact.
+    """
     data = outcome.data
     panels = list(figure.subplots(1, 2))
     for axes, key in zip(panels, ("repaired", "printed"), strict=True):

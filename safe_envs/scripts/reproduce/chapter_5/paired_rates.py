@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from safe_envs.scripts.reproduce.framework.artefact import Claim, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Workload
 from safe_envs.scripts.reproduce.framework.paired import (
     PRINTED_EPISODES,
     MeasuredFilter,
@@ -28,7 +28,7 @@ def measured(
     options: dict[str, Any],
     filters: Sequence[str],
     models: Sequence[GeneratorModel],
-    sample: Sample,
+    sample: Workload,
 ) -> dict[str, MeasuredFilter]:
     """Return the rates of filters that learn nothing, and of "ddscbf" with several models.
 
@@ -47,7 +47,12 @@ def measured(
 
 
 def apart(first: MeasuredFilter, second: MeasuredFilter) -> str:
-    """Return the first rate less the second one on the same episodes, in words."""
+    """Return the first rate less the second one on the same episodes, in words.
+
+    Args:
+        first: one filter.
+        second: the other.
+    """
     return with_interval(difference("", first.flags, second.flags), " points")
 
 
@@ -73,13 +78,9 @@ def close(runs: Mapping[str, MeasuredFilter], scbf: float, ddscbf: float, where:
     """
     limit = resolution(scbf, ddscbf)
     gap = difference("", runs["ddscbf"].flags, runs["scbf"].flags)
-    return Claim(
-        f"DDSCBF is as safe as SCBF{where}",
-        gap.low is not None and gap.high is not None and -limit <= gap.low and gap.high <= limit,
-        f"DDSCBF - SCBF = {with_interval(gap, ' points')}, over identifications and episodes; limit"
-        f" {limit:.1f} points, what two samples of {PRINTED_EPISODES} tell apart",
-        printed=False,
-    )
+    within = gap.low is not None and gap.high is not None and max(-gap.low, gap.high) <= limit
+    values = {"gap": with_interval(gap, " points"), "limit": limit, "runs": PRINTED_EPISODES}
+    return CHAPTER.claim("table-5.1", "close", within, where=where, **values)
 
 
 def explain_gap(runs: Mapping[str, MeasuredFilter], cbf: str, where: str) -> str:
@@ -91,8 +92,6 @@ def explain_gap(runs: Mapping[str, MeasuredFilter], cbf: str, where: str) -> str
         where: beginning of the sentence.
     """
     without = runs[f"cbf:alpha={NO_RATE}"]
-    return (
-        f"{where}, SCBF - CBF is {apart(runs['scbf'], runs[cbf])}: the class-K term (CBF with"
-        f" alpha = 0 less CBF) makes {apart(without, runs[cbf])} of it, and the noise part"
-        f" (SCBF less CBF with alpha = 0) {apart(runs['scbf'], without)}"
-    )
+    parts = {"term": apart(without, runs[cbf]), "noise": apart(runs["scbf"], without)}
+    gap = apart(runs["scbf"], runs[cbf])
+    return CHAPTER.note("table-5.1", "gap", where=where, all=gap, **parts)

@@ -13,16 +13,13 @@ from safe_envs.agents import make_problem
 from safe_envs.agents.evaluation.bound_check import starts_of
 from safe_envs.agents.evaluation.contradiction import by_rate
 from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
-    Identification,
+    NoiseIdentification,
     identifications,
     learning_values,
     models,
     repeated,
 )
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
-    draw_learning,
-    learning_outcome,
-)
+from safe_envs.scripts.reproduce.chapter_5.noise_terms import draw_learning, learning_outcome
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     CHAPTER,
     EPISODES,
@@ -31,12 +28,7 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     explain_gap,
     measured,
 )
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, safer
 from safe_envs.scripts.reproduce.framework.verdict import disagreement
 from safe_envs.wrappers import DDSCBF, SCBF, SafetyFilter
@@ -72,11 +64,11 @@ class PendulumSetting:
         """Return the text of the CBF."""
         return f"cbf:alpha={self.alpha}"
 
-    def options(self, sample: Sample) -> dict[str, Any]:
+    def options(self, sample: Workload) -> dict[str, Any]:
         """Return the environment's arguments: a quick sample ends after 5 s at the latest."""
         return {"start": self.start, "horizon": sample.work(round(2 * self.horizon)) / 2}
 
-    def describe(self, sample: Sample) -> str:
+    def describe(self, sample: Workload) -> str:
         """Return it in words."""
         where = {"near-origin": "from (.1 rad, .1 rad/s)", "uniform": "uniform in C"}[self.start]
         return (
@@ -90,7 +82,7 @@ A, B = (
 )
 
 
-def compute_table(sample: Sample) -> Outcome:
+def compute_table(sample: Workload) -> Findings:
     """Compute Table 5.1 in both settings."""
     learned = repeated(ENV, NOISE, sample)
     found = {
@@ -103,7 +95,7 @@ def compute_table(sample: Sample) -> Outcome:
         (outcome_of(each, found[each], _quiet(each, sample)), found[each]) for each in (B, A)
     )
     literal = measured(ENV, B.options(sample), [], models(learned, "printed"), sample)["ddscbf"]
-    return Outcome(
+    return Findings(
         numbers=main.numbers,
         claims=main.claims,
         alternative_settings={A.describe(sample): other},
@@ -121,7 +113,7 @@ def compute_table(sample: Sample) -> Outcome:
     )
 
 
-def _quiet(setting: PendulumSetting, sample: Sample) -> MeasuredFilter:
+def _quiet(setting: PendulumSetting, sample: Workload) -> MeasuredFilter:
     """Return the rate of the CBF on the same episodes without noise."""
     return measured(ENV, {**setting.options(sample), "noise": 0.0}, [setting.cbf], [], sample)[
         setting.cbf
@@ -130,7 +122,7 @@ def _quiet(setting: PendulumSetting, sample: Sample) -> MeasuredFilter:
 
 def outcome_of(
     setting: PendulumSetting, runs: dict[str, MeasuredFilter], quiet: MeasuredFilter
-) -> Outcome:
+) -> Findings:
     """Return numbers and claims in a setting.
 
     Args:
@@ -146,29 +138,20 @@ def outcome_of(
         ),
         runs[WITHOUT].number("CBF with alpha = 0"),
     ]
-    low, high = (100 * end for end in (ddscbf.row.ci_low, ddscbf.row.ci_high))
-    above = (
-        f"DDSCBF is safe in more than {THRESHOLD:g} % of the episodes, as counted, whatever its"
-        " interval"
-    )
+    ends = {"low": 100 * ddscbf.row.ci_low, "high": 100 * ddscbf.row.ci_high}
+    claim = partial(CHAPTER.claim, "table-5.1")
     claims = [
-        Claim(
-            "every trajectory is unsafe with the CBF",
-            cbf.row.safe == 0,
-            f"{cbf.row.safe} of {cbf.row.episodes} are safe",
-        ),
+        claim("unsafe", cbf.row.safe == 0, row=cbf.row),
         safer(
-            "the noise makes trajectories unsafe with the CBF that are safe without it",
-            quiet,
-            cbf,
+            "the noise makes trajectories unsafe with the CBF that are safe without it", quiet, cbf
         ),
-        Claim(above, ddscbf.rate > THRESHOLD, f"{ddscbf.rate:.1f} % [{low:.1f}, {high:.1f}]"),
+        claim("above", ddscbf.rate > THRESHOLD, rate=ddscbf.rate, **ends),
         close(runs, PRINTED["SCBF"], PRINTED["DDSCBF"]),
     ]
-    return Outcome(numbers, claims)
+    return Findings(numbers, claims)
 
 
-def in_other_setting(other: Outcome) -> str:
+def in_other_setting(other: Findings) -> str:
     """Return the verdict's reasons had the other setting been the main one, in words."""
     apart = [text for number in other.numbers if (text := disagreement(number))]
     failed = [
@@ -176,13 +159,11 @@ def in_other_setting(other: Outcome) -> str:
         for claim in other.claims
         if claim.printed and not claim.holds
     ]
-    return (
-        "A and B had both been computed before B was taken as the main setting; in A:"
-        f" {'; '.join([*apart, *failed]) or 'all as in the thesis'}"
-    )
+    reasons = "; ".join([*apart, *failed]) or "all as in the thesis"
+    return CHAPTER.note("table-5.1", "other", reasons=reasons)
 
 
-def _by_printed_estimator(learned: list[Identification], sample: Sample) -> str:
+def _by_printed_estimator(learned: list[NoiseIdentification], sample: Workload) -> str:
     printed = models(learned, "printed")
     options = ({**A.options(sample), **box} for box in ({}, {"box": _UNBOUNDED}))
     rates = (measured(ENV, each, [], printed, sample)["ddscbf"].rate for each in options)
@@ -190,22 +171,18 @@ def _by_printed_estimator(learned: list[Identification], sample: Sample) -> str:
     return CHAPTER.note("table-5.1", "estimator", bounded=bounded, free=free)
 
 
-def _sampled(sample: Sample) -> str:
+def _sampled(sample: Workload) -> str:
     """Return what the CBF of A loses to the control period alone, in words."""
     ahead = f"{A.cbf}:sampling_margin=first-order"
     said = []
     for where, noise in (("without noise", 0.0), ("with it", NOISE)):
         found = measured(ENV, {**A.options(sample), "noise": noise}, [A.cbf, ahead], [], sample)
-        plain = found[A.cbf]
-        said.append(
-            f"{where} {plain.rate:.1f} % (median of the minimum h {plain.row.min_h_median:.1g}),"
-            " with a margin for it"
-            f" {found[ahead].rate:.1f} %"
-        )
+        runs = {"plain": found[A.cbf], "ahead": found[ahead]}
+        said.append(CHAPTER.note("table-5.1", "sampled", where=where, **runs))
     return f"the CBF is held for 10 ms; safe in A: {'; '.join(said)}"
 
 
-def _horizons(setting: PendulumSetting, sample: Sample) -> str:
+def _horizons(setting: PendulumSetting, sample: Workload) -> str:
     """Return up to which horizons the printed rates of SCBF and CBF are reproduced, in words."""
     found = measured(
         ENV, {"start": setting.start, "horizon": setting.longest}, [setting.cbf, "scbf"], [], sample
@@ -222,7 +199,7 @@ def _horizons(setting: PendulumSetting, sample: Sample) -> str:
     return f"{setting.name}: the printed rates of SCBF and of CBF are both reproduced at {said}"
 
 
-def _bounds(first: Identification, scbf: MeasuredFilter, sample: Sample) -> list[str]:
+def _bounds(first: NoiseIdentification, scbf: MeasuredFilter, sample: Workload) -> list[str]:
     """Return what Prop. 4.2.8 gives, and what Prop. 5.2.2 asks for at the origin, in words."""
     problem, model = make_problem(ENV, **B.options(sample)), first.learned["martingale"]
     margin = next(iter(model.record.errors.values()))
@@ -240,13 +217,7 @@ def _bounds(first: Identification, scbf: MeasuredFilter, sample: Sample) -> list
     bound = guarantee.applicable_bounds(starts_of(problem), problem.duration)[0]
     bound = bound.without(by_rate(bound.value, scbf.row.ci_high))
     value = f"none, {bound.reason}" if bound.value is None else f"{100 * bound.value:.1f} %"
-    return [
-        *notes,
-        (
-            f"SCBF knows the noise and needs no margin: {bound.name} = {value} ({bound.status});"
-            " measured: see SCBF"
-        ),
-    ]
+    return [*notes, CHAPTER.note("table-5.1", "bound", bound=bound, value=value)]
 
 
 def printed_term(theta: Any) -> Any:
@@ -254,7 +225,7 @@ def printed_term(theta: Any) -> Any:
     return -math.sqrt(3) * (0.1 * theta) ** 2
 
 
-def _table_values(sample: Sample) -> dict[str, Any]:
+def _table_values(sample: Workload) -> dict[str, Any]:
     return {
         "main": B.describe(sample),
         "count": sample.size(EPISODES),
@@ -262,13 +233,12 @@ def _table_values(sample: Sample) -> dict[str, Any]:
     }
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
+ARTEFACTS = (
     CHAPTER.artefact(
         "figure-5.1",
         partial(learning_outcome, ENV, NOISE, 0, "-sqrt(3) (.1 theta)^2", printed_term),
         partial(learning_values, region="C", law=f"sigma = {NOISE:g} theta"),
         draw_learning,
-        (7.5, 3.8),
     ),
     CHAPTER.artefact("table-5.1", compute_table, _table_values),
 )

@@ -30,12 +30,7 @@ from safe_envs.scripts.reproduce.chapter_6.learning_times import (
     generator_work,
     recursion,
 )
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import measure
 from safe_envs.wrappers.learning.generator import learn_generator
 
@@ -49,7 +44,7 @@ PRINTED = CHAPTER.printed("table-6.3")
 
 def printed_second_generator(problem: SafetyProblem) -> sp.Expr:
     """Return b_2 by the formula of Sec. 6.3.2, with the numbers of the plant."""
-    values = {symbol.name: value for symbol, value in problem.plant.parameters.items()}
+    values = problem.plant.parameter_values
     (v, z), (u,), mass = problem.plant.states, problem.plant.inputs, values["M"]
     gap, closing = z - 10, values["v_f"] - v
     drag = values["f_0"] + values["f_1"] * v + values["f_2"] * v**2
@@ -59,12 +54,12 @@ def printed_second_generator(problem: SafetyProblem) -> sp.Expr:
     )
 
 
-def _world(sample: Sample) -> SafetyProblem:
+def _world(sample: Workload) -> SafetyProblem:
     problem = make_problem(ENV)
     return replace(problem, horizon=_QUICK_HORIZON) if sample.quick else problem
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute Table 6.3."""
     problem, chosen = _world(sample), seeds(sample, _CONTROLLERS)
     size = sample.size(EPISODES), sample.seed
@@ -88,13 +83,13 @@ def compute(sample: Sample) -> Outcome:
     fewer = None if sample.quick else bayesian(REPETITIONS[0], _FEW_CONTROLLERS)
     blind = measure(problem.configured(model={"sigma_1": 0.0, "sigma_2": 0.0}), "scbf", *size)
     by_recursion = measure(problem, "ddscbf", *size, [recursion(sample)])
-    return Outcome(
+    return Findings(
         numbers=table(found),
         claims=[similar({"": found})],
         alternative_settings={}
         if fewer is None
         else {
-            f"K = {REPETITIONS[0]} in the identification": Outcome(
+            f"K = {REPETITIONS[0]} in the identification": Findings(
                 table(fewer), [similar({"": fewer})]
             )
         },
@@ -120,7 +115,7 @@ def _notes(
     ]
 
 
-def _values(sample: Sample) -> dict[str, Any]:
+def _values(sample: Workload) -> dict[str, Any]:
     systems, short = (
         len(seeds(sample, _CONTROLLERS)),
         ", too short for a car to get near the other one,",
@@ -135,4 +130,4 @@ def _values(sample: Sample) -> dict[str, Any]:
     }
 
 
-ARTEFACTS: tuple[Artefact, ...] = (CHAPTER.artefact("table-6.3", compute, _values),)
+ARTEFACTS = (CHAPTER.artefact("table-6.3", compute, _values),)

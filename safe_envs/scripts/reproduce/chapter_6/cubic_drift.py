@@ -15,29 +15,8 @@ from matplotlib.figure import Figure
 from safe_envs import SafetyProblem
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
-from safe_envs.scripts.reproduce.chapter_6.identifications import (
-    AT_REST,
-    CHAPTER,
-    DEGREE,
-    REPETITIONS,
-    STARTS,
-    STEPS,
-    draw_estimate,
-    estimated_drift,
-    identified_from,
-    one_more,
-    parameter,
-    predicted,
-    seeds,
-    true_drift,
-)
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import is_above
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
 from safe_envs.wrappers.learning.data.transitions import Transitions
@@ -45,10 +24,12 @@ from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.learning.regression import Rows, posterior
 
-_SETTINGS = CHAPTER.settings["cubic"]
+_SETTINGS = bayes.CHAPTER.settings["cubic"]
 ENV, PRIOR, POINTS, SHOWN = (_SETTINGS[name] for name in ("env", "prior", "points", "shown"))
+_note = partial(bayes.CHAPTER.note, "table-6.1")
+_claim = partial(bayes.CHAPTER.claim, "table-6.1")
 _IDENTIFICATIONS, _PICTURED = 40, 20  # for Table 6.1 and for Fig. 6.1
-_PRINTED_MSE = CHAPTER.printed("table-6.1")
+_PRINTED_MSE = bayes.CHAPTER.printed("table-6.1")
 _UNITS = {"f_1": "(x_1/s)^2", "f_2": "(x_2/s)^2"}
 """Each in those of its own state. The errors of f_1 and f_2 have nearly the same law: which is
 larger in one identification is chance."""
@@ -84,13 +65,16 @@ def study(
         chosen: seeds of the identifications.
         starts: trajectories of the data.
         steps: states of each.
+
+    Returns:
+        The errors of the identifications.
     """
-    truth = true_drift(problem, x)
+    truth = bayes.true_drift(problem, x)
     estimates, squares, in_deviations, overconfident = [], [], [], []
     for seed in chosen:
-        data = collect(problem, starts, repetitions, AT_REST, steps=steps, seed=seed)
-        learned = identified_from(problem, data, PRIOR)
-        mean, deviation = estimated_drift(learned, x)
+        data = collect(problem, starts, repetitions, bayes.AT_REST, steps=steps, seed=seed)
+        learned = bayes.identified_from(problem, data, PRIOR)
+        mean, deviation = bayes.estimated_drift(learned, x)
         estimates.append((mean, deviation))
         squares.append(((mean - truth) ** 2).mean(axis=0))
         in_deviations.append(float(np.sqrt((((mean - truth) / deviation) ** 2).mean())))
@@ -127,9 +111,7 @@ def falls(name: str, squares: Mapping[int, np.ndarray]) -> Claim:
         sure.append(is_above(ratio))
         low, fold, high = np.exp([ratio.low or 0.0, ratio.ours, ratio.high or 0.0])
         evidence.append(f"{fold:.2g}-fold [{low:.2g}, {high:.2g}] on average from K = {a} to {b}")
-    return Claim(
-        f"The error of {name} falls as the repetitions K grow.", all(sure), ", ".join(evidence)
-    )
+    return _claim("falls", all(sure), what=name, each=", ".join(evidence))
 
 
 def falls_as_printed(
@@ -146,41 +128,33 @@ def falls_as_printed(
     by = dict(zip(squares, printed, strict=True))
     for a, b in combinations(squares, 2):
         ratios = np.log(squares[a] / squares[b])
-        low, high = map(math.exp, one_more(ratios))
+        low, high = map(math.exp, bayes.one_more(ratios))
         possible.append(low <= by[a] / by[b] <= high)
-        evidence.append(
-            f"from K = {a} to {b} {by[a] / by[b]:.3g}-fold in the thesis,"
-            f" {math.exp(ratios.mean()):.3g}-fold [{low:.2g}, {high:.2g}] here, {b / a:.3g}-fold by"
-            " the law"
-        )
-    fold, first, last = by[min(by)] / by[max(by)], min(by), max(by)
-    return Claim(
-        f"The MSE of {name} falls {fold:.0f}-fold from K = {first} to {last}, in the printed"
-        " steps.",
-        all(possible),
-        "; ".join(evidence),
-    )
+        folds = {"printed": by[a] / by[b], "ours": math.exp(ratios.mean()), "law": b / a}
+        evidence.append(_note("fold", a=a, b=b, low=low, high=high, **folds))
+    ends = {"fold": by[min(by)] / by[max(by)], "first": min(by), "last": max(by)}
+    return _claim("as_printed", all(possible), what=name, each="; ".join(evidence), **ends)
 
 
-def compute_errors(sample: Sample) -> Outcome:
+def compute_errors(sample: Workload) -> Findings:
     """Compute Table 6.1."""
     problem = make_problem(ENV)
     x = draw_states(problem, POINTS, np.random.default_rng([sample.seed, 61]))
-    chosen = seeds(sample, _IDENTIFICATIONS)
-    found = {k: study(problem, x, k, chosen, STARTS, STEPS) for k in REPETITIONS}
+    chosen = bayes.seeds(sample, _IDENTIFICATIONS)
+    found = {k: study(problem, x, k, chosen, bayes.STARTS, bayes.STEPS) for k in bayes.REPETITIONS}
     squares = {
         name: {k: each.squares[:, i] for k, each in found.items()}
         for i, name in enumerate(_PRINTED_MSE)
     }
     numbers = [
-        predicted(f"MSE of {name}, K = {k}", values, printed, _UNITS[name])
+        bayes.predicted(f"MSE of {name}, K = {k}", values, printed, _UNITS[name])
         for name, by in squares.items()
         for (k, values), printed in zip(by.items(), _PRINTED_MSE[name], strict=True)
     ]
-    many = found[REPETITIONS[-1]]
-    doubt = f"rms error in standard deviations of the posterior, K = {REPETITIONS[-1]}"
+    many = found[bayes.REPETITIONS[-1]]
+    doubt = f"rms error in standard deviations of the posterior, K = {bayes.REPETITIONS[-1]}"
     widths = [n.high / n.low for n in numbers if n.low and n.high]
-    return Outcome(
+    return Findings(
         numbers=[*numbers, Number.mean(doubt, many.errors_in_deviations, least=0.0)],
         claims=[
             *(falls(name, by) for name, by in squares.items()),
@@ -188,8 +162,8 @@ def compute_errors(sample: Sample) -> Outcome:
         ],
         printed_formula=[Number.mean(doubt, many.overconfident, least=0.0)],
         notes=[
-            CHAPTER.note("table-6.1", "span", least=min(widths), largest=max(widths)),
-            _compared_with_law(problem, x, chosen, found[REPETITIONS[0]]),
+            _note("span", least=min(widths), largest=max(widths)),
+            _compared_with_law(problem, x, chosen, found[bayes.REPETITIONS[0]]),
         ],
     )
 
@@ -201,25 +175,25 @@ def _compared_with_law(
 
     They are from states all over the disk and from as many on trajectories.
     """
-    spread_out = study(problem, x, REPETITIONS[0], chosen, STARTS * STEPS, 1)
-    sigma = parameter(problem, "sigma_1")
-    time = REPETITIONS[0] * STARTS * STEPS * problem.dt
-    law = Features.of(problem, DEGREE).count * sigma**2 / time
+    spread_out = study(problem, x, bayes.REPETITIONS[0], chosen, bayes.STARTS * bayes.STEPS, 1)
+    sigma = problem.plant.parameter_values["sigma_1"]
+    time = bayes.REPETITIONS[0] * bayes.STARTS * bayes.STEPS * problem.dt
+    law = Features.of(problem, bayes.DEGREE).count * sigma**2 / time
     ratio = Number.mean("ratio", spread_out.squares.mean(axis=1) / law, least=0.0)
-    counts = {"data": STARTS * STEPS, "count": len(chosen)}
+    counts = {"data": bayes.STARTS * bayes.STEPS, "count": len(chosen)}
     share = followed.squares.mean() / law
-    return CHAPTER.note("table-6.1", "law", ratio=ratio, law=law, followed=share, **counts)
+    return _note("law", ratio=ratio, law=law, followed=share, **counts)
 
 
-def compute_figure(sample: Sample) -> Outcome:
+def compute_figure(sample: Workload) -> Findings:
     """Compute Figure 6.1."""
     problem = make_problem(ENV)
     x = draw_states(problem, SHOWN, np.random.default_rng([sample.seed, 62]))
     x = x[x[:, 0].argsort()]
-    chosen = seeds(sample, _PICTURED)
-    found = {k: study(problem, x, k, chosen, STARTS, STEPS) for k in REPETITIONS}
+    chosen = bayes.seeds(sample, _PICTURED)
+    found = {k: study(problem, x, k, chosen, bayes.STARTS, bayes.STEPS) for k in bayes.REPETITIONS}
     numbers = [
-        predicted(f"rms error of f_2, K = {k}", np.sqrt(s.squares[:, 1]), unit="1/s")
+        bayes.predicted(f"rms error of f_2, K = {k}", np.sqrt(s.squares[:, 1]), unit="1/s")
         for k, s in found.items()
     ]
     covered = Number.mean(
@@ -230,13 +204,13 @@ def compute_figure(sample: Sample) -> Outcome:
     printed = Number.mean(
         covered.name, np.concatenate([s.overconfident for s in found.values()]), least=0.0
     )
-    return Outcome(
+    return Findings(
         numbers=[*numbers, covered],
         claims=[falls("f_2 = x_1^3", {k: np.sqrt(s.squares[:, 1]) for k, s in found.items()})],
         printed_formula=[printed],
         data={
             "x_1": x[:, 0].tolist(),
-            "truth": true_drift(problem, x)[:, 1].tolist(),
+            "truth": bayes.true_drift(problem, x)[:, 1].tolist(),
             **{f"estimate {k}": s.first[0][:, 1].tolist() for k, s in found.items()},
             **{f"deviation {k}": s.first[1][:, 1].tolist() for k, s in found.items()},
         },
@@ -247,24 +221,24 @@ def compute_figure(sample: Sample) -> Outcome:
     )
 
 
-def _draw_drift(figure: Figure, outcome: Outcome) -> None:
+def _draw_drift(figure: Figure, outcome: Findings) -> None:
     data, line = outcome.data, np.linspace(-1.0, 1.0, 201)
-    panels = figure.subplots(1, len(REPETITIONS), sharey=True)
-    for letter, axes, k in zip("abc", panels, REPETITIONS, strict=True):
+    panels = figure.subplots(1, len(bayes.REPETITIONS), sharey=True)
+    for letter, axes, k in zip("abc", panels, bayes.REPETITIONS, strict=True):
         estimate = data[f"estimate {k}"], data[f"deviation {k}"]
-        draw_estimate(axes, (line, line**3), data["x_1"], *estimate, COLORS[0])
+        bayes.draw_estimate(axes, (line, line**3), data["x_1"], *estimate, COLORS[0])
         axes.set(xlabel="$x_1$", title=f"({letter}) K = {k}")
     panels[0].set_ylabel("$f_2$ (1/s)")
     add_legend(figure, panels[0].get_legend_handles_labels()[0])
 
 
-def _values(states: int, full: int, sample: Sample) -> dict[str, Any]:
-    return {"states": states, "identifications": len(seeds(sample, full))}
+def _values(states: int, full: int, sample: Workload) -> dict[str, Any]:
+    return {"states": states, "identifications": len(bayes.seeds(sample, full))}
 
 
-ARTEFACTS: tuple[Artefact, ...] = (
-    CHAPTER.artefact(
-        "figure-6.1", compute_figure, partial(_values, SHOWN, _PICTURED), _draw_drift, (7.0, 3.2)
+ARTEFACTS = (
+    bayes.CHAPTER.artefact(
+        "figure-6.1", compute_figure, partial(_values, SHOWN, _PICTURED), _draw_drift
     ),
-    CHAPTER.artefact("table-6.1", compute_errors, partial(_values, POINTS, _IDENTIFICATIONS)),
+    bayes.CHAPTER.artefact("table-6.1", compute_errors, partial(_values, POINTS, _IDENTIFICATIONS)),
 )

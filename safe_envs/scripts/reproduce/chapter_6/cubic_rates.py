@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import sympy as sp
@@ -30,12 +30,7 @@ from safe_envs.scripts.reproduce.chapter_6.worst_case import (
     at_one_horizon,
     worst_for_ever,
 )
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, measure
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
@@ -56,7 +51,7 @@ PRINTED = CHAPTER.printed("table-6.2")
 
 def printed_generator(problem: SafetyProblem) -> sp.Expr:
     """Return A h by the formula of Sec. 6.3.1, with the numbers of the plant."""
-    values = {symbol.name: value for symbol, value in problem.plant.parameters.items()}
+    values = problem.plant.parameter_values
     (x_1, x_2), (u,) = problem.plant.states, problem.plant.inputs
     noise = 2 * values["sigma_2"] ** 2
     return 2 * values["a"] * x_1**2 + x_1 * x_2 - 2 * x_1**3 * x_2 - 2 * x_2**2 * u - noise
@@ -79,7 +74,7 @@ class _Models:
     generators: list[GeneratorModel]
 
     @classmethod
-    def learn(cls, world: SafetyProblem, sample: Sample) -> _Models:
+    def learn(cls, world: SafetyProblem, sample: Workload) -> _Models:
         """Learn all; a quick sample does without what is only compared with the table."""
         chosen = seeds(sample, CONTROLLERS)
         compared = () if sample.quick else chosen
@@ -93,7 +88,7 @@ class _Models:
         )
 
 
-def _generator_work(sample: Sample) -> dict[str, Any]:
+def _generator_work(sample: Workload) -> dict[str, Any]:
     return {name: sample.work(_SETTINGS[f"generator_{name}"]) for name in ("points", "repetitions")}
 
 
@@ -105,9 +100,7 @@ class _Column:
         name: of the start.
         problem: from there.
         printed: the printed rates and the printed bound, by row.
-        scbf: the one that knows the system.
-        ddscbf: with each learned generator.
-        bayesian: with each identification.
+        models: what is learned.
         supremum: c of h.
         shortfall: m, by how much A h >= 0 is violated where no input meets it.
         sample: how much is simulated.
@@ -116,36 +109,29 @@ class _Column:
     name: str
     problem: SafetyProblem
     printed: Mapping[str, float]
-    scbf: MeasuredFilter
-    ddscbf: LearnedController
-    bayesian: LearnedController
+    models: _Models
     supremum: float
     shortfall: float
-    sample: Sample
+    sample: Workload
 
-    @classmethod
-    def run(
-        cls,
-        i: int,
-        world: SafetyProblem,
-        models: _Models,
-        worst: tuple[float, float],
-        sample: Sample,
-    ) -> _Column:
-        """Evaluate all controllers from the i-th start; worst: supremum and shortfall."""
-        name, start = list(PLACES.items())[i]
-        problem = world.configured(start=start)
-        scbf = measure(problem, "scbf", sample.size(EPISODES), sample.seed)
-        return cls(
-            name,
-            problem,
-            {row: values[i] for row, values in PRINTED.items()},
-            scbf,
-            LearnedController.run(problem, "ddscbf", models.generators, scbf, sample.seed),
-            LearnedController.run(problem, "bayesian-scbf", models.systems, scbf, sample.seed),
-            *worst,
-            sample,
-        )
+    @cached_property
+    def scbf(self) -> MeasuredFilter:
+        """Return the SCBF that knows the system."""
+        return measure(self.problem, "scbf", self.sample.size(EPISODES), self.sample.seed)
+
+    @cached_property
+    def ddscbf(self) -> LearnedController:
+        """Return DDSCBF with each learned generator."""
+        return self.learned("ddscbf", self.models.generators)
+
+    @cached_property
+    def bayesian(self) -> LearnedController:
+        """Return the Bayesian SCBF with each identification."""
+        return self.learned("bayesian-scbf", self.models.systems)
+
+    def learned(self, text: str, models: Sequence[Any]) -> LearnedController:
+        """Return a learned filter with each model."""
+        return LearnedController.run(self.problem, text, models, self.scbf, self.sample.seed)
 
     @property
     def barrier(self) -> float:
@@ -201,25 +187,29 @@ class _Column:
         return [measure(problem, "scbf", *size).rates[0] for problem in systems]
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute Table 6.2."""
     world = make_problem(ENV)
     models, found = _Models.learn(world, sample), verify(world, [SCBF()], seed=sample.seed)
     worst = float(found.analysis.suprema[0]), float(found.analysis.max_shortfall[0])
-    columns = [_Column.run(i, world, models, worst, sample) for i in range(len(PLACES))]
-    # A quick sample learns nothing of what is only compared with the table.
-    rough = {
-        each.name: LearnedController.run(
-            each.problem, "bayesian-scbf", models.rough, each.scbf, sample.seed
+    columns = [
+        _Column(
+            name,
+            world.configured(start=start),
+            {row: values[i] for row, values in PRINTED.items()},
+            models,
+            *worst,
+            sample,
         )
-        for each in columns
-        if models.rough
-    }
+        for i, (name, start) in enumerate(PLACES.items())
+    ]
+    # A quick sample learns nothing of what is only compared with the table.
+    rough = {c.name: c.learned("bayesian-scbf", models.rough) for c in columns if models.rough}
     dull = {each.name: each.dull(models.feeble) for each in columns}
     few = [number for each in columns if rough for number in each.numbers(rough[each.name])]
     setting = f"K = {REPETITIONS[0]} in the identification"
     measured = {each.name: (each.numbers(each.bayesian)[:3], each.bound) for each in columns}
-    return Outcome(
+    return Findings(
         numbers=[number for each in columns for number in each.numbers(each.bayesian)],
         claims=[
             similar({each.name: each.bayesian for each in columns}),
@@ -228,7 +218,7 @@ def compute(sample: Sample) -> Outcome:
                 _long(sample), {each.name: (each.late(), each.bound) for each in columns}
             ),
         ],
-        alternative_settings={setting: Outcome(few, [similar(rough)])} if few else {},
+        alternative_settings={setting: Findings(few, [similar(rough)])} if few else {},
         printed_formula=[
             number for each in columns for number in each.by_printed_formulas(dull[each.name])
         ],
@@ -260,11 +250,11 @@ def _notes(columns: Sequence[_Column], dull: Mapping[str, Sequence[float]]) -> l
     ]
 
 
-def _long(sample: Sample) -> int:
+def _long(sample: Workload) -> int:
     return QUICK_LONG if sample.quick else LONG
 
 
-def _values(sample: Sample) -> dict[str, Any]:
+def _values(sample: Workload) -> dict[str, Any]:
     systems = len(seeds(sample, CONTROLLERS))
     return {
         **{f"{name}_used": value for name, value in _generator_work(sample).items()},
@@ -276,4 +266,4 @@ def _values(sample: Sample) -> dict[str, Any]:
     }
 
 
-ARTEFACTS: tuple[Artefact, ...] = (CHAPTER.artefact("table-6.2", compute, _values),)
+ARTEFACTS = (CHAPTER.artefact("table-6.2", compute, _values),)

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from scipy.special import stdtrit
 
 from safe_envs import SafetyProblem
-from safe_envs.scripts.reproduce.framework.artefact import Number, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Number, Workload
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.learning.data.collection import collect
@@ -71,17 +71,17 @@ def estimated_drift(learned: Posterior, x: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def true_drift(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
-    """Return the plant's f at states, both of shape (B, n)."""
+    """Return the plant's f at states, shape (B, n).
+
+    Args:
+        problem: with the plant.
+        x: states, shape (B, n).
+    """
     f = sp.lambdify([problem.plant.states], list(problem.plant.numeric(problem.plant.drift)))
     return np.array([f(row) for row in x.tolist()], dtype=float)
 
 
-def parameter(problem: SafetyProblem, name: str) -> float:
-    """Return a parameter of the plant by its name, such as a noise level."""
-    return {symbol.name: value for symbol, value in problem.plant.parameters.items()}[name]
-
-
-def seeds(sample: Sample, full: int) -> range:
+def seeds(sample: Workload, full: int) -> range:
     """Return seeds of identifications, others for each seed of the sample.
 
     A quick sample has a tenth, and three if there are as many.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 from safe_envs.agents import make_problem
@@ -14,13 +14,7 @@ from safe_envs.scripts.reproduce.chapter_6.identifications import (
     predicted,
     seeds,
 )
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
 
 SETTINGS = CHAPTER.settings["car"]
@@ -34,21 +28,18 @@ _RECURSION, _BAYESIAN = _PRINTED_SECONDS
 _FAR_LESS = 10.0
 
 
-def generator_work(sample: Sample) -> dict[str, Any]:
+def generator_work(sample: Workload) -> dict[str, Any]:
     """Return the amount of data of DDSCBF, as `learn_generator` takes it."""
-    return {
-        "points": sample.work(POINTS),
-        "repetitions": sample.work(GENERATOR_REPETITIONS),
-    }
+    return {"points": sample.work(POINTS), "repetitions": sample.work(GENERATOR_REPETITIONS)}
 
 
-def generator_values(sample: Sample) -> dict[str, int]:
+def generator_values(sample: Workload) -> dict[str, int]:
     """Return the same as the lines of a setting name it."""
     return {f"{name}_used": value for name, value in generator_work(sample).items()}
 
 
 @cache
-def recursion(sample: Sample) -> GeneratorModel:
+def recursion(sample: Workload) -> GeneratorModel:
     """Return DDSCBF's networks by the printed estimate, learned once for both tables."""
     how: dict[str, Any] = {"way": "network", "estimator": "printed", "seed": seeds(sample, 1)[0]}
     return learn_generator(make_problem(ENV), **generator_work(sample), **how)
@@ -60,20 +51,11 @@ def sooner(ratio: float) -> list[Claim]:
     Source: thesis Sec. 7.1, which calls that dramatic, and gives no factor.
     """
     printed = _PRINTED_SECONDS[_RECURSION] / _PRINTED_SECONDS[_BAYESIAN]
-    evidence = f"{ratio:.3g} times; more than {printed:.0f} times in the thesis"
-    return [
-        Claim(
-            "Identifying the system first takes less time than the recursion.",
-            ratio > 1.0,
-            evidence,
-        ),
-        Claim(
-            f"It is at least {_FAR_LESS:g} times less.", ratio >= _FAR_LESS, evidence, printed=False
-        ),
-    ]
+    claim = partial(CHAPTER.claim, "table-6.4", ratio=ratio, printed=printed, least=_FAR_LESS)
+    return [claim("sooner", ratio > 1.0), claim("far_sooner", ratio >= _FAR_LESS)]
 
 
-def compute(sample: Sample) -> Outcome:
+def compute(sample: Workload) -> Findings:
     """Compute Table 6.4."""
     problem, networks = make_problem(ENV), recursion(sample)
     how: dict[str, Any] = {"way": "direct", "seed": seeds(sample, 1)[0]}
@@ -92,7 +74,7 @@ def compute(sample: Sample) -> Outcome:
         "printed": printed / evaluations * 1e3,
     }
     quick = predicted(_BAYESIAN, seconds, _PRINTED_SECONDS[_BAYESIAN], "s")
-    return Outcome(
+    return Findings(
         numbers=[
             slow,
             quick,
@@ -115,8 +97,8 @@ def _one_by_one(networks: GeneratorModel) -> float:
     return (time.perf_counter() - begun) / _ONE_BY_ONE
 
 
-def _values(sample: Sample) -> dict[str, int]:
+def _values(sample: Workload) -> dict[str, int]:
     return {**generator_values(sample), "timed": len(seeds(sample, _TIMED))}
 
 
-ARTEFACTS: tuple[Artefact, ...] = (CHAPTER.artefact("table-6.4", compute, _values),)
+ARTEFACTS = (CHAPTER.artefact("table-6.4", compute, _values),)

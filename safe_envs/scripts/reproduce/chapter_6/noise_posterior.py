@@ -12,31 +12,16 @@ from matplotlib.figure import Figure
 
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
-from safe_envs.scripts.reproduce.chapter_6.identifications import (
-    AT_REST,
-    CHAPTER,
-    CONFIDENCE,
-    REPETITIONS,
-    SETTINGS,
-    identified,
-    parameter,
-    seeds,
-)
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.estimators import rates
 from safe_envs.wrappers.learning.regression import sigma_map, sigma_samples
 
 NOISE_STARTS, NOISE_STEPS, DRAWS = (
-    SETTINGS[name] for name in ("noise_starts", "noise_steps", "draws")
+    bayes.SETTINGS[name] for name in ("noise_starts", "noise_steps", "draws")
 )
-PRIOR_OF_SIGMA = SETTINGS["prior_of_sigma"]
+PRIOR_OF_SIGMA = bayes.SETTINGS["prior_of_sigma"]
 _BINS = 50
 
 
@@ -48,7 +33,7 @@ def credible(name: str, draws: np.ndarray, unit: str) -> Number:
         draws: shape (D,).
         unit: of the draws.
     """
-    low, high = np.quantile(draws, _ends(CONFIDENCE)).tolist()
+    low, high = np.quantile(draws, _ends(bayes.CONFIDENCE)).tolist()
     return Number(name, float(np.median(draws)), low, high, unit=unit)
 
 
@@ -57,24 +42,29 @@ def _ends(content: float) -> tuple[float, float]:
     return (1 - content) / 2, (1 + content) / 2
 
 
-def noise_levels(section: str, unit: tuple[str, ...], sample: Sample) -> Outcome:
+def noise_levels(section: str, unit: tuple[str, ...], sample: Workload) -> Findings:
     """Sample the posterior of sigma from the residuals of fresh trajectories, given f and g.
 
     Args:
         section: of the settings.
         unit: of each level.
         sample: how much is simulated.
+
+    Returns:
+        Medians and intervals of the levels, by the corrected and by the printed likelihood.
     """
-    env, prior = (CHAPTER.settings[section][name] for name in ("env", "prior"))
+    env, prior = (bayes.CHAPTER.settings[section][name] for name in ("env", "prior"))
     problem = make_problem(env)
-    first, second, *_ = seeds(sample, 2)
-    learned = identified(problem, REPETITIONS[-1], first, prior)
-    data = collect(problem, sample.work(NOISE_STARTS), 1, AT_REST, steps=NOISE_STEPS, seed=second)
+    first, second, *_ = bayes.seeds(sample, 2)
+    learned = bayes.identified(problem, bayes.REPETITIONS[-1], first, prior)
+    data = collect(
+        problem, sample.work(NOISE_STARTS), 1, bayes.AT_REST, steps=NOISE_STEPS, seed=second
+    )
     left = data.successors[:, 0] - data.x - rates(learned.system, data) * problem.dt
     squares, count = (left**2).sum(axis=0), len(left)
     rng = np.random.default_rng([sample.seed, 63])
     alpha, beta = PRIOR_OF_SIGMA
-    true = [parameter(problem, name) for name in ("sigma_1", "sigma_2")]
+    true = [problem.plant.parameter_values[name] for name in ("sigma_1", "sigma_2")]
     numbers, printed, every, shown = [], [], [], {"truth": true}
     for i, (s, at) in enumerate(zip(squares.tolist(), unit, strict=True), start=1):
         draws = sigma_samples(s / problem.dt, count, alpha, beta, DRAWS, rng)
@@ -87,20 +77,14 @@ def noise_levels(section: str, unit: tuple[str, ...], sample: Sample) -> Outcome
         shown |= {f"counts {i}": counts.tolist(), f"edges {i}": edges.tolist()}
     modes = sigma_map(squares / problem.dt, np.full(len(squares), count), alpha, beta).tolist()
     sharp = np.mean([draws.std() / draws.mean() for draws in every])
-    notes = [
-        (
-            "Most probable:"
-            f" {', '.join(f'sigma_{i} = {mode:.4f}' for i, mode in enumerate(modes, start=1))}."
-            f" Relative standard deviation {100 * sharp:.2f} %; by the law sqrt(1/(2 N))"
-            f" {100 / np.sqrt(2 * count):.2f} % with N = {count} residuals."
-        ),
-    ]
-    return Outcome(
+    probable = ", ".join(f"sigma_{i} = {mode:.4f}" for i, mode in enumerate(modes, start=1))
+    law = {"deviation": 100 * sharp, "law": 100 / np.sqrt(2 * count), "count": count}
+    return Findings(
         numbers=numbers,
         claims=[gathered(every, true)],
         printed_formula=printed,
         data=shown,
-        notes=notes,
+        notes=[bayes.CHAPTER.note("figure-6.2", "modes", modes=probable, **law)],
     )
 
 
@@ -113,20 +97,18 @@ def gathered(every: Sequence[np.ndarray], true: Sequence[float]) -> Claim:
         every: draws from each posterior.
         true: value of each level.
     """
-    levels = _ends(1 - (1 - CONFIDENCE) / len(every))
+    levels = _ends(1 - (1 - bayes.CONFIDENCE) / len(every))
     found = [tuple(np.quantile(draws, levels).tolist()) for draws in every]
     content = f"{100 * (levels[1] - levels[0]):g} %"
-    return Claim(
-        "The posteriors of sigma_1 and sigma_2 are around the true values.",
-        all(low <= level <= high for (low, high), level in zip(found, true, strict=True)),
-        "; ".join(
-            f"{content} of that of sigma_{i} in [{low:.4f}, {high:.4f}], true {level:g}"
-            for i, ((low, high), level) in enumerate(zip(found, true, strict=True), start=1)
-        ),
+    holds = all(low <= level <= high for (low, high), level in zip(found, true, strict=True))
+    each = "; ".join(
+        f"{content} of that of sigma_{i} in [{low:.4f}, {high:.4f}], true {level:g}"
+        for i, ((low, high), level) in enumerate(zip(found, true, strict=True), start=1)
     )
+    return bayes.CHAPTER.claim("figure-6.2", "gathered", holds, each=each)
 
 
-def draw_levels(figure: Figure, outcome: Outcome) -> None:
+def _draw_levels(figure: Figure, outcome: Findings) -> None:
     """Draw histograms of the draws, and the medians by the printed likelihood."""
     data = outcome.data
     panels = figure.subplots(1, 3)
@@ -144,7 +126,7 @@ def draw_levels(figure: Figure, outcome: Outcome) -> None:
     add_legend(figure, [first[0], *second])
 
 
-def _draw_likelihoods(axes: Axes, outcome: Outcome) -> None:
+def _draw_likelihoods(axes: Axes, outcome: Findings) -> None:
     """Draw medians by either likelihood; their intervals are thinner than the points."""
     truth = outcome.data["truth"][0]
     for row, numbers in enumerate((outcome.numbers, outcome.printed_formula)):
@@ -171,17 +153,13 @@ def _pretty(unit: str) -> str:
     return unit.replace("sqrt(s)", "$\\sqrt{\\mathrm{s}}$")
 
 
-def _values(sigma: str, sample: Sample) -> dict[str, Any]:
+def _values(sigma: str, sample: Workload) -> dict[str, Any]:
     return {"trajectories": sample.work(NOISE_STARTS), "sigma": sigma}
 
 
-ARTEFACTS: tuple[Artefact, ...] = tuple(
-    CHAPTER.artefact(
-        name,
-        partial(noise_levels, section, unit),
-        partial(_values, sigma),
-        draw_levels,
-        (7.0, 3.2),
+ARTEFACTS = tuple(
+    bayes.CHAPTER.artefact(
+        name, partial(noise_levels, section, unit), partial(_values, sigma), _draw_levels
     )
     for name, section, unit, sigma in (
         ("figure-6.2", "cubic", ("1/sqrt(s)", "1/sqrt(s)"), ".2"),

@@ -22,14 +22,12 @@ def above_worst(horizon: float, each: Mapping[str, tuple[Sequence[Number], float
         place: (min(number.low or 0.0 for number in rates), bound)
         for place, (rates, bound) in each.items()
     }
-    return Claim(
-        f"Within {horizon:g} s all measured rates are above the worst case h/c.",
-        all(low > bound for low, bound in lowest.values()),
-        "; ".join(
-            f"{place}: lower ends from {low:.1f} %, h/c {bound:.0f} %"
-            for place, (low, bound) in lowest.items()
-        ),
+    holds = all(low > bound for low, bound in lowest.values())
+    evidence = "; ".join(
+        f"{place}: lower ends from {low:.1f} %, h/c {bound:.0f} %"
+        for place, (low, bound) in lowest.items()
     )
+    return CHAPTER.claim("table-6.2", "above_worst", holds, seconds=horizon, each=evidence)
 
 
 def worst_for_ever(seconds: float, each: Mapping[str, tuple[Number, float]]) -> Claim:
@@ -39,14 +37,12 @@ def worst_for_ever(seconds: float, each: Mapping[str, tuple[Number, float]]) -> 
         seconds: how long.
         each: the rate after that and h/c, in per cent, by the start.
     """
-    return Claim(
-        f"h/c is a worst case for ever; here up to {seconds:g} s.",
-        all(rate.high is not None and rate.high >= bound for rate, bound in each.values()),
-        "; ".join(
-            f"{place}: SCBF {rate.ours:.1f} % [{rate.low:.1f}, {rate.high:.1f}], h/c {bound:.0f} %"
-            for place, (rate, bound) in each.items()
-        ),
+    holds = all(rate.high is not None and rate.high >= bound for rate, bound in each.values())
+    evidence = "; ".join(
+        f"{place}: SCBF {rate.ours:.1f} % [{rate.low:.1f}, {rate.high:.1f}], h/c {bound:.0f} %"
+        for place, (rate, bound) in each.items()
     )
+    return CHAPTER.claim("table-6.2", "for_ever", holds, seconds=seconds, each=evidence)
 
 
 def at_one_horizon(first: MeasuredFilter, second: MeasuredFilter, printed: Sequence[float]) -> str:

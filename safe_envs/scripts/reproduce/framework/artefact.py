@@ -14,7 +14,7 @@ from safe_envs.errors import require_whole
 
 
 @dataclass(frozen=True)
-class Sample:
+class Workload:
     """How much is simulated.
 
     Attributes:
@@ -70,6 +70,11 @@ class Number:
     printed: float | None = None
     printed_trials: int | None = None
     unit: str = ""
+
+    @property
+    def suffix(self) -> str:
+        """Return the unit as it follows a value."""
+        return f" {self.unit}" if self.unit else ""
 
     @classmethod
     def rate(
@@ -136,7 +141,7 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Findings:
     """The outcome of an artefact, as JSON-able data.
 
     Attributes:
@@ -150,7 +155,7 @@ class Outcome:
 
     numbers: list[Number] = field(default_factory=list)
     claims: list[Claim] = field(default_factory=list)
-    alternative_settings: dict[str, Outcome] = field(default_factory=dict)
+    alternative_settings: dict[str, Findings] = field(default_factory=dict)
     printed_formula: list[Number] = field(default_factory=list)
     data: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
@@ -160,7 +165,7 @@ class Outcome:
         return asdict(self)
 
     @classmethod
-    def from_document(cls, document: dict[str, Any]) -> Outcome:
+    def from_document(cls, document: dict[str, Any]) -> Findings:
         """Return the outcome that `document` wrote.
 
         Raises:
@@ -215,10 +220,10 @@ class Artefact:
 
     name: str
     title: str
-    compute: Callable[[Sample], Outcome]
-    setting: Callable[[Sample], tuple[str, ...]]
+    compute: Callable[[Workload], Findings]
+    setting: Callable[[Workload], tuple[str, ...]]
     assumptions: tuple[str, ...] = ()
     errata: tuple[str, ...] = ()
     argument: str = ""
-    draw: Callable[[Figure, Outcome], None] | None = None
+    draw: Callable[[Figure, Findings], None] | None = None
     size: tuple[float, float] = (7.0, 4.2)

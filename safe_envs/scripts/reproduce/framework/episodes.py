@@ -51,6 +51,9 @@ def periods(
         episodes: numbers of the episodes; number i has the same start and noise in every filter.
         seed: of all of them.
         knowledge: what the filter knows, "model" or "plant".
+
+    Returns:
+        An iterator over the periods, until all episodes have ended.
     """
     conditions = parse_conditions(condition, problem) if isinstance(condition, str) else condition
     world = SafeVectorEnv(problem, len(episodes))

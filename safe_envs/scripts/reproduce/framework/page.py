@@ -17,9 +17,9 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.verdict import RULES, Judgement, judge
 
@@ -32,7 +32,7 @@ class _Entry:
     """An artefact on the page."""
 
     artefact: Artefact
-    outcome: Outcome
+    outcome: Findings
     seconds: float
     judgement: Judgement
     picture: str
@@ -70,7 +70,7 @@ class _Entry:
 
 
 def write_page(
-    folder: Path, found: Sequence[tuple[Artefact, Outcome, float]], sample: Sample
+    folder: Path, found: Sequence[tuple[Artefact, Findings, float]], sample: Workload
 ) -> None:
     """Write `index.html` and `index.md` of what was found.
 
@@ -119,34 +119,24 @@ def _picture(folder: Path, artefact: Artefact) -> str:
 
 
 def _value(number: Number) -> str:
-    return _quantity(number.ours, number.unit)
+    form = ".1f" if number.unit == "%" else ".3g"
+    return f"{number.ours:{form}}{number.suffix}"
 
 
 def _range(number: Number) -> str:
     if number.low is None or number.high is None:
         return ""
-    return (
-        f"[{_quantity(number.low, '')}, {_quantity(number.high, '')}]"
-        if number.unit != "%"
-        else f"[{number.low:.1f}, {number.high:.1f}]"
-    )
+    form = ".1f" if number.unit == "%" else ".3g"
+    return f"[{number.low:{form}}, {number.high:{form}}]"
 
 
 def _printed(number: Number) -> str:
     if number.printed is None:
         return "-"
     size = f" (of {number.printed_trials})" if number.printed_trials else ""
-    return f"{number.printed:g}{_unit(number.unit)}{size}"
+    return f"{number.printed:g}{number.suffix}{size}"
 
 
 def _cell(text: str) -> str:
     """Return a text as a cell of a Markdown table."""
     return text.replace("|", "\\|")
-
-
-def _quantity(value: float, unit: str) -> str:
-    return f"{value:.1f} %" if unit == "%" else f"{value:.3g}{_unit(unit)}"
-
-
-def _unit(unit: str) -> str:
-    return f" {unit}" if unit else ""

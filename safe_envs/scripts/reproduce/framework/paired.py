@@ -90,6 +90,9 @@ def measure(
         seed: of the episodes.
         models: what a learned filter uses, one at a time; none for a filter that learns nothing.
         how: further arguments of `evaluate`.
+
+    Returns:
+        Statistics over all models, with those of each.
     """
     found = []
     for learned in [[model] for model in models] or [[]]:
@@ -124,17 +127,32 @@ def difference(name: str, first: Sequence[np.ndarray], second: Sequence[np.ndarr
 
 
 def is_above(number: Number, value: float = 0.0) -> bool:
-    """Return whether the whole interval of a number is above a value."""
+    """Return whether the whole interval of a number is above a value.
+
+    Args:
+        number: with its interval.
+        value: to compare with.
+    """
     return number.low is not None and number.low > value
 
 
 def is_below(number: Number, value: float = 0.0) -> bool:
-    """Return whether the whole interval of a number is below a value."""
+    """Return whether the whole interval of a number is below a value.
+
+    Args:
+        number: with its interval.
+        value: to compare with.
+    """
     return number.high is not None and number.high < value
 
 
 def with_interval(number: Number, unit: str = "") -> str:
-    """Return a difference with its sign, a unit if given, and its interval, as text."""
+    """Return a difference with its sign and its interval, as text.
+
+    Args:
+        number: the difference.
+        unit: of it, with a space in front.
+    """
     return f"{number.ours:+.1f}{unit} [{number.low:.1f}, {number.high:.1f}]"
 
 

@@ -11,20 +11,16 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from safe_envs.agents.jobs.fingerprint import (
-    file_checksum,
-    package_versions,
-    source_checksum,
-)
+from safe_envs.agents.jobs.fingerprint import file_checksum, package_versions, source_checksum
 from safe_envs.agents.jobs.store import ResultStore, reading
 from safe_envs.atomic_io import write_atomically
 from safe_envs.scripts.figures.evaluation_figure import STYLE
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Findings, Workload
 
 _SUFFIXES = (".png", ".svg")
 
 
-def configuration(artefact: Artefact, sample: Sample) -> dict[str, Any]:
+def configuration(artefact: Artefact, sample: Workload) -> dict[str, Any]:
     """Return everything that a result depends on, as JSON-able data.
 
     Args:
@@ -39,7 +35,7 @@ def configuration(artefact: Artefact, sample: Sample) -> dict[str, Any]:
     }
 
 
-def require_same_sample(folder: Path, artefacts: Iterable[Artefact], sample: Sample) -> None:
+def require_same_sample(folder: Path, artefacts: Iterable[Artefact], sample: Workload) -> None:
     """Check that a folder holds no results of another sample, which would be overwritten.
 
     Args:
@@ -54,7 +50,7 @@ def require_same_sample(folder: Path, artefacts: Iterable[Artefact], sample: Sam
     ResultStore(folder).require_same_options(names, asdict(sample))
 
 
-def read(folder: Path, artefact: Artefact, sample: Sample) -> tuple[Outcome, float] | None:
+def read(folder: Path, artefact: Artefact, sample: Workload) -> tuple[Findings, float] | None:
     """Return a kept outcome and its seconds, or None without one of the same configuration.
 
     Args:
@@ -63,14 +59,14 @@ def read(folder: Path, artefact: Artefact, sample: Sample) -> tuple[Outcome, flo
         sample: by which it is to be computed.
 
     Raises:
-        ConfigurationError: the result is damaged or altered.
+        ConfigurationError: the result is damaged or altered; a ValueError below becomes one.
     """
     store = ResultStore(folder)
     document = store.read(artefact.name, configuration(artefact, sample))
     if document is None:
         return None
     with reading(store.path(artefact.name)):
-        outcome, pictures = Outcome.from_document(document["outcome"]), document["pictures"]
+        outcome, pictures = Findings.from_document(document["outcome"]), document["pictures"]
         seconds = float(document["seconds"])
         if not 0.0 <= seconds < math.inf:
             raise ValueError(f"it took {seconds} seconds")
@@ -84,7 +80,7 @@ def read(folder: Path, artefact: Artefact, sample: Sample) -> tuple[Outcome, flo
 
 
 def keep(
-    folder: Path, artefact: Artefact, sample: Sample, outcome: Outcome, seconds: float
+    folder: Path, artefact: Artefact, sample: Workload, outcome: Findings, seconds: float
 ) -> None:
     """Draw an outcome, and write it after its pictures, whose checksums it holds.
 
@@ -106,7 +102,7 @@ def keep(
     ResultStore(folder).keep(artefact.name, configuration(artefact, sample), content)
 
 
-def _drawn(folder: Path, artefact: Artefact, outcome: Outcome) -> dict[str, str]:
+def _drawn(folder: Path, artefact: Artefact, outcome: Findings) -> dict[str, str]:
     """Draw the pictures of an outcome; return their checksums by suffix."""
     if artefact.draw is None:
         return {}

@@ -9,14 +9,14 @@ from typing import Any
 from rich.table import Table
 
 from safe_envs.scripts.reports.tables import make_table
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Findings, Workload
 from safe_envs.scripts.reproduce.framework.verdict import judge
 
-Found = Sequence[tuple[Artefact, Outcome, float]]
+Found = Sequence[tuple[Artefact, Findings, float]]
 """Artefacts with their outcomes and the seconds that these took."""
 
 
-def summary_document(found: Found, sample: Sample) -> dict[str, Any]:
+def summary_document(found: Found, sample: Workload) -> dict[str, Any]:
     """Return artefacts with their verdicts and outcomes, as JSON-able data.
 
     Args:
@@ -33,8 +33,13 @@ def summary_document(found: Found, sample: Sample) -> dict[str, Any]:
     return {"sample": asdict(sample), "artefacts": rows}
 
 
-def summary_table(found: Found, sample: Sample) -> Table:
-    """Return a table of verdicts, with the arguments of `summary_document`."""
+def summary_table(found: Found, sample: Workload) -> Table:
+    """Return a table of verdicts.
+
+    Args:
+        found: what was computed.
+        sample: by which.
+    """
     table = make_table("llp", "artefact", "verdict", "because", tight=False)
     for artefact, outcome, _ in found:
         judgement = judge(artefact, outcome, sample)

@@ -1,9 +1,10 @@
 """Settings, printed numbers, assumptions and errata of the thesis: `thesis/chapter_N.yaml`.
 
-A file has `settings` (sections of named values) and `artefacts`. An artefact has a title, the lines
-of its setting, its assumptions and errata, the argument why it cannot be reproduced, if any, notes
-by name, and its printed numbers. In these texts {name} is a value of the section that the artefact
-names, or one that its module gives.
+A file has `settings` (sections of named values) and `artefacts`. An artefact has a title, the size
+of its figure in inches, the lines of its setting, its assumptions and errata, the argument why it
+cannot be reproduced, if any, notes and claims by name, and its printed numbers. A claim has a
+sentence, its evidence, and `printed: no` if it is a check of ours. In these texts {name} is a value
+of the section that the artefact names, or one that its module gives.
 """
 
 from __future__ import annotations
@@ -19,10 +20,11 @@ import yaml
 from matplotlib.figure import Figure
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.reproduce.framework.artefact import Artefact, Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Findings, Workload
 
+_SIZE = [7.0, 4.2]
 _TEXTS = ("setting", "assumptions", "errata")
-_FIELDS = {"settings", "title", *_TEXTS, "argument", "notes", "printed"}
+_FIELDS = {"settings", "title", "size", *_TEXTS, "argument", "notes", "claims", "printed"}
 
 
 @dataclass(frozen=True)
@@ -47,27 +49,43 @@ class Chapter:
         Args:
             artefact: its name.
             name: of the note.
-            values: that the note names besides those of the section.
+            values: that the note names in addition to those of the section.
         """
-        text = self.artefacts[artefact]
-        return text["notes"][name].format(**{**self.settings[text["settings"]], **values})
+        return self._filled(artefact, self.artefacts[artefact]["notes"][name], values)
+
+    def claim(self, artefact: str, name: str, /, holds: Any, **values: Any) -> Claim:
+        """Return a claim of an artefact.
+
+        Args:
+            artefact: its name.
+            name: of the claim.
+            holds: whether it is true.
+            values: that sentence and evidence name in addition to those of the section.
+        """
+        text = self.artefacts[artefact]["claims"][name]
+        sentence, evidence = (
+            self._filled(artefact, text[part], values) for part in ("sentence", "evidence")
+        )
+        return Claim(sentence, bool(holds), evidence, text.get("printed", True))
+
+    def _filled(self, artefact: str, text: str, values: Mapping[str, Any]) -> str:
+        section = self.settings[self.artefacts[artefact]["settings"]]
+        return text.format(**{**section, **values})
 
     def artefact(
         self,
         name: str,
-        compute: Callable[[Sample], Outcome],
-        values: Callable[[Sample], Mapping[str, Any]],
-        draw: Callable[[Figure, Outcome], None] | None = None,
-        size: tuple[float, float] = (7.0, 4.2),
+        compute: Callable[[Workload], Findings],
+        values: Callable[[Workload], Mapping[str, Any]],
+        draw: Callable[[Figure, Findings], None] | None = None,
     ) -> Artefact:
         """Return an artefact with the texts of this chapter.
 
         Args:
             name: of the artefact, such as "table-4.1".
             compute: does the work.
-            values: what the lines of the setting name besides the section's values, for a sample.
+            values: what the lines of the setting name beyond the section's values, for a sample.
             draw: fills an empty figure from the outcome; None for a table.
-            size: of the figure, in inches.
         """
         text = self.artefacts[name]
         section = self.settings[text["settings"]]
@@ -84,7 +102,7 @@ class Chapter:
             filled("errata"),
             text["argument"].format(**section),
             draw,
-            size,
+            text["size"],
         )
 
 
@@ -127,7 +145,8 @@ def _artefact(given: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str
     single = {key: _text(given.get(key, "")) for key in ("settings", "title", "argument")}
     lines = {key: tuple(_lines(given.get(key, []))) for key in _TEXTS}
     notes = {key: _text(text) for key, text in given.get("notes", {}).items()}
-    return {**single, **lines, "notes": notes, "printed": _values(given.get("printed", {}))}
+    named = {key: _values(given.get(key, {})) for key in ("claims", "printed")}
+    return {**single, **lines, "notes": notes, **named, "size": _value(given.get("size", _SIZE))}
 
 
 def _lines(given: Any) -> list[str]:

@@ -6,15 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from importlib.resources import files
 from itertools import permutations
 
+import yaml
+
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Number,
-    Outcome,
-    Sample,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Findings, Number, Workload
 
 
 class Verdict(StrEnum):
@@ -28,30 +26,11 @@ class Verdict(StrEnum):
     NONE = "no verdict, for a quick run"
 
 
-RULES = {
-    Verdict.REPRODUCED: (
-        "every claim of the thesis holds, every printed number agrees, and no order of printed"
-        " numbers is turned. A rate agrees if the 95 % interval of its difference to the printed"
-        " one, at the printed sample size, holds 0, and ours is at most twice as wide as the"
-        " thesis'; another number, if the printed one is inside our 95 % interval. An order"
-        " counts if the printed sample sizes can tell the two numbers apart at 95 %"
-    ),
-    Verdict.ORDERING: (
-        "some number does not agree, but every claim holds, and no order of printed numbers is"
-        " turned"
-    ),
-    Verdict.ALTERNATIVE: (
-        "neither of the above, but with the settings that are named every printed number agrees, no"
-        " order is turned, and the claims that are looked at there hold, among them all that do not"
-        " hold otherwise"
-    ),
-    Verdict.NOT: "none of the above; the argument is given, if one is known",
-    Verdict.WRONG_FORMULA: (
-        "said in addition: a number by the printed formula is outside our interval by the corrected"
-        " one. It gives the thesis' numbers where these agree with them"
-    ),
-    Verdict.NONE: "a twentieth of the work shows that it works, and not what comes out",
-}
+_TEXTS = yaml.safe_load(
+    (files("safe_envs.scripts.reproduce") / "thesis" / "verdicts.yaml").read_text("utf-8")
+)
+RULES = {verdict: _TEXTS[verdict.value] for verdict in Verdict}
+"""By what each verdict is reached, in words."""
 
 _WIDEST = 2.0
 """How many times wider than that of a printed rate our interval may be, to say that the two agree.
@@ -88,7 +67,7 @@ class Judgement:
         return {Verdict.REPRODUCED: "good", Verdict.NOT: "bad"}.get(self.verdict, "middle")
 
 
-def judge(artefact: Artefact, outcome: Outcome, sample: Sample) -> Judgement:
+def judge(artefact: Artefact, outcome: Findings, sample: Workload) -> Judgement:
     """Return the verdict by `RULES`.
 
     Args:
@@ -130,11 +109,11 @@ def judge(artefact: Artefact, outcome: Outcome, sample: Sample) -> Judgement:
             [*reasons, *([artefact.argument] if artefact.argument else [])],
         )
     wrong = [number for number in outcome.printed_formula if not _same(number, outcome.numbers)]
-    reasons += [f"by the printed formula {n.name} is {n.ours:.3g}{_unit(n)}" for n in wrong]
+    reasons += [f"by the printed formula {n.name} is {n.ours:.3g}{n.suffix}" for n in wrong]
     return Judgement(verdict, bool(wrong), _matches_thesis(outcome), tuple(reasons))
 
 
-def _says_something(outcome: Outcome) -> bool:
+def _says_something(outcome: Findings) -> bool:
     return any(number.printed is not None for number in outcome.numbers) or any(
         claim.printed for claim in outcome.claims
     )
@@ -145,8 +124,8 @@ def disagreement(number: Number) -> str | None:
     if number.printed is None:
         return None
     text = (
-        f"{number.name}: {number.printed:g}{_unit(number)} printed,"
-        f" {number.ours:.3g}{_unit(number)} here"
+        f"{number.name}: {number.printed:g}{number.suffix} printed,"
+        f" {number.ours:.3g}{number.suffix} here"
     )
     low, high = _ends(number)
     if number.printed_trials is None:
@@ -183,7 +162,7 @@ def _turned(orders: Sequence[tuple[Number, Number]]) -> list[tuple[Number, Numbe
     return [(first, second) for first, second in orders if not first.ours > second.ours]
 
 
-def _reached(found: Outcome, outcome: Outcome, failed: Sequence[str]) -> bool:
+def _reached(found: Findings, outcome: Findings, failed: Sequence[str]) -> bool:
     """Return whether another setting gives all that is printed, and what fails otherwise."""
     claims = {claim.sentence: claim.holds for claim in found.claims if claim.printed}
     names = {number.name for number in found.numbers if number.printed is not None}
@@ -196,7 +175,7 @@ def _reached(found: Outcome, outcome: Outcome, failed: Sequence[str]) -> bool:
     )
 
 
-def _matches_thesis(outcome: Outcome) -> bool:
+def _matches_thesis(outcome: Findings) -> bool:
     """Return whether numbers by the printed formula agree with the printed ones."""
     printed = {number.name: number for number in outcome.numbers}
     both = [
@@ -242,7 +221,3 @@ def _difference(
     """
     (a, a_low, a_high), (b, b_low, b_high) = first, second
     return a - b - math.hypot(a - a_low, b_high - b), a - b + math.hypot(a_high - a, b - b_low)
-
-
-def _unit(number: Number) -> str:
-    return f" {number.unit}" if number.unit else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.reproduce.framework.artefact import Outcome, Sample
+from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter, read
 
 TEXT = """
@@ -23,9 +23,9 @@ artefacts:
 def test_texts_are_filled_in_from_the_section_and_the_module() -> None:
     found = read(TEXT, "file")
     artefact = found.artefact(
-        "table-0.1", lambda _: Outcome(), lambda sample: {"count": sample.size(7)}
+        "table-0.1", lambda _: Findings(), lambda sample: {"count": sample.size(7)}
     )
-    assert artefact.setting(Sample()) == ("thrown 7 times", "of 2.5 g", "sides 2")
+    assert artefact.setting(Workload()) == ("thrown 7 times", "of 2.5 g", "sides 2")
     assert (artefact.title, artefact.argument) == ("A coin", "2.5 g is too much")
     assert (artefact.assumptions, artefact.errata) == ((), ())
     assert found.printed("table-0.1") == {"heads": 48.0}

@@ -9,9 +9,9 @@ import pytest
 from safe_envs.scripts.reproduce.framework.artefact import (
     Artefact,
     Claim,
+    Findings,
     Number,
-    Outcome,
-    Sample,
+    Workload,
 )
 from safe_envs.scripts.reproduce.framework.verdict import (
     RULES,
@@ -21,8 +21,8 @@ from safe_envs.scripts.reproduce.framework.verdict import (
     printed_orders,
 )
 
-TABLE = Artefact("table-0.0", "", lambda _: Outcome(), lambda _: (), argument="no two are alike")
-SAMPLE = Sample()
+TABLE = Artefact("table-0.0", "", lambda _: Findings(), lambda _: (), argument="no two are alike")
+SAMPLE = Workload()
 SAID, SAID_NOT = Claim("it flies", True, ""), Claim("it flies", False, "")
 CHECK_FAILS = Claim("it sings", False, "", printed=False)
 
@@ -35,7 +35,7 @@ def rates(high, low, printed=(90.0, 60.0)):
 
 
 def claims(*found):
-    return Outcome(claims=list(found))
+    return Findings(claims=list(found))
 
 
 def test_a_rate_agrees_by_the_interval_of_the_difference():
@@ -95,74 +95,76 @@ def test_orders_are_those_that_the_printed_samples_can_tell_apart():
 @pytest.mark.parametrize(
     ("outcome", "verdict"),
     [
-        (Outcome(rates(88, 60)), Verdict.REPRODUCED),
-        (Outcome(rates(88, 60), [SAID_NOT]), Verdict.NOT),
-        (Outcome(rates(88, 60), [CHECK_FAILS]), Verdict.REPRODUCED),
-        (Outcome(rates(40, 20)), Verdict.ORDERING),
-        (Outcome(rates(40, 20), [CHECK_FAILS]), Verdict.ORDERING),
-        (Outcome(rates(40, 20), [SAID_NOT]), Verdict.NOT),
-        (Outcome(rates(20, 40)), Verdict.NOT),
+        (Findings(rates(88, 60)), Verdict.REPRODUCED),
+        (Findings(rates(88, 60), [SAID_NOT]), Verdict.NOT),
+        (Findings(rates(88, 60), [CHECK_FAILS]), Verdict.REPRODUCED),
+        (Findings(rates(40, 20)), Verdict.ORDERING),
+        (Findings(rates(40, 20), [CHECK_FAILS]), Verdict.ORDERING),
+        (Findings(rates(40, 20), [SAID_NOT]), Verdict.NOT),
+        (Findings(rates(20, 40)), Verdict.NOT),
         # Equal ones are turned, too.
-        (Outcome(rates(75, 75)), Verdict.NOT),
+        (Findings(rates(75, 75)), Verdict.NOT),
         (
-            Outcome(rates(20, 40), alternative_settings={"more noise": Outcome(rates(88, 60))}),
+            Findings(rates(20, 40), alternative_settings={"more noise": Findings(rates(88, 60))}),
             Verdict.ALTERNATIVE,
         ),
         (
-            Outcome(rates(20, 40), alternative_settings={"more noise": Outcome(rates(88, 20))}),
+            Findings(rates(20, 40), alternative_settings={"more noise": Findings(rates(88, 20))}),
             Verdict.NOT,
         ),
         (
-            Outcome(rates(20, 40), alternative_settings={"more noise": Outcome(rates(75, 75))}),
+            Findings(rates(20, 40), alternative_settings={"more noise": Findings(rates(75, 75))}),
             Verdict.NOT,
         ),
         (
-            Outcome(rates(20, 40), alternative_settings={"more noise": Outcome(rates(88, 60)[:1])}),
-            Verdict.NOT,
-        ),
-        (
-            Outcome(
-                rates(20, 40),
-                alternative_settings={"more noise": Outcome(rates(88, 60), [SAID_NOT])},
+            Findings(
+                rates(20, 40), alternative_settings={"more noise": Findings(rates(88, 60)[:1])}
             ),
             Verdict.NOT,
         ),
         (
-            Outcome(
+            Findings(
+                rates(20, 40),
+                alternative_settings={"more noise": Findings(rates(88, 60), [SAID_NOT])},
+            ),
+            Verdict.NOT,
+        ),
+        (
+            Findings(
                 rates(20, 40),
                 [SAID_NOT],
-                alternative_settings={"more noise": Outcome(rates(88, 60))},
+                alternative_settings={"more noise": Findings(rates(88, 60))},
             ),
             Verdict.NOT,
         ),
         (
-            Outcome(
+            Findings(
                 rates(20, 40),
                 [SAID_NOT],
-                alternative_settings={"more noise": Outcome(rates(88, 60), [SAID])},
+                alternative_settings={"more noise": Findings(rates(88, 60), [SAID])},
             ),
             Verdict.ALTERNATIVE,
         ),
         (
-            Outcome(
+            Findings(
                 rates(20, 40),
-                alternative_settings={"more noise": Outcome(rates(88, 60), [CHECK_FAILS])},
+                alternative_settings={"more noise": Findings(rates(88, 60), [CHECK_FAILS])},
             ),
             Verdict.ALTERNATIVE,
         ),
         (
-            Outcome(
+            Findings(
                 rates(20, 40),
-                alternative_settings={"more noise": Outcome([Number("nothing printed", 1.0)])},
+                alternative_settings={"more noise": Findings([Number("nothing printed", 1.0)])},
             ),
             Verdict.NOT,
         ),
         (
-            Outcome(claims=[SAID_NOT], alternative_settings={"more noise": claims(SAID)}),
+            Findings(claims=[SAID_NOT], alternative_settings={"more noise": claims(SAID)}),
             Verdict.ALTERNATIVE,
         ),
         (
-            Outcome(
+            Findings(
                 claims=[SAID_NOT],
                 alternative_settings={"more noise": claims(replace(SAID, sentence="another"))},
             ),
@@ -170,7 +172,7 @@ def test_orders_are_those_that_the_printed_samples_can_tell_apart():
         ),
         (claims(SAID), Verdict.REPRODUCED),
         # With nothing that is printed, nothing is reproduced.
-        (Outcome([Number("ours", 1.0)], [replace(SAID, printed=False)]), Verdict.NOT),
+        (Findings([Number("ours", 1.0)], [replace(SAID, printed=False)]), Verdict.NOT),
         (claims(SAID_NOT), Verdict.NOT),
     ],
 )
@@ -182,11 +184,11 @@ def test_the_verdict_follows_from_the_numbers(outcome, verdict):
         verdict == Verdict.ALTERNATIVE
     )
     assert (TABLE.argument in judgement.reasons) is (verdict == Verdict.NOT)
-    assert judge(TABLE, outcome, Sample(quick=True)).verdict == Verdict.NONE
+    assert judge(TABLE, outcome, Workload(quick=True)).verdict == Verdict.NONE
 
 
 def test_orders_that_are_turned_are_named():
-    assert "high is not above low" in judge(TABLE, Outcome(rates(75, 75)), SAMPLE).reasons
+    assert "high is not above low" in judge(TABLE, Findings(rates(75, 75)), SAMPLE).reasons
 
 
 def test_a_printed_formula_is_wrong_if_it_gives_another_number():
@@ -198,24 +200,24 @@ def test_a_printed_formula_is_wrong_if_it_gives_another_number():
         (Number("exact", 3.0), True),
         (Number("exact", 2.0), False),
     ):
-        judgement = judge(TABLE, Outcome(ours, printed_formula=[printed_formula]), SAMPLE)
+        judgement = judge(TABLE, Findings(ours, printed_formula=[printed_formula]), SAMPLE)
         assert judgement.wrong_formula is wrong
         assert judgement.text == "reproduced; printed formula is wrong" if wrong else "reproduced"
 
 
 def test_a_wrong_formula_that_gives_the_print_is_said_to():
     text = judge(
-        TABLE, Outcome(rates(40, 20), printed_formula=[Number("high", 90.0, unit="%")]), SAMPLE
+        TABLE, Findings(rates(40, 20), printed_formula=[Number("high", 90.0, unit="%")]), SAMPLE
     ).text
     assert text == "ordering reproduced; printed formula is wrong, and gives the thesis' numbers"
     own = Number("high", 35.0, printed=35.0, unit="%")
     assert judge(
         TABLE,
-        Outcome([Number("high", 27.0, unit="%"), rates(40, 20)[1]], printed_formula=[own]),
+        Findings([Number("high", 27.0, unit="%"), rates(40, 20)[1]], printed_formula=[own]),
         SAMPLE,
     ).matches_thesis
     # What is outside the printed number's interval gives something else again.
     text = judge(
-        TABLE, Outcome(rates(40, 20), printed_formula=[Number("high", 10.0, unit="%")]), SAMPLE
+        TABLE, Findings(rates(40, 20), printed_formula=[Number("high", 10.0, unit="%")]), SAMPLE
     ).text
     assert text == "ordering reproduced; printed formula is wrong"
