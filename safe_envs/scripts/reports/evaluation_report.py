@@ -7,12 +7,12 @@ from rich.text import Text
 
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
 from safe_envs.agents.evaluation.comparison import Comparison
+from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.refinement import TOLERANCE, Refinement
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rate_text import percent, percent_in
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
 from safe_envs.scripts.reports.tables import make_table, print_whole

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import FilterTiming
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.dynamics.lie import lie_derivative_g, vanishes
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rate_text import percent
 
 Cell = Callable[[EvaluationRow, FilterTiming], str]
 """From a row, and what was timed of it, to a text."""

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text
 
+from safe_envs.agents.evaluation.rate_text import percent, rate_of
 from safe_envs.agents.evaluation.spec import UNFILTERED
-from safe_envs.rate_text import percent, rate_of
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import make_table
 
