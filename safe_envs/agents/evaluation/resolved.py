@@ -18,7 +18,7 @@ from safe_envs.agents.evaluation.spec import (
 from safe_envs.agents.evaluation.targets import make_target
 from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.policies.custom import policy_name
-from safe_envs.agents.policies.registry import policy_file
+from safe_envs.agents.policies.registry import make_policy, policy_file
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition, parse_conditions, require_readable, spec_of
@@ -54,11 +54,8 @@ class ResolvedEvaluation:
                 "monitoring = 'continuous': the path of a third-party env between its steps is"
                 " unknown; use 'discrete'"
             )
-        given = spec.policy
-        self.policy = (
-            self.target.make_policy(given, spec.trust)
-            if isinstance(given, str)
-            else self.target.adapt_policy(given)
+        self.policy = make_policy(
+            spec.policy, self.problem, spec.trust, self.target.spaces, self.target.filter_spec
         )
         asked = (UNFILTERED, self.target.filter) if spec.filters is None else spec.filters
         filters = {filter_text(each): each for each in asked}
