@@ -10,8 +10,8 @@ from safe_envs.agents.evaluation.comparison import pair_counts
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.results import Evaluation
-from safe_envs.agents.evaluation.rollout import Progress
 from safe_envs.agents.evaluation.rows import EvaluationRow
+from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem

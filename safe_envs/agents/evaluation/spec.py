@@ -24,6 +24,9 @@ KNOWLEDGE = ("model", "plant")
 OBJECTIVES = ("nearest", "clf")
 """Objectives of filters."""
 
+Progress = Callable[[float], None]
+"""Is called with the number, or the part, of the work that is done."""
+
 Filter = str | Condition | Sequence[Condition]
 """A text, a condition for every barrier, or one condition for each barrier."""
 
@@ -87,7 +90,7 @@ class EvaluationSpec:
                 raise ConfigurationError(f"{name} = {shown(value)}; {nearest(value, allowed)}")
         require_confidence(self.confidence)
         require_monitoring(self.monitoring)
-        filters = (self.filters,) if isinstance(self.filters, str | Condition) else self.filters
+        filters = listed(self.filters)
         given = {k: v for k, v in (self.options or {}).items() if v is not None}
         for name, value in (
             ("filters", None if filters is None else tuple(filters)),
@@ -152,7 +155,7 @@ class RunSettings:
     num_envs: int = 1024
     jobs: int = 1
     record: bool = False
-    progress: Callable[[float], None] | None = None
+    progress: Progress | None = None
 
     def __post_init__(self) -> None:
         require_whole("num_envs", self.num_envs, 1)
@@ -162,6 +165,11 @@ class RunSettings:
                 f"jobs = {self.jobs}: trajectories for pictures are kept in one process; leave jobs"
                 " out, or the picture"
             )
+
+
+def listed(filters: Sequence[Filter] | Filter | None) -> Sequence[Filter] | None:
+    """Return filters as a sequence, where one may be given in place of several."""
+    return (filters,) if isinstance(filters, str | Condition) else filters
 
 
 def filter_text(given: Filter) -> str:

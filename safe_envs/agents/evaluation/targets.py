@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 
-from safe_envs.agents.evaluation.rollout import Env
-from safe_envs.agents.policies.base import Policy
-from safe_envs.dynamics.integrators import Integrator
 from safe_envs.envs.vector_env import SafeVectorEnv
-from safe_envs.errors import ConfigurationError, shown
+from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.registry import full_id, make_problem, title_of
 from safe_envs.wrappers import (
-    Condition,
     FilterSpec,
     SafetyFilterVectorWrapper,
     SafetyMonitorVector,
 )
+
+Env = SafeVectorEnv | SafetyMonitorVector | SafetyFilterVectorWrapper
+"""A batch of envs."""
 
 _MOST_ENVS = 64
 """Third-party envs are stepped one by one: more of them at once would only take memory."""
@@ -38,6 +37,8 @@ class NativeTarget:
         filter_spec: None.
         spaces: None, those of the problem's env.
         problem: what is simulated.
+        filter: its default one.
+        title: what results call it.
         why_no_bound: None; a bound may be looked for.
 
     Raises:
@@ -56,33 +57,12 @@ class NativeTarget:
         self.problem = (
             problem if isinstance(problem, SafetyProblem) else make_problem(problem, **self.options)
         )
+        self.filter = self.problem.filter
+        self.title = self.problem.name if self.env_id is None else title_of(self.env_id, options)
 
-    @property
-    def filter(self) -> str:
-        """The default filter of the problem."""
-        return self.problem.filter
-
-    @property
-    def title(self) -> str:
-        """How results call it."""
-        return self.problem.name if self.env_id is None else title_of(self.env_id, self.options)
-
-    def env(
-        self, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int
-    ) -> Env:
-        """Return a batch of envs behind the filter of conditions, or unfiltered."""
-        env = SafeVectorEnv(self.problem, num_envs)
-        return (
-            SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
-        )
-
-    def is_deterministic(self, policy: Any) -> bool:
-        """Return whether all episodes are one and the same."""
-        noise = Integrator(
-            self.problem.plant, self.problem.dt, self.problem.substeps, "arrays"
-        ).channels
-        acts_alike = policy.deterministic if isinstance(policy, Policy) else True
-        return acts_alike and not noise and not self.problem.starts[self.problem.start].uniforms
+    def env(self, num_envs: int) -> Env:
+        """Return a batch of unfiltered envs."""
+        return SafeVectorEnv(self.problem, num_envs)
 
 
 class ExternalTarget:
@@ -98,6 +78,8 @@ class ExternalTarget:
         filter_spec: as given.
         spaces: of observations and actions.
         problem: the model as a problem.
+        filter: the one that the filter spec names, or else the default one of the model.
+        title: the id.
         why_no_bound: that the model may not be the env.
 
     Raises:
@@ -109,7 +91,8 @@ class ExternalTarget:
     why_no_bound = "the env is not this project's, and may differ from the model"
 
     def __init__(self, env_id: str, filter_spec: FilterSpec) -> None:
-        self.env_id, self.filter_spec = env_id, filter_spec
+        self.env_id = self.title = env_id
+        self.filter_spec = filter_spec
         self.options: dict[str, Any] = {}
         with gym.make(env_id) as env:
             if isinstance(getattr(env.unwrapped, "problem", None), SafetyProblem):
@@ -124,39 +107,13 @@ class ExternalTarget:
                 )
             self.problem = filter_spec.problem(env.unwrapped, env.action_space, env_id, steps)
             self.spaces = env.observation_space, env.action_space
+        self.filter = filter_spec.filter or self.problem.filter
 
-    @property
-    def filter(self) -> str:
-        """The filter that the filter spec names, or else the default one of the model."""
-        return self.filter_spec.filter or self.problem.filter
-
-    @property
-    def title(self) -> str:
-        """How results call it."""
-        return self.env_id
-
-    def env(
-        self, conditions: Sequence[Condition], knowledge: str, objective: str, num_envs: int
-    ) -> Env:
-        """Return a batch of envs behind the filter of conditions, or unfiltered."""
-        if knowledge != "model":
-            raise ConfigurationError(
-                f"knowledge = {shown(knowledge)}: of a third-party env nothing is known but the"
-                " model"
-            )
-        env = SafetyMonitorVector(
-            gym.make_vec(
-                self.env_id, num_envs=min(num_envs, _MOST_ENVS), vectorization_mode="sync"
-            ),
-            self.filter_spec,
-        )
-        return (
-            SafetyFilterVectorWrapper(env, conditions, knowledge, objective) if conditions else env
-        )
-
-    def is_deterministic(self, policy: Any) -> bool:
-        """Return False: whether all episodes are one and the same is unknown."""
-        return False
+    def env(self, num_envs: int) -> Env:
+        """Return a batch of unfiltered envs."""
+        size = min(num_envs, _MOST_ENVS)
+        env = gym.make_vec(self.env_id, num_envs=size, vectorization_mode="sync")
+        return SafetyMonitorVector(env, self.filter_spec)
 
 
 def make_target(

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, smallest
-from safe_envs.agents.evaluation.rollout import Env, Progress
+from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.policies.base import Policy
+from safe_envs.agents.rare_events.particles import MakeTiltedEnv
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import gradient
 from safe_envs.envs.simulation import NoiseStreams
@@ -167,10 +168,6 @@ def optimal_tilt(
         log_second_moment, bounds=(0.0, _STRONGEST / math.sqrt(horizon)), method="bounded"
     )
     return float(found.x), math.sqrt(max(math.exp(min(found.fun, 700.0)) - 1.0, 0.0))
-
-
-MakeTiltedEnv = Callable[[np.ndarray], Env]
-"""A filtered `TiltedNoiseEnv` with drifts of given lengths."""
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, smallest
-from safe_envs.agents.evaluation.rollout import Env
+from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.policies.base import Policy
-from safe_envs.agents.rare_events.importance_sampling import MakeTiltedEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
+
+MakeTiltedEnv = Callable[[np.ndarray], Env]
+"""Makes a filtered `TiltedNoiseEnv` with drifts of given lengths."""
 
 _FIRST_ROOM = 64
 _FEWEST_ENVS = 64

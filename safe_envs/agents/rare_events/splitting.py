@@ -10,8 +10,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.jobs import blas_threads
-from safe_envs.agents.rare_events.importance_sampling import MakeTiltedEnv
-from safe_envs.agents.rare_events.particles import Particles
+from safe_envs.agents.rare_events.particles import MakeTiltedEnv, Particles
 
 KILLED = 0.75
 """Share of a repetition's paths that are killed at a level, at least."""

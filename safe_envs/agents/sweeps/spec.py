@@ -5,14 +5,13 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import file_checksum
-from safe_envs.agents.sweeps.cell import Cell, versions
+from safe_envs.agents.sweeps.cell import Cell, Sweep, versions
 from safe_envs.agents.sweeps.dependencies import absolute, read_by, with_imported
 from safe_envs.agents.sweeps.document import document_in
 from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_of
@@ -27,19 +26,6 @@ _TOGETHER = {"filter": ("env", "system", "knowledge", "objective"), "policy": ("
 
 _MOST_CELLS = 50_000
 """All of them are compared, in a second, before the first is computed."""
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """Cells, in the order of their file.
-
-    Attributes:
-        cells: each once.
-        swept: names of the settings that are not the same in all of them.
-    """
-
-    cells: tuple[Cell, ...]
-    swept: tuple[str, ...]
 
 
 def read_sweep(path: Path, trust: bool = False) -> Sweep:

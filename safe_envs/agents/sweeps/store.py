@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from safe_envs.agents.jobs.job import Outcome
 from safe_envs.agents.jobs.store import ResultStore, reading, remove_stale
-from safe_envs.agents.sweeps.cell import Cell
+from safe_envs.agents.sweeps.cell import Cell, Sweep
 from safe_envs.agents.sweeps.settings import text_of
-from safe_envs.agents.sweeps.spec import Sweep
 from safe_envs.atomic_io import write_json
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 from safe_envs.errors import ConfigurationError, shortened

@@ -15,7 +15,7 @@ from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:
     from safe_envs.agents.jobs.job import Outcome
-    from safe_envs.agents.sweeps.spec import Sweep
+    from safe_envs.agents.sweeps.cell import Sweep
 
 Row = dict[str, Any]
 
