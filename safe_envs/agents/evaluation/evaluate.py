@@ -46,7 +46,7 @@ def evaluate(
     progress: Progress | None = None,
     **fields: Any,
 ) -> Evaluation:
-    """Estimate the safety of a policy under each filter.
+    """RareEstimate the safety of a policy under each filter.
 
     An episode is safe if every barrier is positive at every control instant, its start included;
     with continuous monitoring between them too, see `BrownianBridge`, which changes neither control

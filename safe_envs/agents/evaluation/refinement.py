@@ -107,6 +107,9 @@ def refine(
         record: keep trajectories of the first evaluation for pictures.
         **arguments: the others of `evaluate`.
 
+    Returns:
+        The three evaluations, and the rates with each period.
+
     Raises:
         ConfigurationError: as for `evaluate`, or dt cannot be divided.
         RelativeDegreeError: a condition does not suit a barrier.

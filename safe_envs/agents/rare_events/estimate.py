@@ -23,8 +23,8 @@ from safe_envs.agents.rare_events.importance_sampling import (
 )
 from safe_envs.agents.rare_events.rows import (
     BETTER,
-    Estimate,
     PlainEpisodes,
+    RareEstimate,
     RareRow,
     verdict,
 )
@@ -76,7 +76,7 @@ def estimate_rare(
     progress: Progress | None = None,
     **fields: Any,
 ) -> RareEvaluation:
-    """Estimate the probability of a violation under each filter, by splitting on h.
+    """RareEstimate the probability of a violation under each filter, by splitting on h.
 
     See `safe_envs.agents.rare_events.splitting.Splitting`.
 
@@ -171,15 +171,17 @@ class _Estimator:
         splitting, work = Splitting(*how), self.work
         power, pilot_steps = splitting.choose(self.particles, work.part())
         found = splitting.estimate(power, self.particles, self.repetitions, work.part())
-        last_part = work.part()
-        low, high = rate_interval(found.first, found.paths, spec.confidence)
-        plain = PlainEpisodes(found.paths, found.first, low, high, found.outside, found.kept_length)
-        steps = found.steps + pilot_steps
+        last_part, paths = work.part(), found.paths
+        low, high = rate_interval(found.first, paths.lowest.size, spec.confidence)
+        plain = PlainEpisodes(
+            paths.lowest.size, found.first, low, high, paths.outside, paths.kept_length
+        )
+        steps = paths.steps + pilot_steps
         nothing = replace(nothing, levels=float(found.levels.mean()), steps=steps, plain=plain)
-        if found.given_up:
+        if found.stuck or found.endless:
             return replace(nothing, reason=_why_none(found, self.particles, problem, plain))
         by = "splitting on h" if power == POWERS[0] else "splitting on h/sqrt(T - t)"
-        split = Estimate.of(by, found.estimates, spec.confidence)
+        split = RareEstimate.of(by, found.estimates, spec.confidence)
         if not found.levels.any():
             split = replace(split, method="plain episodes", ci_low=low, ci_high=high)
         drift, drift_steps = self._by_drift(
@@ -205,13 +207,13 @@ class _Estimator:
         found: Repetitions,
         to_beat: float,
         progress: Progress | None,
-    ) -> tuple[Estimate | None, int]:
+    ) -> tuple[RareEstimate | None, int]:
         """Return the estimate by importance sampling, and the control periods that it took.
 
         There is none unless it is predicted to be much better.
         """
         duration, sizes = self.resolved.problem.duration, (self.particles, self.repetitions)
-        length, deviation = optimal_tilt(found.girsanov_integrals, found.shares, duration)
+        length, deviation = optimal_tilt(*found.violating(), duration)
         if not BETTER * deviation / math.sqrt(math.prod(sizes)) < to_beat:
             return None, 0
         try:
@@ -222,7 +224,7 @@ class _Estimator:
         if not (estimates > 0.0).all():
             return None, steps
         method = f"drift of {length:.3g}/sqrt(s)"
-        return Estimate.of(method, estimates, self.resolved.spec.confidence), steps
+        return RareEstimate.of(method, estimates, self.resolved.spec.confidence), steps
 
 
 def _why_none(

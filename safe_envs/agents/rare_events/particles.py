@@ -65,7 +65,12 @@ class Records:
         self._count[paths] += 1
 
     def first_below(self, levels: np.ndarray, paths: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the first records of paths below levels, as the arguments of `add`."""
+        """Return the first records of paths below levels, as the arguments of `add`.
+
+        Args:
+            levels: heights, shape (B,).
+            paths: shape (B,).
+        """
         # Records fall along the first axis, and what was not filled is lower than all.
         rows = (self._height[:, paths] >= levels).sum(axis=0)
         return tuple(kept[rows, paths] for kept in self._kept)

@@ -88,7 +88,12 @@ def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Swe
 
 
 def describe(cell: Cell, names: Iterable[str]) -> str:
-    """Return a cell in a few words: its settings of these names."""
+    """Return a cell in a few words: its settings of these names.
+
+    Args:
+        cell: to describe.
+        names: of the settings.
+    """
     return ", ".join(
         f"{name} = {text_of(cell.settings[name])}" for name in names if name in cell.settings
     )

@@ -120,7 +120,7 @@ class Source:
 
 
 @dataclass(frozen=True, eq=False)
-class Identification:
+class IdentifyAnswer:
     """A learned model and its accuracy.
 
     Attributes:

@@ -28,7 +28,12 @@ _COLUMNS = (
 
 
 def print_rare(console: Console, answer: RareEvaluation) -> None:
-    """Print a heading, a row for each filter, and what has to be known to read them."""
+    """Print a heading, a row for each filter, and what has to be known to read them.
+
+    Args:
+        console: to print on.
+        answer: to print.
+    """
     config = answer.config
     interval = f"{100 * config['confidence']:.10g} % interval"
     say(console, _heading(answer))
