@@ -115,7 +115,7 @@ def identify(
         functions=compare(learned, problem, seed),
         options=arguments,
         seed=seed,
-        source=None if data is None or transitions is None else Source.of(data, transitions),
+        source=None if data is None or transitions is None else Source(data, transitions),
         out=out,
         use=env.evaluate_command("--filter", _filter_of(method), "--learned", str(out)),
     )

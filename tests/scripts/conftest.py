@@ -37,5 +37,5 @@ def strictly(path):
 
 @pytest.fixture
 def coarse_bounds(monkeypatch):
-    """Has bounds estimated by a shorter search, where a test does not depend on how large they are."""
+    """Estimate bounds by a shorter search, where a test does not depend on their size."""
     hurry(monkeypatch)

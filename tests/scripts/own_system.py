@@ -9,8 +9,12 @@ x, v, u, sigma = sp.symbols("x v u sigma", real=True)
 
 
 def _cart(noise, parameters, barrier=1 - x**2, **more):
-    system = ControlAffineSDE.from_rate((x, v), (u,), [v, u - 0.5 * v], diffusion=[0, noise], parameters=parameters)
-    given = {"start": [(-0.5, 0.5), (-0.5, 0.5)], "dt": 0.03, "horizon": 1.0, "nominal": 1.5 * v - 4 * x, "gains": (2.0, 2.0)}
+    rate, noises = [v, u - 0.5 * v], [0, noise]
+    system = ControlAffineSDE.from_rate(
+        (x, v), (u,), rate, diffusion=noises, parameters=parameters
+    )
+    given = {"start": [(-0.5, 0.5), (-0.5, 0.5)], "dt": 0.03, "horizon": 1.0}
+    given |= {"nominal": 1.5 * v - 4 * x, "gains": (2.0, 2.0)}
     return state_problem(system, barrier, box=(-5.0, 5.0), name="cart", **{**given, **more})
 
 

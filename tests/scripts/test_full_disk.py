@@ -1,4 +1,4 @@
-"""Commands on a full disk: status 2, a line that says so, what was there before, and nothing else."""
+"""Commands on a full disk: status 2, a line that says so, and what was there before."""
 
 from __future__ import annotations
 

@@ -19,7 +19,6 @@ from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
 from safe_envs.agents.evaluation.rollout import play, play_in_processes
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import (
-    UNFILTERED,
     EvaluationSpec,
     Filter,
     Progress,
@@ -28,11 +27,8 @@ from safe_envs.agents.evaluation.spec import (
 )
 from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.evaluation.trajectories import Trajectories
-from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition
-
-__all__ = ["UNFILTERED", "Evaluation", "evaluate", "package_versions", "run_evaluation"]
 
 
 def evaluate(

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from rich.console import Console
 from rich.text import Text
 
@@ -112,26 +115,29 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
 def heading(evaluation: Evaluation) -> Text:
     """Return what was evaluated, in two lines."""
     config = evaluation.config
-    title = Text(evaluation.title, style="bold")
     repeats = max((row.learning.repeats for row in evaluation.rows if row.learning), default=1)
     often = f" x {repeats} identifications" if repeats > 1 else ""
+    return heading_of(config, evaluation.problem, f"{config['episodes']} episodes{often}")
+
+
+def heading_of(config: Mapping[str, Any], problem: SafetyProblem, what: str) -> Text:
+    """Return what was evaluated, in two lines.
+
+    Args:
+        config: of the evaluation.
+        problem: that was evaluated.
+        what: number of the episodes.
+    """
+    title = Text(config["title"], style="bold")
     title.append(
-        f" | policy {config['policy']['name']} | {config['episodes']} episodes{often} | seed"
-        f" {config['seed']}",
-        style="not bold",
+        f" | policy {config['policy']['name']} | {what} | seed {config['seed']}", style="not bold"
     )
+    seen = config["filter_spec"]
+    system = f"seen through {seen}, {_timing(problem)}" if seen else describe_system(problem)
     goal = ", joint QP with the goal" if config["objective"] == "clf" else ""
     watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
-    title.append(
-        f"\n{_told(evaluation)}{watched}; filters know the {config['knowledge']}{goal}",
-        style="not bold",
-    )
+    title.append(f"\n{system}{watched}; filters know the {config['knowledge']}{goal}", "not bold")
     return title
-
-
-def _told(evaluation: Evaluation) -> str:
-    problem, spec = evaluation.problem, evaluation.config["filter_spec"]
-    return describe_system(problem) if spec is None else f"seen through {spec}, {_timing(problem)}"
 
 
 def describe_system(problem: SafetyProblem) -> str:

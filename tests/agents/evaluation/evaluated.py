@@ -111,5 +111,5 @@ def replay(env_id, options, spec, policy_name, episodes, seed, knowledge="model"
 
 
 def safe_so_far(trajectories, times, dt):
-    """How many trajectories of h are positive up to each time; one that has ended stays as it was."""
+    """Count the trajectories of h that are positive up to each time; ended ones stay so."""
     return [sum(min(h[: round(t / dt) + 1]) > 0 for h in trajectories) for t in times]

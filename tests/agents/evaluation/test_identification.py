@@ -24,7 +24,7 @@ LEARNED = ("bayesian-scbf", "bayesian-scbf:confidence=0.9")
 
 @pytest.fixture(scope="module")
 def posterior():
-    """Identified by default, with the seed that the first repeat of an evaluation with seed 0 has."""
+    """Identified by default, with the seed of the first repeat of an evaluation with seed 0."""
     return learner_of("bayesian")(DISK, seed=0)
 
 

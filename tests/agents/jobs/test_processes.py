@@ -135,7 +135,9 @@ if __name__ == "__main__":
     from joblib import Parallel, delayed
     from safe_envs.agents.jobs.processes import end_with_parent, local_processes
 
-    pool = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=end_with_parent, initargs=(os.getpid(),))
+    pool = ProcessPoolExecutor(
+        1, mp_context=get_context("spawn"), initializer=end_with_parent, initargs=(os.getpid(),)
+    )
     pool.submit(work, sys.argv[1])
     Parallel(2, backend=local_processes())(delayed(work)(sys.argv[1]) for _ in range(2))
 """
@@ -171,7 +173,7 @@ def wait_until(condition, seconds=30):
 
 
 def is_running(process):
-    """Whether there is such a process, one that has ended but that nobody has asked for left out."""
+    """Whether there is such a process that has not ended."""
     status = Path(f"/proc/{process}/stat")
     if status.parent.parent.joinpath("self").exists():
         return status.exists() and status.read_text().rpartition(")")[2].split()[0] != "Z"

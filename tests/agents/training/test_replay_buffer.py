@@ -264,7 +264,7 @@ def test_each_env_without_a_filter_keeps_its_proposal():
 
 
 class View(dict):
-    """An info that is one row of a batch, of which only what is given is at hand in the row itself."""
+    """An info that is one row of a batch, of which only what is given is in the row itself."""
 
     def __init__(self, batch, index, **given):
         super().__init__(given)
@@ -352,7 +352,7 @@ def test_actions_and_combinations_that_are_not_allowed():
 def test_executed_actions_beyond_the_box(executed):
     with pytest.raises(
         ConfigurationError,
-        match=r"not between \[0.0, -3.0\] and \[4.0, 5.0\]; give the input bounds of the env's problem",
+        match=r"not between \[0.0, -3.0\] and \[4.0, 5.0\]; give the input bounds of the env's",
     ):
         add(buffer_of(envs=1), [{"safe_action": np.array(executed)}])
 

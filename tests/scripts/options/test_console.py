@@ -1,4 +1,4 @@
-"""How errors end a command, how much is printed, and that every way to start a command is the same."""
+"""How errors end a command, how much is printed, and that all ways to start one are the same."""
 
 from __future__ import annotations
 
