@@ -90,6 +90,7 @@ def render(
         inputs=text_options.inputs_of(env.system, policy, names, learned or ()),
     )
     problem = make_problem(env.full_id, **env.arguments)
+    still = out.suffix.lower() == ".png"
     with progress_bar("Drawing") as tell:
         runs = make_runs(
             problem,
@@ -100,20 +101,12 @@ def render(
             knowledge=knowledge,
             learned=learned or (),
         )
-        every = (
-            problem.steps
-            if out.suffix.lower() == ".png"
-            else steps_a_frame(out, problem.dt, problem.steps)
-        )
+        every = problem.steps if still else steps_a_frame(out, problem.dt, problem.steps)
         count = write_film(out, frames_of(runs, every, problem.steps, tell), every * problem.dt)
     console = stdout()
     for each in runs:
         say(console, each.summary())
-    size = (
-        "a still"
-        if out.suffix.lower() == ".png"
-        else f"{count} frames, {count * every * problem.dt:.2f} s"
-    )
+    size = "a still" if still else f"{count} frames, {count * every * problem.dt:.2f} s"
     say(console, f"{out}: {size}")
     write_result(
         json_file,
