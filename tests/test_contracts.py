@@ -64,7 +64,7 @@ them, for they are ordinary words."""
 
 MODULES = {
     "actors": "sb3_actor",
-    "blocks": "fixed_batch",
+    "blocks": "base",
     "craft": "quadrotor",
     "mistakes": "validation",
     "places": "object_import",

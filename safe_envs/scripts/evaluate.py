@@ -48,7 +48,7 @@ def evaluate(
     differences.
 
     With --rare the probability of a violation is printed instead, with its interval and what plain
-    Monte Carlo would need.
+    Monte Carlo would need. For the columns see `docs/guides/evaluate.md`.
     """
     reads = text_options.inputs_of(env.system, policy, filters or (), learned or (), filter_spec)
     text_options.require_outputs(json, plot, episodes_out=episodes_out, inputs=reads)
@@ -133,7 +133,7 @@ def _evaluate_rare(
     """Estimate, print and write.
 
     Raises:
-        ConfigurationError: One of the refused options was given.
+        ConfigurationError: one of the refused options was given.
     """
     from safe_envs.agents.rare_events.estimate import estimate_rare
     from safe_envs.scripts.reports.rare_report import print_rare

@@ -82,7 +82,7 @@ def identify(
     """
     from safe_envs.registry import make_problem, title_of
     from safe_envs.scripts.reports.identify_answer import (
-        Identification,
+        IdentifyAnswer,
         Source,
         compare,
     )
@@ -107,7 +107,7 @@ def identify(
         warnings.simplefilter("ignore", IdentifiabilityWarning)
         learned = learner(problem, seed=seed, progress=tell, **chosen)
     learned.save(out)
-    found = Identification(
+    found = IdentifyAnswer(
         env_id=env.full_id,
         title=title_of(env.full_id, arguments),
         problem=problem,
@@ -115,7 +115,7 @@ def identify(
         functions=compare(learned, problem, seed),
         options=arguments,
         seed=seed,
-        source=None if data is None or transitions is None else Source.of(data, transitions),
+        source=None if data is None or transitions is None else Source(data, transitions),
         out=out,
         use=env.evaluate_command("--filter", _filter_of(method), "--learned", str(out)),
     )

@@ -79,20 +79,18 @@ def render(
             f"--filter {filter_name} and --compare {compare} are both there; give one of them"
         )
     require_film(out)
-    names = (
-        None
-        if filter_name is None and compare is None
-        else [filter_name]
-        if filter_name is not None
-        else split_filters(compare or "")
-    )
+    if compare is not None:
+        names = split_filters(compare)
+    else:
+        names = [] if filter_name is None else [filter_name]
     text_options.require_outputs(
         json_file,
         None,
         out=out,
-        inputs=text_options.inputs_of(env.system, policy, names or (), learned or ()),
+        inputs=text_options.inputs_of(env.system, policy, names, learned or ()),
     )
     problem = make_problem(env.full_id, **env.arguments)
+    still = out.suffix.lower() == ".png"
     with progress_bar("Drawing") as tell:
         runs = make_runs(
             problem,
@@ -103,20 +101,12 @@ def render(
             knowledge=knowledge,
             learned=learned or (),
         )
-        every = (
-            problem.steps
-            if out.suffix.lower() == ".png"
-            else steps_a_frame(out, problem.dt, problem.steps)
-        )
+        every = problem.steps if still else steps_a_frame(out, problem.dt, problem.steps)
         count = write_film(out, frames_of(runs, every, problem.steps, tell), every * problem.dt)
     console = stdout()
     for each in runs:
         say(console, each.summary())
-    size = (
-        "a still"
-        if out.suffix.lower() == ".png"
-        else f"{count} frames, {count * every * problem.dt:.2f} s"
-    )
+    size = "a still" if still else f"{count} frames, {count * every * problem.dt:.2f} s"
     say(console, f"{out}: {size}")
     write_result(
         json_file,
@@ -203,7 +193,7 @@ class Run:
         return self._world.render()
 
     def summary(self) -> str:
-        """How the episode went."""
+        """Return how the episode went."""
         safe = "safe" if self._violated_at is None else f"violation at {self._violated_at:.2f} s"
         share = (
             f", {self._info['episode_interventions']} interventions"
@@ -237,6 +227,15 @@ def make_runs(
     learned: Sequence[Path],
 ) -> list[Run]:
     """Return an episode for each filter, all with the same seed, at its start.
+
+    Args:
+        problem: what is simulated.
+        names: of the filters.
+        policy: name of the policy.
+        trust: load a policy's .zip, which runs code in it.
+        seed: of start, noise and learning.
+        knowledge: of the filters.
+        learned: files of learned models.
 
     Raises:
         ConfigurationError: a filter or the policy is unknown or does not fit the problem.

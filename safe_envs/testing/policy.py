@@ -8,7 +8,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.policies.base import Policy
-from safe_envs.agents.policies.custom import as_policy, policy_name
+from safe_envs.agents.policies.custom import policy_name
 from safe_envs.agents.policies.registry import make_policy
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
@@ -49,11 +49,7 @@ def check_policy(
     """
     if isinstance(problem, str):
         problem = make_problem(problem)
-    actor = (
-        make_policy(policy, problem, trust)
-        if isinstance(policy, str)
-        else as_policy(policy, problem)
-    )
+    actor = make_policy(policy, problem, trust)
     found = _Checked(actor, problem, seed, min(steps, problem.steps))
     together = found.actions(range(episodes))
     again = found.actions(range(episodes))

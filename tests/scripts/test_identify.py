@@ -223,7 +223,7 @@ def test_what_is_said_of_data_from_elsewhere():
         data.signature, data.x, data.u, data.successors[:, 0], 0.01 * np.arange(1, data.points + 1)
     )
     assert (
-        str(Source.of(Path("log.npz"), logged))
+        str(Source(Path("log.npz"), logged))
         == f"in steps of 0.01 to {0.01 * data.points:g} s, from elsewhere"
     )
 

@@ -134,6 +134,9 @@ def measure(
         seed: of all randomness.
         progress: called with the part of the work that is done, from 0 to 1.
 
+    Returns:
+        A measurement for each start, with the bounds that it contradicts.
+
     Raises:
         ConfigurationError: as `evaluate`.
     """
@@ -155,7 +158,12 @@ def measure(
 
 
 def starts_of(problem: SafetyProblem, seed: int = 0) -> np.ndarray:
-    """Return the starts that bounds are averaged over, shape (B, n); one if all are the same."""
+    """Return the starts that bounds are averaged over, shape (B, n); one if all are the same.
+
+    Args:
+        problem: whose starts they are.
+        seed: of the draws.
+    """
     return draw_starts(problem, STARTS if problem.starts[problem.start].uniforms else 1, seed)
 
 

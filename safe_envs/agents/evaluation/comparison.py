@@ -53,6 +53,9 @@ def pair_counts(first: np.ndarray, second: np.ndarray) -> Table:
     Args:
         first: which episodes are safe with the one, shape (E,).
         second: which of the same are with the other.
+
+    Returns:
+        The four counts.
     """
     counts = (first & second, first & ~second, second & ~first, ~(first | second))
     both, only_first, only_second, neither = (int(np.count_nonzero(each)) for each in counts)
@@ -68,6 +71,9 @@ def compare_all(safe: Mapping[str, Sequence[np.ndarray]], confidence: float) -> 
         safe: by filter, which episodes are safe, shape (E,): once, or with each of several
             identifications.
         confidence: of the interval of the difference of the rates.
+
+    Returns:
+        A comparison for each pair.
     """
     return [
         _compare(second, first, _tables(safe[second], safe[first]), confidence)

@@ -66,7 +66,12 @@ def judged(row: Bounded, ci_high: float) -> Bounded:
 
 
 def withheld(row: Bounded, reason: str) -> Bounded:
-    """Return a row without its bounds, and with the reason."""
+    """Return a row without its bounds, and with the reason.
+
+    Args:
+        row: with bounds.
+        reason: how they are contradicted.
+    """
     note, posterior = f"withheld: {reason}", row.posterior_bound
     row = replace(row, withheld=reason, estimated_bound=None)
     if posterior is None:

@@ -8,8 +8,8 @@ import numpy as np
 
 from safe_envs.agents.evaluation.rounding import may_touch, touches
 from safe_envs.agents.evaluation.rows import EpisodeResults, EpisodeSummary
+from safe_envs.agents.evaluation.running_sum import RunningSum
 from safe_envs.agents.evaluation.statistics import (
-    RunningSum,
     rate_interval,
     safety_curve,
     share,
@@ -90,7 +90,15 @@ class EpisodeBatch:
         )
 
     def touching(self, problem: SafetyProblem, count: int) -> int:
-        """Count the violations among the first `count` episodes that only touch h = 0."""
+        """Count the violations among the first `count` episodes that only touch h = 0.
+
+        Args:
+            problem: whose barriers they are.
+            count: number of episodes.
+
+        Returns:
+            The number of such violations.
+        """
         low, part = self.h_min[:count], ~self.safe[:count]
         part &= may_touch(low, self.watch.depth[:count])
         if not part.any():

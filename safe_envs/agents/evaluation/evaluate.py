@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
@@ -13,25 +13,22 @@ from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.episode_batch import EpisodeStatistics, PlayedBatch
 from safe_envs.agents.evaluation.guarantees import GuaranteeAverager, together
 from safe_envs.agents.evaluation.identification import describe, seconds_of
-from safe_envs.agents.evaluation.parallel_rollout import play_in_processes
 from safe_envs.agents.evaluation.repeats import pooled
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
 from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
-from safe_envs.agents.evaluation.rollout import Env, Progress, play
+from safe_envs.agents.evaluation.rollout import play, play_in_processes
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import (
-    UNFILTERED,
     EvaluationSpec,
     Filter,
+    Progress,
     RunSettings,
+    listed,
 )
+from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.evaluation.trajectories import Trajectories
-from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import Condition, FilterSpec
-from safe_envs.wrappers.learning import LearnedModel
-
-__all__ = ["UNFILTERED", "Evaluation", "evaluate", "package_versions", "run_evaluation"]
+from safe_envs.wrappers import Condition
 
 
 def evaluate(
@@ -39,24 +36,13 @@ def evaluate(
     policy: Any = "nominal",
     filters: Sequence[Filter] | Filter | None = None,
     *,
-    trust: bool = False,
-    options: Mapping[str, Any] | None = None,
-    episodes: int = 1000,
-    seed: int = 0,
     num_envs: int = 1024,
-    knowledge: str = "model",
-    objective: str = "nearest",
-    confidence: float = 0.95,
-    bounds: bool = True,
-    filter_spec: FilterSpec | str | None = None,
-    learned: Sequence[LearnedModel | Path | str] = (),
-    repeats: int = 1,
-    monitoring: str = "discrete",
     jobs: int = 1,
-    progress: Progress | None = None,
     record: bool = False,
+    progress: Progress | None = None,
+    **fields: Any,
 ) -> Evaluation:
-    """Estimate the safety of a policy under each filter.
+    """RareEstimate the safety of a policy under each filter.
 
     An episode is safe if every barrier is positive at every control instant, its start included;
     with continuous monitoring between them too, see `BrownianBridge`, which changes neither control
@@ -77,48 +63,22 @@ def evaluate(
     `safe_envs.agents.evaluation.statistics.repeated_interval`.
 
     Args:
-        problem: see `EvaluationSpec`, as for all arguments but the last ones.
+        problem: a `SafetyProblem`, or the id of an env.
         policy: a name, a path, an object with `predict`, a class, or a function of a batch.
         filters: texts and conditions, or one of them; by default "none" and the problem's own.
-        trust: load a policy's .zip, which runs code that it contains.
-        options: arguments of `gym.make` for an id.
-        episodes: number for each filter.
-        seed: whole number from 0.
         num_envs: how many episodes to simulate side by side.
-        knowledge: what the filters know, "model" or "plant".
-        objective: of the filters, "nearest" or "clf".
-        confidence: of all intervals, between 0 and 1.
-        bounds: look for bounds, which takes a search of the safe set for each filter.
-        filter_spec: how filters see a third-party env.
-        learned: models, or files of `safe-envs identify`, to use in place of learning.
-        repeats: number of identifications of what is learned.
-        monitoring: where h is checked, "discrete" or "continuous".
         jobs: number of processes; the result is the same.
-        progress: called with the part of the work that is done, from 0 to 1.
         record: keep trajectories for pictures.
+        progress: called with the part of the work that is done, from 0 to 1.
+        **fields: all else that determines the result, such as `episodes`, `seed`, `options`,
+            `knowledge`, `learned`, `repeats` and `monitoring`: see `EvaluationSpec`.
 
     Raises:
         ConfigurationError: An argument names something unknown or is out of range.
         RelativeDegreeError: A condition does not suit a barrier.
         NumericalError: A simulation or a condition left the finite numbers.
     """
-    spec = EvaluationSpec(
-        problem=problem,
-        policy=policy,
-        filters=[filters] if isinstance(filters, str | Condition) else filters,
-        options=options or {},
-        filter_spec=filter_spec,
-        learned=learned,
-        trust=trust,
-        episodes=episodes,
-        seed=seed,
-        knowledge=knowledge,
-        objective=objective,
-        confidence=confidence,
-        bounds=bounds,
-        repeats=repeats,
-        monitoring=monitoring,
-    )
+    spec = EvaluationSpec(problem, policy, listed(filters), **fields)
     return run_evaluation(spec, RunSettings(num_envs, jobs, record, progress))
 
 
@@ -129,9 +89,7 @@ def run_evaluation(spec: EvaluationSpec, settings: RunSettings | None = None) ->
         spec: all that determines the result.
         settings: how it is run.
     """
-    settings = settings or RunSettings()
-    runner = _Runner(ResolvedEvaluation(spec), settings)
-    return runner.run()
+    return _Runner(ResolvedEvaluation(spec), settings or RunSettings()).run()
 
 
 class _Runner:
@@ -157,13 +115,7 @@ class _Runner:
             name: [resolved.env(conditions, size) for conditions in each]
             for name, each in resolved.filters.items()
         }
-        config = {
-            **resolved.config(),
-            **{
-                name: getattr(spec, name)
-                for name in ("episodes", "seed", "repeats", "confidence", "monitoring")
-            },
-        }
+        config = {**resolved.config(), "episodes": spec.episodes, "repeats": spec.repeats}
         shape = (resolved.problem.steps, resolved.problem.plant.n, spec.episodes)
         trajectories = (
             {name: Trajectories(*shape) for name in resolved.names} if settings.record else {}
@@ -190,7 +142,7 @@ class _Runner:
             episodes,
             visited,
             resolved.learning.models(),
-            resolved.target.is_deterministic(resolved.policy),
+            resolved.is_deterministic,
         )
 
     def _simulated(
@@ -229,8 +181,8 @@ class _Runner:
                 self._bridge,
             )
         return play_in_processes(
-            self._resolved,
-            conditions,
+            partial(self._resolved.env, conditions),
+            self._resolved.policy,
             spec.episodes,
             spec.seed,
             settings.num_envs,

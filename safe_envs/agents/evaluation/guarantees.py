@@ -11,7 +11,8 @@ import numpy as np
 
 from safe_envs.agents.evaluation.contradiction import by_states, withheld
 from safe_envs.agents.evaluation.rows import BoundSummary, PosteriorSummary
-from safe_envs.agents.evaluation.statistics import RunningSum, share
+from safe_envs.agents.evaluation.running_sum import RunningSum
+from safe_envs.agents.evaluation.statistics import share
 from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import SafeEnvsError

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from safe_envs.agents.evaluation.rollout import Progress
 from safe_envs.agents.evaluation.rows import LearningSummary
+from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import (

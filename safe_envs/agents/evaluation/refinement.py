@@ -10,8 +10,8 @@ from safe_envs.agents.evaluation.comparison import pair_counts
 from safe_envs.agents.evaluation.contradiction import judged
 from safe_envs.agents.evaluation.evaluate import evaluate
 from safe_envs.agents.evaluation.results import Evaluation
-from safe_envs.agents.evaluation.rollout import Progress
 from safe_envs.agents.evaluation.rows import EvaluationRow
+from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.statistics import paired_difference_interval
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
@@ -106,6 +106,9 @@ def refine(
         progress: called with the part of the work of all three that is done, from 0 to 1.
         record: keep trajectories of the first evaluation for pictures.
         **arguments: the others of `evaluate`.
+
+    Returns:
+        The three evaluations, and the rates with each period.
 
     Raises:
         ConfigurationError: as for `evaluate`, or dt cannot be divided.

@@ -8,20 +8,28 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.identification import Learning
-from safe_envs.agents.evaluation.rollout import Env, Progress
 from safe_envs.agents.evaluation.spec import (
     UNFILTERED,
     EvaluationSpec,
+    Progress,
     conditions_in,
     filter_text,
 )
-from safe_envs.agents.evaluation.targets import make_target
+from safe_envs.agents.evaluation.targets import Env, make_target
 from safe_envs.agents.jobs.fingerprint import file_checksum
+from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.policies.custom import policy_name
-from safe_envs.agents.policies.registry import policy_file
+from safe_envs.agents.policies.registry import make_policy, policy_file
+from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import Condition, parse_conditions, require_readable, spec_of
+from safe_envs.wrappers import (
+    Condition,
+    SafetyFilterVectorWrapper,
+    parse_conditions,
+    require_readable,
+    spec_of,
+)
 from safe_envs.wrappers.conditions import learned_parts, require_known
 
 
@@ -49,16 +57,10 @@ class ResolvedEvaluation:
         self.spec = spec
         self.target = make_target(spec.problem, spec.options, spec.filter_spec)
         self.problem = self.target.problem
-        if spec.monitoring == "continuous" and self.target.filter_spec is not None:
-            raise ConfigurationError(
-                "monitoring = 'continuous': the path of a third-party env between its steps is"
-                " unknown; use 'discrete'"
-            )
-        given = spec.policy
-        self.policy = (
-            self.target.make_policy(given, spec.trust)
-            if isinstance(given, str)
-            else self.target.adapt_policy(given)
+        if self.target.filter_spec is not None:
+            _require_third_party(spec)
+        self.policy = make_policy(
+            spec.policy, self.problem, spec.trust, self.target.spaces, self.target.filter_spec
         )
         asked = (UNFILTERED, self.target.filter) if spec.filters is None else spec.filters
         filters = {filter_text(each): each for each in asked}
@@ -122,11 +124,38 @@ class ResolvedEvaluation:
             conditions: one for each barrier; none for the unfiltered env.
             num_envs: size of the batch.
         """
-        env = self.target.env(conditions, self.spec.knowledge, self.spec.objective, num_envs)
+        env = self.filtered(self.target.env(num_envs), conditions)
         env.reset(seed=0)
         space: Any = env.action_space
         env.step(np.clip(np.zeros(space.shape, dtype=space.dtype), space.low, space.high))
         return env
+
+    def filtered(self, env: Any, conditions: Sequence[Condition]) -> Env:
+        """Return a batch of envs behind the filter of conditions.
+
+        Args:
+            env: unfiltered.
+            conditions: one for each barrier; none for the unfiltered env.
+
+        Returns:
+            The env itself without conditions.
+        """
+        if not conditions:
+            return env
+        return SafetyFilterVectorWrapper(env, conditions, self.spec.knowledge, self.spec.objective)
+
+    @property
+    def is_frozen(self) -> bool:
+        """Whether nothing is random after the start of an episode."""
+        plan, policy = self.problem, self.policy
+        noise = Integrator(plan.plant, plan.dt, plan.substeps, "arrays").channels
+        return not noise and (policy.deterministic if isinstance(policy, Policy) else True)
+
+    @property
+    def is_deterministic(self) -> bool:
+        """Whether all episodes are one and the same, as far as is known."""
+        random_start = self.problem.starts[self.problem.start].uniforms
+        return self.target.filter_spec is None and self.is_frozen and not random_start
 
     def config(self) -> dict[str, Any]:
         """Return all that determines the result as JSON-able data, once filters are read."""
@@ -145,6 +174,9 @@ class ResolvedEvaluation:
             ],
             "knowledge": spec.knowledge,
             "objective": spec.objective,
+            "seed": spec.seed,
+            "confidence": spec.confidence,
+            "monitoring": spec.monitoring,
         }
 
 
@@ -165,6 +197,20 @@ class WorkParts:
         report = self._progress
         return (
             None if report is None else lambda done: report((before + done / whole) / self._parts)
+        )
+
+
+def _require_third_party(spec: EvaluationSpec) -> None:
+    """Raise ConfigurationError for what cannot be had of a third-party env."""
+    if spec.monitoring == "continuous":
+        raise ConfigurationError(
+            "monitoring = 'continuous': the path of a third-party env between its steps is"
+            " unknown; use 'discrete'"
+        )
+    if spec.knowledge != "model":
+        raise ConfigurationError(
+            f"knowledge = {shown(spec.knowledge)}: of a third-party env nothing is known but the"
+            " model"
         )
 
 

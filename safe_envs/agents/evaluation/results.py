@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.evaluation.comparison import Comparison
+from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.rows import EpisodeResults, EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
 from safe_envs.agents.evaluation.trajectories import Trajectories
@@ -15,7 +16,6 @@ from safe_envs.agents.evaluation.visited_states import VisitedStates
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rate_text import percent, percent_in
 from safe_envs.wrappers.learning import LearnedModel
 
 _TEXT_TITLES = ("bound", "min h, median", "violations", "intervened", "infeasible", "return")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -12,25 +13,23 @@ from safe_envs.agents.evaluation.brownian_bridge import (
     Exponentials,
     smallest,
 )
-from safe_envs.agents.evaluation.episode_batch import (
-    EpisodeBatch,
-    EpisodeStatistics,
-    PlayedBatch,
-)
+from safe_envs.agents.evaluation.episode_batch import EpisodeBatch, PlayedBatch
+from safe_envs.agents.evaluation.spec import Progress
+from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.agents.jobs import blas_threads
+from safe_envs.agents.jobs.processes import compute_in_order
 from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.policies.custom import policy_name
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.info import Info
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import InvalidInputError, SafeEnvsError, shortened
-from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyMonitorVector
+from safe_envs.wrappers import SafetyMonitorVector
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
 
-Env = SafeVectorEnv | SafetyMonitorVector | SafetyFilterVectorWrapper
-Progress = Callable[[float], None]
-"""Is called with the number, or the part, of the work that is done."""
+_PARTS = 4
+"""Parts into which the work of each process is divided, so that there is progress to report."""
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -43,34 +42,6 @@ def episode_seed(seed: int, episode: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=(episode,)).generate_state(1, np.uint64)[0])
 
 
-def run_episodes(
-    env: Env,
-    policy: Any,
-    episodes: int,
-    seed: int,
-    progress: Progress | None = None,
-    trajectories: Trajectories | None = None,
-    bridge: BrownianBridge | None = None,
-) -> EpisodeStatistics:
-    """Simulate episodes 0..episodes-1 in batches of the size of the vector env.
-
-    Args:
-        env: with next-step autoreset: what it simulates after an episode's end is ignored.
-        policy: anything with Stable-Baselines3's `predict`.
-        episodes: how many.
-        seed: whose children seed the episodes.
-        progress: called after every step with the number of episodes that are done; those under
-            way count with the part that is done.
-        trajectories: is filled, if given.
-        bridge: gives the minimum h between control instants too; it changes neither control nor
-            noise.
-    """
-    found = EpisodeStatistics(readable(env).problem)
-    for batch in play(env, policy, range(episodes), seed, progress, trajectories, bridge):
-        found.add(batch)
-    return found
-
-
 def play(
     env: Env,
     policy: Any,
@@ -80,7 +51,22 @@ def play(
     trajectories: Trajectories | None = None,
     bridge: BrownianBridge | None = None,
 ) -> Iterator[PlayedBatch]:
-    """Simulate consecutive episodes batch by batch; see `run_episodes` for the arguments."""
+    """Simulate consecutive episodes in batches of the size of the vector env.
+
+    Args:
+        env: with next-step autoreset: what it simulates after an episode's end is ignored.
+        policy: anything with Stable-Baselines3's `predict`.
+        episodes: their numbers.
+        seed: whose children seed the episodes.
+        progress: called after every step with the number of episodes that are done; those under
+            way count with the part that is done.
+        trajectories: is filled, if given.
+        bridge: gives the minimum h between control instants too; it changes neither control nor
+            noise.
+
+    Returns:
+        Each batch once its episodes have ended.
+    """
     world = readable(env)
     for first in range(episodes.start, episodes.stop, env.num_envs):
         count = min(env.num_envs, episodes.stop - first)
@@ -102,6 +88,56 @@ def play(
             batch.touching(world.problem, count),
             batch.watch.visited(count),
         )
+
+
+def play_in_processes(
+    make_env: Callable[[int], Env],
+    policy: Any,
+    episodes: int,
+    seed: int,
+    num_envs: int,
+    jobs: int,
+    continuous: bool,
+    progress: Progress | None,
+) -> Iterator[PlayedBatch]:
+    """Simulate episodes 0..episodes-1 by `jobs` processes, which remain for the next call.
+
+    Args:
+        make_env: makes a vector env of a size.
+        policy: anything with Stable-Baselines3's `predict`.
+        episodes: how many.
+        seed: whose children seed the episodes.
+        num_envs: how many to simulate side by side in each process, at most.
+        jobs: number of processes.
+        continuous: whether to monitor h between control instants.
+        progress: receives the number of episodes that are done.
+
+    Returns:
+        The batches in the order of the episodes.
+
+    Raises:
+        ConfigurationError: Something cannot be sent to a process, mostly a custom policy.
+        WorkersLostError: A process was ended from outside.
+    """
+    size = max(1, math.ceil(episodes / (jobs * _PARTS)))
+    parts = [range(first, min(first + size, episodes)) for first in range(0, episodes, size)]
+    shared = (make_env, policy, seed, num_envs, continuous)
+    for part, batches in zip(parts, compute_in_order(_played, shared, parts, jobs), strict=True):
+        yield from batches
+        if progress:
+            progress(part.stop)
+
+
+def _played(
+    shared: tuple[Callable[[int], Env], Any, int, int, bool], part: range
+) -> list[PlayedBatch]:
+    make_env, policy, seed, num_envs, continuous = shared
+    env = make_env(min(num_envs, len(part)))
+    bridge = BrownianBridge(readable(env).problem) if continuous else None
+    try:
+        return list(play(env, policy, part, seed, bridge=bridge))
+    finally:
+        env.close()
 
 
 class _MinimumWatch:

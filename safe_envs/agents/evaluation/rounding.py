@@ -25,6 +25,9 @@ def may_touch(lowest: np.ndarray, largest: np.ndarray) -> np.ndarray:
     Args:
         lowest: minimum h of each episode, shape (B,).
         largest: maximum h of each, shape (B,).
+
+    Returns:
+        Which episodes are to be looked at, shape (B,).
     """
     return lowest >= -_NEARLY * largest
 

@@ -26,6 +26,9 @@ KNOWLEDGE = ("model", "plant")
 OBJECTIVES = ("nearest", "clf")
 """Objectives of filters."""
 
+Progress = Callable[[float], None]
+"""Is called with the number, or the part, of the work that is done."""
+
 Filter = str | Condition | Sequence[Condition]
 """A text, a condition for every barrier, or one condition for each barrier."""
 
@@ -96,7 +99,7 @@ class EvaluationSpec:
         require_monitoring(self.monitoring)
         if not isinstance(self.options or {}, Mapping):
             raise ConfigurationError(f"options = {shown(self.options)}; give a dictionary")
-        filters = (self.filters,) if isinstance(self.filters, str | Condition) else self.filters
+        filters = listed(self.filters)
         if not (filters is None or isinstance(filters, Iterable)):
             raise ConfigurationError(
                 f"filters = {shown(filters)}; give texts such as 'hocbf:p=2,8', and conditions"
@@ -173,7 +176,7 @@ class RunSettings:
     num_envs: int = 1024
     jobs: int = 1
     record: bool = False
-    progress: Callable[[float], None] | None = None
+    progress: Progress | None = None
 
     def __post_init__(self) -> None:
         require_whole("num_envs", self.num_envs, 1)
@@ -190,6 +193,11 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
     raise TypeError
+
+
+def listed(filters: Sequence[Filter] | Filter | None) -> Sequence[Filter] | None:
+    """Return filters as a sequence, where one may be given in place of several."""
+    return (filters,) if isinstance(filters, str | Condition) else filters
 
 
 def filter_text(given: Filter) -> str:

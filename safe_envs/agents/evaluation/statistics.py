@@ -29,12 +29,15 @@ def require_confidence(confidence: Any) -> None:
 def wilson_interval(
     successes: float, trials: float, confidence: float = 0.95
 ) -> tuple[float, float]:
-    """Wilson's score interval for the probability of success of independent trials.
+    """Return Wilson's score interval for the probability of success of independent trials.
 
     Args:
         successes: how many of the trials succeeded.
         trials: at least 1.
         confidence: of the two-sided interval.
+
+    Returns:
+        The ends of the interval.
 
     Raises:
         ConfigurationError: the counts contradict each other, or the confidence is out of range.
@@ -46,7 +49,7 @@ def wilson_interval(
 def rate_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
     """Return Wilson's interval, or Clopper and Pearson's where all or no trials succeeded.
 
-    Arguments and errors as for `wilson_interval`.
+    For arguments and errors see `wilson_interval`.
     """
     low, high = rate_band(_counts(successes, trials), trials, confidence)
     return float(low), float(high)
@@ -55,7 +58,16 @@ def rate_interval(successes: int, trials: int, confidence: float = 0.95) -> tupl
 def rate_band(
     successes: np.ndarray, trials: int, confidence: float = 0.95
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`rate_interval` of each count of an array: the lower and the upper ends."""
+    """Return the `rate_interval` of each count of an array.
+
+    Args:
+        successes: counts, shape (B,).
+        trials: of each.
+        confidence: of the intervals.
+
+    Returns:
+        The lower and the upper ends, shape (B,) each.
+    """
     low, high = _wilson(successes, trials, _deviations(confidence))
     # The tail beyond the end on the one side is p^trials; the other end is 0 or 1.
     exact = ((1.0 - confidence) / 2.0) ** (1.0 / trials)
@@ -184,11 +196,14 @@ def log_normal_interval(
 
 
 def mcnemar_p(only_first: int, only_second: int) -> float:
-    """McNemar's exact two-sided p value: were the pairs that differ fair coins?
+    """Return McNemar's exact two-sided p value: were the pairs that differ fair coins?
 
     Args:
         only_first: pairs in which only the first succeeded.
         only_second: pairs in which only the second succeeded.
+
+    Returns:
+        The p value.
     """
     from scipy.special import bdtr
 
@@ -225,25 +240,6 @@ def _counts(successes: float, trials: float) -> np.ndarray:
             " successes"
         )
     return np.asarray(successes)
-
-
-class RunningSum:
-    """Sum of values in the order given, the same to the last bit in any portions."""
-
-    def __init__(self) -> None:
-        self.total = 0.0
-
-    @classmethod
-    def of(cls, values: np.ndarray) -> float:
-        """Return the sum of values, shape (B,), added one after the other."""
-        found = cls()
-        found.add(values)
-        return found.total
-
-    def add(self, values: np.ndarray) -> None:
-        """Add values, shape (B,), one after the other."""
-        # cumsum is sequential, where sum() would pair the values up by position.
-        self.total = float(np.cumsum(np.concatenate(([self.total], values)))[-1])
 
 
 @dataclass(frozen=True)
@@ -289,5 +285,10 @@ def curve_instants(steps: int) -> np.ndarray:
 
 
 def share(part: float, whole: float) -> float | None:
-    """Return part / whole, or None where there is nothing to share."""
+    """Return part / whole, or None where there is nothing to share.
+
+    Args:
+        part: of the whole.
+        whole: 0 where there is nothing.
+    """
     return part / whole if whole else None

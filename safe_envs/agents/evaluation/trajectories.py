@@ -33,7 +33,15 @@ class Trajectories:
         self.states = np.full((steps + 1, min(episodes, _KEPT_STATES), states), np.nan)
 
     def note(self, k: int, first: int, present: np.ndarray, h: np.ndarray, x: Components) -> None:
-        """Keep instant k of a batch that begins with the episode `first`."""
+        """Keep instant k of a batch that begins with the episode `first`.
+
+        Args:
+            k: the instant.
+            first: number of the first episode.
+            present: which episodes are under way, shape (B,).
+            h: smallest barrier values, shape (B,).
+            x: components of the states, each of shape (B,).
+        """
         self._put(self.barrier[k], first, present, h)
         for j, component in enumerate(x):
             self._put(self.states[k, :, j], first, present, component)

@@ -34,7 +34,7 @@ class VisitedStates:
 
     @classmethod
     def nothing(cls, problem: SafetyProblem) -> VisitedStates:
-        """Of no episodes."""
+        """Return those of no episodes."""
         n, m = len(problem.states), len(problem.inputs)
         return cls(np.empty((0, n)), np.empty((0, m)), np.empty(0), np.empty((0, n)), np.empty(0))
 

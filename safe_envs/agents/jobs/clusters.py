@@ -48,8 +48,8 @@ def dask_settings(address: str, report: Callable[[str], None]) -> Iterator[dict[
 
     Args:
         address: of the scheduler.
-        report: receives a message when it has lost all its workers. If none come for minutes, joblib
-            raises ConfigurationError.
+        report: receives a message when it has lost all its workers. If none come for minutes,
+            joblib raises ConfigurationError.
 
     Raises:
         ConfigurationError: there is no scheduler, or it has no workers.

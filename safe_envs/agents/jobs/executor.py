@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from typing import Any, cast
 
 from safe_envs.agents.jobs.clusters import TaskLostError, dask_settings, ray_settings
-from safe_envs.agents.jobs.job import Job, Outcome, outcome_of
+from safe_envs.agents.jobs.job import Job, JobOutcome, outcome_of
 from safe_envs.agents.jobs.processes import local_processes
 from safe_envs.errors import (
     ConfigurationError,
@@ -87,7 +87,7 @@ class Backend:
 def run(
     jobs: Iterable[Job],
     backend: Backend,
-    keep: Callable[[Outcome], None],
+    keep: Callable[[JobOutcome], None],
     report: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Compute jobs, each once.
@@ -101,8 +101,8 @@ def run(
         jobs: what to compute. The results do not depend on their order.
         backend: where.
         keep: receives each outcome as soon as it exists, in the order of completion.
-        report: receives what the user should know meanwhile, such as that a cluster has lost all its
-            workers; called by any thread.
+        report: receives what the user should know meanwhile, such as that a cluster has lost all
+            its workers; called by any thread.
 
     Raises:
         ConfigurationError: a cluster cannot be reached, or has no workers.
@@ -136,7 +136,7 @@ def run(
                 error = loss if was_alone else _alone(job, take)
                 if error is not None:
                     message = f"the process that computed it ended: {error}"
-                    keep(Outcome(job.key, None, message, 0.0))
+                    keep(JobOutcome(job.key, None, message, 0.0))
                     del missing[job.key]
                 if any_computed and (error is not None or not under_way):
                     break
@@ -177,7 +177,7 @@ def _spread(jobs: Sequence[Job]) -> Sequence[Job]:
 
 def _outcomes(
     jobs: Sequence[Job], backend: Backend, report: Callable[[str], None]
-) -> Generator[Outcome, None, None]:
+) -> Generator[JobOutcome, None, None]:
     """Yield outcomes in the order of completion.
 
     Raises:
@@ -196,7 +196,7 @@ def _outcomes(
         # One job is one task, so that each outcome is kept as soon as it exists.
         parallel = Parallel(return_as="generator_unordered", batch_size=1, **settings)  # pyright: ignore[reportArgumentType]
         with (
-            closing(cast("Generator[Outcome, None, None]", parallel(tasks()))) as outcomes,
+            closing(cast("Generator[JobOutcome, None, None]", parallel(tasks()))) as outcomes,
             warnings.catch_warnings(),
         ):
             # joblib warns of tasks that nobody waits for, which closing this early intends.

@@ -32,7 +32,7 @@ class Job(Protocol):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class JobOutcome:
     """The end of a job.
 
     Attributes:
@@ -48,7 +48,7 @@ class Outcome:
     seconds: float
 
 
-def outcome_of(job: Job) -> Outcome:
+def outcome_of(job: Job) -> JobOutcome:
     """Compute a job on one thread; an exception becomes the error of the outcome."""
     from threadpoolctl import threadpool_limits
 
@@ -62,7 +62,7 @@ def outcome_of(job: Job) -> Outcome:
         error = str(raised)
     except Exception as raised:
         error = f"{type(raised).__name__}: {raised}{_where(raised)}"
-    return Outcome(job.key, result, error, time.perf_counter() - began)
+    return JobOutcome(job.key, result, error, time.perf_counter() - began)
 
 
 def _where(error: Exception) -> str:

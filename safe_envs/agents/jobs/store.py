@@ -80,7 +80,7 @@ class ResultStore:
         """Return the content of a file with its configuration, whatever that is; None without one.
 
         Raises:
-            ConfigurationError: the file is damaged or altered.
+            ConfigurationError: the file is damaged or altered; see `reading`.
         """
         path = self.path(key)
         if not os.path.exists(path):
@@ -96,6 +96,10 @@ class ResultStore:
 
     def read(self, key: str, configuration: Mapping[str, Any]) -> Document | None:
         """Return the content that was kept for a key under an equal configuration, or None.
+
+        Args:
+            key: name of the file.
+            configuration: as for `keep`.
 
         Raises:
             ConfigurationError: the file is damaged or altered.
@@ -141,7 +145,12 @@ def make_folder(folder: Path) -> None:
 
 
 def remove_stale(folder: Path, pattern: str) -> None:
-    """Remove files of a pattern that nobody has written to for an hour."""
+    """Remove files of a pattern that nobody has written to for an hour.
+
+    Args:
+        folder: to look in.
+        pattern: of the names.
+    """
     for path in folder.glob(pattern):
         with suppress(OSError):
             if time.time() - path.stat().st_mtime > _STALE:
@@ -155,6 +164,9 @@ def reading(path: Path, advice: str = "remove it, and it is computed again") -> 
     Args:
         path: of the file or folder.
         advice: what the user can do, to end the message with.
+
+    Returns:
+        The context.
 
     Raises:
         ConfigurationError: the block raised an exception, other than one of this project's.

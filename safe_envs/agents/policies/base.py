@@ -1,4 +1,4 @@
-"""The interface of a policy, and the name of the file of a saved one."""
+"""The interface of a policy, its bases, and the name of the file of a saved one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.errors import InvalidInputError
+from safe_envs.errors import ConfigurationError, InvalidInputError
+
+BLOCK = 128
+"""Observations in a block; see `BlockPolicy`."""
 
 POLICY_FILE = "policy.npz"
 """Name of the file of a policy that was saved as data; see `safe_envs.agents.policies.network`."""
@@ -60,6 +63,62 @@ class Policy(ABC):
         """
 
 
+class StatelessPolicy(Policy):
+    """Base of the policies whose actions depend on the observations alone.
+
+    Args:
+        width: number k of the entries of an observation.
+    """
+
+    def __init__(self, width: int) -> None:
+        self._width = width
+
+    @abstractmethod
+    def actions(self, given: np.ndarray) -> np.ndarray:
+        """Return the actions at one observation (k,) or a batch (B, k), in double precision."""
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, Any]:
+        """Check the observations and choose actions; see `Policy.predict`.
+
+        Raises:
+            InvalidInputError: The observation has another shape than (k,) or (B, k).
+        """
+        return self.actions(checked_observation(observation, self._width)), state
+
+
+class BlockPolicy(StatelessPolicy):
+    """Base of the policies that are networks.
+
+    A matrix product rounds a row differently in batches of different sizes. So every network call
+    gets a block of the same number of rows, with an episode always in the same row of its block.
+    """
+
+    _offset = 0
+
+    @abstractmethod
+    def act(self, block: np.ndarray) -> np.ndarray:
+        """Return the actions (BLOCK, m) at observations (BLOCK, k) in float32."""
+
+    def begin(self, episodes: range, seed: int) -> None:
+        """Remember in which row of its block the first episode belongs; see `Policy.begin`."""
+        self._offset = episodes.start % BLOCK
+
+    def actions(self, given: np.ndarray) -> np.ndarray:
+        """Ask the network for its deterministic actions; see `StatelessPolicy.actions`."""
+        rows = np.atleast_2d(given)
+        end = self._offset + len(rows)
+        padded = np.zeros((-(-end // BLOCK) * BLOCK, self._width), dtype=np.float32)
+        padded[self._offset : end] = rows
+        found = [self.act(padded[k : k + BLOCK]) for k in range(0, len(padded), BLOCK)]
+        return np.concatenate(found)[self._offset : end].reshape(*given.shape[:-1], -1)
+
+
 def checked_observation(observation: Any, width: int) -> np.ndarray:
     """Return observations in double precision.
 
@@ -88,3 +147,37 @@ def saved_policy_file(path: Path) -> Path | None:
     if os.path.isdir(path):
         return path / POLICY_FILE
     return path if path.suffix == ".npz" else None
+
+
+def require_spaces(
+    what: str, network: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]
+) -> None:
+    """Raise ConfigurationError unless a network takes an env's observations and gives its actions.
+
+    Args:
+        what: the network is, to begin the message with.
+        network: a policy of Stable-Baselines3.
+        observation_space: of the env that it is to act in.
+        action_space: of that env.
+    """
+    spaces = (
+        ("observation", network.observation_space, observation_space),
+        ("action", network.action_space, action_space),
+    )
+    for kind, trained, wanted in spaces:
+        if trained != wanted:
+            raise ConfigurationError(
+                f"{what} was trained for another {kind} space, {_difference(trained, wanted)}"
+            )
+
+
+def _difference(trained: gym.Space[Any], wanted: gym.Space[Any]) -> str:
+    if (
+        not (isinstance(trained, gym.spaces.Box) and isinstance(wanted, gym.spaces.Box))
+        or trained.shape != wanted.shape
+    ):
+        return f"{trained}; the env's is {wanted}"
+    theirs, ours = [
+        f"between {space.low.tolist()} and {space.high.tolist()}" for space in (trained, wanted)
+    ]
+    return f"{theirs}; the env's is {ours}"

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from safe_envs.agents.policies.base import Policy, checked_observation
+from safe_envs.agents.policies.base import StatelessPolicy
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import ConfigurationError, NumericalError
 from safe_envs.problem.clf import CLF
@@ -18,7 +16,7 @@ from safe_envs.wrappers.filter_qp import (
 )
 
 
-class CLFController(Policy):
+class CLFController(StatelessPolicy):
     """Minimizes w_u |u|^2 + w_d d^2 subject to AV + rate V <= d and the input bounds, exactly.
 
     It is the joint QP of `safe_envs.wrappers.SafetyFilter` without barriers: put a filter with
@@ -43,28 +41,20 @@ class CLFController(Policy):
                 f"{problem.name} has no control Lyapunov function; use the policy nominal, or"
                 " give one"
             )
+        super().__init__(len(problem.features))
         self._name = problem.name
-        self._width = len(problem.features)
         self._columns = _columns_of_states(problem)
         self._center, self._half = center_and_half_width(problem)
         low, high = [pair[0] for pair in problem.box], [pair[1] for pair in problem.box]
         qp = FilterQP(problem.model, (), low, high, [1.0] * problem.model.m, [], problem.dt, goal)
         self._floats, self._arrays = FilterQPSolver(qp, "floats"), FilterQPSolver(qp, "arrays")
 
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: Any = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, Any]:
-        """Solve the QP; see `Policy.predict`. Actions are in double precision.
+    def actions(self, given: np.ndarray) -> np.ndarray:
+        """Solve the QP; see `StatelessPolicy.actions`.
 
         Raises:
-            InvalidInputError: the observation has another shape than (k,) or (B, k).
-            NumericalError: the goal has no finite value at an observation.
+            NumericalError: The goal has no finite value at an observation.
         """
-        given = checked_observation(observation, self._width)
         x = np.ascontiguousarray(given[..., self._columns].T)
         try:
             if given.ndim == 1:
@@ -81,10 +71,9 @@ class CLFController(Policy):
             raise NumericalError(
                 f"the goal of {self._name!r} has no finite value at the observation {row.tolist()}"
             ) from error
-        actions = np.stack(
+        return np.stack(
             [(u - c) / w for u, c, w in zip(inputs, self._center, self._half, strict=True)], axis=-1
         )
-        return actions, state
 
 
 def _columns_of_states(problem: SafetyProblem) -> list[int]:

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.agents.policies.base import Policy, Spaces, checked_observation
+from safe_envs.agents.policies.base import Spaces, StatelessPolicy
 from safe_envs.errors import (
     ConfigurationError,
     InvalidInputError,
@@ -19,7 +19,7 @@ from safe_envs.errors import (
 from safe_envs.problem.problem import SafetyProblem
 
 
-class FunctionPolicy(Policy):
+class FunctionPolicy(StatelessPolicy):
     """A function of a batch of observations as a policy.
 
     Args:
@@ -30,23 +30,16 @@ class FunctionPolicy(Policy):
     """
 
     def __init__(self, function: Callable[[np.ndarray], Any], width: int, inputs: int) -> None:
-        self._function = function
-        self._width, self._m = width, inputs
+        super().__init__(width)
+        self._function, self._m = function, inputs
         self.name = policy_name(function)
 
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: Any = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, Any]:
-        """Call the function; see `Policy.predict`.
+    def actions(self, given: np.ndarray) -> np.ndarray:
+        """Call the function; see `StatelessPolicy.actions`.
 
         Raises:
             InvalidInputError: The function fails, or returns anything but (B, m) finite numbers.
         """
-        given = checked_observation(observation, self._width)
         rows = np.atleast_2d(given)
         try:
             actions = np.asarray(self._function(rows), dtype=np.float64)
@@ -70,7 +63,7 @@ class FunctionPolicy(Policy):
                 f"the policy {self.name} {reason} for {len(rows)} observations; return finite"
                 f" numbers in [-1, 1] of shape ({len(rows)}, {self._m}), a row for each observation"
             )
-        return actions.reshape(*given.shape[:-1], self._m), state
+        return actions.reshape(*given.shape[:-1], self._m)
 
 
 def as_policy(given: Any, problem: SafetyProblem, spaces: Spaces | None = None) -> Any:

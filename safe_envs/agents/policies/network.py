@@ -10,9 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.policies.base import POLICY_FILE, saved_policy_file
-from safe_envs.agents.policies.fixed_batch import BlockPolicy
-from safe_envs.agents.policies.sb3 import require_spaces
+from safe_envs.agents.policies.base import (
+    POLICY_FILE,
+    BlockPolicy,
+    require_spaces,
+    saved_policy_file,
+)
 from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
 from safe_envs.problem.problem import SafetyProblem

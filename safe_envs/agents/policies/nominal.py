@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from safe_envs.agents.policies.base import Policy, checked_observation
+from safe_envs.agents.policies.base import StatelessPolicy
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import NumericalError
@@ -15,7 +13,7 @@ from safe_envs.problem.problem import SafetyProblem
 _CHUNK = 128
 
 
-class NominalController(Policy):
+class NominalController(StatelessPolicy):
     """The problem's nominal controller.
 
     It sees the observation and the model's parameters, never the plant.
@@ -25,8 +23,8 @@ class NominalController(Policy):
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
+        super().__init__(len(problem.features))
         self._name = problem.name
-        self._width = len(problem.features)
         self._box = problem.box
         self._center, self._half = center_and_half_width(problem)
         symbols = tuple(f.symbol for f in problem.features)
@@ -34,20 +32,12 @@ class NominalController(Policy):
         self._floats = compile_function(symbols, laws, "floats")
         self._arrays = compile_function(symbols, laws, "arrays")
 
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: Any = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, Any]:
-        """Evaluate the laws; actions are in double precision.
+    def actions(self, given: np.ndarray) -> np.ndarray:
+        """Evaluate the laws; see `StatelessPolicy.actions`.
 
         Raises:
-            InvalidInputError: the observation has another shape than (k,) or (B, k).
-            NumericalError: a law has no finite value at an observation.
+            NumericalError: A law has no finite value at an observation.
         """
-        given = checked_observation(observation, self._width)
         if given.ndim == 1:
             try:
                 inputs = self._floats(*given.tolist())
@@ -64,7 +54,7 @@ class NominalController(Policy):
         if not np.isfinite(actions).all():
             rows = given.reshape(-1, self._width)
             raise self._undefined(rows[~np.isfinite(actions.reshape(len(rows), -1)).all(axis=1)][0])
-        return actions, state
+        return actions
 
     def _undefined(self, observation: np.ndarray) -> NumericalError:
         return NumericalError(
@@ -73,7 +63,7 @@ class NominalController(Policy):
         )
 
 
-class ZeroController(Policy):
+class ZeroController(StatelessPolicy):
     """The physical input 0, or the point within the input bounds nearest to it.
 
     Args:
@@ -81,24 +71,17 @@ class ZeroController(Policy):
     """
 
     def __init__(self, problem: SafetyProblem) -> None:
-        self._width = len(problem.features)
+        super().__init__(len(problem.features))
         center, half = center_and_half_width(problem)
         inputs = [min(max(0.0, low), high) for low, high in problem.box]
         self._action = np.array([(u - c) / w for u, c, w in zip(inputs, center, half, strict=True)])
 
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: Any = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, Any]:
-        """Return the one action, for every observation; see `Policy.predict`."""
-        given = checked_observation(observation, self._width)
-        return np.tile(self._action, (*given.shape[:-1], 1)), state
+    def actions(self, given: np.ndarray) -> np.ndarray:
+        """Return the one action for every observation; see `StatelessPolicy.actions`."""
+        return np.tile(self._action, (*given.shape[:-1], 1))
 
 
-class RandomPolicy(Policy):
+class RandomPolicy(StatelessPolicy):
     """Independent actions, uniform in [-1, 1].
 
     In an evaluation every episode has a stream of its own, so that its actions do not depend on the
@@ -112,7 +95,7 @@ class RandomPolicy(Policy):
     deterministic = False
 
     def __init__(self, problem: SafetyProblem, seed: int = 0) -> None:
-        self._width = len(problem.features)
+        super().__init__(len(problem.features))
         self._m = len(problem.inputs)
         self._generator = np.random.default_rng(seed)
         self._streams: list[np.random.Generator] = []
@@ -127,20 +110,14 @@ class RandomPolicy(Policy):
         self._drawn = np.empty((len(episodes), _CHUNK, self._m))
         self._position = _CHUNK
 
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: Any = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, Any]:
-        """Draw actions; see `Policy.predict`. They stay random with `deterministic`."""
-        batch = checked_observation(observation, self._width).shape[:-1]
+    def actions(self, given: np.ndarray) -> np.ndarray:
+        """Draw actions; see `StatelessPolicy.actions`."""
+        batch = given.shape[:-1]
         if batch != (len(self._streams),):
-            return self._generator.uniform(-1.0, 1.0, (*batch, self._m)), state
+            return self._generator.uniform(-1.0, 1.0, (*batch, self._m))
         if self._position == _CHUNK:
             for stream, drawn in zip(self._streams, self._drawn, strict=True):
                 stream.random(out=drawn)
             self._position = 0
         self._position += 1
-        return 2.0 * self._drawn[:, self._position - 1] - 1.0, state
+        return 2.0 * self._drawn[:, self._position - 1] - 1.0

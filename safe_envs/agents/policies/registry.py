@@ -20,12 +20,14 @@ from safe_envs.agents.policies.nominal import (
     RandomPolicy,
     ZeroController,
 )
+from safe_envs.agents.policies.third_party import ModelPolicy
 from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.object_import import load_object, resolved
 from safe_envs.plugins import POLICIES as POLICY_PLUGINS
 from safe_envs.plugins import load_plugin, module_of, plugin_names
 from safe_envs.problem.problem import SafetyProblem
+from safe_envs.wrappers import FilterSpec
 
 _NAMED: dict[str, Any] = {
     "nominal": NominalController,
@@ -41,20 +43,26 @@ _PLACE = re.compile(r".+\.py:\w+|[^\W\d]\w*(\.\w+)*:\w+")
 
 
 def make_policy(
-    name: str, problem: SafetyProblem, trust: bool = False, spaces: Spaces | None = None
+    given: Any,
+    problem: SafetyProblem,
+    trust: bool = False,
+    spaces: Spaces | None = None,
+    filter_spec: FilterSpec | None = None,
 ) -> Any:
-    """Return a named policy, one from a Python file, or one that was trained.
+    """Return a named policy, one from a Python file, one that was trained, or one for an object.
 
     Args:
-        name: one of `POLICIES`; a name that an installed package declares in the entry-point group
+        given: one of `POLICIES`; a name that an installed package declares in the entry-point group
             `safe_envs.policies`; FILE.py:NAME or MODULE:NAME of what `as_policy` takes, which runs
             that code; the folder where `safe-envs train` or
             `safe_envs.agents.policies.network.save_policy` put a policy, or one of the two files of
-            the policy in it; or the path of a .zip of Stable-Baselines3.
+            the policy in it; the path of a .zip of Stable-Baselines3; or what `as_policy` takes.
         problem: which the policy is to act in.
         trust: load a .zip too, which runs code that it contains.
         spaces: of observations and actions, which a policy that was trained or is a function is to
             fit; by default those of the problem's env.
+        filter_spec: how filters see the third-party env whose model the problem is, if it is one.
+            The built-in policies see the model's state there.
 
     Returns:
         A `Policy`, or another object with its `predict`.
@@ -63,6 +71,13 @@ def make_policy(
         ConfigurationError: There is neither such a name nor such a file, the file does not fit the
             problem, or it is a .zip that is not trusted.
     """
+    if not isinstance(given, str):
+        return as_policy(given, problem, spaces)
+    name = given
+    if filter_spec is not None and spaces is not None:
+        _require_third_party(name, problem.name, filter_spec)
+        if name in _NAMED:
+            return ModelPolicy(_NAMED[name](problem), filter_spec, problem, spaces[1])
     if name in _NAMED:
         return _NAMED[name](problem)
     if name in plugin_names(POLICY_PLUGINS):
@@ -82,6 +97,20 @@ def make_policy(
     return _make_of_archive(
         Path(name), spaces or (observation_box(problem), action_box(problem)), trust
     )
+
+
+def _require_third_party(name: str, env_id: str, filter_spec: FilterSpec) -> None:
+    """Raise ConfigurationError for the name of a policy that a third-party env cannot have."""
+    if name == "nominal" and filter_spec.nominal is None:
+        raise ConfigurationError(
+            "the filter spec has no nominal controller; give it one, or --policy zero, random or a"
+            " .zip"
+        )
+    if name not in POLICIES and saved_policy_file(Path(name)) is not None:
+        raise ConfigurationError(
+            f"{name} holds a policy for envs of this project; give a .zip of Stable-Baselines3 for"
+            f" {env_id}"
+        )
 
 
 def _make_of_archive(path: Path, spaces: Spaces, trust: bool) -> Policy:

@@ -12,7 +12,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from safe_envs.agents.policies.fixed_batch import BlockPolicy
+from safe_envs.agents.policies.base import BlockPolicy, require_spaces
 from safe_envs.bounded_reading import open_archive, open_regular
 from safe_envs.errors import ConfigurationError, shortened
 
@@ -104,40 +104,6 @@ def _is_archive(path: Path) -> bool:
         zlib.error,
     ):
         return False
-
-
-def require_spaces(
-    what: str, network: Any, observation_space: gym.Space[Any], action_space: gym.Space[Any]
-) -> None:
-    """Raise ConfigurationError unless a network takes an env's observations and gives its actions.
-
-    Args:
-        what: the network is, to begin the message with.
-        network: a policy of Stable-Baselines3.
-        observation_space: of the env that it is to act in.
-        action_space: of that env.
-    """
-    spaces = (
-        ("observation", network.observation_space, observation_space),
-        ("action", network.action_space, action_space),
-    )
-    for kind, trained, wanted in spaces:
-        if trained != wanted:
-            raise ConfigurationError(
-                f"{what} was trained for another {kind} space, {_difference(trained, wanted)}"
-            )
-
-
-def _difference(trained: gym.Space[Any], wanted: gym.Space[Any]) -> str:
-    if (
-        not (isinstance(trained, gym.spaces.Box) and isinstance(wanted, gym.spaces.Box))
-        or trained.shape != wanted.shape
-    ):
-        return f"{trained}; the env's is {wanted}"
-    theirs, ours = [
-        f"between {space.low.tolist()} and {space.high.tolist()}" for space in (trained, wanted)
-    ]
-    return f"{theirs}; the env's is {ours}"
 
 
 def _load(path: Path) -> Any:

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
-from safe_envs.agents.evaluation.rollout import Env, Progress
-from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter
+from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, listed
 from safe_envs.agents.evaluation.statistics import rate_interval
+from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.jobs.fingerprint import package_versions
-from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.rare_events.importance_sampling import (
     ImportanceSampling,
     TiltedNoiseEnv,
@@ -26,17 +23,14 @@ from safe_envs.agents.rare_events.importance_sampling import (
 )
 from safe_envs.agents.rare_events.rows import (
     BETTER,
-    Estimate,
     PlainEpisodes,
+    RareEstimate,
     RareRow,
     verdict,
 )
 from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Repetitions, Splitting
-from safe_envs.dynamics.integrators import Integrator
 from safe_envs.errors import NumericalError, require_whole
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import Condition, SafetyFilterVectorWrapper
-from safe_envs.wrappers.learning import LearnedModel
 
 PARTICLES = 250
 REPETITIONS = 20
@@ -76,20 +70,13 @@ def estimate_rare(
     policy: Any = "nominal",
     filters: Sequence[Filter] | Filter | None = None,
     *,
-    trust: bool = False,
-    options: Mapping[str, Any] | None = None,
     particles: int = PARTICLES,
     repetitions: int = REPETITIONS,
-    seed: int = 0,
     num_envs: int = 4096,
-    knowledge: str = "model",
-    objective: str = "nearest",
-    confidence: float = 0.95,
-    learned: Sequence[LearnedModel | Path | str] = (),
-    monitoring: str = "discrete",
     progress: Progress | None = None,
+    **fields: Any,
 ) -> RareEvaluation:
-    """Estimate the probability of a violation under each filter, by splitting on h.
+    """RareEstimate the probability of a violation under each filter, by splitting on h.
 
     See `safe_envs.agents.rare_events.splitting.Splitting`.
 
@@ -106,19 +93,13 @@ def estimate_rare(
         problem: as for `evaluate`, but no third-party env, whose state cannot be restored.
         policy: as for `evaluate`, without memory.
         filters: as for `evaluate`.
-        trust: as for `evaluate`.
-        options: as for `evaluate`.
         particles: episodes of a repetition.
         repetitions: independent ones, at least 10.
-        seed: of all randomness.
         num_envs: the most episodes side by side; another number is another draw of the same
             estimate.
-        knowledge: as for `evaluate`.
-        objective: as for `evaluate`.
-        confidence: of all intervals, between 0 and 1.
-        learned: as for `evaluate`; what is missing is learned once.
-        monitoring: as for `evaluate`.
         progress: called with the part of the work that is done, from 0 to 1.
+        **fields: `seed`, `options`, `knowledge`, `objective`, `confidence`, `learned`, `monitoring`
+            and `trust` of `EvaluationSpec`; what is missing is learned once.
 
     Raises:
         ConfigurationError: An argument names something unknown or is out of range, or the env or
@@ -132,31 +113,21 @@ def estimate_rare(
         ("num_envs", num_envs, 1),
     ):
         require_whole(name, value, least)
-    resolved = ResolvedEvaluation(
-        EvaluationSpec(
-            problem=problem,
-            policy=policy,
-            filters=[filters] if isinstance(filters, str | Condition) else filters,
-            options=options or {},
-            learned=learned,
-            trust=trust,
-            seed=seed,
-            knowledge=knowledge,
-            objective=objective,
-            confidence=confidence,
-            monitoring=monitoring,
-        )
+    # Those that are given here have no meaning for splitting, and are refused among the fields.
+    spec = EvaluationSpec(
+        problem,
+        policy,
+        listed(filters),
+        filter_spec=None,
+        episodes=1,
+        repeats=1,
+        bounds=False,
+        **fields,
     )
+    resolved = ResolvedEvaluation(spec)
     work = WorkParts(progress, len(resolved.learning.missing()) + 3 * len(resolved.names))
     resolved.learn(work.part)
-    config = {
-        **resolved.config(),
-        "particles": particles,
-        "repetitions": repetitions,
-        "seed": seed,
-        "confidence": confidence,
-        "monitoring": monitoring,
-    }
+    config = {**resolved.config(), "particles": particles, "repetitions": repetitions}
     estimator = _Estimator(resolved, particles, repetitions, num_envs, work)
     rows, speeds = [], []
     for name in resolved.names:
@@ -167,27 +138,6 @@ def estimate_rare(
             {"filter": name, "seconds": seconds, "steps_per_second": rows[-1].steps / seconds}
         )
     return RareEvaluation(resolved.problem, config, rows, {"num_envs": num_envs, "rows": speeds})
-
-
-def _why_frozen(world: SafetyProblem, policy: Any) -> str:
-    """Return why copies of an episode would all be the same, if so."""
-    random = not policy.deterministic if isinstance(policy, Policy) else False
-    if random or Integrator(world.plant, world.dt, world.substeps, "arrays").channels:
-        return ""
-    return (
-        "nothing is random after the start, so that copies of an episode go on like it; plain"
-        " episodes find all that there is"
-    )
-
-
-def _tilted_env(
-    resolved: ResolvedEvaluation, conditions: Sequence[Condition], lengths: np.ndarray
-) -> Env:
-    """Return a batch of envs whose noise may drift, behind a filter; see `TiltedNoiseEnv`."""
-    env, spec = TiltedNoiseEnv(resolved.problem, lengths), resolved.spec
-    if not conditions:
-        return env
-    return SafetyFilterVectorWrapper(env, conditions, spec.knowledge, spec.objective)
 
 
 @dataclass(frozen=True)
@@ -205,24 +155,33 @@ class _Estimator:
         resolved, spec = self.resolved, self.resolved.spec
         problem = resolved.problem
         nothing = RareRow(filter=name, policy=policy, status="none")
-        frozen = _why_frozen(problem, resolved.policy)
-        if frozen:
-            return replace(nothing, reason=frozen)
+        if resolved.is_frozen:
+            reason = (
+                "nothing is random after the start, so that copies of an episode go on like it;"
+                " plain episodes find all that there is"
+            )
+            return replace(nothing, reason=reason)
         bridge = BrownianBridge(problem) if spec.monitoring == "continuous" else None
-        make = partial(_tilted_env, resolved, resolved.filters[name][0])
+
+        def make(lengths: np.ndarray) -> Env:
+            tilted = TiltedNoiseEnv(problem, lengths)
+            return resolved.filtered(tilted, resolved.filters[name][0])
+
         how = (make, resolved.policy, spec.seed, self.num_envs, bridge)
         splitting, work = Splitting(*how), self.work
         power, pilot_steps = splitting.choose(self.particles, work.part())
         found = splitting.estimate(power, self.particles, self.repetitions, work.part())
-        last_part = work.part()
-        low, high = rate_interval(found.first, found.paths, spec.confidence)
-        plain = PlainEpisodes(found.paths, found.first, low, high, found.outside, found.kept_length)
-        steps = found.steps + pilot_steps
+        last_part, paths = work.part(), found.paths
+        low, high = rate_interval(found.first, paths.lowest.size, spec.confidence)
+        plain = PlainEpisodes(
+            paths.lowest.size, found.first, low, high, paths.outside, paths.kept_length
+        )
+        steps = paths.steps + pilot_steps
         nothing = replace(nothing, levels=float(found.levels.mean()), steps=steps, plain=plain)
-        if found.given_up:
+        if found.stuck or found.endless:
             return replace(nothing, reason=_why_none(found, self.particles, problem, plain))
         by = "splitting on h" if power == POWERS[0] else "splitting on h/sqrt(T - t)"
-        split = Estimate.of(by, found.estimates, spec.confidence)
+        split = RareEstimate.of(by, found.estimates, spec.confidence)
         if not found.levels.any():
             split = replace(split, method="plain episodes", ci_low=low, ci_high=high)
         drift, drift_steps = self._by_drift(
@@ -248,13 +207,13 @@ class _Estimator:
         found: Repetitions,
         to_beat: float,
         progress: Progress | None,
-    ) -> tuple[Estimate | None, int]:
+    ) -> tuple[RareEstimate | None, int]:
         """Return the estimate by importance sampling, and the control periods that it took.
 
         There is none unless it is predicted to be much better.
         """
         duration, sizes = self.resolved.problem.duration, (self.particles, self.repetitions)
-        length, deviation = optimal_tilt(found.girsanov_integrals, found.shares, duration)
+        length, deviation = optimal_tilt(*found.violating(), duration)
         if not BETTER * deviation / math.sqrt(math.prod(sizes)) < to_beat:
             return None, 0
         try:
@@ -265,7 +224,7 @@ class _Estimator:
         if not (estimates > 0.0).all():
             return None, steps
         method = f"drift of {length:.3g}/sqrt(s)"
-        return Estimate.of(method, estimates, self.resolved.spec.confidence), steps
+        return RareEstimate.of(method, estimates, self.resolved.spec.confidence), steps
 
 
 def _why_none(

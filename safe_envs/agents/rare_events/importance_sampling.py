@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, smallest
-from safe_envs.agents.evaluation.rollout import Env, Progress
+from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.policies.base import Policy
+from safe_envs.agents.rare_events.particles import MakeTiltedEnv
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import gradient
 from safe_envs.envs.simulation import NoiseStreams
@@ -169,10 +170,6 @@ def optimal_tilt(
     return float(found.x), math.sqrt(max(math.exp(min(found.fun, 700.0)) - 1.0, 0.0))
 
 
-MakeTiltedEnv = Callable[[np.ndarray], Env]
-"""A filtered `TiltedNoiseEnv` with drifts of given lengths."""
-
-
 @dataclass(frozen=True)
 class ImportanceSampling:
     """How to estimate the probability that h comes down to 0, from episodes that are pushed there.
@@ -197,7 +194,7 @@ class ImportanceSampling:
     def estimate(
         self, length: float, episodes: int, repetitions: int, progress: Progress | None = None
     ) -> tuple[np.ndarray, int]:
-        """Estimate the probability.
+        """RareEstimate the probability.
 
         Args:
             length: of the drift, in 1/sqrt(s).

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, smallest
-from safe_envs.agents.evaluation.rollout import Env
+from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.policies.base import Policy
-from safe_envs.agents.rare_events.importance_sampling import MakeTiltedEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.env_wrappers.safety_filter_vector import readable
+
+MakeTiltedEnv = Callable[[np.ndarray], Env]
+"""Makes a filtered `TiltedNoiseEnv` with drifts of given lengths."""
 
 _FIRST_ROOM = 64
 _FEWEST_ENVS = 64
@@ -30,21 +33,21 @@ class Records:
 
     def __init__(self, paths: int, states: int, features: int) -> None:
         self._count = np.zeros(paths, dtype=np.int64)
-        self._height = np.full((_FIRST_ROOM, paths), -np.inf)
-        self._time = np.zeros((_FIRST_ROOM, paths), dtype=np.int64)
-        self._ended = np.zeros((_FIRST_ROOM, paths), dtype=bool)
-        self._state = np.zeros((_FIRST_ROOM, paths, states))
-        self._observation = np.zeros((_FIRST_ROOM, paths, features), dtype=np.float32)
-        self._climbed = np.zeros((_FIRST_ROOM, paths, 2))
-
-    @property
-    def _kept(self) -> tuple[np.ndarray, ...]:
-        return self._height, self._time, self._ended, self._state, self._observation, self._climbed
+        shape = (_FIRST_ROOM, paths)
+        # Height, control instant, whether the episode ended, state, observation and integrals.
+        self._kept = [
+            np.full(shape, -np.inf),
+            np.zeros(shape, dtype=np.int64),
+            np.zeros(shape, dtype=bool),
+            np.zeros((*shape, states)),
+            np.zeros((*shape, features), dtype=np.float32),
+            np.zeros((*shape, 2)),
+        ]
 
     def clear(self, paths: np.ndarray) -> None:
         """Forget the records of some paths."""
         self._count[paths] = 0
-        self._height[:, paths] = -np.inf
+        self._kept[0][:, paths] = -np.inf
 
     def add(self, paths: np.ndarray, *entries: np.ndarray) -> None:
         """Note a record of each of some paths.
@@ -55,16 +58,21 @@ class Records:
               and `TiltedNoiseEnv.girsanov_integrals`.
         """
         rows = self._count[paths]
-        if rows.size and int(rows.max()) == len(self._height):
+        if rows.size and int(rows.max()) == len(self._kept[0]):
             self._grow()
         for kept, values in zip(self._kept, entries, strict=True):
             kept[rows, paths] = values
         self._count[paths] += 1
 
     def first_below(self, levels: np.ndarray, paths: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the first records of paths below levels, as the arguments of `add`."""
+        """Return the first records of paths below levels, as the arguments of `add`.
+
+        Args:
+            levels: heights, shape (B,).
+            paths: shape (B,).
+        """
         # Records fall along the first axis, and what was not filled is lower than all.
-        rows = (self._height[:, paths] >= levels).sum(axis=0)
+        rows = (self._kept[0][:, paths] >= levels).sum(axis=0)
         return tuple(kept[rows, paths] for kept in self._kept)
 
     def last(self, paths: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -72,13 +80,10 @@ class Records:
         return tuple(kept[self._count[paths] - 1, paths] for kept in self._kept)
 
     def _grow(self) -> None:
-        room = len(self._height)
-        for name in ("_height", "_time", "_ended", "_state", "_observation", "_climbed"):
-            old = getattr(self, name)
-            fill = np.full(
-                (room, *old.shape[1:]), -np.inf if name == "_height" else 0, dtype=old.dtype
-            )
-            setattr(self, name, np.concatenate([old, fill]))
+        self._kept = [
+            np.concatenate([old, np.full_like(old, 0 if i else -np.inf)])
+            for i, old in enumerate(self._kept)
+        ]
 
 
 class Particles:
@@ -147,14 +152,15 @@ class Particles:
                 at_start = info["barrier"].mean(axis=0)
                 self._units = np.where(at_start > 0.0, at_start, 1.0)
             h = smallest(info["barrier"][:count] / self._units)
+            # At the start the weight is 1.
             begun = (
+                h,
                 np.zeros(count, dtype=np.int64),
                 np.zeros(count, dtype=bool),
                 world.state[:count],
                 observation[:count],
+                world.girsanov_integrals[:count],
             )
-            # At the start the weight is 1.
-            begun = (h, *begun, world.girsanov_integrals[:count])
             self.outside += int(np.count_nonzero(h <= 0.0))
             lengths[some] = self._play(env, some, observation, begun)
         kept = lengths[self.lowest > 0.0]

@@ -18,7 +18,7 @@ _ROUGH = 1.0
 
 
 @dataclass(frozen=True)
-class Estimate:
+class RareEstimate:
     """A probability, from independent repetitions.
 
     Attributes:
@@ -38,7 +38,7 @@ class Estimate:
     estimates: list[float]
 
     @classmethod
-    def of(cls, method: str, estimates: np.ndarray, confidence: float) -> Estimate:
+    def of(cls, method: str, estimates: np.ndarray, confidence: float) -> RareEstimate:
         """Make an estimate from those of the repetitions, shape (R,), all above 0.
 
         Args:
@@ -85,7 +85,7 @@ class RareRow:
         policy: name of the policy.
         status: "estimated" or "none".
         reason: why there is no estimate.
-        method: as all up to `estimates` see `Estimate`; None without one.
+        method: as all up to `estimates` see `RareEstimate`; None without one.
         probability: of a violation.
         ci_low: lower end of its interval.
         ci_high: upper end.
@@ -113,7 +113,7 @@ class RareRow:
     plain_episodes_needed: float | None = None
     plain_steps_needed: float | None = None
     doubt: str | None = None
-    check: Estimate | None = None
+    check: RareEstimate | None = None
     levels: float = 0.0
     steps: int = 0
     plain: PlainEpisodes | None = None
@@ -124,8 +124,8 @@ class RareRow:
 
 
 def verdict(
-    split: Estimate, drift: Estimate | None, plain: PlainEpisodes
-) -> tuple[Estimate, Estimate | None, str | None]:
+    split: RareEstimate, drift: RareEstimate | None, plain: PlainEpisodes
+) -> tuple[RareEstimate, RareEstimate | None, str | None]:
     """Return which of two estimates is the result, which its check, and what contradicts it.
 
     Importance sampling's is the result if its relative error is less than half of splitting's and
@@ -159,5 +159,5 @@ def verdict(
     return found, check, doubt
 
 
-def _overlap(one: Estimate, other: Estimate | PlainEpisodes) -> bool:
+def _overlap(one: RareEstimate, other: RareEstimate | PlainEpisodes) -> bool:
     return one.ci_low <= other.ci_high and other.ci_low <= one.ci_high

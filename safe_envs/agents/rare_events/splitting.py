@@ -10,8 +10,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.jobs import blas_threads
-from safe_envs.agents.rare_events.importance_sampling import MakeTiltedEnv
-from safe_envs.agents.rare_events.particles import Particles
+from safe_envs.agents.rare_events.particles import MakeTiltedEnv, Particles
 
 KILLED = 0.75
 """Share of a repetition's paths that are killed at a level, at least."""
@@ -26,45 +25,6 @@ POWERS = (0.0, 0.5)
 _PILOTS = 10
 _FEWEST_PARTICLES = 50
 _OFTEN = 0.1
-
-
-@dataclass(frozen=True)
-class Repetitions:
-    """Independent estimates of one probability.
-
-    Attributes:
-        estimates: unbiased, shape (R,); those that were given up are 0.
-        levels: that each took, shape (R,).
-        steps: control periods that were simulated in all.
-        first: violations among the paths of the beginning, which are plain episodes.
-        paths: how many these are.
-        outside: how many of them start where h <= 0.
-        kept_length: mean length of those that do not violate, in control periods; None without any.
-        length: mean length of all of these, up to a violation, in control periods.
-        stuck: for each repetition all of whose paths stood at one level, h there.
-        endless: for each one that fell below `LEAST`, h of its last level.
-        girsanov_integrals: of the paths that violate, as in
-            `safe_envs.agents.rare_events.importance_sampling.TiltedNoiseEnv`, shape (V, 2).
-        shares: of the probability for which each of them stands, shape (V,).
-    """
-
-    estimates: np.ndarray
-    levels: np.ndarray
-    steps: int
-    first: int
-    paths: int
-    outside: int
-    kept_length: float | None
-    length: float
-    stuck: tuple[float, ...]
-    endless: tuple[float, ...]
-    girsanov_integrals: np.ndarray
-    shares: np.ndarray
-
-    @property
-    def given_up(self) -> int:
-        """Number of repetitions without an estimate."""
-        return len(self.stuck) + len(self.endless)
 
 
 @dataclass(frozen=True)
@@ -113,7 +73,7 @@ class Splitting:
             One of `POWERS`, and the control periods that were simulated.
         """
         count = max(particles // 5, _FEWEST_PARTICLES)
-        run = _Run(self, np.repeat(POWERS, _PILOTS), count, spawn_key=(0, 2))
+        run = Repetitions(self, np.repeat(POWERS, _PILOTS), count, spawn_key=(0, 2))
         often = run.first > _OFTEN * run.paths.lowest.size
         if not often:
             run.finish(progress)
@@ -127,7 +87,7 @@ class Splitting:
         repetitions: int,
         progress: Callable[[float], None] | None = None,
     ) -> Repetitions:
-        """Estimate the probability.
+        """RareEstimate the probability.
 
         Args:
             power: of the score.
@@ -135,25 +95,15 @@ class Splitting:
             repetitions: R.
             progress: called with the part of the way from the first level to 0.
 
+        Returns:
+            The estimates, and what the repetitions found.
+
         Raises:
             ConfigurationError: the policy has a memory.
         """
-        run = _Run(self, np.full(repetitions, power), particles, spawn_key=(1, 2))
-        length = run.paths.steps / run.paths.lowest.size
+        run = Repetitions(self, np.full(repetitions, power), particles, spawn_key=(1, 2))
         run.finish(progress)
-        return Repetitions(
-            run.estimates,
-            run.levels,
-            run.paths.steps,
-            run.first,
-            run.paths.lowest.size,
-            run.paths.outside,
-            run.paths.kept_length,
-            length,
-            tuple(run.stuck),
-            tuple(run.endless),
-            *run.violating(),
-        )
+        return run
 
 
 def _spread(estimates: np.ndarray) -> tuple[int, float]:
@@ -165,17 +115,31 @@ def _spread(estimates: np.ndarray) -> tuple[int, float]:
     return len(estimates) - len(found), float(np.std(np.log(found))) if len(found) else 0.0
 
 
-class _Run:
-    """Repetitions under way, after their first episodes."""
+class Repetitions:
+    """Independent estimates of one probability, which are final after `finish`.
+
+    Args:
+        how: the envs, the policy and the seed.
+        powers: of the score of each repetition, shape (R,).
+        particles: N.
+        spawn_key: of their seed.
+
+    Attributes:
+        estimates: unbiased, shape (R,); those that were given up are 0.
+        levels: that each took, shape (R,).
+        paths: of all repetitions; those of the beginning are plain episodes.
+        first: violations among the paths of the beginning.
+        length: mean length of all of these, up to a violation, in control periods.
+        stuck: for each repetition all of whose paths stood at one level, h there.
+        endless: for each one that fell below `LEAST`, h of its last level.
+    """
 
     def __init__(
         self, how: Splitting, powers: np.ndarray, particles: int, spawn_key: Sequence[int]
     ) -> None:
         seed = np.random.SeedSequence(how.seed, spawn_key=spawn_key)
-        self._particles, self._rank = (
-            particles,
-            min(max(round(how.killed * particles), 1), particles - 1),
-        )
+        self._particles = particles
+        self._rank = min(max(round(how.killed * particles), 1), particles - 1)
         self._generator = np.random.default_rng(seed.spawn(1)[0])
         self.paths = Particles(
             how.make, how.policy, np.repeat(powers, particles), seed, how.num_envs, how.bridge
@@ -186,6 +150,7 @@ class _Run:
         with blas_threads.limited():
             self.paths.begin()
         self.first = int(np.count_nonzero(self.paths.lowest <= 0.0))
+        self.length = self.paths.steps / self.paths.lowest.size
 
     def finish(self, progress: Callable[[float], None] | None) -> None:
         """Go from level to level until every repetition has its estimate or is given up."""

@@ -1,4 +1,4 @@
-"""A cell of a sweep: one evaluation of one policy under one filter, and what identifies it."""
+"""The cells of a sweep: evaluations of one policy under one filter, and what identifies them."""
 
 from __future__ import annotations
 
@@ -112,6 +112,19 @@ class Cell:
                     f"the worker finds another content in {path}; put all files of a sweep on a"
                     " disk that workers share"
                 )
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Cells, in the order of their file.
+
+    Attributes:
+        cells: each once.
+        swept: names of the settings that are not the same in all of them.
+    """
+
+    cells: tuple[Cell, ...]
+    swept: tuple[str, ...]
 
 
 @cache

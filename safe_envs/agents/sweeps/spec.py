@@ -5,14 +5,13 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import file_checksum
-from safe_envs.agents.sweeps.cell import Cell, versions
+from safe_envs.agents.sweeps.cell import Cell, Sweep, versions
 from safe_envs.agents.sweeps.dependencies import (
     absolute,
     installed,
@@ -32,19 +31,6 @@ _TOGETHER = {"filter": ("env", "system", "knowledge", "objective"), "policy": ("
 
 _MOST_CELLS = 50_000
 """All of them are compared, in a second, before the first is computed."""
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """Cells, in the order of their file.
-
-    Attributes:
-        cells: each once.
-        swept: names of the settings that are not the same in all of them.
-    """
-
-    cells: tuple[Cell, ...]
-    swept: tuple[str, ...]
 
 
 def read_sweep(path: Path, trust: bool = False) -> Sweep:
@@ -107,7 +93,12 @@ def sweep_of(document: Any, trust: bool = False, what: str = "the sweep") -> Swe
 
 
 def describe(cell: Cell, names: Iterable[str]) -> str:
-    """Return a cell in a few words: its settings of these names."""
+    """Return a cell in a few words: its settings of these names.
+
+    Args:
+        cell: to describe.
+        names: of the settings.
+    """
     return ", ".join(
         f"{name} = {text_of(cell.settings[name])}" for name in names if name in cell.settings
     )

@@ -8,11 +8,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safe_envs.agents.jobs.job import Outcome
+from safe_envs.agents.jobs.job import JobOutcome
 from safe_envs.agents.jobs.store import ResultStore, reading, remove_stale
-from safe_envs.agents.sweeps.cell import Cell
+from safe_envs.agents.sweeps.cell import Cell, Sweep
 from safe_envs.agents.sweeps.settings import text_of
-from safe_envs.agents.sweeps.spec import Sweep
 from safe_envs.atomic_io import write_json
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
 from safe_envs.errors import ConfigurationError, shortened
@@ -82,7 +81,7 @@ class Store:
         missing = [cell for key, cell in self._cells.items() if key not in self._finished]
         return sorted(missing, key=lambda cell: cell.key in self._failed)
 
-    def keep(self, outcome: Outcome) -> None:
+    def keep(self, outcome: JobOutcome) -> None:
         """Write an outcome, unless it failed and another run has the result.
 
         Raises:

@@ -147,8 +147,8 @@ def _replay(problem: SafetyProblem, action: str, settings: dict[str, Any]) -> di
     given = [key for key in _OF_THE_BUFFER if key in settings]
     if given:
         raise ConfigurationError(
-            f"{', '.join(given)}: with a filter in the loop the replay buffer is that of --action; leave"
-            " it out"
+            f"{', '.join(given)}: with a filter in the loop the replay buffer is that of --action;"
+            " leave it out"
         )
     return replay_options(
         problem, action, n_steps=settings.pop("n_steps", 1), gamma=settings.pop("gamma", 0.99)

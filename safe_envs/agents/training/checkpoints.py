@@ -84,6 +84,9 @@ def keep_checkpoint(
         figures: of the training so far.
         seconds: that it took.
 
+    Returns:
+        The path of the checkpoint.
+
     Raises:
         ConfigurationError: it cannot be written, as on a full disk; the previous one remains.
     """
@@ -134,7 +137,8 @@ def restore_model(checkpoint: Path, model: Any, figures: SafetyFigures, n_timest
         Seconds that the training had taken by then.
 
     Raises:
-        ConfigurationError: the checkpoint cannot be read, or is that of another model.
+        ConfigurationError: the checkpoint cannot be read, see `reading`, or is that of another
+            model.
     """
     with reading(checkpoint, _ADVICE):
         document = json.loads(read_bytes(checkpoint / _STATE, _MOST_TEXT))

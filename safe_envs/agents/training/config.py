@@ -88,8 +88,8 @@ class Training:
             raise ConfigurationError(f"action = {self.action!r}; {nearest(self.action, ACTIONS)}")
         if self.action != ACTIONS[0] and not self.learns_on_executed:
             raise ConfigurationError(
-                f"action = {self.action!r} is for SAC and TD3 with a filter in the loop; leave it out: others"
-                " learn on what they propose"
+                f"action = {self.action!r} is for SAC and TD3 with a filter in the loop; leave it"
+                " out: others learn on what they propose"
             )
         if self.action == ACTIONS[0] and self.learns_on_executed and self.intervention_penalty:
             raise ConfigurationError(

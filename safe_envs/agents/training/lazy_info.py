@@ -49,7 +49,12 @@ class LazyInfo(dict[str, Any]):
         return key in self._left or dict.__contains__(self, key)
 
     def get(self, key: str, default: Any = None) -> Any:
-        """Return an entry, or the default if there is none."""
+        """Return an entry, or the default if there is none.
+
+        Args:
+            key: of the entry.
+            default: in its place.
+        """
         return self[key] if key in self._left else _get(self, key, default)
 
     def copy(self) -> LazyInfo:

@@ -114,6 +114,9 @@ class NativeVecEnv(VecEnv):
             indices: of the envs to return a result for.
             **method_kwargs: its keyword arguments.
 
+        Returns:
+            The result for each env.
+
         Raises:
             AttributeError: neither has it.
             ConfigurationError: the method advances the envs, which only this class may do.

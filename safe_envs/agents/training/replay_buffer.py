@@ -122,7 +122,7 @@ class FilteredReplayBuffer(ReplayBuffer):
             super().add(obs, next_obs, action, reward, done, infos)
 
     def _executed(self, proposed: np.ndarray, infos: list[dict[str, Any]]) -> np.ndarray:
-        """Return the executed actions in [-1, 1], or proposals without a filter, shape (n_envs, m)."""
+        """Return executed actions in [-1, 1], or proposals without a filter, shape (n_envs, m)."""
         each = _of_each(infos, "safe_action")
         if isinstance(each, np.ndarray):
             return self._normalized(each)
@@ -140,7 +140,8 @@ class FilteredReplayBuffer(ReplayBuffer):
             low, high = self._center - self._half, self._center + self._half
             raise ConfigurationError(
                 f"the executed actions {physical.tolist()} are not between {low.tolist()} and"
-                f" {high.tolist()}; give the input bounds of the env's problem, as replay_options(env) does"
+                f" {high.tolist()}; give the input bounds of the env's problem, as"
+                " replay_options(env) does"
             )
         return clipped
 
@@ -256,7 +257,7 @@ def _box_of(source: Any) -> tuple[tuple[float, float], ...]:
         ) from error
     if len(boxes) > 1:
         raise ConfigurationError(
-            f"the envs have different input bounds {sorted(boxes)}; one learner needs the same for all of"
-            " them"
+            f"the envs have different input bounds {sorted(boxes)}; one learner needs the"
+            " same for all of them"
         )
     return boxes.pop()

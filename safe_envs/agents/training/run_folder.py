@@ -105,7 +105,7 @@ def read_evaluations(folder: Path) -> list[dict[str, Any]]:
     """Return the evaluations so far.
 
     Raises:
-        ConfigurationError: their file is damaged or altered.
+        ConfigurationError: their file is damaged or altered; see `reading`.
     """
     path = folder / EVALUATIONS
     if not path.exists():

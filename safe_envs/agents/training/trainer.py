@@ -1,21 +1,60 @@
-"""Training of agents with a filter in the loop, which resumes after an interruption."""
+"""Training of agents with a filter in the loop, in parts, which resumes after an interruption.
+
+Each part begins with randomness of its own, which depends only on the seed and the number of steps
+until then; the episodes go on from one part to the next. So a training that was interrupted goes on
+after its last whole part exactly as it would have.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from stable_baselines3.common.callbacks import CallbackList, ConvertCallback
+from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
+from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import VecMonitor
 
+from safe_envs.agents.evaluation.evaluate import evaluate
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs import blas_threads
 from safe_envs.agents.jobs.store import make_folder
-from safe_envs.agents.training.checkpoints import remove_unfinished
+from safe_envs.agents.training.algorithms import MOST_SHOWN, new_model
+from safe_envs.agents.training.callbacks import ProgressLog, SafetyFigures
+from safe_envs.agents.training.checkpoints import (
+    copy_policy,
+    drop_replay_buffer,
+    keep_checkpoint,
+    last_checkpoint,
+    remove_unfinished,
+    restore_model,
+    resume_episodes,
+)
 from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.run_folder import LOCK, prepare, require_folder
-from safe_envs.agents.training.session import TrainingSession
-from safe_envs.errors import ConfigurationError
+from safe_envs.agents.training.hyperparameters import OFF_POLICY
+from safe_envs.agents.training.run_folder import (
+    BEST,
+    EVALUATIONS,
+    LOCK,
+    PROGRESS,
+    SHOWN,
+    prepare,
+    read_evaluations,
+    require_folder,
+)
+from safe_envs.agents.training.vec_env import make_sb3_env
+from safe_envs.atomic_io import write_json
+from safe_envs.errors import ConfigurationError, SafeEnvsError
 from safe_envs.file_locks import locked
+from safe_envs.registry import make_problem
+
+_OF_EVALUATIONS = 2**32 - 1
+"""Key of their seeds, which no number of steps is."""
 
 
 def train(
@@ -78,3 +117,162 @@ def train(
         with blas_threads.limited(training.threads):
             session.run(progress or (lambda _: None))
     return session.seconds
+
+
+class TrainingSession:
+    """One run of a training, from its beginning or from a checkpoint.
+
+    Attributes:
+        seconds: processor time that the learning took, in all runs of the training so far.
+
+    Args:
+        training: what to do.
+        folder: of the training.
+        resume: go on after the last checkpoint.
+    """
+
+    def __init__(self, training: Training, folder: Path, resume: bool = False) -> None:
+        self.seconds = 0.0
+        self._training, self._folder = training, folder
+        self._problem = make_problem(training.env_id, **training.options)
+        self._figures = SafetyFigures()
+        envs = VecMonitor(
+            make_sb3_env(
+                training.env_id,
+                training.num_envs,
+                training.filter,
+                knowledge=training.knowledge,
+                intervention_penalty=training.intervention_penalty,
+                **training.options,
+            )
+        )
+        action = training.action if training.learns_on_executed else None
+        self._model: Any = new_model(
+            training.algorithm, envs, self._problem, training.hyperparameters, action, training.seed
+        )
+        checkpoint = last_checkpoint(folder) if resume else None
+        if checkpoint is not None:
+            self.seconds = restore_model(
+                checkpoint, self._model, self._figures, training.n_timesteps
+            )
+        known = read_evaluations(folder) if resume else []
+        self._evaluations = [e for e in known if e["timesteps"] <= self._model.num_timesteps]
+
+    def log(self, tensorboard: Path | None) -> None:
+        """Log to the folder of the training, and to one for tensorboard."""
+        folder, done = self._folder, self._model.num_timesteps
+        outputs: list[Any] = [ProgressLog(folder / PROGRESS, done)]
+        if tensorboard is not None:
+            from torch.utils.tensorboard.writer import SummaryWriter
+
+            of_run = TensorBoardOutputFormat(str(tensorboard / folder.resolve().name))
+            of_run.writer.close()
+            # What was logged after the checkpoint is logged again.
+            of_run.writer = SummaryWriter(
+                of_run.writer.log_dir, purge_step=done + 1 if done else None
+            )
+            outputs.append(of_run)
+        self._model.set_logger(Logger(str(folder), outputs))
+
+    def run(self, progress: Callable[[float], None]) -> None:
+        """Train part by part, from the state of the model, and leave the finished policy."""
+        training, model, folder = self._training, self._model, self._folder
+        checkpoint = last_checkpoint(folder)
+        if checkpoint is not None and model.num_timesteps > max(
+            (e["timesteps"] for e in self._evaluations), default=0
+        ):
+            self._evaluate(checkpoint)
+        while model.num_timesteps < training.n_timesteps:
+            end = (model.num_timesteps // training.eval_freq + 1) * training.eval_freq
+            self._train_part(checkpoint, min(end, training.n_timesteps), progress)
+            checkpoint = keep_checkpoint(folder, model, self._problem, self._figures, self.seconds)
+            self._evaluate(checkpoint)
+        if checkpoint is not None:
+            copy_policy(checkpoint, folder)
+            drop_replay_buffer(checkpoint)
+        model.get_env().close()
+
+    def _train_part(
+        self, checkpoint: Path | None, end: int, progress: Callable[[float], None]
+    ) -> None:
+        training, model = self._training, self._model
+        seed = _child_seed(training.seed, model.num_timesteps)
+        set_random_seed(seed)
+        model.action_space.seed(seed)
+        if checkpoint is None:
+            model.get_env().seed(seed)
+        else:
+            resume_episodes(checkpoint, model, seed)
+
+        def note(_: dict[str, Any], __: dict[str, Any]) -> bool:
+            progress(min(model.num_timesteps / training.n_timesteps, 1.0))
+            return True  # anything else would end the training
+
+        # Schedules refer to the whole training, not to its part.
+        of_part = model._update_current_progress_remaining
+        model._update_current_progress_remaining = lambda done, _: of_part(
+            done, training.n_timesteps
+        )
+        began = time.process_time()
+        try:
+            model.learn(
+                end - model.num_timesteps,
+                CallbackList([self._figures, ConvertCallback(note)]),
+                log_interval=4 if training.algorithm in OFF_POLICY else 1,
+                reset_num_timesteps=False,
+            )
+        except (
+            ArithmeticError,
+            AssertionError,
+            LookupError,
+            RuntimeError,
+            TypeError,
+            ValueError,
+        ) as error:
+            if isinstance(error, SafeEnvsError):
+                raise
+            raise ConfigurationError(
+                f"the training failed after {model.num_timesteps} steps ({type(error).__name__}:"
+                f" {str(error)[:MOST_SHOWN]}): it diverged, or a hyperparameter is not allowed;"
+                f" they are {str(training.hyperparameters)[:MOST_SHOWN]}"
+            ) from error
+        finally:
+            del model._update_current_progress_remaining
+        self.seconds += time.process_time() - began
+        # What the last updates recorded would be lost if the training was interrupted now.
+        model.logger.dump(model.num_timesteps)
+
+    def _evaluate(self, checkpoint: Path) -> None:
+        """Evaluate a checkpoint, and keep its policy if its return is the best so far."""
+        training, model = self._training, self._model
+        seed = _child_seed(training.seed, _OF_EVALUATIONS)
+        found = evaluate(
+            training.env_id,
+            str(checkpoint),
+            [training.filter or UNFILTERED],
+            options=training.options,
+            episodes=training.eval_episodes,
+            seed=seed,
+            knowledge=training.knowledge,
+            bounds=False,
+        )
+        row = {k: v for k, v in found.rows[0].as_dict().items() if k not in ("curve", "policy")}
+        best = max((e["return_mean"] for e in self._evaluations), default=-np.inf)
+        self._evaluations.append(
+            {
+                "timesteps": model.num_timesteps,
+                "seed": seed,
+                **row,
+                "training": self._figures.figures(),
+            }
+        )
+        if row["return_mean"] > best:
+            copy_policy(checkpoint, self._folder / BEST)
+        for key in SHOWN:
+            model.logger.record(f"eval/{key}", row[key])
+        model.logger.dump(model.num_timesteps)
+        write_json(self._folder / EVALUATIONS, self._evaluations)
+
+
+def _child_seed(seed: int, *key: int) -> int:
+    return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1)[0])

@@ -11,12 +11,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from safe_envs.agents.evaluation.evaluate import UNFILTERED, Evaluation
+from safe_envs.agents.evaluation.rate_text import percent
+from safe_envs.agents.evaluation.results import Evaluation
+from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.policies.base import POLICY_FILE
 from safe_envs.atomic_io import write_atomically
 from safe_envs.dynamics.codegen import compile_function
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rate_text import percent
 from safe_envs.scripts.reports.evaluation_report import describe_system
 
 # Okabe and Ito's palette, which the colour-blind can tell apart; the unfiltered env always has the

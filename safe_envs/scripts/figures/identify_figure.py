@@ -16,7 +16,7 @@ from matplotlib.ticker import MaxNLocator
 
 from safe_envs.atomic_io import write_atomically
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, add_legend
-from safe_envs.scripts.reports.identify_answer import Function, Identification
+from safe_envs.scripts.reports.identify_answer import Function, IdentifyAnswer
 from safe_envs.scripts.reports.quantities import relative_text
 from safe_envs.wrappers.learning.models.noise import Diffusion
 from safe_envs.wrappers.learning.models.posterior import Posterior
@@ -41,7 +41,7 @@ _SAMPLES_HANDLE = Patch(color=COLORS[1], alpha=0.6, label="samples of the poster
 _TRUTH_HANDLE = Line2D([], [], color=_TRUTH, linewidth=1.4, label="truth")
 
 
-def draw(found: Identification, path: Path) -> None:
+def draw(found: IdentifyAnswer, path: Path) -> None:
     """Draw an identification, and write the picture whole or not at all.
 
     Args:
@@ -79,7 +79,7 @@ def draw(found: Identification, path: Path) -> None:
         write_atomically(path, lambda part: figure.savefig(part, dpi=150))
 
 
-def _levels(found: Identification) -> dict[str, tuple[int, Function]]:
+def _levels(found: IdentifyAnswer) -> dict[str, tuple[int, Function]]:
     """Return the constant variances to show as posteriors of sigma, by name, with their state."""
     diffusion = _constant_noise(found)
     named = {function.name: function for function in found.compared}
@@ -94,7 +94,7 @@ def _levels(found: Identification) -> dict[str, tuple[int, Function]]:
     return {function.name: (i, function) for i, function in noisy[:_MOST_LEVELS]}
 
 
-def _constant_noise(found: Identification) -> Diffusion | None:
+def _constant_noise(found: IdentifyAnswer) -> Diffusion | None:
     """Return the learned noise if it is constant."""
     learned = found.learned
     return (
@@ -154,7 +154,7 @@ def _draw_function(axes: Axes, function: Function) -> Line2D | Patch:
     return _ESTIMATE_HANDLE
 
 
-def _draw_level(axes: Axes, found: Identification, index: int, function: Function) -> None:
+def _draw_level(axes: Axes, found: IdentifyAnswer, index: int, function: Function) -> None:
     """Draw the posterior of the noise of a state, as in Fig. 6.2 of the thesis."""
     noise, state = _constant_noise(found), found.problem.states[index]
     assert noise is not None

@@ -11,7 +11,7 @@ from safe_envs.scripts.options.console import progress_bar
 
 if TYPE_CHECKING:
     from safe_envs.agents.jobs.executor import Backend
-    from safe_envs.agents.jobs.job import Job, Outcome
+    from safe_envs.agents.jobs.job import Job, JobOutcome
 
 
 def run_jobs(
@@ -19,9 +19,9 @@ def run_jobs(
     backend: Backend,
     out: Path,
     title: str,
-    keep: Callable[[Outcome], None] = lambda _: None,
-) -> list[Outcome]:
-    """Compute jobs; return the outcomes of those that failed.
+    keep: Callable[[JobOutcome], None] = lambda _: None,
+) -> list[JobOutcome]:
+    """Compute jobs with a progress bar.
 
     Args:
         jobs: what to compute.
@@ -29,13 +29,16 @@ def run_jobs(
         out: folder of the results, from which the same command resumes after a stop.
         title: of the progress bar.
         keep: receives each outcome as soon as it exists.
+
+    Returns:
+        The outcomes of the jobs that failed.
     """
     from safe_envs.agents.jobs.executor import run
 
-    ended: list[Outcome] = []
+    ended: list[JobOutcome] = []
     with progress_bar(title) as tell:
 
-        def note(outcome: Outcome) -> None:
+        def note(outcome: JobOutcome) -> None:
             keep(outcome)
             ended.append(outcome)
             if tell:

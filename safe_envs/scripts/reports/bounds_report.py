@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from safe_envs.agents.evaluation.bound_check import Horizon, Measurement
-from safe_envs.rate_text import percent_in
+from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.quantities import share_text, state_text
 from safe_envs.scripts.reports.tables import make_table

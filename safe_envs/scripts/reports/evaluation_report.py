@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from rich.console import Console
 from rich.text import Text
 
 from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
 from safe_envs.agents.evaluation.comparison import Comparison
+from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.refinement import TOLERANCE, Refinement
 from safe_envs.agents.evaluation.results import Evaluation
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rate_text import percent, percent_in
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
 from safe_envs.scripts.reports.tables import make_table, print_whole
@@ -43,7 +46,12 @@ _VERDICTS = {
 
 
 def print_evaluation(console: Console, evaluation: Evaluation) -> None:
-    """Print a heading, a row for each filter, comparisons, and notes on how to read them."""
+    """Print a heading, a row for each filter, comparisons, and notes on how to read them.
+
+    Args:
+        console: to print on.
+        evaluation: to print.
+    """
     interval = _interval(evaluation)
     say(console, heading(evaluation))
     learned = learned_columns(evaluation.rows)
@@ -70,7 +78,12 @@ def print_evaluation(console: Console, evaluation: Evaluation) -> None:
 
 
 def print_refinement(console: Console, refinement: Refinement) -> None:
-    """Print the safety rates with each control period, and whether they have converged."""
+    """Print the safety rates with each control period, and whether they have converged.
+
+    Args:
+        console: to print on.
+        refinement: to print.
+    """
     interval = _interval(refinement.evaluations[0])
     say(
         console,
@@ -100,32 +113,35 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
 
 
 def heading(evaluation: Evaluation) -> Text:
-    """What was evaluated, in two lines."""
+    """Return what was evaluated, in two lines."""
     config = evaluation.config
-    title = Text(evaluation.title, style="bold")
     repeats = max((row.learning.repeats for row in evaluation.rows if row.learning), default=1)
     often = f" x {repeats} identifications" if repeats > 1 else ""
+    return heading_of(config, evaluation.problem, f"{config['episodes']} episodes{often}")
+
+
+def heading_of(config: Mapping[str, Any], problem: SafetyProblem, what: str) -> Text:
+    """Return what was evaluated, in two lines.
+
+    Args:
+        config: of the evaluation.
+        problem: that was evaluated.
+        what: number of the episodes.
+    """
+    title = Text(config["title"], style="bold")
     title.append(
-        f" | policy {config['policy']['name']} | {config['episodes']} episodes{often} | seed"
-        f" {config['seed']}",
-        style="not bold",
+        f" | policy {config['policy']['name']} | {what} | seed {config['seed']}", style="not bold"
     )
+    seen = config["filter_spec"]
+    system = f"seen through {seen}, {_timing(problem)}" if seen else describe_system(problem)
     goal = ", joint QP with the goal" if config["objective"] == "clf" else ""
     watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
-    title.append(
-        f"\n{_told(evaluation)}{watched}; filters know the {config['knowledge']}{goal}",
-        style="not bold",
-    )
+    title.append(f"\n{system}{watched}; filters know the {config['knowledge']}{goal}", "not bold")
     return title
 
 
-def _told(evaluation: Evaluation) -> str:
-    problem, spec = evaluation.problem, evaluation.config["filter_spec"]
-    return describe_system(problem) if spec is None else f"seen through {spec}, {_timing(problem)}"
-
-
 def describe_system(problem: SafetyProblem) -> str:
-    """Noise, mismatch and timing of a problem."""
+    """Return noise, mismatch and timing of a problem."""
     return f"{describe_plant(problem)}, {_timing(problem)}"
 
 
@@ -134,7 +150,7 @@ def _timing(problem: SafetyProblem) -> str:
 
 
 def describe_plant(problem: SafetyProblem) -> str:
-    """Noise and mismatch of a problem."""
+    """Return noise and mismatch of a problem."""
     plant = {p.name: value for p, value in problem.plant.parameters.items()}
     model = {p.name: value for p, value in problem.model.parameters.items()}
     noise = ", ".join(f"{name} = {plant[name]:g}" for name in problem.noise)
@@ -171,7 +187,7 @@ def _describe(comparison: Comparison) -> str:
 
 
 def _notes(evaluation: Evaluation) -> list[str]:
-    """What has to be known to read the table."""
+    """Return what has to be known to read the table."""
     steps = evaluation.problem.steps
     notes = unsafe_starts(1.0 - evaluation.rows[0].curve.rate[0])
     notes += [note for row in evaluation.rows for note in (*_of_bound(row), *_of_violations(row))]
@@ -206,7 +222,7 @@ def _of_bound(row: EvaluationRow) -> list[str]:
 
 
 def _of_violations(row: EvaluationRow) -> list[str]:
-    """How many violations are no more than rounding."""
+    """Return how many violations are no more than rounding."""
     touching, violations = row.touching, row.violations
     if not touching:
         return []
@@ -220,7 +236,7 @@ def _of_violations(row: EvaluationRow) -> list[str]:
 
 
 def unsafe_starts(share: float) -> list[str]:
-    """A note on episodes that start where h <= 0, if there are some."""
+    """Return a note on episodes that start where h <= 0, if there are some."""
     if share == 0.0:
         return []
     some = "all episodes start" if share == 1.0 else f"{percent(share)} of the episodes start"
@@ -228,7 +244,14 @@ def unsafe_starts(share: float) -> list[str]:
 
 
 def early_end(name: str, which: str, length: float, steps: int) -> str:
-    """A note on episodes that do not last as long as they might."""
+    """Return a note on episodes that do not last as long as they might.
+
+    Args:
+        name: of the filter.
+        which: episodes they are.
+        length: their mean length in control periods.
+        steps: of a whole episode.
+    """
     return (
         f"with {name} the {which} ends after {length:.1f} of {steps} steps, at the goal or outside"
         " the workspace; its safety is that of the instants until then."

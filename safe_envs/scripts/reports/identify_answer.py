@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.evaluate import package_versions
+from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.reports.evaluation_report import describe_plant, describe_system
@@ -84,43 +84,20 @@ class Source:
 
     Attributes:
         path: of the file.
-        shortest: of the steps, in s.
-        longest: of the steps, in s.
-        seed: of the data; None for data from elsewhere.
+        data: of the file.
     """
 
     path: Path
-    shortest: float
-    longest: float
-    seed: int | None
-
-    @classmethod
-    def of(cls, path: Path, data: Transitions) -> Source:
-        """Describe the data of a file.
-
-        Args:
-            path: of the file.
-            data: of the file.
-
-        Returns:
-            Path, lengths of the steps and seed.
-        """
-        return cls(path, float(data.dt.min()), float(data.dt.max()), data.seed)
+    data: Transitions
 
     def __str__(self) -> str:
-        steps = (
-            f"{self.shortest:g} s"
-            if self.shortest == self.longest
-            else f"{self.shortest:g} to {self.longest:g} s"
-        )
-        return (
-            f"in steps of {steps},"
-            f" {'from elsewhere' if self.seed is None else f'of the seed {self.seed}'}"
-        )
+        shortest, longest, seed = self.data.dt.min(), self.data.dt.max(), self.data.seed
+        steps = f"{shortest:g} s" if shortest == longest else f"{shortest:g} to {longest:g} s"
+        return f"in steps of {steps}, {'from elsewhere' if seed is None else f'of the seed {seed}'}"
 
 
 @dataclass(frozen=True, eq=False)
-class Identification:
+class IdentifyAnswer:
     """A learned model and its accuracy.
 
     Attributes:

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.identify_answer import STATES, Function, Identification
+from safe_envs.scripts.reports.identify_answer import STATES, Function, IdentifyAnswer
 from safe_envs.scripts.reports.quantities import relative_text
 from safe_envs.scripts.reports.tables import make_table
 
@@ -30,7 +30,7 @@ _ERRORS = {
 """What the held-out errors of each method are, or of its way."""
 
 
-def print_report(console: Console, found: Identification) -> None:
+def print_report(console: Console, found: IdentifyAnswer) -> None:
     """Print what was learned from what, its errors, and how to use it.
 
     Args:

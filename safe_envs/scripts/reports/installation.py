@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -25,9 +24,6 @@ _NEEDED = ""
 
 _TOLERANCE = 1e-6
 _STEPS = 20
-_SPEED_ID = "safe_envs/StochasticDubins-v0"
-_SPEED_FILTER = "scbf"
-_NUM_ENVS = 1024
 
 
 @dataclass(frozen=True)
@@ -148,28 +144,18 @@ def _check(name: str, look: Callable[[], tuple[bool, str]], advice: str) -> Chec
 
 def speeds() -> dict[str, float]:
     """Return the steps per second of single envs on this machine, by what is stepped."""
-    from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
+    from safe_envs.scripts.reports.benchmark_cases import (
+        NUM_ENVS,
+        scalar_steps,
+        vector_steps,
+    )
 
-    def scalar() -> gym.Env[Any, Any]:
-        return gym.make(
-            _SPEED_ID, disable_env_checker=True, horizon=1e9, start=[0.0, 0.0, 0.0], noise=0.01
-        )
-
-    def vector() -> Any:
-        return gym.make_vec(_SPEED_ID, num_envs=_NUM_ENVS)
-
-    vector_name = f"vector env of {_NUM_ENVS}"
-    filtered = SafetyFilterVectorWrapper(vector(), _SPEED_FILTER)
-    cases = {
-        "env": (scalar(), 1, 1000),
-        f"env with {_SPEED_FILTER}": (SafetyFilterWrapper(scalar(), _SPEED_FILTER), 1, 500),
-        vector_name: (vector(), _NUM_ENVS, 50),
-        f"{vector_name} with {_SPEED_FILTER}": (filtered, _NUM_ENVS, 50),
-    }
+    vector, filtered = f"vector env of {NUM_ENVS}", "with scbf"
+    names = ("env", f"env {filtered}", vector, f"{vector} {filtered}")
     found = {}
-    for name, (env, size, steps) in cases.items():
-        env.reset(seed=0)
-        action = np.full(env.action_space.shape, 0.3, dtype=np.float32)
-        seconds = min(timeit.repeat(partial(env.step, action), number=steps, repeat=3))
-        found[name] = size * steps / seconds
+    for name, case in zip(names, [*scalar_steps().values(), *vector_steps().values()], strict=True):
+        case.prepare()
+        steps = 500 if case.states == 1 else 50
+        seconds = min(timeit.repeat(case.call, number=steps, repeat=3))
+        found[name] = case.states * steps / seconds
     return found

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rich.table import Table
 
-from safe_envs.rate_text import percent_in
+from safe_envs.agents.evaluation.rate_text import percent_in
 from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:

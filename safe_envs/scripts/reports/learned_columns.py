@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.agents.evaluation.results import FilterTiming
 from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.dynamics.lie import lie_derivative_g, vanishes
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rate_text import percent
 
 Cell = Callable[[EvaluationRow, FilterTiming], str]
 """From a row, and what was timed of it, to a text."""
@@ -30,7 +30,12 @@ def learned_columns(rows: Sequence[EvaluationRow]) -> dict[str, Cell]:
 
 
 def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list[str]:
-    """Return notes on what was learned of a problem, and on bounds over posteriors."""
+    """Return notes on what was learned of a problem, and on bounds over posteriors.
+
+    Args:
+        rows: of the evaluation.
+        problem: that was evaluated.
+    """
     repeats = _repeats(rows)
     if not repeats:
         return []
@@ -65,8 +70,8 @@ def learned_notes(rows: Sequence[EvaluationRow], problem: SafetyProblem) -> list
             notes.append(
                 f"bound of {name} over the posterior: (1 - delta)(h_0 - (m + e) T)/c,"
                 f" estimated, with probability delta = {bound.delta:.3g} that the identification"
-                f" does not contain the system, shortfall m = {bound.shortfall:.3g}, bias of the steps e ="
-                f" {bound.bias:.3g}, c = {bound.supremum:.3g}."
+                f" does not contain the system, shortfall m = {bound.shortfall:.3g}, bias of the"
+                f" steps e = {bound.bias:.3g}, c = {bound.supremum:.3g}."
             )
     return notes
 

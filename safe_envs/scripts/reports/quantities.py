@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from safe_envs.agents.evaluation.rate_text import percent
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.rate_text import percent
 
 _NOTHING = 1e-6
 """Accuracy of a coordinate of a state found by a search, in parts of the workspace."""

@@ -11,8 +11,8 @@ from safe_envs.agents.rare_events.estimate import RareEvaluation
 from safe_envs.agents.rare_events.rows import RareRow
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.evaluation_report import (
-    describe_system,
     early_end,
+    heading_of,
     unsafe_starts,
 )
 from safe_envs.scripts.reports.tables import make_table, print_whole
@@ -28,10 +28,16 @@ _COLUMNS = (
 
 
 def print_rare(console: Console, answer: RareEvaluation) -> None:
-    """Print a heading, a row for each filter, and what has to be known to read them."""
+    """Print a heading, a row for each filter, and what has to be known to read them.
+
+    Args:
+        console: to print on.
+        answer: to print.
+    """
     config = answer.config
     interval = f"{100 * config['confidence']:.10g} % interval"
-    say(console, _heading(answer))
+    how = f"{config['repetitions']} repetitions of {config['particles']} particles"
+    say(console, heading_of(config, answer.problem, f"rare violations, {how}"))
     table = make_table("pr", "filter", f"P(violation) [{interval}]", *_COLUMNS)
     for row, speed in zip(answer.rows, answer.timing["rows"], strict=True):
         table.add_row(Text(row.filter), *_cells(row, speed["steps_per_second"]))
@@ -44,24 +50,6 @@ def print_rare(console: Console, answer: RareEvaluation) -> None:
         console.print(reasons)
     for note in _notes(answer):
         say(console, note)
-
-
-def _heading(answer: RareEvaluation) -> Text:
-    config = answer.config
-    title = Text(config["title"], style="bold")
-    how = f"{config['repetitions']} repetitions of {config['particles']} particles"
-    title.append(
-        f" | policy {config['policy']['name']} | rare violations, {how} | seed {config['seed']}",
-        style="not bold",
-    )
-    watched = ", monitored continuously" if config["monitoring"] == "continuous" else ""
-    goal = ", joint QP with the goal" if config["objective"] == "clf" else ""
-    title.append(
-        f"\n{describe_system(answer.problem)}{watched}; filters know the"
-        f" {config['knowledge']}{goal}",
-        style="not bold",
-    )
-    return title
 
 
 def _cells(row: RareRow, speed: float) -> list[str]:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.text import Text
 
+from safe_envs.agents.evaluation.rate_text import percent, rate_of
 from safe_envs.agents.evaluation.spec import UNFILTERED
-from safe_envs.rate_text import percent, rate_of
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import make_table
 
 if TYPE_CHECKING:
-    from safe_envs.agents.jobs.job import Outcome
-    from safe_envs.agents.sweeps.spec import Sweep
+    from safe_envs.agents.jobs.job import JobOutcome
+    from safe_envs.agents.sweeps.cell import Sweep
 
 Row = dict[str, Any]
 
@@ -65,7 +65,13 @@ def print_cells(console: Console, index: dict[str, Any], rows: Sequence[Row], wo
 
 
 def report_document(index: dict[str, Any], rows: Sequence[Row], worst: int) -> dict[str, Any]:
-    """Return the content of `print_cells`, with the same arguments, as JSON-able data."""
+    """Return the content of `print_cells`, with the same arguments, as JSON-able data.
+
+    Args:
+        index: of the sweep.
+        rows: its cells.
+        worst: how many of the worst to return.
+    """
     failed = _failed(rows)
     return {
         "swept": index["swept"],
@@ -76,7 +82,7 @@ def report_document(index: dict[str, Any], rows: Sequence[Row], worst: int) -> d
     }
 
 
-def sweep_document(sweep: Sweep, failures: Sequence[Outcome]) -> dict[str, Any]:
+def sweep_document(sweep: Sweep, failures: Sequence[JobOutcome]) -> dict[str, Any]:
     """Return what was swept and which cells failed, as JSON-able data.
 
     Args:
@@ -94,7 +100,7 @@ def sweep_document(sweep: Sweep, failures: Sequence[Outcome]) -> dict[str, Any]:
     return {"failed": failed, "swept": sweep.swept, "versions": versions()}
 
 
-def failures_text(sweep: Sweep, failures: Sequence[Outcome]) -> str:
+def failures_text(sweep: Sweep, failures: Sequence[JobOutcome]) -> str:
     """Return which cells failed and why, in the order of the file.
 
     Args:

@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.console import Console
 
-from safe_envs.rate_text import rate_of
+from safe_envs.agents.evaluation.rate_text import rate_of
 from safe_envs.scripts.options.console import say
 from safe_envs.scripts.reports.tables import make_table
 

@@ -11,7 +11,7 @@ import pytest
 
 from safe_envs import ConfigurationError, RelativeDegreeError
 from safe_envs.agents import NominalController, evaluate, make_problem
-from safe_envs.agents.evaluation.rollout import play, run_episodes
+from safe_envs.agents.evaluation.rollout import play
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.envs.vector_env import SafeVectorEnv
 
@@ -96,7 +96,6 @@ def test_batches_have_the_starts_of_their_episodes():
     found = [batch.starts for batch in play(SafeVectorEnv(problem, 4), policy, range(10), 7)]
     assert [x.shape for x in found] == [(4, 3), (4, 3), (2, 3)]
     starts = np.concatenate(found)
-    assert len(run_episodes(SafeVectorEnv(problem, 4), policy, 10, 7).results.safe) == 10
     recorded = (
         evaluate(problem, policy, ["none"], episodes=10, seed=7, record=True)
         .trajectories["none"]

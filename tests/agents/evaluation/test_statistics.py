@@ -11,8 +11,8 @@ import pytest
 from scipy.stats import binom, binomtest, multinomial, norm
 
 from safe_envs import ConfigurationError
+from safe_envs.agents.evaluation.running_sum import RunningSum
 from safe_envs.agents.evaluation.statistics import (
-    RunningSum,
     curve_instants,
     log_normal_interval,
     mcnemar_p,

@@ -11,7 +11,7 @@ import pytest
 
 from safe_envs.agents.jobs import clusters, executor
 from safe_envs.agents.jobs.executor import Backend, run
-from safe_envs.agents.jobs.job import Job, Outcome
+from safe_envs.agents.jobs.job import Job, JobOutcome
 from safe_envs.errors import ConfigurationError, WorkersLostError
 
 pytestmark = pytest.mark.slow
@@ -49,13 +49,13 @@ class Pretended:
         )
         return self.kept
 
-    def _outcomes(self, jobs: Sequence[Job], *_: Any) -> Iterator[Outcome]:
+    def _outcomes(self, jobs: Sequence[Job], *_: Any) -> Iterator[JobOutcome]:
         self.given.append(len(jobs))
         for k in range(0, len(jobs), 2):
             pair = jobs[k : k + 2]
             if self._ends({int(job.key) for job in pair}):
                 raise executor._LossError("it went away", jobs[: k + 2])
-            yield from (Outcome(job.key, None, None, 0.0) for job in pair)
+            yield from (JobOutcome(job.key, None, None, 0.0) for job in pair)
 
 
 @pytest.mark.parametrize("killing", [{0, 1, 2}, {5, 6, 7}, {0, 2, 4, 6}, {3}])

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate, make_policy, make_problem, refine
-from safe_envs.agents.policies.fixed_batch import BLOCK
+from safe_envs.agents.policies.base import BLOCK
 from safe_envs.agents.policies.network import NetworkPolicy, load_policy, save_policy
 from safe_envs.errors import InvalidInputError
 from safe_envs.wrappers.learning.models.files import load, save

@@ -20,7 +20,7 @@ from safe_envs.agents.rare_events.importance_sampling import (
     log_ratio,
     optimal_tilt,
 )
-from safe_envs.agents.rare_events.rows import Estimate, PlainEpisodes, verdict
+from safe_envs.agents.rare_events.rows import PlainEpisodes, RareEstimate, verdict
 from safe_envs.agents.rare_events.splitting import Splitting
 from tests.oracles.laws import X, brownian, first_passage, walk_passage
 
@@ -43,7 +43,7 @@ def test_exact_for_several_barriers_and_substeps():
     problem = replace(brownian(0.1, 1.0, 0.0, 0.3, [1 - X, 1 + X]), substeps=2)
     splitting, drifting = both(problem, BrownianBridge(problem))
     found = splitting.estimate(0.5, 100, 10)
-    length, deviation = optimal_tilt(found.girsanov_integrals, found.shares, 1.0)
+    length, deviation = optimal_tilt(*found.violating(), 1.0)
     estimates, steps = drifting.estimate(length, 250, 20)
     low, high = log_normal_interval(estimates, 0.99)
     assert low < 2 * first_passage(1.0, 0.0, 0.3, 1.0) < high
@@ -98,23 +98,22 @@ def test_ratios_undo_a_drift_of_several_channels():
 def test_best_drift_of_a_walk_goes_straight_to_the_level():
     problem = brownian(0.05, 1.0, 0.0, 0.2)
     found = both(problem)[0].estimate(0.5, 100, 10)
-    length, deviation = optimal_tilt(found.girsanov_integrals, found.shares, 1.0)
+    length, deviation = optimal_tilt(*found.violating(), 1.0)
     # Five deviations away, in the time that there is.
     assert length == pytest.approx(5.0, rel=0.1)
     assert 1.0 < deviation < 5.0
     plain = 1 / math.sqrt(walk_passage(1.0, 20, 0.0, 0.2 * math.sqrt(0.05)))
-    assert optimal_tilt(0.0 * found.girsanov_integrals, found.shares, 1.0)[1] == pytest.approx(
-        plain, rel=0.5
-    )
+    integrals, shares = found.violating()
+    assert optimal_tilt(0.0 * integrals, shares, 1.0)[1] == pytest.approx(plain, rel=0.5)
 
 
 def test_violations_on_another_way_count_against_a_drift():
     problem = brownian(0.05, 1.0, 0.0, 0.2)
     found = both(problem)[0].estimate(0.5, 100, 10)
-    good = optimal_tilt(found.girsanov_integrals, found.shares, 1.0)[1]
-    girsanov_integrals = found.girsanov_integrals.copy()
+    good = optimal_tilt(*found.violating(), 1.0)[1]
+    girsanov_integrals, shares = found.violating()
     girsanov_integrals[::50, 0] = 0.0
-    assert optimal_tilt(girsanov_integrals, found.shares, 1.0)[1] > 30 * good
+    assert optimal_tilt(girsanov_integrals, shares, 1.0)[1] > 30 * good
 
 
 @pytest.mark.slow
@@ -161,7 +160,7 @@ def test_without_noise_chance_may_come_from_the_policy():
 
 def row(p, width, error, spread=0.1):
     estimates = p * np.exp(spread * np.resize((-1, 1), 20))
-    return Estimate("", p, p / width, p * width, error, estimates.tolist())
+    return RareEstimate("", p, p / width, p * width, error, estimates.tolist())
 
 
 NOTHING_SEEN = PlainEpisodes(5000, 0, 0.0, 7e-4)

@@ -119,7 +119,7 @@ def test_splitting_is_unbiased_and_its_interval_covers():
     intervals = [log_normal_interval(part) for part in np.split(found.estimates, 40)]
     # 33 of 40 or less has a probability of .003 if 95 % are held.
     assert sum(low < exact < high for low, high in intervals) >= 34
-    assert math.fsum(found.shares) == pytest.approx(found.estimates.mean())
+    assert math.fsum(found.violating()[1]) == pytest.approx(found.estimates.mean())
 
 
 def test_splitting_looks_between_instants():

@@ -9,9 +9,10 @@ from typing import Any
 
 import pytest
 
-from safe_envs.agents.jobs.job import Outcome, outcome_of
+from safe_envs.agents.jobs.job import JobOutcome, outcome_of
 from safe_envs.agents.jobs.store import ResultStore
-from safe_envs.agents.sweeps.spec import Sweep, sweep_of
+from safe_envs.agents.sweeps.cell import Sweep
+from safe_envs.agents.sweeps.spec import sweep_of
 from safe_envs.agents.sweeps.store import Store, read
 from safe_envs.errors import ConfigurationError
 from tests.oracles.full_disk import no_file_larger_than
@@ -27,12 +28,12 @@ def sweep() -> Sweep:
 
 
 @pytest.fixture(scope="module")
-def outcomes(sweep: Sweep) -> list[Outcome]:
+def outcomes(sweep: Sweep) -> list[JobOutcome]:
     return [outcome_of(cell) for cell in sweep.cells]
 
 
 def test_what_was_kept_is_read_in_the_order_of_the_file(
-    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+    tmp_path: Path, sweep: Sweep, outcomes: list[JobOutcome]
 ):
     store = Store(tmp_path, sweep)
     assert store.missing == list(sweep.cells)
@@ -62,10 +63,10 @@ def test_what_was_kept_is_read_in_the_order_of_the_file(
 
 
 def test_a_failed_cell_is_told_and_tried_again(
-    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+    tmp_path: Path, sweep: Sweep, outcomes: list[JobOutcome]
 ):
     store = Store(tmp_path, sweep)
-    store.keep(Outcome(sweep.cells[0].key, None, "it broke", 0.1))
+    store.keep(JobOutcome(sweep.cells[0].key, None, "it broke", 0.1))
     assert read(tmp_path)["error"].to_pylist() == ["it broke"]
     # Those that failed come last, so that they keep no other from being computed.
     assert Store(tmp_path, sweep).missing == [*sweep.cells[1:], sweep.cells[0]]
@@ -74,24 +75,24 @@ def test_a_failed_cell_is_told_and_tried_again(
 
 
 def test_a_failure_replaces_no_result_of_another_run(
-    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+    tmp_path: Path, sweep: Sweep, outcomes: list[JobOutcome]
 ):
     store, other = Store(tmp_path, sweep), Store(tmp_path, sweep)
     other.keep(outcomes[0])
-    store.keep(Outcome(sweep.cells[0].key, None, "it broke", 0.1))
+    store.keep(JobOutcome(sweep.cells[0].key, None, "it broke", 0.1))
     assert read(tmp_path)["error"].to_pylist() == [None]
     assert store.missing == list(sweep.cells[1:])
 
 
 def test_settings_of_cells_that_are_not_there_have_columns(
-    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+    tmp_path: Path, sweep: Sweep, outcomes: list[JobOutcome]
 ):
     Store(tmp_path, sweep).keep(outcomes[0])
     assert read(tmp_path).select(["noise", "start"]).to_pylist() == [{"noise": 0.1, "start": None}]
 
 
 def test_the_results_of_another_sweep_are_read_until_there_is_one_of_this(
-    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+    tmp_path: Path, sweep: Sweep, outcomes: list[JobOutcome]
 ):
     first = Store(tmp_path, sweep)
     for outcome in outcomes:
@@ -122,7 +123,7 @@ def test_what_was_being_written_when_a_run_was_killed_is_removed(tmp_path: Path,
 
 
 def test_cells_of_another_sweep_stay_and_are_not_read(
-    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+    tmp_path: Path, sweep: Sweep, outcomes: list[JobOutcome]
 ):
     store = Store(tmp_path, sweep)
     for outcome in outcomes:
@@ -134,7 +135,7 @@ def test_cells_of_another_sweep_stay_and_are_not_read(
 
 
 def test_a_full_disk_loses_nothing_that_is_finished(
-    tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]
+    tmp_path: Path, sweep: Sweep, outcomes: list[JobOutcome]
 ):
     store = Store(tmp_path, sweep)
     store.keep(outcomes[0])
@@ -153,7 +154,7 @@ def test_a_full_disk_loses_nothing_that_is_finished(
     assert len(read(tmp_path)) == 2
 
 
-def test_a_broken_file_is_computed_again(tmp_path: Path, sweep: Sweep, outcomes: list[Outcome]):
+def test_a_broken_file_is_computed_again(tmp_path: Path, sweep: Sweep, outcomes: list[JobOutcome]):
     store = Store(tmp_path, sweep)
     store.keep(outcomes[0])
     (file,) = (tmp_path / "cells").iterdir()

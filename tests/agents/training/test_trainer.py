@@ -22,8 +22,7 @@ from safe_envs.agents.training.hyperparameters import (
     scheduled,
     whole_batches,
 )
-from safe_envs.agents.training.session import TrainingSession
-from safe_envs.agents.training.trainer import train
+from safe_envs.agents.training.trainer import TrainingSession, train
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.registry import make_problem
 from safe_envs.wrappers.learning.models.files import load

@@ -14,7 +14,13 @@ def percent(rate: float | None) -> str:
 
 
 def percent_in(rate: float, low: float, high: float) -> str:
-    """Return a rate with its interval, in per cent, as text."""
+    """Return a rate with its interval, in per cent, as text.
+
+    Args:
+        rate: from 0 to 1.
+        low: lower end of its interval.
+        high: upper end.
+    """
     rate_text, low_text, high_text = _percents(rate, low, high)
     return f"{rate_text} % [{low_text}, {high_text}]"
 

@@ -1,7 +1,7 @@
 import pytest
 
+from safe_envs.agents.evaluation.rate_text import percent, percent_in
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.rate_text import percent, percent_in
 
 
 @pytest.mark.parametrize(
