@@ -22,7 +22,7 @@ from safe_envs.agents.policies.registry import policy_file
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import Condition, parse_conditions, require_readable, spec_of
-from safe_envs.wrappers.conditions import learned_parts, require_known
+from safe_envs.wrappers.conditions.text_parts import learned_parts, require_known
 
 
 class ResolvedEvaluation:

@@ -11,7 +11,7 @@ from typing import Any
 
 from safe_envs.agents.policies.registry import absolute_policy, policy_file
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
-from safe_envs.wrappers.conditions import files_of, with_absolute_paths
+from safe_envs.wrappers.conditions.text_parts import files_of, with_absolute_paths
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:

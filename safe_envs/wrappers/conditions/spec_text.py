@@ -32,6 +32,9 @@ dozen gains take a second."""
 Learned = Mapping[str, LearnedModel]
 """Learned models by method."""
 
+Conditions = Condition | Sequence[Condition] | str
+"""One condition for every barrier, one for each, or their text."""
+
 
 def parse_conditions(
     text: str, problem: SafetyProblem, learned: Learned | None = None
@@ -58,9 +61,7 @@ def parse_conditions(
     )
 
 
-def conditions_for(
-    problem: SafetyProblem, given: Condition | Sequence[Condition] | str
-) -> tuple[Condition, ...]:
+def conditions_for(problem: SafetyProblem, given: Conditions) -> tuple[Condition, ...]:
     """Return a condition for every barrier of a problem.
 
     Args:

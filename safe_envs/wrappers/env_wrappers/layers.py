@@ -12,7 +12,8 @@ from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info, filter_info
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import Condition, spec_of
+from safe_envs.wrappers.conditions import spec_of
+from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
@@ -23,7 +24,7 @@ class FilterLayer:
     def attach(
         self,
         inner: Any,
-        condition: Condition | Sequence[Condition] | str,
+        condition: Conditions,
         knowledge: str,
         objective: str,
         priorities: Sequence[float] | None,

@@ -11,7 +11,7 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info, filter_info
-from safe_envs.wrappers.conditions import Condition
+from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
     rest_info,
@@ -57,7 +57,7 @@ class SafetyFilterWrapper(
     def __init__(
         self,
         env: gym.Env[np.ndarray, np.ndarray],
-        condition: Condition | Sequence[Condition] | str,
+        condition: Conditions,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,

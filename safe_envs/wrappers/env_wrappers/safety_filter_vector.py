@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from safe_envs.envs.info import Info, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv, VectorStep
-from safe_envs.wrappers.conditions import Condition
+from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
     rest_info,
@@ -37,7 +37,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def __init__(
         self,
         env: gym.vector.VectorEnv,
-        condition: Condition | Sequence[Condition] | str,
+        condition: Conditions,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,

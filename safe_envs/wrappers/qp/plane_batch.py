@@ -8,12 +8,12 @@ comes from the same operations in the same order as for one state.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from safe_envs.wrappers.qp.min_slack import is_unique, least_violating
-from safe_envs.wrappers.qp.rounding import ROUNDING, stack, tolerances
+from safe_envs.wrappers.qp.rounding import ROUNDING, Arrays, Entries, Floats, stack, tolerances
 
 
 class Plane(NamedTuple):
@@ -70,13 +70,13 @@ class Plane(NamedTuple):
 
 @np.errstate(all="ignore")
 def project_arrays(
-    a: Sequence[Sequence[Any]],
-    b: Sequence[Any],
-    v: Sequence[np.ndarray],
-    low: Sequence[Any],
-    high: Sequence[Any],
-    w: Sequence[Any],
-    priority: Sequence[float],
+    a: Sequence[Entries],
+    b: Entries,
+    v: Arrays,
+    low: Entries,
+    high: Entries,
+    w: Entries,
+    priority: Floats,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Project the inputs of B states.
 
