@@ -92,15 +92,11 @@ class SafetyFilter(ComponentFilter):
         self.constraints = tuple(
             condition.constraint(model, barrier) for barrier, condition in self.pairs
         )
-        qp = FilterQP(
-            model,
-            self.constraints,
-            *input_bounds(model, box),
-            positive_weights("weights", weights, model.m),
-            positive_weights("priorities", priorities, len(self.constraints)),
-            control_period(self.constraints, dt),
-            clf,
-        )
+        low, high = input_bounds(model, box)
+        weights = positive_weights("weights", weights, model.m)
+        priorities = positive_weights("priorities", priorities, len(pairs))
+        period = control_period(self.constraints, dt)
+        qp = FilterQP(model, self.constraints, low, high, weights, priorities, period, clf)
         super().__init__(qp, [barrier.name for barrier, _ in self.pairs])
         self._state_shape, self._input_shape = (model.n,), (model.m,)
 
@@ -213,15 +209,9 @@ class SafetyFilter(ComponentFilter):
             if not finite(barrier.T):
                 self._require_values(barrier.reshape(-1, len(barriers)), states)
         cause = np.broadcast_to(cause, len(inputs[0])).reshape(batch)
+        cause, feasible = np.where(active.any(axis=-1), cause, -1), feasible.reshape(batch)
         return FilterDecision(
-            action,
-            margin,
-            active > 0.0,
-            feasible.reshape(batch),
-            slack,
-            np.where(active.any(axis=-1), cause, -1),
-            proposed,
-            barrier,
+            action, margin, active > 0.0, feasible, slack, cause, proposed, barrier
         )
 
     def _filter_one(self, x: np.ndarray, u: np.ndarray) -> FilterDecision:

@@ -84,13 +84,7 @@ class Condition(ABC):
 
     def __post_init__(self) -> None:
         margin = self.sampling_margin
-        if margin in ("none", FIRST_ORDER):
-            return
-        if (
-            isinstance(margin, bool)
-            or not isinstance(margin, int | float)
-            or not 0 <= margin < math.inf
-        ):
+        if margin not in ("none", FIRST_ORDER) and not is_nonnegative(margin):
             raise ConfigurationError(
                 f"sampling_margin = {shown(margin)}; allowed: none, {FIRST_ORDER}, or a number >= 0"
             )
@@ -109,6 +103,9 @@ class Condition(ABC):
         Args:
             model: system that the filter knows.
             barrier: barrier h.
+
+        Returns:
+            The constraint, with its margin for sampling.
 
         Raises:
             RelativeDegreeError: The condition does not suit the barrier's relative degree.
@@ -132,7 +129,15 @@ class Condition(ABC):
 
     @abstractmethod
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
-        """Derive the constraint without a margin for sampling."""
+        """Derive the constraint without a margin for sampling.
+
+        Args:
+            model: system to differentiate along.
+            barrier: barrier h.
+
+        Returns:
+            The constraint.
+        """
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> Condition:
@@ -167,6 +172,12 @@ class Condition(ABC):
         """Arguments that make the same condition, besides the sampling margin."""
         given = {key: value for key, value in vars(self).items() if key != "sampling_margin"}
         return {key: value for key, value in given.items() if value is not None}
+
+
+def is_nonnegative(value: Any) -> bool:
+    """Return whether a value is a finite number of at least 0."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and 0 <= value < math.inf
 
 
 @lru_cache(maxsize=256)

@@ -92,19 +92,9 @@ class SafetyFilterWrapper(
         executed, nominal, active = decision.action, decision.proposed, True in decision.active
         if self._inner.viewer is not None:
             self._inner.viewer.announce([nominal], [active], [decision.feasible])
-        if self._directly:
-            observation, reward, terminated, truncated, info = self._inner.step_physical(executed)
-        else:
-            observation, reward, terminated, truncated, info = self.env.step(
-                self._inner.normalized_action(executed)
-            )
-            if any(
-                [  # noqa: C419
-                    abs(u - v) > t
-                    for u, v, t in zip(executed, self._inner.executed, self._tolerance, strict=True)
-                ]
-            ):
-                raise self.changed_action(executed)
+        observation, reward, terminated, truncated, info = self.execute(
+            self.env, executed, self._directly
+        )
         differs = active and executed != nominal
         self._interventions += differs
         self._infeasible += not decision.feasible

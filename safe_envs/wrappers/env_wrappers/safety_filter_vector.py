@@ -97,19 +97,9 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             self._inner.viewer.announce(
                 np.stack(decision.proposed, axis=-1), active, decision.feasible
             )
-        if self.env is self._inner:
-            observation, reward, terminated, truncated, info = self._inner.step_physical(
-                decision.action
-            )
-        else:
-            observation, reward, terminated, truncated, info = self.env.step(
-                self._inner.normalized_action(decision.action)
-            )
-            for u, v, tolerance in zip(
-                decision.action, self._inner.executed, self._tolerance, strict=True
-            ):
-                if not np.allclose(u, v, rtol=0.0, atol=tolerance):
-                    raise self.changed_action(decision.action)
+        observation, reward, terminated, truncated, info = self.execute(
+            self.env, decision.action, self.env is self._inner
+        )
         added = self._decided(decision, active)
         begun = self._inner.episodes.begun
         if np.count_nonzero(begun):
