@@ -47,7 +47,7 @@ class CostReturnWrapper:
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode, as in Gymnasium."""
+        """Start an episode; see `gymnasium.Env.reset`."""
         restarted = (options or {}).get("reset_mask", True)
         self._ended = self._ended & ~np.asarray(restarted, dtype=bool)
         return self.env.reset(seed=seed, options=options)

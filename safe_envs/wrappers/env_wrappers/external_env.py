@@ -41,7 +41,15 @@ class ActionMap(NamedTuple):
 
     @classmethod
     def scaled(cls, factor: Any, offset: Any = 0.0) -> ActionMap:
-        """Input = offset + factor action; numbers, or one for each input."""
+        """Return the map of input = offset + factor action.
+
+        Args:
+            factor: a number, or one for each input.
+            offset: likewise.
+
+        Raises:
+            ConfigurationError: A number is not finite, or a factor is 0.
+        """
         f, o = np.asarray(factor, dtype=float), np.asarray(offset, dtype=float)
         if not (np.isfinite(f).all() and np.isfinite(o).all() and f.all()):
             raise ConfigurationError(

@@ -123,7 +123,7 @@ class SafetyMonitor(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start an episode."""
+        """Start an episode; see `gymnasium.Env.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._episode.restart()
         seen = self._seen(observation)
@@ -143,7 +143,7 @@ class SafetyMonitor(
         return observation, reward, terminated, truncated, {**info, **seen}
 
     def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, Any, bool, bool, Info]:
-        """`step` for the model's input."""
+        """Pass on an input of the model; see `step`."""
         return self.step(self.normalized_action(u))
 
     def render(self) -> Any:
@@ -196,6 +196,11 @@ def _undefined(name: str, x: Sequence[float]) -> NumericalError:
 
 def barrier_table(barriers: Any, name: str, x: Components) -> np.ndarray:
     """Return the values of the barriers at a batch of states, shape (B, k).
+
+    Args:
+        barriers: compiled for arrays.
+        name: of the problem, for errors.
+        x: n components of the states.
 
     Raises:
         NumericalError: one is not finite.

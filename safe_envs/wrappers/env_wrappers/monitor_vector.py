@@ -79,7 +79,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start episodes in every env, or in those of `options["reset_mask"]`."""
+        """Start episodes in every env, or those of a mask; see `SafeVectorEnv.reset`."""
         # Gymnasium's own vector envs take the mask out of the mapping that they are given.
         restarted = np.array(
             (options or {}).get("reset_mask", self.episodes.everywhere), dtype=bool
@@ -128,7 +128,7 @@ class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
         )
 
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
-        """`step` for the components of the model's inputs."""
+        """Pass on components of the model's inputs; see `step`."""
         return self.step(self.normalized_action(u))
 
     def render(self) -> Any:

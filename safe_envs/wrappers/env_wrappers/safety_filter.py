@@ -79,7 +79,7 @@ class SafetyFilterWrapper(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start an episode."""
+        """Start an episode; see `gymnasium.Env.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._interventions = 0
         self._infeasible = 0

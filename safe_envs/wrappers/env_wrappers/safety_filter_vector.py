@@ -57,7 +57,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start episodes in every env, or in those of `options["reset_mask"]`."""
+        """Start episodes in every env, or those of a mask; see `SafeVectorEnv.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
         present = info["_cost"]
         self._forget(present)

@@ -25,7 +25,7 @@ class FilterQPSolver(CompiledQP):
     """Solves a QP for states given component by component, as floats or as arrays of a batch."""
 
     def solve_single(self, x: Sequence[Any], u: Sequence[Any]) -> FilterDecision:
-        """Solve a plain QP of one constraint; raises as `solve`."""
+        """Solve a plain QP of one constraint; see `solve`."""
         values = self._values(*self._with_terms(x))
         if self._uncertain:
             return self._solve_uncertain(values, u)
@@ -70,6 +70,9 @@ class FilterQPSolver(CompiledQP):
         Args:
             x: n components of the state.
             u: m components of the proposed input.
+
+        Returns:
+            The decision in components.
 
         Raises:
             UndefinedConstraintError: A constraint or the goal has no finite value.

@@ -37,7 +37,15 @@ def project_floats(
     high: Floats,
     w: Floats,
 ) -> tuple[list[float], float, bool, bool]:
-    """Project the input u of one state.
+    """Project the input of one state.
+
+    Args:
+        a: m entries of the constraint.
+        b: the offset.
+        u: m proposed inputs.
+        low: m lower bounds.
+        high: m upper bounds.
+        w: m positive weights.
 
     Returns:
         The minimiser (m floats), its margin a . u + b, whether the constraint had to act, and

@@ -49,7 +49,7 @@ def tolerance(a: Floats, b: float, u: Floats) -> float:
 
 
 def tolerances(a: Entries | np.ndarray, b: Any, u: Entries | np.ndarray) -> Any:
-    """`tolerance` for arrays, the m coefficients and inputs in front."""
+    """Return the tolerances of a batch; see `tolerance`. Coefficients and inputs are in front."""
     found = ROUNDING * np.abs(b)
     for aj, uj in zip(a, u, strict=True):
         found = found + ROUNDING * np.abs(aj * uj)
@@ -57,7 +57,12 @@ def tolerances(a: Entries | np.ndarray, b: Any, u: Entries | np.ndarray) -> Any:
 
 
 def stack(entries: Entries, size: int) -> np.ndarray:
-    """Return floats and arrays (B,) as the rows of an array (len(entries), B)."""
+    """Return floats and arrays (B,) as the rows of an array (len(entries), B).
+
+    Args:
+        entries: the floats and arrays.
+        size: B.
+    """
     table = np.empty((len(entries), size))
     for row, entry in zip(table, entries, strict=True):
         row[:] = entry

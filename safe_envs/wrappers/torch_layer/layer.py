@@ -84,7 +84,7 @@ class TorchFilter(torch.nn.Module):
         Args:
             x: states, shape (..., n).
             u: proposed inputs, shape (..., m), in physical units.
-            return_result: whether to return the flags beside the action.
+            return_result: whether to return the flags with the action.
 
         Returns:
             The action, shape (..., m), of the type of `u` and on its device; or a `TorchResult`
