@@ -84,7 +84,7 @@ def nearest_step(
     These are a z + gaps = 0; before, |weights (a z + gaps)|^2 is minimised.
 
     Args:
-        a: a of the constraints, in units of the weights, shape (R, k, m).
+        a: coefficients of the constraints, in units of the weights, shape (R, k, m).
         gaps: their values at z = 0, shape (R, k).
         weights: of the constraints that cannot be met, 0 for others, shape (R, k).
         binding: constraints that bind, shape (R, k).
@@ -126,7 +126,7 @@ def _held_and_binding(
     only.
 
     Args:
-        a: in units of the weights, shape (k, m).
+        a: coefficients in units of the weights, shape (k, m).
         way: from the proposal to the action, in the same units, shape (m,).
         low: inputs that may be held at their lower bounds, shape (m,).
         high: inputs that may be held at their upper bounds, shape (m,).
