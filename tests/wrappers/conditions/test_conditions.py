@@ -195,9 +195,15 @@ def test_pieces_of_a_barrier_have_to_meet_as_smoothly_as_the_chain_differentiate
     noisy = ControlAffineSDE((X,), (u,), [0], [1], [1])
     chain = ControlAffineSDE((X, y), (u,), [y, 0], [0, 1], [0, 1])
     needs = [
-        (CBF(1.0), noisy, 0), (RCBF(), noisy, 0), (CBF(1.0, sampling_margin="first-order"), noisy, 1), (HOCBF((1.0, 1.0)), chain, 1),
-        (SCBF(), noisy, 1), (SRCBF(), noisy, 1), (SZCBF((1.0, 1.0)), chain, 3), (SCBF(sampling_margin="first-order"), noisy, 3),
-    ]  # fmt: skip
+        (CBF(1.0), noisy, 0),
+        (RCBF(), noisy, 0),
+        (CBF(1.0, sampling_margin="first-order"), noisy, 1),
+        (HOCBF((1.0, 1.0)), chain, 1),
+        (SCBF(), noisy, 1),
+        (SRCBF(), noisy, 1),
+        (SZCBF((1.0, 1.0)), chain, 3),
+        (SCBF(sampling_margin="first-order"), noisy, 3),
+    ]
     for condition, system, order in needs:
         if order <= smooth:
             condition.constraint(system, Barrier(h))
