@@ -123,7 +123,7 @@ def split_filters(text: str) -> list[str]:
         ConfigurationError: one has no text.
     """
     from safe_envs.agents.evaluation.spec import UNFILTERED
-    from safe_envs.wrappers.conditions import head_pattern
+    from safe_envs.wrappers.conditions.text_parts import head_pattern
 
     found = [part.strip() for part in re.split(rf",(?=\s*{head_pattern(UNFILTERED)})", text)]
     if not all(found):
@@ -244,7 +244,7 @@ def make_runs(
     from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
     from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
     from safe_envs.agents.policies.registry import make_policy
-    from safe_envs.wrappers.conditions import require_known
+    from safe_envs.wrappers.conditions.text_parts import require_known
 
     for name in names:
         # A comma that is left in the name is one of --compare before an unknown name.

@@ -1,29 +1,7 @@
 """What keeps an env safe: conditions, their QPs, the safety filter and its gym wrappers."""
 
-from safe_envs.wrappers.conditions import (
-    CBF,
-    CONDITIONS,
-    DDSCBF,
-    ECBF,
-    HOCBF,
-    LEARNED,
-    RCBF,
-    SCBF,
-    SRCBF,
-    SZCBF,
-    AffineConstraint,
-    BayesianSCBF,
-    ClassK,
-    Condition,
-    LearnedCondition,
-    LearnedHOCBF,
-    condition_names,
-    parse_condition,
-    parse_conditions,
-    power,
-    require_readable,
-    spec_of,
-)
+from safe_envs.wrappers import conditions
+from safe_envs.wrappers.conditions import *  # noqa: F403
 from safe_envs.wrappers.env_wrappers.external_env import ActionMap, FilterSpec
 from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
@@ -35,37 +13,16 @@ from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
 __all__ = [
-    "CBF",
-    "CONDITIONS",
-    "DDSCBF",
-    "ECBF",
-    "HOCBF",
-    "LEARNED",
-    "RCBF",
-    "SCBF",
-    "SRCBF",
-    "SZCBF",
     "ActionMap",
-    "AffineConstraint",
-    "BayesianSCBF",
-    "ClassK",
-    "Condition",
     "FilterDecision",
     "FilterSpec",
-    "LearnedCondition",
-    "LearnedHOCBF",
     "SafetyFilter",
     "SafetyFilterVectorWrapper",
     "SafetyFilterWrapper",
     "SafetyMonitor",
     "SafetyMonitorVector",
-    "condition_names",
-    "parse_condition",
-    "parse_conditions",
-    "power",
-    "require_readable",
-    "spec_of",
 ]
+__all__ += conditions.__all__
 
 if __name__ == "wrappers":  # imported through the link at the top level of a checkout
     from safe_envs.checkout_links import redirect

@@ -26,9 +26,15 @@ from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.validators import real_array
-from safe_envs.wrappers.conditions import Condition, conditions_for
+from safe_envs.wrappers.conditions import Condition
+from safe_envs.wrappers.conditions.spec_text import Conditions, conditions_for
 from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP
 from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE, ComponentFilter
+from safe_envs.wrappers.filter_qp.qp import (
+    control_period,
+    input_bounds,
+    positive_weights,
+)
 
 _DOUBLE = np.dtype(np.float64)
 
@@ -90,15 +96,11 @@ class SafetyFilter(ComponentFilter):
         self.constraints = tuple(
             condition.constraint(model, barrier) for barrier, condition in self.pairs
         )
-        qp = FilterQP.checked(
-            model,
-            self.constraints,
-            box,
-            weights=weights,
-            priorities=priorities,
-            dt=dt,
-            clf=clf,
-        )
+        low, high = input_bounds(model, box)
+        weights = positive_weights("weights", weights, model.m)
+        priorities = positive_weights("priorities", priorities, len(pairs))
+        period = control_period(self.constraints, dt)
+        qp = FilterQP(model, self.constraints, low, high, weights, priorities, period, clf)
         super().__init__(qp, [barrier.name for barrier, _ in self.pairs])
         self._state_shape, self._input_shape = (model.n,), (model.m,)
 
@@ -106,7 +108,7 @@ class SafetyFilter(ComponentFilter):
     def for_problem(
         cls,
         problem: SafetyProblem,
-        conditions: Condition | Sequence[Condition] | str,
+        conditions: Conditions,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
@@ -203,31 +205,17 @@ class SafetyFilter(ComponentFilter):
             _require_finite(x, u)
             decision = self._decide(states, inputs)
             barriers = self._barriers_arrays(*states)
-            parts = (
-                decision.action,
-                decision.margin,
-                decision.active,
-                decision.slack,
-                decision.proposed,
-                barriers,
-            )
+            action, margin, active, feasible, slack, cause, proposed, _ = decision
             action, margin, active, slack, proposed, barrier = [
-                stacked(part, len(inputs[0])).reshape(*batch, len(part)) for part in parts
+                stacked(part, len(inputs[0])).reshape(*batch, len(part))
+                for part in (action, margin, active, slack, proposed, barriers)
             ]
             if not finite(barrier.T):
                 self._require_values(barrier.reshape(-1, len(barriers)), states)
-        cause = np.where(
-            active.any(axis=-1), np.broadcast_to(decision.cause, len(inputs[0])).reshape(batch), -1
-        )
+        cause = np.broadcast_to(cause, len(inputs[0])).reshape(batch)
+        cause, feasible = np.where(active.any(axis=-1), cause, -1), feasible.reshape(batch)
         return FilterDecision(
-            action,
-            margin,
-            active > 0.0,
-            decision.feasible.reshape(batch),
-            slack,
-            cause,
-            proposed,
-            barrier,
+            action, margin, active > 0.0, feasible, slack, cause, proposed, barrier
         )
 
     def _filter_one(self, x: np.ndarray, u: np.ndarray) -> FilterDecision:

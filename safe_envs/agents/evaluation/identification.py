@@ -13,12 +13,8 @@ from safe_envs.agents.evaluation.rows import LearningSummary
 from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import (
-    LEARNED,
-    Condition,
-    learned_parts,
-    parse_conditions,
-)
+from safe_envs.wrappers.conditions import LEARNED, Condition, parse_conditions
+from safe_envs.wrappers.conditions.text_parts import learned_parts
 from safe_envs.wrappers.learning import LearnedModel, learner_of, load_learned
 
 

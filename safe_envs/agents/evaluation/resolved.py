@@ -30,7 +30,7 @@ from safe_envs.wrappers import (
     require_readable,
     spec_of,
 )
-from safe_envs.wrappers.conditions import learned_parts, require_known
+from safe_envs.wrappers.conditions.text_parts import learned_parts, require_known
 
 
 class ResolvedEvaluation:

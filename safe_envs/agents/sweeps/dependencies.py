@@ -16,7 +16,11 @@ from safe_envs.agents.policies.registry import (
     policy_module,
 )
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, read_bytes
-from safe_envs.wrappers.conditions import files_of, modules_of, with_absolute_paths
+from safe_envs.wrappers.conditions.text_parts import (
+    files_of,
+    modules_of,
+    with_absolute_paths,
+)
 
 
 def absolute(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,21 +9,12 @@ from safe_envs.wrappers.conditions.learned import DDSCBF, LearnedCondition, Lear
 from safe_envs.wrappers.conditions.reciprocal import RCBF, SRCBF
 from safe_envs.wrappers.conditions.registry import CONDITIONS, LEARNED, condition_names
 from safe_envs.wrappers.conditions.spec_text import (
-    conditions_for,
     parse_condition,
     parse_conditions,
     require_readable,
     spec_of,
 )
 from safe_envs.wrappers.conditions.stochastic import SCBF, SZCBF
-from safe_envs.wrappers.conditions.text_parts import (
-    files_of,
-    head_pattern,
-    learned_parts,
-    modules_of,
-    require_known,
-    with_absolute_paths,
-)
 
 __all__ = [
     "CBF",
@@ -43,16 +34,9 @@ __all__ = [
     "LearnedCondition",
     "LearnedHOCBF",
     "condition_names",
-    "conditions_for",
-    "files_of",
-    "head_pattern",
-    "learned_parts",
-    "modules_of",
     "parse_condition",
     "parse_conditions",
     "power",
-    "require_known",
     "require_readable",
     "spec_of",
-    "with_absolute_paths",
 ]

@@ -84,13 +84,7 @@ class Condition(ABC):
 
     def __post_init__(self) -> None:
         margin = self.sampling_margin
-        if margin in ("none", FIRST_ORDER):
-            return
-        if (
-            isinstance(margin, bool)
-            or not isinstance(margin, int | float)
-            or not 0 <= margin < math.inf
-        ):
+        if margin not in ("none", FIRST_ORDER) and not is_nonnegative(margin):
             raise ConfigurationError(
                 f"sampling_margin = {shown(margin)}; allowed: none, {FIRST_ORDER}, or a number >= 0"
             )
@@ -109,6 +103,9 @@ class Condition(ABC):
         Args:
             model: system that the filter knows.
             barrier: barrier h.
+
+        Returns:
+            The constraint, with its margin for sampling.
 
         Raises:
             RelativeDegreeError: The condition does not suit the barrier's relative degree.
@@ -132,7 +129,15 @@ class Condition(ABC):
 
     @abstractmethod
     def derived(self, model: ControlAffineSDE, barrier: Barrier) -> AffineConstraint:
-        """Derive the constraint without a margin for sampling."""
+        """Derive the constraint without a margin for sampling.
+
+        Args:
+            model: system to differentiate along.
+            barrier: barrier h.
+
+        Returns:
+            The constraint.
+        """
 
     @classmethod
     def for_gains(cls, gains: Sequence[float]) -> Condition:
@@ -177,6 +182,12 @@ def _sympified(found: Any, inputs: int) -> AffineConstraint:
         raise ValueError(f"{len(found.coefficient)} coefficients for {inputs} inputs")
     coefficient, chain = (tuple(map(sp.sympify, e)) for e in (found.coefficient, found.chain))
     return replace(found, coefficient=coefficient, offset=sp.sympify(found.offset), chain=chain)
+
+
+def is_nonnegative(value: Any) -> bool:
+    """Return whether a value is a finite number of at least 0."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return is_number and 0 <= value < math.inf
 
 
 @lru_cache(maxsize=256)

@@ -129,7 +129,7 @@ class BayesianSCBF(LearnedCondition):
         )
 
     def variance_factors(self, outputs: np.ndarray) -> np.ndarray:
-        """By what the variance of each f_i + g_i u is multiplied, z^2 among others, shape (n,).
+        """Return by what the variance of each f_i + g_i u is multiplied, shape (n,), as by z^2.
 
         Args:
             outputs: whether the barrier depends on each state, (n,).
@@ -144,10 +144,8 @@ class BayesianSCBF(LearnedCondition):
         # The variance of the weights is that of the noise, which may be as large as its interval
         # allows: more than estimated, since the interval leaves out a quarter at most of what is
         # smaller, and the median of a chi^2 lies below its mean.
-        largest, estimated = (
-            noise.sigma_intervals(self.delta_sigma)[:, 1] ** 2,
-            noise.squares / noise.count,
-        )
+        largest = noise.sigma_intervals(self.delta_sigma)[:, 1] ** 2
+        estimated = noise.squares / noise.count
         allowed = np.divide(largest, estimated, out=np.ones(len(largest)), where=estimated > 0)
         return (
             stats.chi2.ppf(1.0 - self.delta_theta, outputs.sum() * self.learned.mean.shape[1])

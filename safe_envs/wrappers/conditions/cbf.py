@@ -17,7 +17,13 @@ from safe_envs.errors import ConfigurationError, RelativeDegreeError, shortened,
 from safe_envs.problem.barrier import Barrier
 from safe_envs.wrappers.conditions.base import Condition
 from safe_envs.wrappers.conditions.chain import chain_of
-from safe_envs.wrappers.conditions.class_k import ClassK, Rate, positive_rates, rates
+from safe_envs.wrappers.conditions.class_k import (
+    ClassK,
+    Rate,
+    entries_of,
+    positive_rates,
+    rates,
+)
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 _STEPS = 100
@@ -175,16 +181,14 @@ _WHY = (
 
 
 def gains_of_poles(poles: Sequence[float]) -> tuple[float, ...]:
-    """k_0..k_(r-1) of the monic polynomial with the given roots."""
+    """Return k_0..k_(r-1) of the monic polynomial with the given roots."""
     s = sp.Symbol("s")
     polynomial = sp.Poly(sp.Mul(*[s - sp.Rational(repr(p)) for p in poles]), s)
     return tuple(float(c) for c in reversed(polynomial.all_coeffs()[1:]))
 
 
 def _real_negative_poles(given: Any) -> tuple[float, ...]:
-    entries = (
-        tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
-    )
+    entries = entries_of(given)
     listing = shortened(", ".join(map(str, entries)) or "none")
     if not all(isinstance(pole, Number) and not isinstance(pole, bool) for pole in entries):
         raise ConfigurationError(

@@ -17,13 +17,18 @@ from safe_envs.wrappers.conditions.class_k import ClassK, Rate, applied
 def chain_of(
     model: ControlAffineSDE, barrier: Barrier, alphas: Sequence[Rate] | None, derivative: Derivative
 ) -> tuple[list[sp.Expr], sp.Expr]:
-    """b_0 = h, b_j = D b_(j-1) + alpha_j(b_(j-1)) for j < r, and the part of b_r without the input.
+    """Return a chain and its end without the input.
+
+    It is b_0 = h, b_j = D b_(j-1) + alpha_j(b_(j-1)) for j < r; the end is that part of b_r.
 
     Args:
         model: the system that D differentiates along.
         barrier: h.
         alphas: alpha_1..alpha_r; None for zeros, with r computed.
         derivative: D, the Lie derivative or the Ito generator.
+
+    Returns:
+        b_0, ..., b_(r-1), and the part of b_r without the input.
 
     Raises:
         RelativeDegreeError: the number of functions is not the relative degree, or there is none.
@@ -54,6 +59,10 @@ def resolved(expression: Any, barrier: Barrier) -> sp.Expr:
     """Return a derivative of a chain without what sympy adds at kinks of class-K functions.
 
     At the kink of s |s| and the like, that has no weight.
+
+    Args:
+        expression: the derivative.
+        barrier: barrier of the chain.
 
     Raises:
         SystemDefinitionError: the kink is the barrier's own: there the chain would jump, and Ito's

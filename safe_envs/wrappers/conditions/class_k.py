@@ -166,16 +166,24 @@ Rate = float | ClassK
 """A class-K function, with a number p for the linear one p s."""
 
 
+def entries_of(given: Any) -> tuple[Any, ...]:
+    """Return the entries of a sequence; one that is none, or a text, is its only entry."""
+    several = isinstance(given, Sequence) and not isinstance(given, str)
+    return tuple(given) if several else (given,)
+
+
 def rates(name: str, given: Any) -> tuple[Rate, ...]:
     """Return class-K functions, the linear ones as positive floats in 1/s.
+
+    Args:
+        name: of the parameter, for errors.
+        given: a function or a sequence of them, each a number, a text, an expression or a `ClassK`.
 
     Raises:
         ConfigurationError: there is none, or one is neither a positive number nor a class-K
             function.
     """
-    entries = (
-        tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
-    )
+    entries = entries_of(given)
     found = tuple(
         ClassK(r) if isinstance(r, str) or getattr(r, "free_symbols", None) else r for r in entries
     )
@@ -188,12 +196,14 @@ def rates(name: str, given: Any) -> tuple[Rate, ...]:
 def positive_rates(name: str, given: Any) -> tuple[float, ...]:
     """Return linear class-K functions as floats, or say that one is not positive.
 
+    Args:
+        name: of the parameter, for errors.
+        given: a rate or a sequence of them, in 1/s.
+
     Raises:
         ConfigurationError: there is none, or one is not a positive finite number.
     """
-    entries = (
-        tuple(given) if isinstance(given, Sequence) and not isinstance(given, str) else (given,)
-    )
+    entries = entries_of(given)
     try:
         # A text that is a number is one already.
         values = (
@@ -208,7 +218,12 @@ def positive_rates(name: str, given: Any) -> tuple[float, ...]:
 
 
 def applied(rate: Rate, value: sp.Expr) -> sp.Expr:
-    """Return alpha(value) for a rate of either kind."""
+    """Return alpha(value) for a rate of either kind.
+
+    Args:
+        rate: the class-K function alpha.
+        value: expression to which it is applied.
+    """
     return rate(value) if isinstance(rate, ClassK) else sp.Float(rate, 17) * value
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -19,7 +18,7 @@ from safe_envs.dynamics.lie import (
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, RelativeDegreeError, shown
 from safe_envs.problem.barrier import Barrier
-from safe_envs.wrappers.conditions.base import FIRST_ORDER, Condition
+from safe_envs.wrappers.conditions.base import FIRST_ORDER, Condition, is_nonnegative
 from safe_envs.wrappers.conditions.cbf import gains_of_poles
 from safe_envs.wrappers.conditions.chain import chain_of
 from safe_envs.wrappers.conditions.class_k import positive_rates
@@ -111,7 +110,7 @@ class LearnedCondition(Condition):
 
 
 def _at_least_zero(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < math.inf:
+    if not is_nonnegative(value):
         raise ConfigurationError(f"{name} = {shown(value)}; give a number >= 0")
 
 
@@ -122,7 +121,7 @@ def require_share(name: str, value: Any) -> None:
         name: what the message calls it.
         value: what was given.
     """
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < 1:
+    if not (is_nonnegative(value) and 0 < value < 1):
         raise ConfigurationError(f"{name} = {shown(value)}; give a number above 0 and below 1")
 
 

@@ -23,7 +23,7 @@ from safe_envs.number_text import real_or_complex
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.base import Condition
 from safe_envs.wrappers.conditions.registry import condition_class, name_of
-from safe_envs.wrappers.conditions.text_parts import Part, part_of, parts_of
+from safe_envs.wrappers.conditions.text_parts import ConditionText, part_of, parts_of
 from safe_envs.wrappers.learning import LearnedModel, load_learned
 
 _MOST_ENTRIES = 12
@@ -32,6 +32,9 @@ dozen gains take a second."""
 
 Learned = Mapping[str, LearnedModel]
 """Learned models by method."""
+
+Conditions = Condition | Sequence[Condition] | str
+"""One condition for every barrier, one for each, or their text."""
 
 
 def parse_conditions(
@@ -59,9 +62,7 @@ def parse_conditions(
     )
 
 
-def conditions_for(
-    problem: SafetyProblem, given: Condition | Sequence[Condition] | str
-) -> tuple[Condition, ...]:
+def conditions_for(problem: SafetyProblem, given: Conditions) -> tuple[Condition, ...]:
     """Return a condition for every barrier of a problem.
 
     Args:
@@ -145,14 +146,16 @@ def _parsed(
 
 
 def _of_model(
-    part: Part, condition: Any, given: dict[str, Any], gains: Sequence[float]
+    part: ConditionText, condition: Any, given: dict[str, Any], gains: Sequence[float]
 ) -> Condition:
     if condition.method is not None or set(given) <= {"sampling_margin"}:
         return replace(_made(part, condition.for_gains, gains), **given)
     return _made(part, condition, **given)
 
 
-def _made(part: Part, make: Callable[..., Condition], *args: Any, **given: Any) -> Condition:
+def _made(
+    part: ConditionText, make: Callable[..., Condition], *args: Any, **given: Any
+) -> Condition:
     """Call what makes a condition; any error of its class becomes a ConfigurationError."""
     try:
         return make(*args, **given)
@@ -178,7 +181,7 @@ def _learned_for(
     return learned[condition.method]
 
 
-def _settings(part: Part) -> tuple[Any, dict[str, Any]]:
+def _settings(part: ConditionText) -> tuple[Any, dict[str, Any]]:
     """Return the class of a condition, and the arguments that its text sets."""
     condition = condition_class(part.name)
     parameters = dict(inspect.signature(condition).parameters)

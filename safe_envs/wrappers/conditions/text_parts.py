@@ -25,7 +25,7 @@ _MODULE = r"[A-Za-z_][\w.]*:[A-Za-z_]\w*(?=\s*(?:[:+,]|$))"
 """MODULE:NAME; a parameter is none, for a "=" follows its name."""
 
 
-class Part(NamedTuple):
+class ConditionText(NamedTuple):
     """The text of one condition, taken apart: its name or place, and what sets its parameters."""
 
     text: str
@@ -59,7 +59,7 @@ def _is_known(name: str) -> bool:
     return ":" in name or name in condition_names()
 
 
-def parts_of(text: str) -> list[Part]:
+def parts_of(text: str) -> list[ConditionText]:
     """Take the text of a filter apart: a "+" divides where the head of a condition follows it."""
     head = re.compile(head_pattern())
     start = len(_head(text, head))
@@ -68,15 +68,15 @@ def parts_of(text: str) -> list[Part]:
     return [_part(part, head) for part in (text[:start] + first, *others)]
 
 
-def part_of(text: str) -> Part:
+def part_of(text: str) -> ConditionText:
     """Take the text of one condition apart."""
     return _part(text, re.compile(head_pattern()))
 
 
-def _part(text: str, head: re.Pattern[str]) -> Part:
+def _part(text: str, head: re.Pattern[str]) -> ConditionText:
     name = _head(text, head)
     rest, *settings = text[len(name) :].split(":")
-    return Part(text, name + rest, settings)
+    return ConditionText(text, name + rest, settings)
 
 
 def _head(text: str, head: re.Pattern[str]) -> str:

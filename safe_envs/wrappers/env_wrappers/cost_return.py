@@ -47,7 +47,7 @@ class CostReturnWrapper:
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Start an episode, as in Gymnasium."""
+        """Start an episode; see `gymnasium.Env.reset`."""
         restarted = (options or {}).get("reset_mask", True)
         self._ended = self._ended & ~np.asarray(restarted, dtype=bool)
         return self.env.reset(seed=seed, options=options)
@@ -71,25 +71,12 @@ class CostReturnWrapper:
                 f"info of {self.env} has no 'cost', but {', '.join(info) or 'nothing'}; use an env"
                 " of this project"
             )
-        if self._mode is None:
-            return (
-                observation,
-                reward,
-                info["cost"],
-                terminated,
-                truncated,
-                {**info, "cost_sum": info["cost"]},
-            )
-        cost = self._costs(info)
-        self._ended = terminated | truncated
-        return (
-            observation,
-            reward,
-            cost,
-            terminated,
-            truncated,
-            {**info, "cost_sum": cost, "_cost_sum": info["_cost"]},
-        )
+        cost, masks = info["cost"], {}
+        if self._mode is not None:
+            cost, masks = self._costs(info), {"_cost_sum": info["_cost"]}
+            self._ended = terminated | truncated
+        info = {**info, "cost_sum": cost, **masks}
+        return observation, reward, cost, terminated, truncated, info
 
     def _costs(self, info: dict[str, Any]) -> np.ndarray:
         """Return the cost of each env, shape (num_envs,), where the info may be that of a reset."""

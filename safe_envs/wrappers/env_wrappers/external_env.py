@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
@@ -21,6 +21,7 @@ from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Variable
 from safe_envs.problem.validation import degree_of
+from safe_envs.wrappers.conditions.class_k import entries_of
 
 Map = Callable[[np.ndarray], np.ndarray]
 
@@ -41,7 +42,15 @@ class ActionMap(NamedTuple):
 
     @classmethod
     def scaled(cls, factor: Any, offset: Any = 0.0) -> ActionMap:
-        """Input = offset + factor action; numbers, or one for each input."""
+        """Return the map of input = offset + factor action.
+
+        Args:
+            factor: a number, or one for each input.
+            offset: likewise.
+
+        Raises:
+            ConfigurationError: A number is not finite, or a factor is 0.
+        """
         f, o = np.asarray(factor, dtype=float), np.asarray(offset, dtype=float)
         if not (np.isfinite(f).all() and np.isfinite(o).all() and f.all()):
             raise ConfigurationError(
@@ -172,17 +181,13 @@ class FilterSpec:
 
     def inputs(self, actions: np.ndarray) -> np.ndarray:
         """Return the model's inputs (..., m) for the env's actions."""
-        return np.asarray(
-            actions if self.action_map is None else self.action_map.to_input(actions),
-            dtype=np.float64,
-        )
+        found = actions if self.action_map is None else self.action_map.to_input(actions)
+        return np.asarray(found, dtype=np.float64)
 
     def actions(self, inputs: np.ndarray) -> np.ndarray:
         """Return the env's actions (..., m) for the model's inputs."""
-        return np.asarray(
-            inputs if self.action_map is None else self.action_map.to_action(inputs),
-            dtype=np.float64,
-        )
+        found = inputs if self.action_map is None else self.action_map.to_action(inputs)
+        return np.asarray(found, dtype=np.float64)
 
     def problem(
         self, env: Any, action_space: gym.Space[Any], name: str, steps: int | None
@@ -200,20 +205,17 @@ class FilterSpec:
                 has inputs, the action map does not take it to a box and back, or the control period
                 is unknown.
         """
-        period = self._period(env, name)
+        period, (low, high) = self._period(env, name), self._bounds(action_space, name)
         defaults = suitable(self.model, self.named)
         model, still = self.model, sp.Integer(0)
-        laws = (still,) * model.m if self.nominal is None else _listed(self.nominal)
+        laws = (still,) * model.m if self.nominal is None else entries_of(self.nominal)
         return SafetyProblem(
             name=name,
             plant=model,
             model=model,
             barriers=self.named,
             states=tuple(Variable(s, -math.inf, math.inf) for s in model.states),
-            inputs=tuple(
-                Variable(u, *ends)
-                for u, ends in zip(model.inputs, self._box(action_space, name), strict=True)
-            ),
+            inputs=tuple(map(Variable, model.inputs, low.tolist(), high.tolist())),
             reward=still,
             nominal=tuple(law_of(law, model) for law in laws),
             starts={"of the env": Start.at((0.0,) * model.n)},
@@ -230,7 +232,7 @@ class FilterSpec:
             )
         return finite_number("dt", given)
 
-    def _box(self, space: gym.Space[Any], name: str) -> list[tuple[float, float]]:
+    def _bounds(self, space: gym.Space[Any], name: str) -> tuple[np.ndarray, np.ndarray]:
         m = self.model.m
         if (
             not isinstance(space, gym.spaces.Box)
@@ -247,22 +249,17 @@ class FilterSpec:
         least, most = ends.min(axis=0), ends.max(axis=0)
         rng = np.random.default_rng(0)
         actions = rng.uniform(low, high, (_POINTS, m))
-        inputs = rng.uniform(least, most, (_POINTS, m))
-        width = most - least
-        there, back = self._mapped(actions), self.actions(inputs)
-        fits = (
-            np.allclose((self.actions(there) - actions) / (high - low), 0.0, atol=1e-6)
-            and (there >= least - 1e-6 * width).all()
-            and (there <= most + 1e-6 * width).all()
-            and (back >= low - 1e-6 * (high - low)).all()
-            and (back <= high + 1e-6 * (high - low)).all()
-        )
-        if not fits or not width.all():
+        there, back = self._mapped(actions), self.actions(rng.uniform(least, most, (_POINTS, m)))
+        fits = all(
+            (found >= lo - 1e-6 * (hi - lo)).all() and (found <= hi + 1e-6 * (hi - lo)).all()
+            for found, lo, hi in ((there, least, most), (back, low, high))
+        ) and np.allclose((self.actions(there) - actions) / (high - low), 0.0, atol=1e-6)
+        if not fits or (least == most).any():
             raise ConfigurationError(
                 f"the action map does not take the action space {space} to a box of inputs and"
                 " back: to_action is to undo to_input, and each action is to move one input alone"
             )
-        return list(zip(least.tolist(), most.tolist(), strict=True))
+        return least, most
 
     def _mapped(self, actions: np.ndarray) -> np.ndarray:
         found = self.inputs(actions)
@@ -272,7 +269,3 @@ class FilterSpec:
                 " to keep the shape"
             )
         return found
-
-
-def _listed(laws: Any) -> tuple[Any, ...]:
-    return tuple(laws) if isinstance(laws, Sequence) else (laws,)

@@ -12,7 +12,8 @@ from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info, filter_info
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import Condition, spec_of
+from safe_envs.wrappers.conditions import spec_of
+from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
 from safe_envs.wrappers.safety_filter import SafetyFilter
 
@@ -23,7 +24,7 @@ class FilterLayer:
     def attach(
         self,
         inner: Any,
-        condition: Condition | Sequence[Condition] | str,
+        condition: Conditions,
         knowledge: str,
         objective: str,
         priorities: Sequence[float] | None,
@@ -52,13 +53,32 @@ class FilterLayer:
         self._tolerance = [1e-6 * (high - low) for low, high in problem.box]
         return text
 
-    def changed_action(self, decided: Sequence[Any]) -> ConfigurationError:
-        """Return the error of a wrapper below that changed the action that was decided."""
-        return ConfigurationError(
-            f"a wrapper below the filter changed the safe action {decided} into"
-            f" {self._inner.executed}: {self}. Put wrappers that change actions around the filter;"
-            " several conditions go into one SafetyFilter"
-        )
+    def execute(self, env: Any, decided: Sequence[Any], directly: bool) -> Any:
+        """Return what the step of an env under the decided input returns.
+
+        Args:
+            env: the env below the filter.
+            decided: m components of the input.
+            directly: whether nothing below can change a step, so that the input need not be
+                encoded.
+
+        Returns:
+            Observation, reward, terminated, truncated and info.
+
+        Raises:
+            ConfigurationError: A wrapper below changed the action.
+        """
+        if directly:
+            return self._inner.step_physical(decided)
+        found = env.step(self._inner.normalized_action(decided))
+        for u, v, t in zip(decided, self._inner.executed, self._tolerance, strict=True):
+            if np.count_nonzero(abs(u - v) > t):
+                raise ConfigurationError(
+                    f"a wrapper below the filter changed the safe action {decided} into"
+                    f" {self._inner.executed}: {self}. Put wrappers that change actions around the"
+                    " filter; several conditions go into one SafetyFilter"
+                )
+        return found
 
 
 def third_party_spec(
@@ -111,13 +131,10 @@ def state_layer(env: Any, kinds: tuple[type, ...], vector: bool) -> Any:
 
 def _unreadable(env: Any, vector: bool) -> ConfigurationError:
     if isinstance(env, gym.vector.VectorEnv) != vector:
-        batched = isinstance(env, gym.vector.VectorEnv)
-        kinds = (
-            ("SafetyFilterVectorWrapper", "a vector env")
-            if batched
-            else ("SafetyFilterWrapper", "a single env")
+        kind, wrapper = ("single", "") if vector else ("vector", "Vector")
+        return ConfigurationError(
+            f"{env} is a {kind} env; put SafetyFilter{wrapper}Wrapper over it"
         )
-        return ConfigurationError(f"{env} is {kinds[1]}; put {kinds[0]} over it")
     if vector and any(isinstance(each.unwrapped, SafeEnv) for each in getattr(env, "envs", [])):
         return ConfigurationError(
             f"{env} holds envs of this project one by one; make them by gym.make_vec, which is many"

@@ -26,7 +26,50 @@ _CHANGE_SIGHT = (
 """Wrappers that change observations."""
 
 
-class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.RecordConstructorArgs):
+class MonitorLayer:
+    """The part of a monitor that does not depend on the number of envs."""
+
+    env: Any
+
+    def watch(
+        self, spec: FilterSpec, one: Any, space: Any, flavour: Flavour, count: int = 1
+    ) -> None:
+        """Prepare to look at an env, or at a batch of them.
+
+        Args:
+            spec: how the state is seen, and what is safe.
+            one: an env without wrappers, where the attribute `dt` may be found.
+            space: action space of one env.
+            flavour: "floats" for one env, "arrays" for a batch.
+            count: number of envs.
+
+        Raises:
+            ConfigurationError: The spec does not fit the env.
+        """
+        env, made = self.env, self.env.spec
+        name = type(env.unwrapped).__name__ if made is None else made.id
+        limit = None if made is None else made.max_episode_steps
+        self.problem = spec.problem(one, space, name, limit)
+        self._spec = spec
+        h = [spec.model.numeric(barrier.expression) for barrier in spec.named]
+        self._barriers: Any = compile_function(spec.model.states, h, flavour)
+        self._low, self._high = space.low.astype(np.float64), space.high.astype(np.float64)
+        self._kind = space.dtype
+        is_drawn = env.render_mode == "rgb_array"
+        self.viewer = Viewer(self.problem, "rgb_array", count) if is_drawn else None
+
+    def normalized_action(self, u: Sequence[Any]) -> np.ndarray:
+        """Return the env's action for components of inputs; the inverse of `physical_action`."""
+        # Of a batch the components are arrays, and the envs come first in the actions.
+        actions = self._spec.actions(np.ascontiguousarray(np.array(u).T))
+        return np.clip(actions, self._low, self._high).astype(self._kind)
+
+
+class SafetyMonitor(
+    MonitorLayer,
+    gym.Wrapper[np.ndarray, Any, np.ndarray, Any],
+    gym.utils.RecordConstructorArgs,
+):
     """Adds cost, violation, barrier, h_min and episode_cost to `info`, by a model's barriers.
 
     Actions pass unchanged.
@@ -52,13 +95,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         gym.Wrapper.__init__(self, env)
         spec = FilterSpec.load(spec) if isinstance(spec, str) else spec
         doubt_layers(env)
-        self.problem = spec.problem(env.unwrapped, env.action_space, *named_and_limited(env))
-        self._spec = spec
-        self._barriers = barriers_of(spec, "floats")
-        self._low, self._high, self._kind = ends_of(env.action_space)
-        self.viewer = (
-            Viewer(self.problem, "rgb_array", 1) if env.render_mode == "rgb_array" else None
-        )
+        self.watch(spec, env.unwrapped, env.action_space, "floats")
         self.executed: Sequence[float] = ()
         self._x: tuple[float, ...] | None = None
         self._episode = Episode()
@@ -83,14 +120,10 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
             )
         return self._spec.inputs(np.clip(given, self._low, self._high)).tolist()
 
-    def normalized_action(self, u: Sequence[float]) -> np.ndarray:
-        """Return the env's action for an input of the model; the inverse of `physical_action`."""
-        return np.clip(self._spec.actions(np.array(u)), self._low, self._high).astype(self._kind)
-
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start an episode."""
+        """Start an episode; see `gymnasium.Env.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._episode.restart()
         seen = self._seen(observation)
@@ -110,7 +143,7 @@ class SafetyMonitor(gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.Rec
         return observation, reward, terminated, truncated, {**info, **seen}
 
     def step_physical(self, u: Sequence[float]) -> tuple[np.ndarray, Any, bool, bool, Info]:
-        """`step` for the model's input."""
+        """Pass on an input of the model; see `step`."""
         return self.step(self.normalized_action(u))
 
     def render(self) -> Any:
@@ -155,26 +188,6 @@ def doubt_layers(env: gym.Env[Any, Any]) -> None:
         layer = layer.env
 
 
-def named_and_limited(env: Any) -> tuple[str, int | None]:
-    """Return the name of an env, and the number of steps after which it is truncated."""
-    spec = env.spec
-    return (
-        (type(env.unwrapped).__name__, None) if spec is None else (spec.id, spec.max_episode_steps)
-    )
-
-
-def ends_of(space: Any) -> tuple[np.ndarray, np.ndarray, Any]:
-    """Return the bounds of a Box action space in double precision, and the type of its numbers."""
-    return space.low.astype(np.float64), space.high.astype(np.float64), space.dtype
-
-
-def barriers_of(spec: FilterSpec, flavour: Flavour) -> Any:
-    """Return the barriers of a spec, compiled."""
-    return compile_function(
-        spec.model.states, [spec.model.numeric(b.expression) for b in spec.named], flavour
-    )
-
-
 def _undefined(name: str, x: Sequence[float]) -> NumericalError:
     return NumericalError(
         f"a barrier over {name} has no finite value at the state {list(x)}; check it there"
@@ -183,6 +196,11 @@ def _undefined(name: str, x: Sequence[float]) -> NumericalError:
 
 def barrier_table(barriers: Any, name: str, x: Components) -> np.ndarray:
     """Return the values of the barriers at a batch of states, shape (B, k).
+
+    Args:
+        barriers: compiled for arrays.
+        name: of the problem, for errors.
+        x: n components of the states.
 
     Raises:
         NumericalError: one is not finite.

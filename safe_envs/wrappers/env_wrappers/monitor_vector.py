@@ -14,19 +14,16 @@ from safe_envs.envs.episode import Episodes
 from safe_envs.envs.info import Info, with_masks
 from safe_envs.envs.vector_env import VectorStep
 from safe_envs.errors import ConfigurationError, InvalidInputError
-from safe_envs.rendering.viewer import Viewer
 from safe_envs.validators import real_array
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
 from safe_envs.wrappers.env_wrappers.monitor import (
+    MonitorLayer,
     barrier_table,
-    barriers_of,
     doubt_layers,
-    ends_of,
-    named_and_limited,
 )
 
 
-class SafetyMonitorVector(gym.vector.VectorWrapper):
+class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):
     """`SafetyMonitor` over a whole batch: arrays with the batch in front, and Gymnasium's masks.
 
     A step that only resets an env (next-step autoreset) counts nothing but its start. With
@@ -46,12 +43,11 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
     """
 
     def __init__(self, env: gym.vector.VectorEnv, spec: FilterSpec | str) -> None:
-        super().__init__(env)
+        gym.vector.VectorWrapper.__init__(self, env)
         spec = FilterSpec.load(spec) if isinstance(spec, str) else spec
         for layer in getattr(env.unwrapped, "envs", [])[:1]:
             doubt_layers(layer)
-        self.problem = spec.problem(_one_of(env), env.single_action_space, *named_and_limited(env))
-        self._spec = spec
+        self.watch(spec, _one_of(env), env.single_action_space, "arrays", self.num_envs)
         try:
             self._mode = AutoresetMode(env.metadata.get("autoreset_mode"))
         except ValueError as error:
@@ -59,13 +55,6 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
                 f"{env} does not say when it resets: its metadata has no autoreset_mode of"
                 " Gymnasium"
             ) from error
-        self._barriers = barriers_of(spec, "arrays")
-        self._low, self._high, self._kind = ends_of(env.single_action_space)
-        self.viewer = (
-            Viewer(self.problem, "rgb_array", self.num_envs)
-            if env.render_mode == "rgb_array"
-            else None
-        )
         self.executed: Components = ()
         self._x: Components = ()
         self.episodes = Episodes(self.num_envs)
@@ -91,16 +80,10 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
             )
         return _columns(self._spec.inputs(np.clip(given, self._low, self._high)))
 
-    def normalized_action(self, u: Sequence[Any]) -> np.ndarray:
-        """Return the envs' actions for components of inputs; the inverse of `physical_action`."""
-        return np.clip(self._spec.actions(np.stack(u, axis=-1)), self._low, self._high).astype(
-            self._kind
-        )
-
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start episodes in every env, or in those of `options["reset_mask"]`."""
+        """Start episodes in every env, or those of a mask; see `SafeVectorEnv.reset`."""
         # Gymnasium's own vector envs take the mask out of the mapping that they are given.
         restarted = np.array(
             (options or {}).get("reset_mask", self.episodes.everywhere), dtype=bool
@@ -149,7 +132,7 @@ class SafetyMonitorVector(gym.vector.VectorWrapper):
         )
 
     def step_physical(self, u: Sequence[Any]) -> VectorStep:
-        """`step` for the components of the model's inputs."""
+        """Pass on components of the model's inputs; see `step`."""
         return self.step(self.normalized_action(u))
 
     def render(self) -> Any:

@@ -11,7 +11,7 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker
 
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.info import Info, filter_info
-from safe_envs.wrappers.conditions import Condition
+from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
     rest_info,
@@ -57,7 +57,7 @@ class SafetyFilterWrapper(
     def __init__(
         self,
         env: gym.Env[np.ndarray, np.ndarray],
-        condition: Condition | Sequence[Condition] | str,
+        condition: Conditions,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
@@ -79,7 +79,7 @@ class SafetyFilterWrapper(
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start an episode."""
+        """Start an episode; see `gymnasium.Env.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._interventions = 0
         self._infeasible = 0
@@ -92,19 +92,9 @@ class SafetyFilterWrapper(
         executed, nominal, active = decision.action, decision.proposed, True in decision.active
         if self._inner.viewer is not None:
             self._inner.viewer.announce([nominal], [active], [decision.feasible])
-        if self._directly:
-            observation, reward, terminated, truncated, info = self._inner.step_physical(executed)
-        else:
-            observation, reward, terminated, truncated, info = self.env.step(
-                self._inner.normalized_action(executed)
-            )
-            if any(
-                [  # noqa: C419
-                    abs(u - v) > t
-                    for u, v, t in zip(executed, self._inner.executed, self._tolerance, strict=True)
-                ]
-            ):
-                raise self.changed_action(executed)
+        observation, reward, terminated, truncated, info = self.execute(
+            self.env, executed, self._directly
+        )
         differs = active and executed != nominal
         self._interventions += differs
         self._infeasible += not decision.feasible

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from safe_envs.envs.info import Info, filter_info, with_masks
 from safe_envs.envs.vector_env import SafeVectorEnv, VectorStep
-from safe_envs.wrappers.conditions import Condition
+from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.env_wrappers.layers import (
     FilterLayer,
     rest_info,
@@ -37,7 +37,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def __init__(
         self,
         env: gym.vector.VectorEnv,
-        condition: Condition | Sequence[Condition] | str,
+        condition: Conditions,
         knowledge: str = "model",
         objective: str = "nearest",
         priorities: Sequence[float] | None = None,
@@ -57,7 +57,7 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, Info]:
-        """Start episodes in every env, or in those of `options["reset_mask"]`."""
+        """Start episodes in every env, or those of a mask; see `SafeVectorEnv.reset`."""
         observation, info = self.env.reset(seed=seed, options=options)
         present = info["_cost"]
         self._forget(present)
@@ -97,19 +97,9 @@ class SafetyFilterVectorWrapper(FilterLayer, gym.vector.VectorWrapper):
             self._inner.viewer.announce(
                 np.stack(decision.proposed, axis=-1), active, decision.feasible
             )
-        if self.env is self._inner:
-            observation, reward, terminated, truncated, info = self._inner.step_physical(
-                decision.action
-            )
-        else:
-            observation, reward, terminated, truncated, info = self.env.step(
-                self._inner.normalized_action(decision.action)
-            )
-            for u, v, tolerance in zip(
-                decision.action, self._inner.executed, self._tolerance, strict=True
-            ):
-                if not np.allclose(u, v, rtol=0.0, atol=tolerance):
-                    raise self.changed_action(decision.action)
+        observation, reward, terminated, truncated, info = self.execute(
+            self.env, decision.action, self.env is self._inner
+        )
         added = self._decided(decision, active)
         begun = self._inner.episodes.begun
         if np.count_nonzero(begun):

@@ -20,7 +20,7 @@ from safe_envs.dynamics.codegen import (
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.filter_qp.decision import UndefinedConstraintError
 from safe_envs.wrappers.filter_qp.qp import FilterQP
-from safe_envs.wrappers.qp import dispatch
+from safe_envs.wrappers.qp import dispatch, second_order_batch, second_order_constraint
 from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance, tolerances
 
 
@@ -52,6 +52,9 @@ class CompiledQP:
         self._larger: Any = np.maximum if arrays else max
         self._tolerance: Any = tolerances if arrays else tolerance
         self._project: Any = dispatch.project_arrays if arrays else dispatch.project_floats
+        self._project_uncertain: Any = (
+            second_order_batch.project_arrays if arrays else second_order_constraint.project_floats
+        )
         if qp.clf is not None:
             qp.clf.require_known(qp.model)
             weights = (qp.clf.input_weight, qp.clf.slack_weight)

@@ -69,6 +69,9 @@ class ComponentFilter:
         Args:
             x: n components of the states.
             u: m components of the proposed inputs.
+
+        Returns:
+            The decisions in components.
         """
         # What overflows or has no value is found below, which says where.
         with np.errstate(all="ignore"):

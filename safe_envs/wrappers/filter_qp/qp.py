@@ -36,43 +36,6 @@ class FilterQP:
     dt: float
     clf: CLF | None
 
-    @classmethod
-    def checked(
-        cls,
-        model: ControlAffineSDE,
-        constraints: tuple[AffineConstraint, ...],
-        box: Sequence[tuple[float, float]],
-        *,
-        weights: Sequence[float] | None,
-        priorities: Sequence[float] | None,
-        dt: float | None,
-        clf: CLF | None,
-    ) -> FilterQP:
-        """Return the QP of arguments as users give them; None stands for weights of one.
-
-        Args:
-            model: system whose symbols the constraints hold.
-            constraints: k constraints.
-            box: (low, high) of each of the m inputs.
-            weights: m weights of the inputs.
-            priorities: k weights of the squared slacks.
-            dt: control period in s.
-            clf: goal of the joint QP.
-
-        Raises:
-            ConfigurationError: The input bounds, a weight or a priority is not allowed, or dt is
-                missing.
-        """
-        return cls(
-            model,
-            constraints,
-            *_bounds(model, box),
-            weights=_positive("weights", weights, model.m),
-            priorities=_positive("priorities", priorities, len(constraints)),
-            dt=_period(constraints, dt),
-            clf=clf,
-        )
-
     @property
     def plain(self) -> bool:
         """Whether the constraints at the proposed input are all there is.
@@ -93,13 +56,20 @@ class FilterQP:
         )
 
 
-def _bounds(
+def input_bounds(
     model: ControlAffineSDE, box: Sequence[tuple[float, float]]
 ) -> tuple[list[float], list[float]]:
+    """Return the lower and the upper bounds of m inputs.
+
+    Args:
+        model: system that has the inputs.
+        box: (low, high) of each input, as users give them.
+
+    Raises:
+        ConfigurationError: Their number is wrong, or one is not a finite interval.
+    """
     if len(box) != model.m:
-        raise ConfigurationError(
-            f"the box has {len(box)} intervals; the model has {model.m} inputs"
-        )
+        raise ConfigurationError(f"box has {len(box)} intervals; the model has {model.m} inputs")
     low, high = [float(pair[0]) for pair in box], [float(pair[1]) for pair in box]
     for symbol, lo, hi in zip(model.inputs, low, high, strict=True):
         if not (math.isfinite(lo) and math.isfinite(hi) and lo < hi):
@@ -110,14 +80,33 @@ def _bounds(
     return low, high
 
 
-def _positive(name: str, given: Sequence[float] | None, count: int) -> list[float]:
+def positive_weights(name: str, given: Sequence[float] | None, count: int) -> list[float]:
+    """Return weights as floats.
+
+    Args:
+        name: of the argument, for errors.
+        given: as users give them; None for ones.
+        count: how many there are to be.
+
+    Raises:
+        ConfigurationError: Their number is wrong, or one is not positive and finite.
+    """
     values = [1.0] * count if given is None else [float(v) for v in given]
     if len(values) != count or not all(math.isfinite(v) and v > 0 for v in values):
         raise ConfigurationError(f"{name} = {values}; give {count} positive numbers")
     return values
 
 
-def _period(constraints: Sequence[AffineConstraint], dt: float | None) -> float:
+def control_period(constraints: Sequence[AffineConstraint], dt: float | None) -> float:
+    """Return the control period in s, 0 where none is given.
+
+    Args:
+        constraints: those of the filter, some of which may need it.
+        dt: as users give it.
+
+    Raises:
+        ConfigurationError: It is not positive and finite, or missing.
+    """
     if dt is None:
         if any(constraint.change is not None for constraint in constraints):
             raise ConfigurationError(

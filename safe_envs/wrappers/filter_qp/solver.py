@@ -14,11 +14,7 @@ import numpy as np
 from safe_envs.dynamics.codegen import Components
 from safe_envs.wrappers.filter_qp.compiled import CompiledQP
 from safe_envs.wrappers.filter_qp.decision import FilterDecision
-from safe_envs.wrappers.qp import (
-    one_constraint,
-    second_order_batch,
-    second_order_constraint,
-)
+from safe_envs.wrappers.qp import one_constraint
 from safe_envs.wrappers.qp.majorant import majorant
 
 _FAR = 1e4
@@ -29,7 +25,7 @@ class FilterQPSolver(CompiledQP):
     """Solves a QP for states given component by component, as floats or as arrays of a batch."""
 
     def solve_single(self, x: Sequence[Any], u: Sequence[Any]) -> FilterDecision:
-        """Solve a plain QP of one constraint; raises as `solve`."""
+        """Solve a plain QP of one constraint; see `solve`."""
         values = self._values(*self._with_terms(x))
         if self._uncertain:
             return self._solve_uncertain(values, u)
@@ -54,12 +50,7 @@ class FilterQPSolver(CompiledQP):
     def _solve_uncertain(self, values: Components, u: Sequence[Any]) -> FilterDecision:
         a, b, *form = values
         p = self._qp
-        project = (
-            second_order_constraint.project_floats
-            if self._flavour == "floats"
-            else second_order_batch.project_arrays
-        )
-        action, margin, active, feasible = project(
+        action, margin, active, feasible = self._project_uncertain(
             (a,), (b,), (form,), u[0], p.low[0], p.high[0], p.priorities
         )
         self._require_finite((margin[0], *form))
@@ -79,6 +70,9 @@ class FilterQPSolver(CompiledQP):
         Args:
             x: n components of the state.
             u: m components of the proposed input.
+
+        Returns:
+            The decision in components.
 
         Raises:
             UndefinedConstraintError: A constraint or the goal has no finite value.
@@ -142,10 +136,6 @@ class FilterQPSolver(CompiledQP):
         The latter is for states outside its domain. The allowed point nearest to an input so far
         off is where h rises most among those that the other constraints allow: these are not to
         suffer from a condition that is undefined.
-
-        The point of the input bounds and of the constraints nearest to one so far off is where h
-        rises most among those that the other constraints allow: these are not to suffer from a
-        condition that is undefined.
         """
         if all(
             defined is True or (defined is not False and defined.all())
@@ -188,12 +178,7 @@ class FilterQPSolver(CompiledQP):
                 self._require_finite(form)
             if self._m == 1 and not goal:
                 q = [forms.get(i, (0.0, 0.0, 0.0)) for i in range(self._count)]
-                project = (
-                    second_order_batch.project_arrays
-                    if self._flavour == "arrays"
-                    else second_order_constraint.project_floats
-                )
-                action, margin, active, feasible = project(
+                action, margin, active, feasible = self._project_uncertain(
                     [ai[0] for ai in a], b, q, u[0], p.low[0], p.high[0], p.priorities
                 )
                 return [action], list(margin), list(active), feasible
@@ -212,12 +197,9 @@ class FilterQPSolver(CompiledQP):
         )
         unit = math.sqrt(self._weights[0] / self._slack_weight)
         rows = [*[(*ai, 0.0) for ai in a], (*[-bj for bj in along], unit)]
-        low, high = (
-            (*self._low, 0.0),
-            (*self._high, self._choose(most > 0.0, 2.0 * most / unit, 1.0)),
-        )
-        w = (*self._weights, self._weights[0])
-        priorities = [*p.priorities[: len(a)], 1.0]
+        low = (*self._low, 0.0)
+        high = (*self._high, self._choose(most > 0.0, 2.0 * most / unit, 1.0))
+        w, priorities = (*self._weights, self._weights[0]), [*p.priorities[: len(a)], 1.0]
         action, margin, active, _ = self._project(
             rows, [*b, -growth], (*u, 0.0 * u[0]), low, high, w, priorities
         )
@@ -276,9 +258,8 @@ class FilterQPSolver(CompiledQP):
             if acts is False or (acts is not True and not np.count_nonzero(acts)):
                 continue
             size = functools.reduce(self._larger, [abs(aj) for aj in ai])
-            unit = self._choose(
-                size > 0.0, size, 1.0
-            )  # so that squares neither overflow nor vanish
+            # So that squares neither overflow nor vanish.
+            unit = self._choose(size > 0.0, size, 1.0)
             square = sum(
                 [p * p / wj for p, wj in zip([aj / unit for aj in ai], self._weights, strict=True)]
             )

@@ -13,7 +13,6 @@ of `safe_envs.wrappers.qp.rounding`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -24,18 +23,25 @@ from safe_envs.wrappers.qp import (
     plane_batch,
     single_active_constraint,
 )
-from safe_envs.wrappers.qp.rounding import stack
+from safe_envs.wrappers.qp.rounding import (
+    ArrayAnswer,
+    Arrays,
+    Entries,
+    FloatAnswer,
+    Floats,
+    stack,
+)
 
 
 def project_floats(
-    a: Sequence[Sequence[float]],
-    b: Sequence[float],
-    v: Sequence[float],
-    low: Sequence[float],
-    high: Sequence[float],
-    w: Sequence[float],
-    priority: Sequence[float],
-) -> tuple[list[float], list[float], list[bool], bool]:
+    a: Sequence[Floats],
+    b: Floats,
+    v: Floats,
+    low: Floats,
+    high: Floats,
+    w: Floats,
+    priority: Floats,
+) -> FloatAnswer:
     """Project the proposed input of one state.
 
     Args:
@@ -54,13 +60,13 @@ def project_floats(
     if len(b) == 1:
         u, margin, active, feasible = one_constraint.project_floats(a[0], b[0], v, low, high, w)
         return u, [margin], [active], feasible
+    found = None
     if len(v) == 2:
-        return plane.project_floats(a, b, v, low, high, w, priority)
-    if len(v) == 1:
-        u, margin, active, feasible = interval.project_floats(
-            [ai for (ai,) in a], b, v[0], low[0], high[0], priority
-        )
-        return [u], margin, active, feasible
+        found = plane.project_floats(a, b, v, low, high, w)
+    elif len(v) == 1:
+        found = interval.project_floats([ai for (ai,) in a], b, v[0], low[0], high[0])
+    if found:
+        return found
     *parts, feasible = project_arrays(a, b, [np.array([c]) for c in v], low, high, w, priority)
     inputs, margins, binding = [[entry.item() for entry in part] for part in parts]
     return inputs, margins, binding, feasible.item()
@@ -68,14 +74,14 @@ def project_floats(
 
 @np.errstate(all="ignore")
 def project_arrays(
-    a: Sequence[Sequence[Any]],
-    b: Sequence[Any],
-    v: Sequence[np.ndarray],
-    low: Sequence[Any],
-    high: Sequence[Any],
-    w: Sequence[Any],
-    priority: Sequence[float],
-) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], np.ndarray]:
+    a: Sequence[Entries],
+    b: Entries,
+    v: Arrays,
+    low: Entries,
+    high: Entries,
+    w: Entries,
+    priority: Floats,
+) -> ArrayAnswer:
     """Project the proposed inputs of a batch of B states.
 
     Args:
@@ -105,14 +111,14 @@ def project_arrays(
 
 
 def _solver(
-    a: Sequence[Sequence[Any]],
-    b: Sequence[Any],
-    v: Sequence[np.ndarray],
-    low: Sequence[Any],
-    high: Sequence[Any],
-    w: Sequence[Any],
-    priority: Sequence[float],
-) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], np.ndarray]:
+    a: Sequence[Entries],
+    b: Entries,
+    v: Arrays,
+    low: Entries,
+    high: Entries,
+    w: Entries,
+    priority: Floats,
+) -> ArrayAnswer:
     size = len(v[0])
     rows = [stack(ai, size) for ai in a]
     offsets, proposed, lower, upper = [stack(part, size) for part in (b, v, low, high)]
@@ -131,8 +137,9 @@ def _solver(
         def of_left(part: np.ndarray) -> np.ndarray:
             return part[:, left].T
 
+        table = np.stack([of_left(row) for row in rows], axis=1)
         found = proxqp.project(
-            np.stack([of_left(row) for row in rows], axis=1),
+            table,
             of_left(solvable),
             of_left(proposed),
             of_left(lower),

@@ -9,27 +9,39 @@ constraint. A constraint with a_i = 0 has no say in the input.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp.rounding import ROUNDING, stack, tolerance, tolerances, total
+from safe_envs.wrappers.qp.rounding import (
+    ROUNDING,
+    Entries,
+    FloatAnswer,
+    Floats,
+    stack,
+    tolerance,
+    tolerances,
+    total,
+)
 
 
-def project_floats(
-    a: Sequence[float],
-    b: Sequence[float],
-    v: float,
-    low: float,
-    high: float,
-    priority: Sequence[float],
-) -> tuple[float, list[float], list[bool], bool]:
-    """Project the input of one state; see `project_arrays`."""
+def project_floats(a: Floats, b: Floats, v: float, low: float, high: float) -> FloatAnswer | None:
+    """Project the input of one state; see `project_arrays`.
+
+    Args:
+        a: k coefficients.
+        b: k offsets.
+        v: proposed input.
+        low: lower bound.
+        high: upper bound.
+
+    Returns:
+        As `dispatch.project_floats`; None where no input meets all constraints.
+    """
     u = low if v < low else high if v > high else v
     margin = [ai * u + bi for ai, bi in zip(a, b, strict=True)]
     if min(margin) >= 0.0:
-        return u, margin, [False] * len(margin), True
+        return [u], margin, [False] * len(margin), True
     lo, hi = low, high
     for ai, bi in zip(a, b, strict=True):
         if ai > 0.0:
@@ -41,42 +53,30 @@ def project_floats(
             if root < hi:
                 hi = root
         elif bi < 0.0:
-            hi = -np.inf
+            return None
     if not lo <= hi:
-        return _one_of_batch(a, b, v, low, high, priority)
+        return None
     u = lo if v < lo else hi if v > hi else v
     margin = [ai * u + bi for ai, bi in zip(a, b, strict=True)]
     if min(margin) < 0.0 and any(
         g < -tolerance((ai,), bi, (u,)) for ai, bi, g in zip(a, b, margin, strict=True) if g < 0.0
     ):
-        return _one_of_batch(a, b, v, low, high, priority)
+        return None
     active = [
         g <= 0.0 or g <= ROUNDING * abs(ai * u) + ROUNDING * abs(bi)
         for ai, bi, g in zip(a, b, margin, strict=True)
     ]
-    return u, margin, active, True
-
-
-def _one_of_batch(
-    a: Sequence[float],
-    b: Sequence[float],
-    v: float,
-    low: float,
-    high: float,
-    priority: Sequence[float],
-) -> tuple[float, list[float], list[bool], bool]:
-    u, margin, active, feasible = project_arrays(a, b, np.array([v]), low, high, priority)
-    return u.item(), margin[:, 0].tolist(), active[:, 0].tolist(), feasible.item()
+    return [u], margin, active, True
 
 
 @np.errstate(all="ignore")
 def project_arrays(
-    a: Sequence[Any],
-    b: Sequence[Any],
+    a: Entries,
+    b: Entries,
     v: np.ndarray,
     low: Any,
     high: Any,
-    priority: Sequence[float],
+    priority: Floats,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Project the input of each of B states.
 
@@ -113,7 +113,7 @@ def _project(
     v: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
-    priority: Sequence[float],
+    priority: Floats,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return what `project_arrays` does, for states that violate a constraint."""
     root = -b / a
@@ -138,7 +138,7 @@ def least_violating(
     b: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
-    priority: Sequence[float] | np.ndarray,
+    priority: Floats | np.ndarray,
 ) -> np.ndarray:
     """Minimise sum_i priority_i max(0, -(a_i u + b_i))^2 where no input meets all constraints.
 

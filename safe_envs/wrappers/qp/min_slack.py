@@ -102,6 +102,11 @@ def is_unique(a: np.ndarray, b: np.ndarray, u: np.ndarray) -> np.ndarray:
     """Return whether minimisers u (2, B) are the only actions with their slacks, shape (B,).
 
     They are if the constraints that they violate cross.
+
+    Args:
+        a: coefficients, shape (2, k, B).
+        b: offsets, shape (k, B).
+        u: the minimisers.
     """
     first, second = a[0] * u[0], a[1] * u[1]
     violated = first + second + b < -ROUNDING * (np.abs(first) + np.abs(second) + np.abs(b))

@@ -15,12 +15,18 @@ divided among the components that are free.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance, tolerances
+from safe_envs.wrappers.qp.rounding import (
+    ROUNDING,
+    Arrays,
+    Entries,
+    Floats,
+    tolerance,
+    tolerances,
+)
 
 _EXCESS = 1e3
 """A constraint that holds with so many times its rounding to spare is not on the nearest action:
@@ -31,14 +37,22 @@ _CORRECTIONS = 3
 
 
 def project_floats(
-    a: Sequence[float],
+    a: Floats,
     b: float,
-    u: Sequence[float],
-    low: Sequence[float],
-    high: Sequence[float],
-    w: Sequence[float],
+    u: Floats,
+    low: Floats,
+    high: Floats,
+    w: Floats,
 ) -> tuple[list[float], float, bool, bool]:
-    """Project the input u of one state.
+    """Project the input of one state.
+
+    Args:
+        a: m entries of the constraint.
+        b: the offset.
+        u: m proposed inputs.
+        low: m lower bounds.
+        high: m upper bounds.
+        w: m positive weights.
 
     Returns:
         The minimiser (m floats), its margin a . u + b, whether the constraint had to act, and
@@ -91,12 +105,12 @@ def _project_scalar(
 
 
 def _follow_multiplier(
-    a: Sequence[float],
+    a: Floats,
     b: float,
-    v: Sequence[float],
-    low: Sequence[float],
-    high: Sequence[float],
-    w: Sequence[float],
+    v: Floats,
+    low: Floats,
+    high: Floats,
+    w: Floats,
 ) -> tuple[list[float], list[float]]:
     """Return the minimiser, and the way of each component along a / w, 0 for those not free."""
     size = max([abs(aj) for aj in a]) or 1.0
@@ -138,12 +152,12 @@ def _follow_multiplier(
 
 
 def project_arrays(
-    a: Sequence[Any],
+    a: Entries,
     b: Any,
-    v: Sequence[np.ndarray],
-    low: Sequence[Any],
-    high: Sequence[Any],
-    w: Sequence[Any],
+    v: Arrays,
+    low: Entries,
+    high: Entries,
+    w: Entries,
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
     """Project the inputs of a batch of B states.
 
@@ -205,7 +219,7 @@ def _project_scalars(
     return u, margin, active, margin >= -product
 
 
-def _dot(a: Sequence[Any], u: Sequence[np.ndarray]) -> np.ndarray:
+def _dot(a: Entries, u: Arrays) -> np.ndarray:
     total = a[0] * u[0]
     for aj, uj in zip(a[1:], u[1:], strict=True):
         total = total + aj * uj
@@ -213,13 +227,13 @@ def _dot(a: Sequence[Any], u: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def _follow_multipliers(
-    a: Sequence[Any],
+    a: Entries,
     b: Any,
-    v: Sequence[np.ndarray],
+    v: Arrays,
     u: list[np.ndarray],
-    low: Sequence[Any],
-    high: Sequence[Any],
-    w: Sequence[Any],
+    low: Entries,
+    high: Entries,
+    w: Entries,
     rows: np.ndarray,
 ) -> tuple[list[np.ndarray], np.ndarray]:
     """Return the inputs, and which states in `rows` have components that can still move (R,).

@@ -1,12 +1,12 @@
-"""Several constraints on two inputs for one state, exact and one by one, in plain floats.
+"""Several constraints on two inputs for one state, exact, in plain floats.
 
     min 1/2 sum_j w_j (u_j - v_j)^2   subject to   a_i . u + b_i >= 0,   low <= u <= high
 
 Seidel's incremental scheme. The proposal clipped into the input bounds is the minimiser without
 constraints. Where it violates the next constraint, the new minimiser lies on that constraint's
 line: the input bounds and the constraints before leave an interval of the line, and the point of
-the line nearest to v is clipped into it. An empty interval means that no action meets the
-constraints.
+the line nearest to v is clipped into it. Where the interval is empty, be it by rounding or because
+no action meets the constraints, `safe_envs.wrappers.qp.plane_batch` finds the answer.
 
 A line is written u_p = alpha + beta u_f. The free input f is the one that adds less to the
 constraint, given how far each input can go: to the end of the input bounds, or as far in the metric
@@ -20,10 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
-from safe_envs.wrappers.qp import plane_batch
-from safe_envs.wrappers.qp.rounding import ROUNDING, tolerance
+from safe_envs.wrappers.qp.rounding import ROUNDING, FloatAnswer, Floats, tolerance
 
 Row = tuple[float, float, float]
 """(a_1, a_2, b) of a constraint a . u + b >= 0; on a line, the second and first input are the pivot
@@ -35,19 +32,21 @@ Input = tuple[float, float, float, float]
 
 
 def project_floats(
-    a: Sequence[Sequence[float]],
-    b: Sequence[float],
-    v: Sequence[float],
-    low: Sequence[float],
-    high: Sequence[float],
-    w: Sequence[float],
-    priority: Sequence[float],
-) -> tuple[list[float], list[float], list[bool], bool]:
+    a: Sequence[Floats], b: Floats, v: Floats, low: Floats, high: Floats, w: Floats
+) -> FloatAnswer | None:
     """Project the input of one state.
 
+    Args:
+        a: k constraints of two coefficients.
+        b: k offsets.
+        v: two proposed inputs.
+        low: two lower bounds.
+        high: two upper bounds.
+        w: two positive weights.
+
     Returns:
-        Inputs (2), margins and binding constraints (k), and whether the constraints can be met
-        together.
+        As `dispatch.project_floats`; None where the constraints cannot be met together, or can up
+        to rounding only.
     """
     (v1, v2), (l1, l2), (h1, h2) = v, low, high
     c1 = l1 if v1 < l1 else h1 if v1 > h1 else v1
@@ -72,7 +71,7 @@ def project_floats(
             found = _onto_line((a2, a1, bi), before, (v2, l2, h2, w[1]), (v1, l1, h1, w[0]))
             u = found and (found[1], found[0])
         if u is None:
-            return _one_of_batch(a, b, v, low, high, w, priority)
+            return None
         u1, u2 = u
     margin = [a1 * u1 + a2 * u2 + bi for a1, a2, bi in rows]
     if not all(
@@ -81,7 +80,7 @@ def project_floats(
             for (a1, a2, bi), g in zip(rows, margin, strict=True)
         ]
     ):
-        return _one_of_batch(a, b, v, low, high, w, priority)
+        return None
     reach = r1 * abs(u1) + r2 * abs(u2)
     s1, s2 = min(e1, reach / r1), min(e2, reach / r2)
     active = [
@@ -92,10 +91,7 @@ def project_floats(
 
 
 def _onto_line(
-    line: Row,
-    before: list[Row],
-    pivot_input: Input,
-    free_input: Input,
+    line: Row, before: list[Row], pivot_input: Input, free_input: Input
 ) -> tuple[float, float] | None:
     """Return the minimiser (pivot, free) on a line within the constraints before, or None."""
     vp, lp, hp, wp = pivot_input
@@ -105,8 +101,7 @@ def _onto_line(
         return None
     alpha, beta = -b / ap, -af / ap
     lo, hi = lf, hf
-    before = [*before, (1.0, 0.0, -lp), (-1.0, 0.0, hp)]
-    for rp, rf, rb in before:
+    for rp, rf, rb in (*before, (1.0, 0.0, -lp), (-1.0, 0.0, hp)):
         slope, offset = rf + rp * beta, rb + rp * alpha
         if abs(slope) <= ROUNDING * abs(rf):
             if offset < -ROUNDING * (abs(rb) + abs(rp * alpha)):
@@ -119,47 +114,9 @@ def _onto_line(
             end = -offset / slope
             if end < hi:
                 hi = end
+    if not lo <= hi:
+        return None
     aim = vf + wp * beta * (vp - alpha - beta * vf) / (wf + wp * beta * beta)
-    if lo <= hi:
-        free = lo if aim < lo else hi if aim > hi else aim
-    else:
-        free = _meeting_point(before, alpha, beta, lf, hf, min(max(aim, hi), lo))
-        if free is None:
-            return None
+    free = lo if aim < lo else hi if aim > hi else aim
     pivot = alpha + beta * free
     return (lp if pivot < lp else hp if pivot > hp else pivot), free
-
-
-def _meeting_point(
-    before: list[Row], alpha: float, beta: float, lo: float, hi: float, aim: float
-) -> float | None:
-    """Return the free input that the constraints leave once each may miss by rounding."""
-    for rp, rf, rb in before:
-        slope, offset = rf + rp * beta, rb + rp * alpha
-        if abs(slope) > ROUNDING * abs(rf):
-            terms = abs(rb) + abs(rp * alpha) + (abs(rf) + abs(rp * beta)) * abs(offset / slope)
-            end = -(offset + ROUNDING * terms) / slope
-            lo, hi = (max(lo, end), hi) if slope > 0.0 else (lo, min(hi, end))
-    free = min(max(aim, lo), hi)
-    # The ends may lie so far off that their rounding is large: what counts is the rounding of the
-    # constraints at the point itself.
-    for rp, rf, rb in before:
-        terms = abs(rb) + abs(rp * alpha) + (abs(rf) + abs(rp * beta)) * abs(free)
-        if not (rf + rp * beta) * free + (rb + rp * alpha) >= -2.0 * ROUNDING * terms:
-            return None
-    return free if lo <= hi else None
-
-
-def _one_of_batch(
-    a: Sequence[Sequence[float]],
-    b: Sequence[float],
-    v: Sequence[float],
-    low: Sequence[float],
-    high: Sequence[float],
-    w: Sequence[float],
-    priority: Sequence[float],
-) -> tuple[list[float], list[float], list[bool], bool]:
-    u, margin, active, feasible = plane_batch.project_arrays(
-        a, b, [np.array([c]) for c in v], low, high, w, priority
-    )
-    return u[:, 0].tolist(), margin[:, 0].tolist(), active[:, 0].tolist(), feasible.item()

@@ -8,12 +8,19 @@ comes from the same operations in the same order as for one state.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from safe_envs.wrappers.qp.min_slack import is_unique, least_violating
-from safe_envs.wrappers.qp.rounding import ROUNDING, stack, tolerances
+from safe_envs.wrappers.qp.rounding import (
+    ROUNDING,
+    Arrays,
+    Entries,
+    Floats,
+    stack,
+    tolerances,
+)
 
 
 class Plane(NamedTuple):
@@ -44,24 +51,38 @@ class Plane(NamedTuple):
         return np.minimum(np.maximum(u, self.low), self.high)
 
     def margin(self, u: np.ndarray) -> np.ndarray:
-        """Margins (k, B) at the inputs (2, B)."""
+        """Return the margins (k, B) at inputs (2, B)."""
         return self.a[0] * u[0] + self.a[1] * u[1] + self.b
 
     def scale(self, u: np.ndarray, away: np.ndarray | float = 0.0) -> np.ndarray:
         """Return how far each input can go (2, B).
 
         It goes to its bound, or as far as u and `away` in the metric of the objective.
+
+        Args:
+            u: inputs, shape (2, B).
+            away: how far more, shape (B,).
         """
         root = np.sqrt(self.w)
         reach = root[0] * np.abs(u[0]) + root[1] * np.abs(u[1]) + away
         return np.minimum(np.maximum(-self.low, self.high), reach / root)
 
     def met(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Whether all constraints are met (B,)."""
+        """Return whether all constraints are met (B,).
+
+        Args:
+            u: inputs, shape (2, B).
+            margin: the constraints' there, shape (k, B).
+        """
         return (margin >= -tolerances(self.a, self.b, u)).all(axis=0)
 
     def binds(self, u: np.ndarray, margin: np.ndarray) -> np.ndarray:
-        """Whether a constraint's margin exceeds zero by no more than rounding."""
+        """Return whether a margin exceeds zero by no more than rounding (k, B).
+
+        Args:
+            u: inputs, shape (2, B).
+            margin: the constraints' there, shape (k, B).
+        """
         s1, s2 = self.scale(u)
         return (margin <= 0.0) | (
             margin <= ROUNDING * (np.abs(self.b) + np.abs(self.a[0]) * s1 + np.abs(self.a[1]) * s2)
@@ -70,15 +91,15 @@ class Plane(NamedTuple):
 
 @np.errstate(all="ignore")
 def project_arrays(
-    a: Sequence[Sequence[Any]],
-    b: Sequence[Any],
-    v: Sequence[np.ndarray],
-    low: Sequence[Any],
-    high: Sequence[Any],
-    w: Sequence[Any],
-    priority: Sequence[float],
+    a: Sequence[Entries],
+    b: Entries,
+    v: Arrays,
+    low: Entries,
+    high: Entries,
+    w: Entries,
+    priority: Floats,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Project the inputs of B states.
+    """Project the inputs of B states; see `dispatch.project_arrays`.
 
     Returns:
         Inputs (2, B), margins (k, B), constraints that bind or cannot be met (k, B), and whether

@@ -66,6 +66,9 @@ def project(
         high: upper bounds, shape (B, m).
         w: positive weights, shape (B, m).
         priority: positive weights of the squared slacks, shape (k,).
+
+    Returns:
+        The inputs, and how they meet the constraints.
     """
     problem = _Problem(a, b, v, low, high, w)
     u, certain = np.empty_like(v), np.zeros(len(v), dtype=bool)

@@ -23,8 +23,20 @@ import numpy as np
 ROUNDING = 16.0 * sys.float_info.epsilon
 """Relative error of a constraint's value."""
 
+Floats = Sequence[float]
+"""Numbers of one state, one for each input or constraint."""
 
-def tolerance(a: Sequence[float], b: float, u: Sequence[float]) -> float:
+Entries = Sequence[Any]
+"""Numbers of a batch of B states, each a float or an array (B,)."""
+
+Arrays = Sequence[np.ndarray]
+
+FloatAnswer = tuple[list[float], list[float], list[bool], bool]
+ArrayAnswer = tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], np.ndarray]
+"""Inputs (m), margins and binding constraints (k), and whether all constraints can be met."""
+
+
+def tolerance(a: Floats, b: float, u: Floats) -> float:
     """Return by how much a constraint may be violated at m inputs and count as met.
 
     Args:
@@ -36,16 +48,21 @@ def tolerance(a: Sequence[float], b: float, u: Sequence[float]) -> float:
     return ROUNDING * abs(b) + sum([ROUNDING * abs(aj * uj) for aj, uj in zip(a, u, strict=True)])
 
 
-def tolerances(a: Sequence[Any] | np.ndarray, b: Any, u: Sequence[Any] | np.ndarray) -> Any:
-    """`tolerance` for arrays, the m coefficients and inputs in front."""
+def tolerances(a: Entries | np.ndarray, b: Any, u: Entries | np.ndarray) -> Any:
+    """Return the tolerances of a batch; see `tolerance`. Coefficients and inputs are in front."""
     found = ROUNDING * np.abs(b)
     for aj, uj in zip(a, u, strict=True):
         found = found + ROUNDING * np.abs(aj * uj)
     return found
 
 
-def stack(entries: Sequence[Any], size: int) -> np.ndarray:
-    """Return floats and arrays (B,) as the rows of an array (len(entries), B)."""
+def stack(entries: Entries, size: int) -> np.ndarray:
+    """Return floats and arrays (B,) as the rows of an array (len(entries), B).
+
+    Args:
+        entries: the floats and arrays.
+        size: B.
+    """
     table = np.empty((len(entries), size))
     for row, entry in zip(table, entries, strict=True):
         row[:] = entry

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp.rounding import ROUNDING, stack, total
+from safe_envs.wrappers.qp.rounding import ROUNDING, Entries, Floats, stack, total
 
 _BISECTIONS = 64
 """As many as halve an interval of doubles down to neighbours."""
@@ -15,13 +15,13 @@ _BISECTIONS = 64
 
 @np.errstate(all="ignore")
 def project_arrays(
-    a: Sequence[Any],
-    b: Sequence[Any],
-    q: Sequence[Sequence[Any]],
+    a: Entries,
+    b: Entries,
+    q: Sequence[Entries],
     v: np.ndarray,
     low: Any,
     high: Any,
-    priority: Sequence[float],
+    priority: Floats,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Project the input of each of B states.
 
@@ -168,7 +168,7 @@ def _least_violating(
     q: np.ndarray,
     nearest: np.ndarray,
     v: np.ndarray,
-    priority: Sequence[float],
+    priority: Floats,
 ) -> np.ndarray:
     """Return the minimiser of the sum of squared slacks nearest to v.
 

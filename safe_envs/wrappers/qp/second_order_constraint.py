@@ -14,25 +14,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from safe_envs.wrappers.qp import second_order_batch
-from safe_envs.wrappers.qp.rounding import ROUNDING
+from safe_envs.wrappers.qp.rounding import ROUNDING, Entries, Floats
 
-Quadratic = Sequence[Any]
+Quadratic = Entries
 """q_0, q_1 and q_2 of a constraint, a positive semidefinite form of (1, u)."""
 
 
 def project_floats(
-    a: Sequence[float],
-    b: Sequence[float],
+    a: Floats,
+    b: Floats,
     q: Sequence[Quadratic],
     v: float,
     low: float,
     high: float,
-    priority: Sequence[float],
+    priority: Floats,
 ) -> tuple[float, list[float], list[bool], bool]:
     """Project the input of one state; see `second_order_batch`."""
     u = low if v < low else high if v > high else v

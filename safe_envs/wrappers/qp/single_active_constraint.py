@@ -6,24 +6,21 @@ and many times faster than a solver, in most states of most filters.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 
 from safe_envs.wrappers.qp.one_constraint import project_arrays as project_onto_row
-from safe_envs.wrappers.qp.rounding import ROUNDING, stack, total
+from safe_envs.wrappers.qp.rounding import ROUNDING, Arrays, Entries, stack, total
 
 Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def project_arrays(
-    a: Sequence[np.ndarray],
+    a: Arrays,
     b: np.ndarray,
     v: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
-    w: Sequence[Any],
+    w: Entries,
 ) -> tuple[Answer, np.ndarray]:
     """Project the proposed inputs of the states in which at most one constraint binds.
 

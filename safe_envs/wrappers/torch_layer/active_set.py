@@ -77,30 +77,30 @@ class ActiveSets:
 
 
 def nearest_step(
-    rows: torch.Tensor, gaps: torch.Tensor, weights: np.ndarray, binding: np.ndarray
+    a: torch.Tensor, gaps: torch.Tensor, weights: np.ndarray, binding: np.ndarray
 ) -> torch.Tensor:
     """Return the shortest steps z (R, m) that meet the binding constraints as equations.
 
-    These are rows z + gaps = 0; before, |weights (rows z + gaps)|^2 is minimised.
+    These are a z + gaps = 0; before, |weights (a z + gaps)|^2 is minimised.
 
     Args:
-        rows: a of the constraints, in units of the weights, shape (R, k, m).
+        a: coefficients of the constraints, in units of the weights, shape (R, k, m).
         gaps: their values at z = 0, shape (R, k).
         weights: of the constraints that cannot be met, 0 for others, shape (R, k).
         binding: constraints that bind, shape (R, k).
     """
-    step = rows.new_zeros(rows.shape[0], rows.shape[2])
-    walls = rows
+    step = a.new_zeros(a.shape[0], a.shape[2])
+    walls = a
     if weights.any():
         lost = torch.from_numpy(weights)
-        compromise = lost[:, :, None] * rows
+        compromise = lost[:, :, None] * a
         inverse = torch.linalg.pinv(compromise, rtol=_RANK)
         step = -(inverse @ (lost * gaps)[:, :, None])[:, :, 0]
         # Along these directions nothing changes for the constraints that cannot be met.
-        walls = rows - (rows @ inverse) @ compromise
-    sizes = torch.linalg.vector_norm(rows.detach(), dim=-1)
+        walls = a - (a @ inverse) @ compromise
+    sizes = torch.linalg.vector_norm(a.detach(), dim=-1)
     scale = torch.from_numpy(binding) / torch.where(sizes > 0.0, sizes, 1.0)
-    left = scale * (gaps + (rows @ step[:, :, None])[:, :, 0])
+    left = scale * (gaps + (a @ step[:, :, None])[:, :, 0])
     return (
         step
         - (torch.linalg.pinv(scale[:, :, None] * walls, rtol=_RANK) @ left[:, :, None])[:, :, 0]
@@ -108,7 +108,7 @@ def nearest_step(
 
 
 def _held_and_binding(
-    rows: np.ndarray,
+    a: np.ndarray,
     way: np.ndarray,
     low: np.ndarray,
     high: np.ndarray,
@@ -126,7 +126,7 @@ def _held_and_binding(
     only.
 
     Args:
-        rows: in units of the weights, shape (k, m).
+        a: coefficients in units of the weights, shape (k, m).
         way: from the proposal to the action, in the same units, shape (m,).
         low: inputs that may be held at their lower bounds, shape (m,).
         high: inputs that may be held at their upper bounds, shape (m,).
@@ -138,13 +138,13 @@ def _held_and_binding(
     size = np.abs(way[left]).max(initial=0.0)
     if size == 0.0:
         return np.zeros(m, dtype=bool), binding
-    lengths = np.linalg.norm(rows[:, left], axis=1)
-    units = rows / np.where(lengths > 0.0, lengths, 1.0)[:, None]
+    lengths = np.linalg.norm(a[:, left], axis=1)
+    units = a / np.where(lengths > 0.0, lengths, 1.0)[:, None]
     normals = np.concatenate([units, -units, np.eye(m), -np.eye(m)])
     candidates = np.flatnonzero(np.concatenate([binding | missed, missed, low, high]))
     shares = np.zeros(len(normals))
     shares[candidates] = scipy.optimize.nnls(normals[np.ix_(candidates, left)].T, way[left] / size)[
         0
     ]
-    of_rows, _, of_low, of_high = np.split(shares > _NOTHING, np.cumsum([len(rows), len(rows), m]))
+    of_rows, _, of_low, of_high = np.split(shares > _NOTHING, np.cumsum([len(a), len(a), m]))
     return of_low | of_high, of_rows & binding

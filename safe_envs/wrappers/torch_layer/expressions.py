@@ -58,7 +58,11 @@ _FUNCTIONS: dict[str, Any] = {
 def compiled_constraints(
     qp: FilterQP,
 ) -> Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor]]:
-    """Return the function from states (B, n) to the constraints' a (B, k, m) and b (B, k)."""
+    """Return the function from states (B, n) to the constraints' a (B, k, m) and b (B, k).
+
+    Raises:
+        ConfigurationError: A constraint holds a function that torch does not have.
+    """
     model, k = qp.model, len(qp.constraints)
     expressions = [model.numeric(e) for c in qp.constraints for e in (*c.coefficient, c.offset)]
     unknown = {

@@ -10,7 +10,7 @@ import torch
 
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.conditions import Condition
+from safe_envs.wrappers.conditions.spec_text import Conditions
 from safe_envs.wrappers.filter_qp import FilterQP
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.torch_layer.active_set import ActiveSets, nearest_step
@@ -71,7 +71,7 @@ class TorchFilter(torch.nn.Module):
     def for_problem(
         cls,
         problem: SafetyProblem,
-        conditions: Condition | Sequence[Condition] | str,
+        conditions: Conditions,
         knowledge: str = "model",
         priorities: Sequence[float] | None = None,
     ) -> TorchFilter:
@@ -84,7 +84,7 @@ class TorchFilter(torch.nn.Module):
         Args:
             x: states, shape (..., n).
             u: proposed inputs, shape (..., m), in physical units.
-            return_result: whether to return the flags beside the action.
+            return_result: whether to return the flags with the action.
 
         Returns:
             The action, shape (..., m), of the type of `u` and on its device; or a `TorchResult`

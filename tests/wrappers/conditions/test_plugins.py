@@ -26,7 +26,11 @@ from safe_envs.wrappers import (
     require_readable,
     spec_of,
 )
-from safe_envs.wrappers.conditions import files_of, learned_parts, with_absolute_paths
+from safe_envs.wrappers.conditions.text_parts import (
+    files_of,
+    learned_parts,
+    with_absolute_paths,
+)
 from tests.conftest import problem_of
 
 SCALAR = problem_of("safe_envs/Scalar-v0")

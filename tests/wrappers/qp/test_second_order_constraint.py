@@ -250,7 +250,7 @@ def test_the_unit_of_a_row_does_not_matter(unit):
 
 def test_a_row_of_nearly_no_slope_that_is_met_everywhere_does_not_forbid_the_rest():
     rows = [1e-170, 1.0], [1.0, -0.5]
-    assert interval.project_floats(*rows, 0.0, -1.0, 1.0, [1.0] * 2)[3]
+    assert interval.project_arrays(*rows, np.zeros(1), -1.0, 1.0, [1.0] * 2)[3].all()
     assert project_floats(*rows, [NOTHING] * 2, 0.0, -1.0, 1.0, [1.0] * 2)[3]
 
 
@@ -273,7 +273,7 @@ def test_a_form_that_hardly_bends_has_a_maximiser_in_both_flavours(q2):
 def test_rows_that_meet_in_one_point_are_feasible_whatever_their_scale():
     for scale in (3.0, 7e5, 0.1):
         rows = [1.0, -scale], [-0.3, 0.3 * scale]
-        assert interval.project_floats(*rows, 0.9, -1.0, 1.0, [1.0] * 2)[3]
+        assert interval.project_arrays(*rows, np.full(1, 0.9), -1.0, 1.0, [1.0] * 2)[3].all()
         assert project_floats(*rows, [NOTHING] * 2, 0.9, -1.0, 1.0, [1.0] * 2)[3]
 
 
