@@ -19,22 +19,23 @@ from safe_envs.dynamics.lie import relative_degree
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.number_text import finite_number
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import Progress, Record
 from safe_envs.wrappers.learning.checks import (
+    Progress,
     Purpose,
     random_stream,
     require_problem,
 )
 from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
+from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.steps import Step
 from safe_envs.wrappers.learning.fit import LEAST_ROWS, AdamSettings, train
+from safe_envs.wrappers.learning.models.base import Record
 from safe_envs.wrappers.learning.models.residual import (
     LearnedResidual,
     ResidualModel,
     lie_derivatives,
     residual_names,
 )
-from safe_envs.wrappers.learning.models.signature import Signature
 
 _SHORTEST, _LONGEST = 1e-4, 100.0
 """Label steps in control periods. Of shorter ones the rounding of h takes over, over longer ones
@@ -71,6 +72,9 @@ def learn_residual(
         step: the plant, if it is not the problem's; a step of it has to last `label_dt` and to be
             free of noise.
         progress: called with the part that is done.
+
+    Returns:
+        The residuals of all barriers.
 
     Raises:
         ConfigurationError: an argument is out of its range, the plant is noisy, or the inputs

@@ -122,6 +122,9 @@ class ChainGuarantee:
             actions: what it executed there, shape (E, m).
             slack: by how much it reports to have violated them, shape (E,); the actions themselves
                 tell how much of it is a sampling margin.
+
+        Returns:
+            A text.
         """
         if self.note:
             return ""

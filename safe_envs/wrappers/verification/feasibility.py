@@ -19,7 +19,7 @@ from safe_envs.wrappers.verification.extrema import (
     without_control,
 )
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.safe_set import Region
+from safe_envs.wrappers.verification.region import Region
 from safe_envs.wrappers.verification.safe_set_analysis import (
     SAMPLES,
     SafeSetAnalysis,
@@ -35,7 +35,7 @@ _BEYOND_LOG2 = 12
 
 
 @dataclass(frozen=True)
-class Part:
+class SetFeasibility:
     """The feasibility of the conditions in a set: in C, or in the intersection of the C_j.
 
     Attributes:
@@ -115,8 +115,8 @@ class Verification:
 
     analysis: SafeSetAnalysis
     barriers: tuple[BarrierFindings, ...]
-    safe_set: Part
-    invariant_set: Part | None
+    safe_set: SetFeasibility
+    invariant_set: SetFeasibility | None
     beyond: bool
     undefined: float
 
@@ -157,6 +157,9 @@ def verify(
         samples: number of states in C at which the drawing ends.
         seed: of all randomness.
 
+    Returns:
+        What was found in C and in the invariant set.
+
     Raises:
         ConfigurationError: an argument is out of its range, or no state of C was found.
         RelativeDegreeError: a condition does not suit a barrier.
@@ -182,13 +185,13 @@ def verify(
     )
 
 
-def _invariant_part(analysis: SafeSetAnalysis, count: int) -> Part:
+def _invariant_part(analysis: SafeSetAnalysis, count: int) -> SetFeasibility:
     level = analysis.formulas.invariant_level(analysis.safe.points)
     share = float((level >= 0.0).mean())
-    return Part(count, share, analysis.infeasible, *analysis.max_shortfall)
+    return SetFeasibility(count, share, analysis.infeasible, *analysis.max_shortfall)
 
 
-def _safe_part(analysis: SafeSetAnalysis, invariant: Part | None) -> Part:
+def _safe_part(analysis: SafeSetAnalysis, invariant: SetFeasibility | None) -> SetFeasibility:
     """Return the part for C, which is that of the invariant set where this is all of C."""
     formulas, points = analysis.formulas, analysis.safe.points
     if invariant is not None and invariant.share == 1.0:
@@ -199,7 +202,7 @@ def _safe_part(analysis: SafeSetAnalysis, invariant: Part | None) -> Part:
         analysis.with_starts(points, formulas.barrier_level),
         analysis.rng(4),
     )
-    return Part(
+    return SetFeasibility(
         len(points), analysis.safe.share, infeasible_part(formulas, points), shortfall, state
     )
 

@@ -15,7 +15,8 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
-from safe_envs.wrappers.verification.safe_set import Region, region_of
+from safe_envs.wrappers.verification.region import Region
+from safe_envs.wrappers.verification.safe_set import region_of
 
 _ROUNDING = 1e-9
 _EDGE = 1e-9
@@ -67,7 +68,7 @@ class Formulas:
 
     @cached_property
     def names(self) -> list[str]:
-        """Names of all chain functions: h, b_1, ...; with that of the barrier if there are several."""
+        """Names of all chain functions: h, b_1, ...; with the barrier's if there are several."""
         several = len(self.stages) > 1
         return [
             barrier.name if j == 0 else f"b_{j}" + f" of {barrier.name}" * several
@@ -164,7 +165,7 @@ class Formulas:
 
     @property
     def joint(self) -> bool:
-        """Whether the joint shortfall is exact: for one condition, independent ones or one input."""
+        """Whether the joint shortfall is exact: one condition, independent ones, or one input."""
         # Sampling margins decide how the filter distributes a violation, by the nominal action.
         sampled = any(c.change is not None for c in self._constraints)
         return self.independent or (self.problem.plant.m == 1 and not sampled)

@@ -31,6 +31,9 @@ def guarantee_of(
         conditions: one for each barrier.
         knowledge: what they know, "model" or "plant".
 
+    Returns:
+        The bound, or why there is none.
+
     Raises:
         ConfigurationError: the conditions are learned and not robust over a posterior, the data
             contradict what the posterior takes for granted, or no state of C was found.

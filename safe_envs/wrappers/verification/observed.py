@@ -20,6 +20,9 @@ def above_suprema(formulas: Formulas, suprema: Sequence[float], x: np.ndarray) -
         formulas: of the chains.
         suprema: c_j of each chain function.
         x: states (B, n), those outside the set or the workspace among them.
+
+    Returns:
+        A text.
     """
     if formulas.certain:
         return ""  # No supremum matters there.
@@ -37,6 +40,9 @@ def above_shortfall(formulas: Formulas, shortfall: float, x: np.ndarray, u: np.n
         shortfall: the largest one that a search found.
         x: states (E, n); those outside the invariant set do not count.
         u: actions (E, m).
+
+    Returns:
+        A text.
     """
     inside = _inside(formulas, x)
     if not inside.any():
@@ -57,6 +63,9 @@ def reaches(name: str, value: float, supremum: float) -> str:
         name: of the function.
         value: that it has.
         supremum: that a search found.
+
+    Returns:
+        A text.
     """
     return f"{name} reaches {value:.4g}, above the supremum of {supremum:.4g} that the search found"
 
@@ -67,6 +76,9 @@ def violated_by(most: float, shortfall: float) -> str:
     Args:
         most: by how much, in the units of b_(r-1) per s.
         shortfall: that a search found.
+
+    Returns:
+        A text.
     """
     return (
         f"the filter violated the condition by {most:.4g}, more than the shortfall of"

@@ -17,8 +17,8 @@ from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification import bounds
 from safe_envs.wrappers.verification.observed import RELATIVE, reaches, violated_by
+from safe_envs.wrappers.verification.region import Region
 from safe_envs.wrappers.verification.safe_set import (
-    Region,
     draw_starts,
     in_workspace,
     region_of,
@@ -99,6 +99,9 @@ def posterior_guarantee(
             do not matter.
         conditions: one, a `BayesianSCBF` with `simultaneous`.
         seed: of the search.
+
+    Returns:
+        The bound.
 
     Raises:
         ConfigurationError: there is another condition or more than one barrier, the data contradict

@@ -9,7 +9,7 @@ import numpy as np
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.verification.extrema import max_shortfall, supremum, unbounded
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.safe_set import Sample, draw_starts, sample
+from safe_envs.wrappers.verification.safe_set import draw_starts, sample
 from safe_envs.wrappers.verification.search import Score
 from safe_envs.wrappers.verification.smoothness import asked_of, roughness
 
@@ -48,7 +48,7 @@ class SafeSetAnalysis:
 
     def __init__(self, formulas: Formulas, samples: int = SAMPLES, seed: int = 0) -> None:
         self.formulas, self.region, self._seed = formulas, formulas.region, seed
-        self.safe: Sample = sample("C", formulas.barrier_level, self.region, samples, self.rng(0))
+        self.safe = sample("C", formulas.barrier_level, self.region, samples, self.rng(0))
         self.starts = draw_starts(formulas.problem, _STARTS)
         self.invariant_set = self._invariant_set()
 
@@ -92,6 +92,9 @@ class SafeSetAnalysis:
         Args:
             points: of the set, shape (B, n).
             level: nonnegative in the set.
+
+        Returns:
+            States, shape (C, n).
         """
         return np.concatenate([points, self.starts[level(self.starts) >= 0.0]])
 
@@ -141,7 +144,7 @@ class SafeSetAnalysis:
         states = self.formulas.problem.states
         found = [
             f"{states[i].symbol} in [{self.region.low[i]:.4g}, {self.region.high[i]:.4g}]"
-            for i in np.flatnonzero(self.region.chosen).tolist()
+            for i in np.flatnonzero(self.region.assumed).tolist()
             if states[i].symbol in asked
         ]
         return f"looked at only for {', '.join(found)}: the workspace is unbounded" if found else ""

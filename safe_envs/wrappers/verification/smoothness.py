@@ -11,7 +11,8 @@ import sympy as sp
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import shortened
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.search import Box, Score, largest
+from safe_envs.wrappers.verification.region import Region
+from safe_envs.wrappers.verification.search import Score, largest
 
 _TOUCHED = 1e-6
 """Part of its typical size at which a function counts as one that reaches 0."""
@@ -92,7 +93,7 @@ def roughness(
     states: Sequence[sp.Symbol],
     level: Score,
     points: np.ndarray,
-    region: Box,
+    region: Region,
     rng: np.random.Generator,
 ) -> str:
     """Say which function is not smooth somewhere in a set, and where; "" if none was found.
@@ -107,6 +108,9 @@ def roughness(
         points: of the set, shape (B, n).
         region: where to look.
         rng: of the search.
+
+    Returns:
+        A text.
     """
     for name, expression, only_poles in asked:
         for edge in edges(expression):
@@ -132,7 +136,7 @@ def _reaches_zero(
     states: Sequence[sp.Symbol],
     level: Score,
     points: np.ndarray,
-    region: Box,
+    region: Region,
     rng: np.random.Generator,
 ) -> np.ndarray | None:
     """Return a state (n,) of the set where a function is 0 to rounding; None if none is found."""

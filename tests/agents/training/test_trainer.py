@@ -26,7 +26,7 @@ from safe_envs.agents.training.session import TrainingSession
 from safe_envs.agents.training.trainer import train
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.learning.models.files import load
+from safe_envs.wrappers.learning.data.files import load
 
 pytestmark = pytest.mark.slow
 

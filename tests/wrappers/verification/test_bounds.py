@@ -14,7 +14,7 @@ TIMES = np.array([0.01, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0])
 
 
 def killed_on_an_interval(x, time, s):
-    """P(Brownian motion of variance s^2 t from x stays in (0, pi) up to a time): the sine series."""
+    """P(Brownian motion of variance s^2 t from x stays in (0, pi) up to a time), by a series."""
     k = np.arange(1, 400, 2)
     return float((4 / (math.pi * k) * np.sin(k * x) * np.exp(-0.5 * (k * s) ** 2 * time)).sum())
 

@@ -15,7 +15,7 @@ import sympy as sp
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.models.values import require_finite, require_text
+from safe_envs.wrappers.learning.data.values import require_finite, require_text
 
 _MOST = 300
 """Features; a regression holds the square of some multiple of their number, and their symbols take

@@ -9,11 +9,11 @@ import sympy as sp
 from scipy.stats import chi2
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.values import (
+from safe_envs.wrappers.learning.data.values import (
     LARGEST,
 )
-from safe_envs.wrappers.learning.regression import Gaussian, sigma_map, sigma_samples
+from safe_envs.wrappers.learning.models.distributions import Gaussian, sigma_map, sigma_samples
+from safe_envs.wrappers.learning.models.features import Features
 
 _ROUNDING = 1e-9
 """Of the entries of a matrix of correlations."""

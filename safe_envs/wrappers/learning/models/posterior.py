@@ -13,7 +13,14 @@ import sympy as sp
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import LearnedModel, Record
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.data.values import (
+    LARGEST,
+    array_of,
+    require_finite,
+)
+from safe_envs.wrappers.learning.models.base import LearnedModel, Record
+from safe_envs.wrappers.learning.models.distributions import Gaussian
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.noise import Diffusion, require_noise
 from safe_envs.wrappers.learning.models.pruning import (
@@ -21,13 +28,6 @@ from safe_envs.wrappers.learning.models.pruning import (
     mixed_by_steps,
     solved,
 )
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import (
-    LARGEST,
-    array_of,
-    require_finite,
-)
-from safe_envs.wrappers.learning.regression import Gaussian
 
 
 @dataclass(frozen=True, eq=False)

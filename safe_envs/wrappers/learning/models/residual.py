@@ -15,12 +15,12 @@ from safe_envs.dynamics.lie import derivatives, lie_derivative_f, lie_derivative
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import LearnedModel, Record
 from safe_envs.wrappers.learning.checks import (
     require_degrees,
 )
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.models.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.network import Network, require_activation
-from safe_envs.wrappers.learning.models.signature import Signature
 
 _ROUNDING = 1e-12
 

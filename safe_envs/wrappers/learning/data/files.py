@@ -23,8 +23,8 @@ from safe_envs.bounded_reading import (
     open_regular,
 )
 from safe_envs.errors import ConfigurationError, shortened, shown
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import LearnedFileError, require_text
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.data.values import LearnedFileError, require_text
 
 DATA = "transitions"
 """Kind of a file that holds data; others hold models or policies."""
