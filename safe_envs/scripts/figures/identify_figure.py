@@ -18,8 +18,7 @@ from safe_envs.atomic_io import write_atomically
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, add_legend
 from safe_envs.scripts.reports.identify_answer import Function, Identification
 from safe_envs.scripts.reports.quantities import relative_text
-from safe_envs.wrappers.learning.models.distributions import sigma_samples
-from safe_envs.wrappers.learning.models.noise import Diffusion
+from safe_envs.wrappers.learning.models.distributions import Diffusion, sigma_samples
 from safe_envs.wrappers.learning.models.posterior import Posterior
 
 _TRUTH = "#D55E00"

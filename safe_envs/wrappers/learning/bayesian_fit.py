@@ -10,9 +10,8 @@ from scipy.stats import chi2, norm
 from scipy.stats import f as fisher
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.wrappers.learning.models.distributions import Gaussian
+from safe_envs.wrappers.learning.models.distributions import Diffusion, Gaussian
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.noise import Diffusion
 from safe_envs.wrappers.learning.regression import Rows, grouped, posterior
 
 _SURE = 0.9999

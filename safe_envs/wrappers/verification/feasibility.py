@@ -11,7 +11,6 @@ import numpy as np
 from safe_envs.errors import require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition, spec_of
-from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.extrema import (
     max_shortfall,
     supremum,
@@ -19,13 +18,13 @@ from safe_envs.wrappers.verification.extrema import (
     without_control,
 )
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.region import Region
+from safe_envs.wrappers.verification.guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.safe_set_analysis import (
     SAMPLES,
     SafeSetAnalysis,
     infeasible_part,
 )
-from safe_envs.wrappers.verification.search import largest
+from safe_envs.wrappers.verification.search import Region, largest
 
 SMALL = 0.01
 """Below this part of its typical size a control authority counts as small."""

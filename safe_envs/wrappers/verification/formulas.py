@@ -15,8 +15,8 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
-from safe_envs.wrappers.verification.region import Region
 from safe_envs.wrappers.verification.safe_set import region_of
+from safe_envs.wrappers.verification.search import Region
 
 _ROUNDING = 1e-9
 _EDGE = 1e-9

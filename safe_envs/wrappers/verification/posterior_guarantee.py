@@ -16,8 +16,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification import bounds
-from safe_envs.wrappers.verification.observed import RELATIVE, reaches, violated_by
-from safe_envs.wrappers.verification.region import Region
+from safe_envs.wrappers.verification.assumptions import RELATIVE, reaches, violated_by
 from safe_envs.wrappers.verification.safe_set import (
     draw_starts,
     in_workspace,
@@ -25,7 +24,7 @@ from safe_envs.wrappers.verification.safe_set import (
     sample,
     workspace_of,
 )
-from safe_envs.wrappers.verification.search import Score, largest
+from safe_envs.wrappers.verification.search import Region, Score, largest
 from safe_envs.wrappers.verification.smoothness import Asked, roughness
 from safe_envs.wrappers.verification.step_bias import rate_bias
 

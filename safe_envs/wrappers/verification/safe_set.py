@@ -14,8 +14,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.simulation import Simulation
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.verification.region import Region
-from safe_envs.wrappers.verification.search import Score, search
+from safe_envs.wrappers.verification.search import Region, Score, search
 
 _PERIOD = 2.0 * math.pi
 _STARTS = 64

@@ -11,8 +11,7 @@ import sympy as sp
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.errors import shortened
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.region import Region
-from safe_envs.wrappers.verification.search import Score, largest
+from safe_envs.wrappers.verification.search import Region, Score, largest
 
 _TOUCHED = 1e-6
 """Part of its typical size at which a function counts as one that reaches 0."""

@@ -20,9 +20,8 @@ from safe_envs.wrappers.learning.data.values import (
     require_finite,
 )
 from safe_envs.wrappers.learning.models.base import LearnedModel, Record
-from safe_envs.wrappers.learning.models.distributions import Gaussian
+from safe_envs.wrappers.learning.models.distributions import Diffusion, Gaussian, require_noise
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.noise import Diffusion, require_noise
 from safe_envs.wrappers.learning.models.pruning import (
     insignificant,
     mixed_by_steps,
