@@ -65,7 +65,7 @@ class VerifyAnswer:
                     "horizon": self.problem.duration,
                 },
                 "states": [s.symbol.name for s in self.problem.states],
-                "drawn": found.drawn,
+                "drawn": found.analysis.safe.drawn,
                 "notes": found.region.notes,
                 "beyond_workspace": found.beyond,
                 "undefined": found.undefined,

@@ -71,7 +71,7 @@ def _searched(found: Verification) -> str:
 def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
     ranges = f" ({'; '.join(found.region.notes)})" if found.region.notes else ""
     lines = [
-        f"{found.drawn} states were drawn from the workspace{ranges}; C is"
+        f"{found.analysis.safe.drawn} states were drawn from the workspace{ranges}; C is"
         f" {share_text(found.safe_set.share)} of it, and {found.safe_set.points} of its states are"
         " looked at"
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -24,18 +25,22 @@ def no_bound(formulas: Formulas) -> str:
             return f"{condition.name} has no chain of rates, as the bounds need under noise"
     if not formulas.certain and any(c.almost_sure for c in formulas.conditions):
         return "the barriers have conditions of different kinds"
-    return _kinked(formulas)
+    functions = zip(formulas.names, formulas.chain_expressions, strict=True)
+    return next(filter(None, (kinked(name, function) for name, function in functions)), "")
 
 
-def _kinked(formulas: Formulas) -> str:
-    """Say which function of a chain has a kink; "" if none has.
+def kinked(name: str, function: Any) -> str:
+    """Say that a function has a kink, where noise adds a local time to its generator; "" if not.
 
-    The noise adds a local time there that the generator does not contain.
+    Args:
+        name: of the function.
+        function: expression of the states.
+
+    Returns:
+        A text.
     """
-    for name, function in zip(formulas.names, formulas.chain_expressions, strict=True):
-        if has_kinks(function):
-            return f"{name} is not twice differentiable, which Ito's formula asks for"
-    return ""
+    asked = "is not twice differentiable, which Ito's formula asks for"
+    return f"{name} {asked}" if has_kinks(function) else ""
 
 
 def mismatch(formulas: Formulas) -> str:
@@ -83,10 +88,10 @@ def amount(shortfall: float) -> str:
 
 def unbounded(analysis: SafeSetAnalysis) -> str:
     """Say which supremum is infinite, where one matters; "" if none is."""
-    growing = (
-        np.flatnonzero(np.isinf(analysis.suprema)) if not analysis.formulas.certain else np.empty(0)
-    )
-    return analysis.infinite(int(growing[0])) if growing.size else ""
+    if analysis.formulas.certain or not np.isinf(analysis.suprema).any():
+        return ""
+    j = int(np.isinf(analysis.suprema).argmax())
+    return f"sup {analysis.formulas.names[j]} {analysis.how_infinite(j)}"
 
 
 RELATIVE = 1e-6

@@ -29,9 +29,6 @@ from safe_envs.wrappers.verification.search import Region, largest
 SMALL = 0.01
 """Below this part of its typical size a control authority counts as small."""
 
-_BEYOND = 10.0
-_BEYOND_LOG2 = 12
-
 
 @dataclass(frozen=True)
 class SetFeasibility:
@@ -134,11 +131,6 @@ class Verification:
         """The bounds of the conditions, with the suprema and the shortfall that were found."""
         return ChainGuarantee(self.formulas, self.analysis)
 
-    @property
-    def drawn(self) -> int:
-        """Number of states that were drawn."""
-        return self.analysis.safe.drawn
-
 
 def verify(
     problem: SafetyProblem,
@@ -171,9 +163,8 @@ def verify(
     invariant = None if points is None else _invariant_part(analysis, len(points))
     safe = _safe_part(analysis, invariant)
     found = tuple(_barrier(i, analysis) for i in range(len(formulas.stages)))
-    wide = analysis.region.scaled(_BEYOND).draw(_BEYOND_LOG2, analysis.rng(6))
-    outside = ((wide < analysis.region.low) | (wide > analysis.region.high)).any(axis=1)
-    beyond = bool((formulas.barrier_level(wide[outside]) >= 0.0).any())
+    wide = analysis.region.beyond(analysis.rng(6))
+    beyond = bool((formulas.barrier_level(wide) >= 0.0).any())
     return Verification(
         analysis,
         found,

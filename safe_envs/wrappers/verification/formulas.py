@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import quadratic_variation_rate
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
@@ -114,13 +114,11 @@ class Formulas:
         return self._compiled(self._constraint_expressions())
 
     def _compiled(self, expressions: Sequence[Any]) -> Any:
-        function = compile_function(
-            self.system.states, [self.system.numeric(e) for e in expressions], "arrays"
-        )
+        function = tabulated(self.system.states, [self.system.numeric(e) for e in expressions])
 
         def values(x: np.ndarray) -> np.ndarray:
             with np.errstate(all="ignore"):
-                return stacked(function(*np.ascontiguousarray(x.T)), len(x))
+                return function(x)
 
         return values
 

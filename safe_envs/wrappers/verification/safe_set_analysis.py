@@ -10,14 +10,12 @@ from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.verification.extrema import max_shortfall, supremum, unbounded
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set import draw_starts, sample
-from safe_envs.wrappers.verification.search import Score
+from safe_envs.wrappers.verification.search import BEYOND, BEYOND_LOG2, Score
 from safe_envs.wrappers.verification.smoothness import asked_of, roughness
 
 SAMPLES = 8192
 
 _FEW = 64
-_BEYOND = 10.0
-_BEYOND_LOG2 = 12
 _TOUCHED = 1e-9
 _NEAR, _NEARER = 1e-6, 1e-8
 _FALL = 0.03
@@ -182,7 +180,7 @@ class SafeSetAnalysis:
             return formulas.chain(x)[:, formulas.barriers]
 
         inner = self.safe.points
-        outer = self.region.scaled(_BEYOND).draw(_BEYOND_LOG2, rng)
+        outer = self.region.scaled(BEYOND).draw(BEYOND_LOG2, rng)
         inner = inner[rng.integers(len(inner), size=len(outer))]
         level = part * float(h(self.safe.points)[:, i].max())
         crossing = (h(inner)[:, i] > level) & (h(outer)[:, i] < level)
@@ -193,10 +191,6 @@ class SafeSetAnalysis:
             inner, outer = np.where(above, middle, inner), np.where(above, outer, middle)
         edge = inner[(h(inner) > 0.0).all(axis=1)]
         return float(np.nan_to_num(formulas.variation_rates(edge)[:, i]).max(initial=0.0))
-
-    def infinite(self, j: int) -> str:
-        """Say that the supremum of the j-th chain function is infinite, or seems so."""
-        return f"sup {self.formulas.names[j]} {self.how_infinite(j)}"
 
     def how_infinite(self, j: int) -> str:
         """Say how sure it is that the supremum of the j-th chain function is infinite."""

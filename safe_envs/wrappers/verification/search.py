@@ -13,6 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+BEYOND, BEYOND_LOG2 = 10.0, 12
+"""Factor of the box that is looked at beyond another one, and the draws from it."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ class Region:
         center = (self.high + self.low) / 2.0
         return replace(self, low=center - half, high=center + half)
 
-    def within(self, low: np.ndarray, high: np.ndarray) -> Region:
+    def within(self, low: ArrayLike, high: ArrayLike) -> Region:
         """Return the part of the box between ends.
 
         Args:
@@ -61,6 +65,22 @@ class Region:
         return replace(
             self, low=np.maximum(self.low, low - more), high=np.minimum(self.high, high + more)
         )
+
+    def beyond(
+        self, rng: np.random.Generator, low: ArrayLike = -np.inf, high: ArrayLike = np.inf
+    ) -> np.ndarray:
+        """Draw points of a far larger box about the same centre, without those in this one.
+
+        Args:
+            rng: of the draw.
+            low: lower ends of the larger box at least, shape (n,).
+            high: its upper ends at most, shape (n,).
+
+        Returns:
+            States, shape (B, n).
+        """
+        wide = self.scaled(BEYOND).within(low, high).draw(BEYOND_LOG2, rng)
+        return wide[((wide < self.low) | (wide > self.high)).any(axis=1)]
 
     def inside(self, x: np.ndarray) -> np.ndarray:
         """Return states (B, n) moved into the box, by whole periods or to its nearest end."""

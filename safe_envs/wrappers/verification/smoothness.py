@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import shortened
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.search import Region, Score, largest
@@ -139,11 +139,11 @@ def _reaches_zero(
     rng: np.random.Generator,
 ) -> np.ndarray | None:
     """Return a state (n,) of the set where a function is 0 to rounding; None if none is found."""
-    compiled = compile_function(tuple(states), [base], "arrays")
+    values = tabulated(states, [base])
 
     def size(x: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            return abs(stacked(compiled(*np.ascontiguousarray(x.T)), len(x))[:, 0])
+            return abs(values(x)[:, 0])
 
     def score(x: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):

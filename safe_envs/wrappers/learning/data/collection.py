@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import (
     ConfigurationError,
     InvalidInputError,
@@ -226,13 +226,9 @@ def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
 def _explored(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
     """Return whether states (B, n) are in the region with positive barriers, shape (B,)."""
     low, high = np.array(problem.exploration.region).T
-    barriers = compile_function(
-        problem.plant.states,
-        [problem.plant.numeric(b.expression) for b in problem.barriers],
-        "arrays",
-    )
+    barriers = [problem.plant.numeric(b.expression) for b in problem.barriers]
     with np.errstate(all="ignore"):
-        values = stacked(barriers(*np.ascontiguousarray(x.T)), len(x))
+        values = tabulated(problem.plant.states, barriers)(x)
     return ((low <= x) & (x <= high)).all(axis=1) & (values > 0).all(axis=1)
 
 

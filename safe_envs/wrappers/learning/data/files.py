@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -136,15 +136,10 @@ def save(
 
     def write(part: Path) -> None:
         with part.open("wb") as stream:
-            _savez(stream, {_HEADER: encoded, **arrays})
+            plain = {name: np.asarray(array) for name, array in arrays.items()}
+            np.savez(stream, allow_pickle=False, header=encoded, **plain)
 
     write_atomically(path, write)
-
-
-def _savez(stream: BinaryIO, arrays: Mapping[str, np.ndarray]) -> None:
-    np.savez(
-        stream, allow_pickle=False, **{name: np.asarray(array) for name, array in arrays.items()}
-    )  # pyright: ignore[reportArgumentType]
 
 
 def _plain(value: Any) -> Any:

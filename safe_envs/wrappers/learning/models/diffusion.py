@@ -79,16 +79,7 @@ class LearnedDiffusion:
 
     def details(self) -> list[dict[str, Any]]:
         """Return all but the weights, for JSON."""
-        return [
-            {
-                "row": e.row,
-                "column": e.column,
-                "degree": e.features.degree,
-                "region": e.features.region,
-                "angles": e.features.angles,
-            }
-            for e in self.entries
-        ]
+        return [{"row": e.row, "column": e.column, **e.features.details()} for e in self.entries]
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return the weights by name."""
@@ -116,7 +107,7 @@ class LearnedDiffusion:
         for d in details:
             # Each place once.
             places.remove((d["row"], d["column"]))
-            features = Features.from_json(states, d["region"], d["degree"], d["angles"])
+            features = Features.restored(states, d)
             weights = array_of(arrays, _name(d["row"], d["column"]), (features.count,))
             entries.append(Entry(int(d["row"]), int(d["column"]), features, weights))
         return cls(states, tuple(entries))
