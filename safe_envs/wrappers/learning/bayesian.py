@@ -28,7 +28,7 @@ from safe_envs.wrappers.learning.identifiability import (
     weaknesses,
 )
 from safe_envs.wrappers.learning.models.base import Record
-from safe_envs.wrappers.learning.models.distributions import Gaussian
+from safe_envs.wrappers.learning.models.distributions import Gaussian, require_prior
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.posterior import Posterior
 from safe_envs.wrappers.learning.regression import Rows
@@ -93,7 +93,11 @@ def identify(  # noqa: PLR0913 - the friendly keyword form
     """
     began = time.perf_counter()
     require_problem(problem)
-    _require_prior(prior, alpha, beta)
+    require_prior(alpha, beta)
+    if not 0 < prior < math.inf:
+        raise ConfigurationError(
+            f"prior = {shown(prior)}; the variance of the weights is positive and finite"
+        )
     collected = data is None
     if data is None:
         collecting = None if progress is None else lambda part: progress(_COLLECTING * part)
@@ -150,32 +154,10 @@ def identify(  # noqa: PLR0913 - the friendly keyword form
     record = Record(
         data.count, data.observed, time.perf_counter() - began, data.seed, errors, settings, warned
     )
-    learned, dt = found.learned, float(data.dt.mean())
-    weights = learned.mean, learned.covariance
-    return Posterior(
-        data.signature,
-        record,
-        features,
-        problem.plant.inputs,
-        scale,
-        *weights,
-        found.diffusion,
-        dt,
-        found.misfit,
-        found.variation,
-    )
-
-
-def _require_prior(prior: float, alpha: float, beta: float) -> None:
-    if not 0 < prior < math.inf:
-        raise ConfigurationError(
-            f"prior = {shown(prior)}; the variance of the weights is positive and finite"
-        )
-    for name, value in (("alpha", alpha), ("beta", beta)):
-        if not 0 <= value < math.inf:
-            raise ConfigurationError(
-                f"{name} = {shown(value)}; the prior of sigma needs a finite number from 0"
-            )
+    weights = found.learned.mean, found.learned.covariance
+    rest = found.diffusion, float(data.dt.mean()), found.misfit, found.variation
+    inputs = problem.plant.inputs
+    return Posterior(data.signature, record, features, inputs, scale, *weights, *rest)
 
 
 def _degree(problem: SafetyProblem, rows: int) -> int:

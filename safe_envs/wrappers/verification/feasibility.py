@@ -160,7 +160,12 @@ def verify(
     formulas = Formulas(problem, conditions, knowledge)
     analysis = SafeSetAnalysis(formulas, samples, seed)
     points = analysis.invariant_set
-    invariant = None if points is None else _invariant_part(analysis, len(points))
+    share = float((formulas.invariant_level(analysis.safe.points) >= 0.0).mean())
+    invariant = (
+        points
+        if points is None
+        else SetFeasibility(len(points), share, analysis.infeasible, *analysis.max_shortfall)
+    )
     safe = _safe_part(analysis, invariant)
     found = tuple(_barrier(i, analysis) for i in range(len(formulas.stages)))
     wide = analysis.region.beyond(analysis.rng(6))
@@ -173,12 +178,6 @@ def verify(
         beyond,
         len(analysis.undefined) / len(analysis.safe.points),
     )
-
-
-def _invariant_part(analysis: SafeSetAnalysis, count: int) -> SetFeasibility:
-    level = analysis.formulas.invariant_level(analysis.safe.points)
-    share = float((level >= 0.0).mean())
-    return SetFeasibility(count, share, analysis.infeasible, *analysis.max_shortfall)
 
 
 def _safe_part(analysis: SafeSetAnalysis, invariant: SetFeasibility | None) -> SetFeasibility:

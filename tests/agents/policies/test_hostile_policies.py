@@ -23,7 +23,7 @@ from safe_envs.registry import make_problem
 from safe_envs.wrappers.learning.data.files import load, save
 from tests.agents.policies.test_network import small
 from tests.test_bounded_reading import damaged_by
-from tests.wrappers.learning.models.test_hostile_files import altered, changed
+from tests.wrappers.learning.data.test_hostile_files import altered, changed
 
 pytestmark = pytest.mark.slow
 

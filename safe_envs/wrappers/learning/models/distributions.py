@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ import sympy as sp
 from scipy.integrate import cumulative_trapezoid
 from scipy.stats import chi2
 
-from safe_envs.errors import ConfigurationError
+from safe_envs.errors import ConfigurationError, shown
 from safe_envs.wrappers.learning.data.values import (
     LARGEST,
 )
@@ -61,7 +62,7 @@ def sigma_map(
         N(0, sigma^2), without dt,
     with N - 1 factors.
     """
-    _require_prior(alpha, beta)
+    require_prior(alpha, beta)
     total = np.asarray(counts) + alpha + 1.0
     return (beta + np.sqrt(beta**2 + 4.0 * total * np.asarray(squares))) / (2.0 * total)
 
@@ -89,7 +90,7 @@ def sigma_quantile(
 
     Source: thesis Eq. (6.8) to (6.10), see `sigma_map`.
     """
-    _require_prior(alpha, beta)
+    require_prior(alpha, beta)
     power = count + alpha
     if not (squares >= 0 and power > 0 and squares + beta > 0):
         raise ConfigurationError(
@@ -122,11 +123,18 @@ def sigma_samples(
     return sigma_quantile(rng.random(size), squares, count, alpha, beta)
 
 
-def _require_prior(alpha: float, beta: float) -> None:
-    if not (np.isfinite(alpha) and np.isfinite(beta) and alpha >= 0 and beta >= 0):
-        raise ConfigurationError(
-            f"alpha = {alpha!r} and beta = {beta!r}; the prior of sigma needs both from 0"
-        )
+def require_prior(alpha: float, beta: float) -> None:
+    """Raise ConfigurationError unless there is a prior of sigma with these numbers.
+
+    Args:
+        alpha: its shape.
+        beta: its scale, in units of sigma.
+    """
+    for name, value in (("alpha", alpha), ("beta", beta)):
+        if not 0 <= value < math.inf:
+            raise ConfigurationError(
+                f"{name} = {shown(value)}; the prior of sigma needs a finite number from 0"
+            )
 
 
 _ROUNDING = 1e-9
