@@ -16,12 +16,12 @@ from safe_envs.dynamics.lie import (
     lie_derivative_f,
     lie_derivative_g,
 )
-from safe_envs.wrappers.learning.base import Record
 from safe_envs.wrappers.learning.data.collection import draw_states
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.models.base import Record
 from safe_envs.wrappers.learning.models.generator import GeneratorModel
 from safe_envs.wrappers.learning.models.network import Network
 from safe_envs.wrappers.learning.models.residual import ResidualModel
-from safe_envs.wrappers.learning.models.signature import Signature
 
 NO_RECORD = Record(0, 0.0, 0.0)
 

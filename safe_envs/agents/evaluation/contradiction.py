@@ -4,7 +4,7 @@ A bound is withheld, and the reason said, where the episodes themselves show tha
 uses, is wrong: a start or a visited state has a b_j above the supremum c_j that was found, the
 filter violated a condition by more than the shortfall m that was found, or the interval of the
 measured rate lies below the bound. See
-`safe_envs.wrappers.verification.chain_guarantee.ChainGuarantee.contradiction` for the first two.
+`safe_envs.wrappers.verification.guarantee.ChainGuarantee.contradiction` for the first two.
 """
 
 from __future__ import annotations

@@ -19,9 +19,9 @@ from safe_envs.agents.policies.base import (
 from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shortened, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.models import files
+from safe_envs.wrappers.learning.data import files
+from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.models.network import Network
-from safe_envs.wrappers.learning.models.signature import Signature
 
 KIND = "policy"
 """Kind of a file that holds a policy."""
@@ -236,7 +236,7 @@ def _policy(content: files.Content, problem: SafetyProblem) -> NetworkPolicy:
         or not np.isfinite(trained).all()
         or (trained[:, 0] >= trained[:, 1]).any()
     ):
-        raise ValueError("the box is not one of the inputs")
+        raise ValueError("the input bounds are not those of the inputs")
     boxes = None if np.array_equal(trained, given) else (trained, given)
     return NetworkPolicy(network, details["output"], normalization, boxes)
 

@@ -18,9 +18,8 @@ from safe_envs.atomic_io import write_atomically
 from safe_envs.scripts.figures.evaluation_figure import COLORS, QUIET, STYLE, add_legend
 from safe_envs.scripts.reports.identify_answer import Function, IdentifyAnswer
 from safe_envs.scripts.reports.quantities import relative_text
-from safe_envs.wrappers.learning.models.noise import Diffusion
+from safe_envs.wrappers.learning.models.distributions import Diffusion, sigma_samples
 from safe_envs.wrappers.learning.models.posterior import Posterior
-from safe_envs.wrappers.learning.regression import sigma_samples
 
 _TRUTH = "#D55E00"
 _MOST = 12

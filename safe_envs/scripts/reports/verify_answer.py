@@ -12,7 +12,7 @@ import numpy as np
 from safe_envs.agents.evaluation.bound_check import Measurement
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers import spec_of
-from safe_envs.wrappers.verification.feasibility import Part, Verification
+from safe_envs.wrappers.verification.feasibility import SetFeasibility, Verification
 from safe_envs.wrappers.verification.results import Bound
 
 
@@ -44,7 +44,7 @@ class VerifyAnswer:
         return self.verification.formulas.problem
 
     @property
-    def part(self) -> Part:
+    def part(self) -> SetFeasibility:
         """The feasibility in the set that becomes invariant; in C if there is none."""
         return self.verification.invariant_set or self.verification.safe_set
 
@@ -65,7 +65,7 @@ class VerifyAnswer:
                     "horizon": self.problem.duration,
                 },
                 "states": [s.symbol.name for s in self.problem.states],
-                "drawn": found.drawn,
+                "drawn": found.analysis.safe.drawn,
                 "notes": found.region.notes,
                 "beyond_workspace": found.beyond,
                 "undefined": found.undefined,

@@ -18,7 +18,7 @@ from safe_envs.scripts.reports.verify_answer import VerifyAnswer
 from safe_envs.wrappers.verification.feasibility import (
     SMALL,
     BarrierFindings,
-    Part,
+    SetFeasibility,
     Verification,
 )
 
@@ -65,17 +65,17 @@ def _section(console: Console, title: str, lines: Sequence[str]) -> None:
 
 def _searched(found: Verification) -> str:
     """Return what shares are of: C, or its part in ranges that were chosen for unbounded states."""
-    return "the part of C that is searched" if found.beyond and found.region.chosen.any() else "C"
+    return "the part of C that is searched" if found.beyond and found.region.assumed.any() else "C"
 
 
 def _set_lines(found: Verification, starts: np.ndarray) -> list[str]:
     ranges = f" ({'; '.join(found.region.notes)})" if found.region.notes else ""
     lines = [
-        f"{found.drawn} states were drawn from the workspace{ranges}; C is"
+        f"{found.analysis.safe.drawn} states were drawn from the workspace{ranges}; C is"
         f" {share_text(found.safe_set.share)} of it, and {found.safe_set.points} of its states are"
         " looked at"
     ]
-    if found.beyond and found.region.chosen.any():
+    if found.beyond and found.region.assumed.any():
         lines.append("C reaches beyond these ranges: shares and shortfalls are of the part inside")
     elif found.beyond:
         lines.append(
@@ -151,7 +151,7 @@ def _parts(found: Verification) -> list[str]:
     return [f"{name}: {_describe_part(found, part)}" for name, part in parts]
 
 
-def _describe_part(found: Verification, part: Part) -> str:
+def _describe_part(found: Verification, part: SetFeasibility) -> str:
     at = state_text(found.formulas.problem, part.worst)
     if not part.shortfall:
         return f"nowhere; the smallest margin is at {at}"

@@ -38,7 +38,7 @@ class BayesianSCBF(LearnedCondition):
     for mean - z sqrt(v) >= 0. With `confidence` z is the quantile of Student's distribution, for
     each (x, u) by itself, and sigma the most probable. With `simultaneous` the ellipsoid of theta
     and the intervals of sigma hold together with that probability, hence for all (x, u) at once:
-    then `safe_envs.wrappers.verification.posterior_bound` has a bound for it. Correlated noise
+    then `safe_envs.wrappers.verification.posterior_guarantee` has a bound for it. Correlated noise
     makes v at most its largest eigenvalue larger. Both hold as far as the features and a constant
     sigma fit the data; what does not is in the warnings of the record.
 

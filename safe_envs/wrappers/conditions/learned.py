@@ -26,8 +26,8 @@ from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 if TYPE_CHECKING:
     from safe_envs.problem.problem import SafetyProblem
-    from safe_envs.wrappers.learning.base import LearnedModel
     from safe_envs.wrappers.learning.generator import GeneratorModel
+    from safe_envs.wrappers.learning.models.base import LearnedModel
     from safe_envs.wrappers.learning.residual import ResidualModel
 
 

@@ -9,10 +9,10 @@ from typing import Any
 
 from safe_envs.errors import nearest, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import LearnedModel, Progress, Record
-from safe_envs.wrappers.learning.checks import require_problem
-from safe_envs.wrappers.learning.models.files import DATA, load
-from safe_envs.wrappers.learning.models.values import LearnedFileError
+from safe_envs.wrappers.learning.checks import Progress, require_problem
+from safe_envs.wrappers.learning.data.files import DATA, load
+from safe_envs.wrappers.learning.data.values import LearnedFileError
+from safe_envs.wrappers.learning.models.base import LearnedModel, Record
 
 __all__ = [
     "METHODS",

@@ -10,9 +10,9 @@ import numpy as np
 
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import Progress, Record
 from safe_envs.wrappers.learning.bayesian_fit import Prior, fit
 from safe_envs.wrappers.learning.checks import (
+    Progress,
     Purpose,
     random_stream,
     require_kind,
@@ -27,9 +27,11 @@ from safe_envs.wrappers.learning.identifiability import (
     misfits,
     weaknesses,
 )
+from safe_envs.wrappers.learning.models.base import Record
+from safe_envs.wrappers.learning.models.distributions import Gaussian, require_prior
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.posterior import Posterior
-from safe_envs.wrappers.learning.regression import Gaussian, Rows
+from safe_envs.wrappers.learning.regression import Rows
 
 _HIGHEST_DEGREE = 3
 _MOST_WEIGHTS = 200
@@ -38,7 +40,7 @@ _FEWEST_HELD_OUT = 10
 _COLLECTING = 0.8
 
 
-def identify(
+def identify(  # noqa: PLR0913 - the friendly keyword form
     problem: SafetyProblem,
     *,
     starts: int = 1000,
@@ -91,7 +93,11 @@ def identify(
     """
     began = time.perf_counter()
     require_problem(problem)
-    _require_prior(prior, alpha, beta)
+    require_prior(alpha, beta)
+    if not 0 < prior < math.inf:
+        raise ConfigurationError(
+            f"prior = {shown(prior)}; the variance of the weights is positive and finite"
+        )
     collected = data is None
     if data is None:
         collecting = None if progress is None else lambda part: progress(_COLLECTING * part)
@@ -148,32 +154,10 @@ def identify(
     record = Record(
         data.count, data.observed, time.perf_counter() - began, data.seed, errors, settings, warned
     )
-    learned, dt = found.learned, float(data.dt.mean())
-    weights = learned.mean, learned.covariance
-    return Posterior(
-        data.signature,
-        record,
-        features,
-        problem.plant.inputs,
-        scale,
-        *weights,
-        found.diffusion,
-        dt,
-        found.misfit,
-        found.variation,
-    )
-
-
-def _require_prior(prior: float, alpha: float, beta: float) -> None:
-    if not 0 < prior < math.inf:
-        raise ConfigurationError(
-            f"prior = {shown(prior)}; the variance of the weights is positive and finite"
-        )
-    for name, value in (("alpha", alpha), ("beta", beta)):
-        if not 0 <= value < math.inf:
-            raise ConfigurationError(
-                f"{name} = {shown(value)}; the prior of sigma needs a finite number from 0"
-            )
+    weights = found.learned.mean, found.learned.covariance
+    rest = found.diffusion, float(data.dt.mean()), found.misfit, found.variation
+    inputs = problem.plant.inputs
+    return Posterior(data.signature, record, features, inputs, scale, *weights, *rest)
 
 
 def _degree(problem: SafetyProblem, rows: int) -> int:
@@ -192,11 +176,11 @@ def _degree(problem: SafetyProblem, rows: int) -> int:
 def _held_out(
     data: Transitions, features: Features, scale: np.ndarray, varying: Features | None, prior: Prior
 ) -> dict[str, float]:
-    """Root-mean-square errors of the rates at start states that were left out, for each state.
+    """Return root-mean-square errors of the rates at start states left out, for each state.
 
     They are in its units per s, with the part that the noise of the data explains; and in standard
-    deviations of the prediction, which are 1 where the posterior is right. Empty where the data are too few to
-    leave any out.
+    deviations of the prediction, which are 1 where the posterior is right. Empty where the data are
+    too few to leave any out.
     """
     if len(np.unique(data.x, axis=0)) < _FEWEST_HELD_OUT:
         return {}

@@ -10,9 +10,9 @@ from scipy.stats import chi2, norm
 from scipy.stats import f as fisher
 
 from safe_envs.errors import ConfigurationError
+from safe_envs.wrappers.learning.models.distributions import Diffusion, Gaussian
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.noise import Diffusion
-from safe_envs.wrappers.learning.regression import Gaussian, Rows, grouped, posterior
+from safe_envs.wrappers.learning.regression import Rows, grouped, posterior
 
 _SURE = 0.9999
 
@@ -81,6 +81,9 @@ def fit(rows: Rows, design: np.ndarray, features: Features | None, prior: Prior)
         design: at these rows, (G, D).
         features: on which the variances are regressed; None for constant noise.
         prior: what was believed before.
+
+    Returns:
+        The weights, the noise, and by how much the features fail.
 
     Raises:
         ConfigurationError: the rows do not repeat and are too few for the weights: nothing is left

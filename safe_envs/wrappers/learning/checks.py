@@ -1,8 +1,9 @@
-"""Checks that every method makes before it learns, and its random streams."""
+"""What every method needs: checks before it learns, random streams, a report of its progress."""
 
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Any
 
@@ -11,6 +12,9 @@ import numpy as np
 from safe_envs.dynamics.lie import relative_degree
 from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.problem.problem import SafetyProblem
+
+Progress = Callable[[float], None]
+"""Called with the part of the work that is done, from 0 to 1."""
 
 _MOST_BYTES = 2e9
 _BYTES = 8

@@ -37,7 +37,7 @@ for each other take far longer."""
 
 
 @dataclass(frozen=True)
-class Estimate:
+class ItoEstimate:
     """An estimate at each point.
 
     Attributes:
@@ -155,7 +155,7 @@ def ito_part(
     value: Values,
     slopes: Slopes,
     estimator: Estimator = "martingale",
-) -> Estimate:
+) -> ItoEstimate:
     """Estimate 1/2 tr(sigma sigma' b_xx) at each point, in one of three ways.
 
     With x_j the K successors of x, and xbar = x + (f + g u) dt:
@@ -207,4 +207,4 @@ def ito_part(
     if estimator == "printed":
         values -= (gradient * rate).sum(axis=1) * data.dt
     more = data.repetitions - 1
-    return Estimate(values / data.dt, deviations / (data.dt * more**0.5) if more else None)
+    return ItoEstimate(values / data.dt, deviations / (data.dt * more**0.5) if more else None)

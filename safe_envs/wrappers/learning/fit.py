@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 
 from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole, shown
-from safe_envs.wrappers.learning.base import Progress
-from safe_envs.wrappers.learning.checks import Purpose, random_stream
+from safe_envs.wrappers.learning.checks import Progress, Purpose, random_stream
+from safe_envs.wrappers.learning.data.values import LARGEST
 from safe_envs.wrappers.learning.models.network import (
     Activation,
     Network,
     require_activation,
 )
-from safe_envs.wrappers.learning.models.values import LARGEST
 
 LEAST_ROWS = 10
 """Fewest rows from which anything is learned."""
@@ -107,6 +106,9 @@ def train(
         sizes: (q,), against which the spread of each target is judged small (see
             `_standardisation`); its largest entry by default.
         progress: called after each epoch.
+
+    Returns:
+        The network of the epoch of least validation loss, with its errors.
 
     Raises:
         InvalidInputError: the arrays have other shapes, fewer than ten rows, or entries that are

@@ -18,12 +18,12 @@ from safe_envs.dynamics.lie import (
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import Progress, Record
-from safe_envs.wrappers.learning.checks import require_kind, require_problem
+from safe_envs.wrappers.learning.checks import Progress, require_kind, require_problem
 from safe_envs.wrappers.learning.data.collection import collect
+from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.steps import Step
 from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.diffusion import LearnedDiffusion
+from safe_envs.wrappers.learning.diffusion import learn_diffusion
 from safe_envs.wrappers.learning.drift_checks import (
     drift_warnings,
     region_warnings,
@@ -38,13 +38,13 @@ from safe_envs.wrappers.learning.estimators import (
     require_estimator,
 )
 from safe_envs.wrappers.learning.fit import AdamSettings, train
+from safe_envs.wrappers.learning.models.base import Record
 from safe_envs.wrappers.learning.models.generator import (
     ACTIVATION,
     GeneratorModel,
     LearnedGenerator,
     order_label,
 )
-from safe_envs.wrappers.learning.models.signature import Signature
 
 Way = Literal["network", "direct"]
 """How a generator is learned: see `learn_generator`."""
@@ -52,7 +52,7 @@ Way = Literal["network", "direct"]
 _TRAINING = AdamSettings((100, 30), ACTIVATION, batch=32)
 
 
-def learn_generator(
+def learn_generator(  # noqa: PLR0913 - the friendly keyword form
     problem: SafetyProblem,
     *,
     points: int = 200,
@@ -83,6 +83,9 @@ def learn_generator(
         seed: of all randomness.
         step: how the system is stepped; None for the plant's.
         progress: called with the part that is done.
+
+    Returns:
+        The generators of all barriers, or the covariance from which they follow.
 
     Raises:
         ConfigurationError: an argument is not allowed, or the data are of another system.
@@ -121,7 +124,7 @@ def learn_generator(
     )
     errors, generators, diffusion = {}, [], None
     if way == "direct":
-        diffusion, errors = LearnedDiffusion.learn(problem, data, mean, slack(data, rate, mean))
+        diffusion, errors = learn_diffusion(problem, data, mean, slack(data, rate, mean))
         warnings += () if diffusion.entries else ("the data show no noise, and none was learned",)
     else:
         settings |= {"estimator": estimator, "training_seed": seed, **asdict(_TRAINING)}

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
+from safe_envs.wrappers.learning.models.distributions import Gaussian
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.regression import Gaussian
 
 _STILL = 1e-8
 """Part of its range that a state has to cover."""
@@ -55,6 +55,9 @@ def weaknesses(
         learned: the posterior of the weights.
         prior: variance of each weight before.
 
+    Returns:
+        Texts; none where the data tell everything.
+
     Source: our own; thesis Sec. 6.3.1 tries u = .1 only, which does not identify g.
     """
     terms = term_names(features, inputs)
@@ -89,6 +92,9 @@ def misfits(features: Features, misfit: np.ndarray, variation: np.ndarray) -> tu
         misfit: part of each state's rate that they miss, (n,).
         variation: part by which the variance of its noise varies although it is taken for constant,
             (n,).
+
+    Returns:
+        Texts; none where nothing material is left out.
     """
     left_out = [
         f"{state}: features of degree {features.degree} miss {100 * part:.3g} % of its rate; give a"

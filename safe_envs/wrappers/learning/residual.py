@@ -14,27 +14,28 @@ from dataclasses import replace
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import relative_degree
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.number_text import finite_number
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import Progress, Record
 from safe_envs.wrappers.learning.checks import (
+    Progress,
     Purpose,
     random_stream,
     require_problem,
 )
 from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
+from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.steps import Step
 from safe_envs.wrappers.learning.fit import LEAST_ROWS, AdamSettings, train
+from safe_envs.wrappers.learning.models.base import Record
 from safe_envs.wrappers.learning.models.residual import (
     LearnedResidual,
     ResidualModel,
     lie_derivatives,
     residual_names,
 )
-from safe_envs.wrappers.learning.models.signature import Signature
 
 _SHORTEST, _LONGEST = 1e-4, 100.0
 """Label steps in control periods. Of shorter ones the rounding of h takes over, over longer ones
@@ -72,6 +73,9 @@ def learn_residual(
             free of noise.
         progress: called with the part that is done.
 
+    Returns:
+        The residuals of all barriers.
+
     Raises:
         ConfigurationError: an argument is out of its range, the plant is noisy, or the inputs
             cannot tell the residuals apart.
@@ -92,10 +96,7 @@ def learn_residual(
     x = draw_states(problem, states, random_stream(seed, Purpose.STATES))
     labels, transitions = residual_labels(problem, x, label_dt, seed, step)
     coordinates = problem.exploration.coordinates
-    inputs = stacked(
-        compile_function(problem.plant.states, coordinates, "arrays")(*np.ascontiguousarray(x.T)),
-        states,
-    )
+    inputs = tabulated(problem.plant.states, coordinates)(x)
     parts, errors = [], {}
     for i, (barrier, (targets, sizes)) in enumerate(zip(problem.barriers, labels, strict=True)):
         trained = train(
@@ -172,10 +173,10 @@ def residual_labels(
         step,
         seed,
     )
-    samples = np.ascontiguousarray(paths.reshape(-1, paths.shape[2]).T)
+    samples = paths.reshape(-1, paths.shape[2])
     found = []
     for barrier, degree in zip(problem.barriers, degrees, strict=True):
-        (h,) = compile_function(problem.plant.states, [barrier.expression], "arrays")(*samples)
+        h = tabulated(problem.plant.states, [barrier.expression])(samples)
         rates = _differences(h.reshape(len(x), len(tried), steps + 1), degree, label_dt)
         drift, last = rates[..., :-1], rates[..., -1]
         _require_agreement(drift, barrier.name)

@@ -9,8 +9,14 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.safe_set import Region, workspace_of
-from safe_envs.wrappers.verification.search import Score, largest, search, towards_zero
+from safe_envs.wrappers.verification.safe_set import workspace_of
+from safe_envs.wrappers.verification.search import (
+    Region,
+    Score,
+    largest,
+    search,
+    towards_zero,
+)
 
 _POOL_LOG2 = 15
 _GROWTH = 1.01
@@ -53,7 +59,7 @@ def supremum(
         box = region.scaled(factor).within(*workspace_of(formulas.problem))
         more = _pool(points, box, rng) if factor == 1.0 else box.draw(_BOX_LOG2, rng)
         before, (reached, _) = reached, largest(score, np.concatenate([points, more]), box, rng)
-        if not region.chosen.any():
+        if not region.assumed.any():
             return reached
         if factor > 1.0 and reached <= _GROWTH * before:
             return max(reached, before)

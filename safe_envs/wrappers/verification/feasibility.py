@@ -11,7 +11,6 @@ import numpy as np
 from safe_envs.errors import require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition, spec_of
-from safe_envs.wrappers.verification.chain_guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.extrema import (
     max_shortfall,
     supremum,
@@ -19,23 +18,20 @@ from safe_envs.wrappers.verification.extrema import (
     without_control,
 )
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.safe_set import Region
+from safe_envs.wrappers.verification.guarantee import ChainGuarantee
 from safe_envs.wrappers.verification.safe_set_analysis import (
     SAMPLES,
     SafeSetAnalysis,
     infeasible_part,
 )
-from safe_envs.wrappers.verification.search import largest
+from safe_envs.wrappers.verification.search import Region, largest
 
 SMALL = 0.01
 """Below this part of its typical size a control authority counts as small."""
 
-_BEYOND = 10.0
-_BEYOND_LOG2 = 12
-
 
 @dataclass(frozen=True)
-class Part:
+class SetFeasibility:
     """The feasibility of the conditions in a set: in C, or in the intersection of the C_j.
 
     Attributes:
@@ -115,8 +111,8 @@ class Verification:
 
     analysis: SafeSetAnalysis
     barriers: tuple[BarrierFindings, ...]
-    safe_set: Part
-    invariant_set: Part | None
+    safe_set: SetFeasibility
+    invariant_set: SetFeasibility | None
     beyond: bool
     undefined: float
 
@@ -135,11 +131,6 @@ class Verification:
         """The bounds of the conditions, with the suprema and the shortfall that were found."""
         return ChainGuarantee(self.formulas, self.analysis)
 
-    @property
-    def drawn(self) -> int:
-        """Number of states that were drawn."""
-        return self.analysis.safe.drawn
-
 
 def verify(
     problem: SafetyProblem,
@@ -157,6 +148,9 @@ def verify(
         samples: number of states in C at which the drawing ends.
         seed: of all randomness.
 
+    Returns:
+        What was found in C and in the invariant set.
+
     Raises:
         ConfigurationError: an argument is out of its range, or no state of C was found.
         RelativeDegreeError: a condition does not suit a barrier.
@@ -166,12 +160,16 @@ def verify(
     formulas = Formulas(problem, conditions, knowledge)
     analysis = SafeSetAnalysis(formulas, samples, seed)
     points = analysis.invariant_set
-    invariant = None if points is None else _invariant_part(analysis, len(points))
+    share = float((formulas.invariant_level(analysis.safe.points) >= 0.0).mean())
+    invariant = (
+        points
+        if points is None
+        else SetFeasibility(len(points), share, analysis.infeasible, *analysis.max_shortfall)
+    )
     safe = _safe_part(analysis, invariant)
     found = tuple(_barrier(i, analysis) for i in range(len(formulas.stages)))
-    wide = analysis.region.scaled(_BEYOND).draw(_BEYOND_LOG2, analysis.rng(6))
-    outside = ((wide < analysis.region.low) | (wide > analysis.region.high)).any(axis=1)
-    beyond = bool((formulas.barrier_level(wide[outside]) >= 0.0).any())
+    wide = analysis.region.beyond(analysis.rng(6))
+    beyond = bool((formulas.barrier_level(wide) >= 0.0).any())
     return Verification(
         analysis,
         found,
@@ -182,13 +180,7 @@ def verify(
     )
 
 
-def _invariant_part(analysis: SafeSetAnalysis, count: int) -> Part:
-    level = analysis.formulas.invariant_level(analysis.safe.points)
-    share = float((level >= 0.0).mean())
-    return Part(count, share, analysis.infeasible, *analysis.max_shortfall)
-
-
-def _safe_part(analysis: SafeSetAnalysis, invariant: Part | None) -> Part:
+def _safe_part(analysis: SafeSetAnalysis, invariant: SetFeasibility | None) -> SetFeasibility:
     """Return the part for C, which is that of the invariant set where this is all of C."""
     formulas, points = analysis.formulas, analysis.safe.points
     if invariant is not None and invariant.share == 1.0:
@@ -199,7 +191,7 @@ def _safe_part(analysis: SafeSetAnalysis, invariant: Part | None) -> Part:
         analysis.with_starts(points, formulas.barrier_level),
         analysis.rng(4),
     )
-    return Part(
+    return SetFeasibility(
         len(points), analysis.safe.share, infeasible_part(formulas, points), shortfall, state
     )
 

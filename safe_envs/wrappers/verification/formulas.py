@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import quadratic_variation_rate
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
-from safe_envs.wrappers.verification.safe_set import Region, region_of
+from safe_envs.wrappers.verification.safe_set import region_of
+from safe_envs.wrappers.verification.search import Region
 
 _ROUNDING = 1e-9
 _EDGE = 1e-9
@@ -67,7 +68,7 @@ class Formulas:
 
     @cached_property
     def names(self) -> list[str]:
-        """Names of all chain functions: h, b_1, ...; with that of the barrier if there are several."""
+        """Names of all chain functions: h, b_1, ...; with the barrier's if there are several."""
         several = len(self.stages) > 1
         return [
             barrier.name if j == 0 else f"b_{j}" + f" of {barrier.name}" * several
@@ -113,13 +114,11 @@ class Formulas:
         return self._compiled(self._constraint_expressions())
 
     def _compiled(self, expressions: Sequence[Any]) -> Any:
-        function = compile_function(
-            self.system.states, [self.system.numeric(e) for e in expressions], "arrays"
-        )
+        function = tabulated(self.system.states, [self.system.numeric(e) for e in expressions])
 
         def values(x: np.ndarray) -> np.ndarray:
             with np.errstate(all="ignore"):
-                return stacked(function(*np.ascontiguousarray(x.T)), len(x))
+                return function(x)
 
         return values
 
@@ -164,7 +163,7 @@ class Formulas:
 
     @property
     def joint(self) -> bool:
-        """Whether the joint shortfall is exact: for one condition, independent ones or one input."""
+        """Whether the joint shortfall is exact: one condition, independent ones, or one input."""
         # Sampling margins decide how the filter distributes a violation, by the nominal action.
         sampled = any(c.change is not None for c in self._constraints)
         return self.independent or (self.problem.plant.m == 1 and not sampled)

@@ -9,23 +9,26 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import compile_function
-from safe_envs.dynamics.lie import has_kinks
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification import bounds
-from safe_envs.wrappers.verification.observed import RELATIVE, reaches, violated_by
+from safe_envs.wrappers.verification.assumptions import (
+    RELATIVE,
+    kinked,
+    reaches,
+    violated_by,
+)
 from safe_envs.wrappers.verification.safe_set import (
-    Region,
     draw_starts,
     in_workspace,
     region_of,
     sample,
     workspace_of,
 )
-from safe_envs.wrappers.verification.search import Score, largest
+from safe_envs.wrappers.verification.search import Region, Score, largest
 from safe_envs.wrappers.verification.smoothness import Asked, roughness
 from safe_envs.wrappers.verification.step_bias import rate_bias
 
@@ -34,8 +37,6 @@ if TYPE_CHECKING:
 
 _SAMPLES = 8192
 _STARTS = 64
-_BEYOND = 10.0
-_BEYOND_LOG2 = 12
 
 
 @dataclass(frozen=True)
@@ -71,7 +72,7 @@ class PosteriorGuarantee:
 
     def at(self, starts: np.ndarray, horizon: float) -> np.ndarray:
         """Return the estimate at starts; see `ChainGuarantee.at`."""
-        h = _values(self._barrier, np.asarray(starts, dtype=np.float64))
+        h = self._barrier(np.asarray(starts, dtype=np.float64))[:, 0]
         return (1.0 - self.delta) * bounds.stage_bound(
             h, self.supremum, horizon, shortfall=self.shortfall + self.bias
         )
@@ -80,10 +81,10 @@ class PosteriorGuarantee:
         self, reached: np.ndarray, violated: np.ndarray, actions: np.ndarray, slack: np.ndarray
     ) -> str:
         """Say what states contradict in c and m; see `ChainGuarantee.contradiction`."""
-        h = _values(self._barrier, reached[in_workspace(reached, self._workspace)])
+        h = self._barrier(reached[in_workspace(reached, self._workspace)])[:, 0]
         if (h > self.supremum * (1.0 + RELATIVE)).any():
             return reaches("h", h.max(), self.supremum)
-        inside = in_workspace(violated, self._workspace) & (_values(self._barrier, violated) > 0.0)
+        inside = in_workspace(violated, self._workspace) & (self._barrier(violated)[:, 0] > 0.0)
         most = float(slack[inside].max(initial=0.0))
         exceeded = most > self.shortfall * (1.0 + RELATIVE)
         return violated_by(most, self.shortfall) if exceeded else ""
@@ -100,6 +101,9 @@ def posterior_guarantee(
         conditions: one, a `BayesianSCBF` with `simultaneous`.
         seed: of the search.
 
+    Returns:
+        The bound.
+
     Raises:
         ConfigurationError: there is another condition or more than one barrier, the data contradict
             what the posterior takes for granted, h is not twice differentiable, or C has no end in
@@ -114,12 +118,12 @@ def posterior_guarantee(
     _require_consistent(posterior)
     robust = SafetyFilter.for_problem(problem, conditions)
     expression = posterior.system.numeric(problem.barriers[0].expression)
-    barrier = compile_function(problem.plant.states, [expression], "arrays")
+    barrier = tabulated(problem.plant.states, [expression])
     row = robust.constraints[0]
     region = region_of(problem, posterior.system, [expression, *row.coefficient, row.offset])
 
     def level(x: np.ndarray) -> np.ndarray:
-        return _values(barrier, x)
+        return barrier(x)[:, 0]
 
     rest = np.mean(problem.box, axis=1)
 
@@ -158,18 +162,9 @@ def _require_smooth(
     region: Region,
     rng: np.random.Generator,
 ) -> None:
-    name = problem.barriers[0].name
-    if has_kinks(expression):
-        raise ConfigurationError(
-            f"{name} is not twice differentiable, which Ito's formula asks for"
-        )
-    rough = roughness(
-        [Asked(name, expression, only_poles=False)],
-        problem.plant.states,
-        level,
-        points,
-        region,
-        rng,
+    asked = Asked(problem.barriers[0].name, expression, only_poles=False)
+    rough = kinked(asked.name, expression) or roughness(
+        [asked], problem.plant.states, level, points, region, rng
     )
     if rough:
         raise ConfigurationError(rough)
@@ -195,10 +190,6 @@ def _require_consistent(posterior: Posterior) -> None:
             )
 
 
-def _values(barrier: Any, x: np.ndarray) -> np.ndarray:
-    return np.broadcast_to(barrier(*np.ascontiguousarray(x.T))[0], len(x))
-
-
 def _require_inside(
     level: Score, region: Region, problem: SafetyProblem, rng: np.random.Generator
 ) -> None:
@@ -206,9 +197,7 @@ def _require_inside(
 
     It may reach beyond the workspace, where episodes are at an end.
     """
-    wide = region.scaled(_BEYOND).within(*workspace_of(problem)).draw(_BEYOND_LOG2, rng)
-    outside = ((wide < region.low) | (wide > region.high)).any(axis=1)
-    if (level(wide[outside]) >= 0.0).any():
+    if (level(region.beyond(rng, *workspace_of(problem))) >= 0.0).any():
         raise ConfigurationError(
             "C reaches beyond the states that are searched, so that neither sup h nor the shortfall"
             " is known"

@@ -1,9 +1,14 @@
-"""A lower bound on the probability of staying safe, and what it is worth."""
+"""Lower bounds on the probability of staying safe: what suits conditions, and what it is worth."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from safe_envs.wrappers.verification import bounds
 
 Status = Literal["estimated", "withheld", "hypothesis fails", "no bound", "not established"]
 """What a bound is worth: no hypothesis was found to fail; it did until episodes contradicted it;
@@ -35,3 +40,109 @@ class Bound:
         if not reason or self.status != "estimated":
             return self
         return replace(self, value=None, error=0.0, status="withheld", reason=reason)
+
+
+class Stages(NamedTuple):
+    """The chains of all barriers, with what the bounds need of them.
+
+    Attributes:
+        rates: of each stage, in 1/s; NaN where a chain has none.
+        suprema: c_j of each.
+        shortfalls: m_j of each, 0 except for the last one of a barrier.
+    """
+
+    rates: tuple[float, ...]
+    suprema: tuple[float, ...]
+    shortfalls: tuple[float, ...]
+
+
+class Candidate(NamedTuple):
+    """A result that suits the conditions.
+
+    Attributes:
+        name: of it.
+        values: at the starts, shape (B,).
+        forever: whether it is of all times.
+        gap: what its proof lacks even where its hypotheses hold; may be empty.
+        allows_shortfall: whether the conditions may be violated somewhere.
+    """
+
+    name: str
+    values: np.ndarray
+    forever: bool = False
+    gap: str = ""
+    allows_shortfall: bool = False
+
+
+def of_order_one(h: np.ndarray, stages: Stages, horizon: float) -> list[Candidate]:
+    """Return the results for one barrier of relative degree 1.
+
+    Args:
+        h: values of the barrier at the starts, shape (B,).
+        stages: of the barrier.
+        horizon: T in s.
+    """
+    (k,), (c,) = stages.rates, stages.suprema
+    if not k:
+        return [Candidate("Prop. 4.2.8: h/c, for ever", bounds.proposition_4_2_8(h, c), True)]
+    # For k <= c the misprinted exponent is merely larger than it has to be.
+    false = f"its exponent is misprinted, and false for k > c: k = {k:g}, c = {c:.4g}" * (k > c)
+    return [
+        Candidate(
+            "Prop. 4.2.5, printed formula: (h/c) e^(-c T)",
+            bounds.proposition_4_2_5_printed(h, c, horizon),
+            gap=false,
+        ),
+        Candidate(
+            "Prop. 4.2.5, corrected: (h/c) e^(-k T)", bounds.proposition_4_2_5(h, c, k, horizon)
+        ),
+    ]
+
+
+def of_stages(b: np.ndarray, stages: Stages, horizon: float, several: bool) -> list[Candidate]:
+    """Return the printed product, for a single barrier, and the union over the stages.
+
+    Args:
+        b: values of all chain functions at the starts, shape (B, sum of the r).
+        stages: of all barriers.
+        horizon: T in s.
+        several: whether there is more than one barrier.
+    """
+    forever = not any(stages.rates)
+    time, length = (math.inf, "for ever") if forever else (horizon, "up to T")
+    union = Candidate(
+        f"union over the stages{' of all barriers' * several}, {length}",
+        bounds.union_bound(b, stages.suprema, time, stages.rates),
+        forever,
+    )
+    if several:
+        return [union]
+    name = (
+        "Thm. 4.2.10, printed formula: product of b_j/c_j"
+        if forever
+        else "Thm. 4.2.10, zeroing: product of (b_j/c_j) e^(-a_j T)"
+    )
+    product = bounds.theorem_4_2_10_printed(b, stages.suprema, time, stages.rates)
+    gap = "its proof conditions on the future"
+    return [Candidate(f"{name}, {length}", product, forever, gap), union]
+
+
+def surely_safe(stages: Stages, b: np.ndarray, horizon: float) -> np.ndarray:
+    """Return 1 for starts from which no path leaves up to T, and 0 elsewhere, shape (B,).
+
+    Without noise b is at least what `stage_bound` subtracts from, so that a positive one is enough.
+
+    Args:
+        stages: of all barriers.
+        b: values of all chain functions at the starts, shape (B, sum of the r).
+        horizon: T in s.
+    """
+    safe = [
+        (
+            bounds.stage_bound(b[:, j], 1.0 + abs(b[:, j]), horizon, rate, m) > 0.0
+            if m
+            else b[:, j] > 0.0
+        )
+        for j, (rate, m) in enumerate(zip(stages.rates, stages.shortfalls, strict=True))
+    ]
+    return np.all(safe, axis=0).astype(float)

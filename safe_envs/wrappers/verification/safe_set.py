@@ -1,10 +1,10 @@
-"""Points of a safe set: quasi-random draws from a box of states."""
+"""Points of a safe set: the states to look at, the starts, and draws from the set."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,82 +14,12 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.simulation import Simulation
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.verification.search import Score, search
+from safe_envs.wrappers.verification.search import Region, Score, search
 
 _PERIOD = 2.0 * math.pi
 _STARTS = 64
 _FIRST_LOG2, _LAST_LOG2 = 12, 18
 _FEW = 16
-
-
-@dataclass(frozen=True)
-class Region:
-    """A box of states.
-
-    Attributes:
-        low: lower ends, shape (n,).
-        high: upper ends, shape (n,).
-        periodic: the states of which the box holds a whole period, shape (n,).
-        chosen: the states whose range was chosen here, since the workspace is unbounded, shape
-            (n,).
-        notes: which of the ranges are not the workspace, in words.
-    """
-
-    low: np.ndarray
-    high: np.ndarray
-    periodic: np.ndarray
-    chosen: np.ndarray
-    notes: tuple[str, ...] = ()
-
-    def scaled(self, factor: float) -> Region:
-        """Return the box that is larger by a factor about the same centre; a period stays one."""
-        half = np.where(self.periodic, 1.0, factor) * (self.high - self.low) / 2.0
-        center = (self.high + self.low) / 2.0
-        return replace(self, low=center - half, high=center + half)
-
-    def within(self, low: np.ndarray, high: np.ndarray) -> Region:
-        """Return the part of the box between ends.
-
-        Args:
-            low: lower ends, shape (n,); may be infinite.
-            high: upper ends, shape (n,); may be infinite.
-        """
-        return replace(self, low=np.maximum(self.low, low), high=np.minimum(self.high, high))
-
-    def around(self, points: np.ndarray, widened: float) -> Region:
-        """Return the part of the box around points.
-
-        Args:
-            points: states, shape (B, n).
-            widened: factor by which it is wider than they are.
-        """
-        low, high = points.min(axis=0), points.max(axis=0)
-        more = (widened - 1.0) * (high - low) / 2.0 + 1e-6 * (self.high - self.low)
-        return replace(
-            self, low=np.maximum(self.low, low - more), high=np.minimum(self.high, high + more)
-        )
-
-    def inside(self, x: np.ndarray) -> np.ndarray:
-        """Return states (B, n) moved into the box, by whole periods or to its nearest end."""
-        clipped = x.clip(self.low, self.high)
-        if not self.periodic.any():
-            return clipped
-        return np.where(self.periodic, self.low + (x - self.low) % (self.high - self.low), clipped)
-
-    def draw(self, log2: int, rng: np.random.Generator) -> np.ndarray:
-        """Draw points that fill the box evenly: a Sobol sequence, shifted at random.
-
-        Args:
-            log2: binary logarithm of their number.
-            rng: of the shift.
-
-        Returns:
-            States, shape (2^log2, n).
-        """
-        from scipy.stats import qmc
-
-        unit = qmc.Sobol(len(self.low), scramble=False).random_base2(log2)
-        return self.low + (self.high - self.low) * ((unit + rng.random(len(self.low))) % 1.0)
 
 
 def workspace_of(problem: SafetyProblem) -> tuple[np.ndarray, np.ndarray]:
@@ -189,7 +119,7 @@ def draw_starts(problem: SafetyProblem, count: int, seed: int = 0) -> np.ndarray
 
 
 @dataclass(frozen=True)
-class Sample:
+class PointsOfSet:
     """Points of a set.
 
     Attributes:
@@ -205,7 +135,7 @@ class Sample:
 
 def sample(
     what: str, level: Score, region: Region, wanted: int, rng: np.random.Generator
-) -> Sample:
+) -> PointsOfSet:
     """Draw points of the set {level >= 0}, in smaller and smaller boxes if the set is small.
 
     Args:
@@ -214,6 +144,9 @@ def sample(
         region: where to look.
         wanted: number of points at which the drawing ends.
         rng: of all randomness.
+
+    Returns:
+        Points; fewer than wanted where the set is small.
 
     Raises:
         ConfigurationError: no point of the set was found.
@@ -228,7 +161,7 @@ def sample(
         share = len(inside) / len(tried) if share is None else share
         found = inside if box is not region else np.concatenate([found, inside])
         if len(found) >= wanted and (box is region or _covers(box, region, found)):
-            return Sample(found, drawn, share)
+            return PointsOfSet(found, drawn, share)
         enough = len(found) >= _FEW
         seeds = found if enough else _climbed(level, tried, region, rng)
         if not len(seeds):
@@ -238,7 +171,7 @@ def sample(
         raise ConfigurationError(
             f"no point of {what} was found among {drawn} of the workspace; is the set empty?"
         )
-    return Sample(found, drawn, share or 0.0)
+    return PointsOfSet(found, drawn, share or 0.0)
 
 
 def _covers(box: Region, region: Region, points: np.ndarray) -> bool:

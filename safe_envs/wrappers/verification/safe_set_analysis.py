@@ -9,15 +9,13 @@ import numpy as np
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.verification.extrema import max_shortfall, supremum, unbounded
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.safe_set import Sample, draw_starts, sample
-from safe_envs.wrappers.verification.search import Score
+from safe_envs.wrappers.verification.safe_set import draw_starts, sample
+from safe_envs.wrappers.verification.search import BEYOND, BEYOND_LOG2, Score
 from safe_envs.wrappers.verification.smoothness import asked_of, roughness
 
 SAMPLES = 8192
 
 _FEW = 64
-_BEYOND = 10.0
-_BEYOND_LOG2 = 12
 _TOUCHED = 1e-9
 _NEAR, _NEARER = 1e-6, 1e-8
 _FALL = 0.03
@@ -48,7 +46,7 @@ class SafeSetAnalysis:
 
     def __init__(self, formulas: Formulas, samples: int = SAMPLES, seed: int = 0) -> None:
         self.formulas, self.region, self._seed = formulas, formulas.region, seed
-        self.safe: Sample = sample("C", formulas.barrier_level, self.region, samples, self.rng(0))
+        self.safe = sample("C", formulas.barrier_level, self.region, samples, self.rng(0))
         self.starts = draw_starts(formulas.problem, _STARTS)
         self.invariant_set = self._invariant_set()
 
@@ -92,6 +90,9 @@ class SafeSetAnalysis:
         Args:
             points: of the set, shape (B, n).
             level: nonnegative in the set.
+
+        Returns:
+            States, shape (C, n).
         """
         return np.concatenate([points, self.starts[level(self.starts) >= 0.0]])
 
@@ -141,7 +142,7 @@ class SafeSetAnalysis:
         states = self.formulas.problem.states
         found = [
             f"{states[i].symbol} in [{self.region.low[i]:.4g}, {self.region.high[i]:.4g}]"
-            for i in np.flatnonzero(self.region.chosen).tolist()
+            for i in np.flatnonzero(self.region.assumed).tolist()
             if states[i].symbol in asked
         ]
         return f"looked at only for {', '.join(found)}: the workspace is unbounded" if found else ""
@@ -179,7 +180,7 @@ class SafeSetAnalysis:
             return formulas.chain(x)[:, formulas.barriers]
 
         inner = self.safe.points
-        outer = self.region.scaled(_BEYOND).draw(_BEYOND_LOG2, rng)
+        outer = self.region.scaled(BEYOND).draw(BEYOND_LOG2, rng)
         inner = inner[rng.integers(len(inner), size=len(outer))]
         level = part * float(h(self.safe.points)[:, i].max())
         crossing = (h(inner)[:, i] > level) & (h(outer)[:, i] < level)
@@ -190,10 +191,6 @@ class SafeSetAnalysis:
             inner, outer = np.where(above, middle, inner), np.where(above, outer, middle)
         edge = inner[(h(inner) > 0.0).all(axis=1)]
         return float(np.nan_to_num(formulas.variation_rates(edge)[:, i]).max(initial=0.0))
-
-    def infinite(self, j: int) -> str:
-        """Say that the supremum of the j-th chain function is infinite, or seems so."""
-        return f"sup {self.formulas.names[j]} {self.how_infinite(j)}"
 
     def how_infinite(self, j: int) -> str:
         """Say how sure it is that the supremum of the j-th chain function is infinite."""

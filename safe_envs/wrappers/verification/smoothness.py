@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import shortened
 from safe_envs.wrappers.verification.formulas import Formulas
-from safe_envs.wrappers.verification.search import Box, Score, largest
+from safe_envs.wrappers.verification.search import Region, Score, largest
 
 _TOUCHED = 1e-6
 """Part of its typical size at which a function counts as one that reaches 0."""
@@ -92,7 +92,7 @@ def roughness(
     states: Sequence[sp.Symbol],
     level: Score,
     points: np.ndarray,
-    region: Box,
+    region: Region,
     rng: np.random.Generator,
 ) -> str:
     """Say which function is not smooth somewhere in a set, and where; "" if none was found.
@@ -107,6 +107,9 @@ def roughness(
         points: of the set, shape (B, n).
         region: where to look.
         rng: of the search.
+
+    Returns:
+        A text.
     """
     for name, expression, only_poles in asked:
         for edge in edges(expression):
@@ -132,15 +135,15 @@ def _reaches_zero(
     states: Sequence[sp.Symbol],
     level: Score,
     points: np.ndarray,
-    region: Box,
+    region: Region,
     rng: np.random.Generator,
 ) -> np.ndarray | None:
     """Return a state (n,) of the set where a function is 0 to rounding; None if none is found."""
-    compiled = compile_function(tuple(states), [base], "arrays")
+    values = tabulated(states, [base])
 
     def size(x: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):
-            return abs(stacked(compiled(*np.ascontiguousarray(x.T)), len(x))[:, 0])
+            return abs(values(x)[:, 0])
 
     def score(x: np.ndarray) -> np.ndarray:
         with np.errstate(all="ignore"):

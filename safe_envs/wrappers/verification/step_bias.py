@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.tables import tabulated
 
 if TYPE_CHECKING:
     from safe_envs.wrappers.learning.models.posterior import Posterior
@@ -40,12 +40,7 @@ def rate_bias(posterior: Posterior, barrier: sp.Expr, box: np.ndarray, x: np.nda
     x = x[:: -(-len(x) // _MOST_STATES)]
     slope, curvature = _derivatives(posterior.features.states, barrier, x)
     spread = posterior.diffusion.matrix() * posterior.diffusion.matrix().T
-    covariance = stacked(
-        compile_function(posterior.features.states, list(spread), "arrays")(
-            *np.ascontiguousarray(x.T)
-        ),
-        len(x),
-    )
+    covariance = tabulated(posterior.features.states, list(spread))(x)
     covariance = covariance.reshape(len(x), *spread.shape)
     most = 0.0
     for u in itertools.islice(
@@ -65,9 +60,7 @@ def _derivatives(
     """Gradient (B, n) and Hessian (B, n, n) of h."""
     slopes = [sp.diff(barrier, s) for s in states]
     curves = [sp.diff(slope, s) for slope in slopes for s in states]
-    values = stacked(
-        compile_function(states, [*slopes, *curves], "arrays")(*np.ascontiguousarray(x.T)), len(x)
-    )
+    values = tabulated(states, [*slopes, *curves])(x)
     n = len(states)
     return values[:, :n], values[:, n:].reshape(len(x), n, n)
 

@@ -19,8 +19,8 @@ from safe_envs.agents import evaluate, make_policy, make_problem, refine
 from safe_envs.agents.policies.base import BLOCK
 from safe_envs.agents.policies.network import NetworkPolicy, load_policy, save_policy
 from safe_envs.errors import InvalidInputError
-from safe_envs.wrappers.learning.models.files import load, save
-from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.data.files import load, save
+from safe_envs.wrappers.learning.data.signature import Signature
 
 pytestmark = pytest.mark.slow
 

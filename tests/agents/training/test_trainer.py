@@ -25,7 +25,7 @@ from safe_envs.agents.training.hyperparameters import (
 from safe_envs.agents.training.trainer import TrainingSession, train
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.learning.models.files import load
+from safe_envs.wrappers.learning.data.files import load
 
 pytestmark = pytest.mark.slow
 

@@ -21,7 +21,7 @@ from safe_envs.wrappers import (
     parse_conditions,
     spec_of,
 )
-from safe_envs.wrappers.learning.models.values import LearnedFileError
+from safe_envs.wrappers.learning.data.values import LearnedFileError
 from safe_envs.wrappers.verification.feasibility import verify
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.guarantee import guarantee_of

@@ -15,7 +15,7 @@ from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import generator
 from safe_envs.wrappers import BayesianSCBF
 from safe_envs.wrappers.learning.bayesian import identify
-from safe_envs.wrappers.learning.models.noise import Diffusion
+from safe_envs.wrappers.learning.models.distributions import Diffusion
 from safe_envs.wrappers.verification.posterior_guarantee import posterior_guarantee
 from tests.conftest import problem_of
 

@@ -21,12 +21,12 @@ from safe_envs.systems.dubins import dubins_disk
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.learning.bayesian_fit import Prior, fit
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
+from safe_envs.wrappers.learning.data.files import load
+from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.transitions import Transitions
+from safe_envs.wrappers.learning.data.values import LearnedFileError
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.files import load
 from safe_envs.wrappers.learning.models.posterior import Posterior
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import LearnedFileError
 from safe_envs.wrappers.learning.regression import Rows, posterior
 
 pytestmark = pytest.mark.slow

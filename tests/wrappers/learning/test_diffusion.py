@@ -12,9 +12,10 @@ from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import ito_correction
 from safe_envs.systems.cubic import x_1, x_2
 from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.diffusion import LearnedDiffusion, covariances
+from safe_envs.wrappers.learning.diffusion import covariances, learn_diffusion
 from safe_envs.wrappers.learning.drift_checks import drift_warnings, slack
 from safe_envs.wrappers.learning.estimators import mean_rates, rates
+from safe_envs.wrappers.learning.models.diffusion import LearnedDiffusion
 from tests.conftest import problem_of
 
 CORRELATED = [[0.3, 0.0], [0.2, 0.15]]
@@ -31,7 +32,7 @@ def learned(problem, points=300, repetitions=1000, inputs=None, seed=0):
     data = collect(
         problem, points, repetitions, inputs or [tuple(np.zeros(len(problem.inputs)))], seed=seed
     )
-    return LearnedDiffusion.learn(problem, data, rates(problem.model, data))
+    return learn_diffusion(problem, data, rates(problem.model, data))
 
 
 def entry_at(problem, expression, x):
@@ -78,7 +79,7 @@ def test_constant_entries_are_the_mean_of_the_estimates():
     problem = problem_of("safe_envs/ACCGap-v0")
     data = collect(problem, 300, 1000, [(0.0,)])
     rate = rates(problem.model, data)
-    diffusion, _ = LearnedDiffusion.learn(problem, data, rate)
+    diffusion, _ = learn_diffusion(problem, data, rate)
     np.testing.assert_allclose(
         np.array(diffusion.covariance, dtype=float),
         np.diag(np.diag(covariances(data, rate).mean(axis=0))),
@@ -146,7 +147,7 @@ def test_no_noise_gives_no_entries():
     steps = collect(problem, 50, 1)
     rate = rates(problem.model, steps)
     exact = replace(steps, successors=(steps.x + rate * steps.dt[:, None])[:, None])
-    found, errors = LearnedDiffusion.learn(problem, exact, rate)
+    found, errors = learn_diffusion(problem, exact, rate)
     assert (found.entries, errors) == ((), {})
     assert found.system(problem.model).diffusion == sp.zeros(3, 1)
 
@@ -154,7 +155,7 @@ def test_no_noise_gives_no_entries():
 def test_passive_logs_are_enough():
     problem = made_up(VARYING)
     data = collect(problem, 200, 1, steps=100, seed=2)
-    found, _ = LearnedDiffusion.learn(problem, data, rates(problem.model, data))
+    found, _ = learn_diffusion(problem, data, rates(problem.model, data))
     # 40000 single squares, each with a relative deviation of sqrt(2): under 1 % for a constant,
     # some ten times that at the corner of a quadratic.
     assert largest_error(problem, found) < 0.1
@@ -183,7 +184,7 @@ def test_a_step_without_noise_is_not_taken_for_noise():
     for data in (collect(problem, 30, 5), collect(problem, 30, 1)):
         rate = rates(problem.model, data)
         mean = mean_rates(problem.model, data, rate)
-        assert LearnedDiffusion.learn(problem, data, mean, slack(data, rate, mean))[0].entries == ()
+        assert learn_diffusion(problem, data, mean, slack(data, rate, mean))[0].entries == ()
         assert not drift_warnings(data, rate, mean, [str(s) for s in problem.plant.states])
 
 
@@ -198,4 +199,4 @@ def test_with_repetitions_a_wrong_drift_is_not_taken_for_noise():
 def test_errors_are_told_at_start_states_that_are_held_out():
     problem = problem_of("safe_envs/ACCGap-v0")
     data = collect(problem, 4, 20, [(float(u),) for u in range(5)])
-    assert LearnedDiffusion.learn(problem, data, rates(problem.model, data))[1] == {}
+    assert learn_diffusion(problem, data, rates(problem.model, data))[1] == {}

@@ -18,12 +18,12 @@ from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.problem.barrier import Barrier
 from safe_envs.systems.pendulum import pendulum
 from safe_envs.wrappers.learning.data.collection import collect
+from safe_envs.wrappers.learning.data.files import load
+from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.transitions import Transitions
+from safe_envs.wrappers.learning.data.values import LearnedFileError
 from safe_envs.wrappers.learning.generator import learn_generator
-from safe_envs.wrappers.learning.models.files import load
 from safe_envs.wrappers.learning.models.generator import GeneratorModel
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import LearnedFileError
 from tests.conftest import problem_of
 
 pytestmark = pytest.mark.slow

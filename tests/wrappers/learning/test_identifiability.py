@@ -12,6 +12,7 @@ from safe_envs.systems.cubic import cubic_sde, cubic_sde_disk
 from safe_envs.systems.quadrotor_altitude import quadrotor_altitude
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.learning.data.collection import collect, draw_states
+from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.steps import plant_step
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.identifiability import (
@@ -20,7 +21,6 @@ from safe_envs.wrappers.learning.identifiability import (
 )
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.posterior import Posterior
-from safe_envs.wrappers.learning.models.signature import Signature
 
 PROBLEM = cubic_sde_disk()
 

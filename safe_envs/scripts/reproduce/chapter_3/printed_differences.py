@@ -9,11 +9,11 @@ from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import derivatives, lie_derivative_f, lie_derivative_g
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import learning_sizes
 from safe_envs.scripts.reproduce.framework.artefact import Workload
-from safe_envs.wrappers.learning.base import Record
 from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
+from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.fit import AdamSettings, train
+from safe_envs.wrappers.learning.models.base import Record
 from safe_envs.wrappers.learning.models.residual import LearnedResidual, ResidualModel
-from safe_envs.wrappers.learning.models.signature import Signature
 
 
 def printed_residuals(

@@ -21,7 +21,7 @@ from safe_envs.scripts.reproduce.framework.artefact import (
 )
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.estimators import rates
-from safe_envs.wrappers.learning.regression import sigma_map, sigma_samples
+from safe_envs.wrappers.learning.models.distributions import sigma_map, sigma_samples
 
 NOISE_STARTS, NOISE_STEPS, DRAWS = (
     bayes.SETTINGS[name] for name in ("noise_starts", "noise_steps", "draws")

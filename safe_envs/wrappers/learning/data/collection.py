@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import (
     ConfigurationError,
     InvalidInputError,
@@ -16,16 +16,17 @@ from safe_envs.errors import (
     require_whole,
 )
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import Progress
 from safe_envs.wrappers.learning.checks import (
+    Progress,
     Purpose,
     random_stream,
     require_problem,
     require_room,
 )
+from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.steps import Step, period_of, plant_step
-from safe_envs.wrappers.learning.data.transitions import Transitions, numbers
-from safe_envs.wrappers.learning.models.signature import Signature
+from safe_envs.wrappers.learning.data.transitions import Transitions
+from safe_envs.wrappers.learning.data.values import numbers
 
 _AT_ONCE = 1 << 17
 """Transitions that are simulated together: few enough for the cache. The noise that a seed gives
@@ -71,7 +72,7 @@ def draw_states(problem: SafetyProblem, count: int, rng: np.random.Generator) ->
     return np.concatenate(found)[:count]
 
 
-def collect(
+def collect(  # noqa: PLR0913 - the friendly keyword form
     problem: SafetyProblem,
     points: int,
     repetitions: int = 1,
@@ -104,8 +105,8 @@ def collect(
         those after one step, and so on; and for each state its inputs in order.
 
     Raises:
-        ConfigurationError: an argument is not allowed, an input is outside the box, the data would
-            take more than 2 GB, or no states are found.
+        ConfigurationError: an argument is not allowed, an input is out of its bounds, the data
+            would take more than 2 GB, or no states are found.
         InvalidInputError: the inputs are no numbers, or the step returns an array of the wrong
             shape, or data that `Transitions` refuses.
         NumericalError: a successor is not finite.
@@ -175,7 +176,7 @@ def collect_paths(
         The states at the times 0, dt, ..., steps * dt, shape (N, steps + 1, n).
 
     Raises:
-        ConfigurationError: an argument is not allowed, or an input is outside the box.
+        ConfigurationError: an argument is not allowed, or an input is out of its bounds.
         InvalidInputError: the states or inputs are no numbers, the states have the wrong shape or
             are not finite, or the step returns an array of the wrong shape.
         NumericalError: a state that is reached is not finite.
@@ -216,8 +217,8 @@ def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
     within = ((low <= tried) & (tried <= high)).all(axis=1)
     if not within.all():
         raise ConfigurationError(
-            f"the input {tried[within.argmin()]} is outside the box {problem.box} of {names}; give"
-            " inputs within it"
+            f"the input {tried[within.argmin()]} is outside the bounds {problem.box} of {names};"
+            " give inputs within them"
         )
     return tried
 
@@ -225,13 +226,9 @@ def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
 def _explored(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
     """Return whether states (B, n) are in the region with positive barriers, shape (B,)."""
     low, high = np.array(problem.exploration.region).T
-    barriers = compile_function(
-        problem.plant.states,
-        [problem.plant.numeric(b.expression) for b in problem.barriers],
-        "arrays",
-    )
+    barriers = [problem.plant.numeric(b.expression) for b in problem.barriers]
     with np.errstate(all="ignore"):
-        values = stacked(barriers(*np.ascontiguousarray(x.T)), len(x))
+        values = tabulated(problem.plant.states, barriers)(x)
     return ((low <= x) & (x <= high)).all(axis=1) & (values > 0).all(axis=1)
 
 

@@ -17,9 +17,9 @@ from safe_envs.errors import (
 )
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.checks import require_kind, require_problem
-from safe_envs.wrappers.learning.models.files import DATA, load, save
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import LearnedFileError
+from safe_envs.wrappers.learning.data.files import DATA, load, save
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.data.values import LearnedFileError, numbers
 
 _ARRAYS = ("x", "u", "successors", "dt")
 
@@ -191,7 +191,16 @@ class Transitions:
         return self._part(~held), self._part(held)
 
     def held_out(self, share: float, rng: np.random.Generator) -> np.ndarray:
-        """Return which rows `split` holds out, shape (P,); see there for arguments and errors."""
+        """Return which rows `split` holds out, shape (P,).
+
+        Args:
+            share: see `split`.
+            rng: see `split`.
+
+        Raises:
+            ConfigurationError: see `split`.
+            InvalidInputError: see `split`.
+        """
         if not 0 < share < 1:
             raise ConfigurationError(
                 f"share = {shown(share)}; give the part of the data to be held out, between 0 and 1"
@@ -218,7 +227,7 @@ class Transitions:
         )
 
     def save(self, path: Path) -> None:
-        """Write the data to a file; see `safe_envs.wrappers.learning.models.files.save`.
+        """Write the data to a file; see `safe_envs.wrappers.learning.data.files.save`.
 
         Raises:
             ConfigurationError: it cannot be written there.
@@ -254,35 +263,6 @@ class Transitions:
             raise LearnedFileError(
                 f"the data in {path} are incomplete: {shortened(error)}. Collect them again"
             ) from error
-
-
-def numbers(name: str, given: Any) -> np.ndarray:
-    """Return numbers as an array of floats, with nothing left out.
-
-    Args:
-        name: of what was given, for the message.
-        given: anything.
-
-    Raises:
-        InvalidInputError: it is none, entries of it are masked, or it is complex.
-    """
-    parts = given if isinstance(given, list | tuple) else (given,)
-    if any(np.ma.is_masked(part) for part in parts):
-        raise InvalidInputError(
-            f"{name} has masked entries, whose values mean nothing; drop such rows, as by"
-            " numpy.ma.compress_rows"
-        )
-    try:
-        found = np.asarray(given)
-        if not np.iscomplexobj(found):
-            return found.astype(float, copy=False)
-    except (TypeError, ValueError) as error:
-        raise InvalidInputError(
-            f"{name} is no array of numbers ({error}); give rows of equal length"
-        ) from error
-    raise InvalidInputError(
-        f"{name} is complex; give real numbers, the parts of a complex state as two states"
-    )
 
 
 def _require_finite(name: str, values: np.ndarray) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import compile_function, stacked
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import ConfigurationError, require_whole, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.models.values import require_finite, require_text
+from safe_envs.wrappers.learning.data.values import require_finite, require_text
 
 _MOST = 300
 """Features; a regression holds the square of some multiple of their number, and their symbols take
@@ -74,27 +74,28 @@ class Features:
         require_whole(name, degree, 0)
         return cls(problem.plant.states, problem.exploration.region, degree, _angles(problem))
 
+    def details(self) -> dict[str, Any]:
+        """Return all but the states, for JSON."""
+        region = [list(ends) for ends in self.region]
+        return {"degree": self.degree, "region": region, "angles": list(self.angles)}
+
     @classmethod
-    def from_json(
-        cls, states: tuple[sp.Symbol, ...], region: Any, degree: Any, angles: Any
-    ) -> Features:
+    def restored(cls, states: tuple[sp.Symbol, ...], details: Mapping[str, Any]) -> Features:
         """Make features as a file describes them.
 
         Args:
             states: n symbols.
-            region: (low, high) of each state.
-            degree: total degree.
-            angles: names of the states that are angles.
+            details: see `details`; others among them do not matter.
 
         Raises:
             TypeError, ValueError: it describes none.
         """
-        ranges = tuple((require_finite(low), require_finite(high)) for low, high in region)
-        found = cls(states, ranges, degree, tuple(map(require_text, angles)))
-        if not all(
-            math.isfinite(half) and half > 0
-            for half in (0.5 * (high - low) for low, high in ranges)
-        ):
+        ranges = tuple(
+            (require_finite(low), require_finite(high)) for low, high in details["region"]
+        )
+        angles = tuple(map(require_text, details["angles"]))
+        found = cls(states, ranges, details["degree"], angles)
+        if not all(0 < 0.5 * (high - low) < math.inf for low, high in ranges):
             raise ValueError(f"the ranges {shown(ranges)}")
         return found
 
@@ -136,11 +137,11 @@ class Features:
 
     @cached_property
     def _compiled(self) -> Any:
-        return compile_function(self.states, self.expressions, "arrays")
+        return tabulated(self.states, self.expressions)
 
     def matrix(self, x: np.ndarray) -> np.ndarray:
         """Return the features at states (B, n), shape (B, M)."""
-        return stacked(self._compiled(*np.ascontiguousarray(x.T)), len(x))
+        return self._compiled(x)
 
     def combined(self, weights: Sequence[float]) -> sp.Expr:
         """Return the function with these M weights, multiplied out."""

@@ -20,12 +20,12 @@ from safe_envs.dynamics.lie import (
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import LearnedModel, Record
 from safe_envs.wrappers.learning.checks import require_degrees
-from safe_envs.wrappers.learning.diffusion import LearnedDiffusion
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.data.values import LearnedFileError
+from safe_envs.wrappers.learning.models.base import LearnedModel, Record
+from safe_envs.wrappers.learning.models.diffusion import LearnedDiffusion
 from safe_envs.wrappers.learning.models.network import Network
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import LearnedFileError
 
 ACTIVATION = "tanh"
 

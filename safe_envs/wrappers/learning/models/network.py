@@ -116,7 +116,7 @@ class Network:
     def unscaled(
         cls, weights: Sequence[np.ndarray], biases: Sequence[np.ndarray], activation: str
     ) -> Network:
-        """Make a network of bare layers, without standardisation.
+        """Make a network of layers without standardisation.
 
         Args:
             weights: of each layer, (outputs, inputs) of the layer.

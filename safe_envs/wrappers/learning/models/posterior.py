@@ -10,24 +10,27 @@ from typing import Any, ClassVar, Self
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import LearnedModel, Record
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.data.values import (
+    LARGEST,
+    array_of,
+    require_finite,
+)
+from safe_envs.wrappers.learning.models.base import LearnedModel, Record
+from safe_envs.wrappers.learning.models.distributions import (
+    Diffusion,
+    Gaussian,
+    require_noise,
+)
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.noise import Diffusion, require_noise
 from safe_envs.wrappers.learning.models.pruning import (
     insignificant,
     mixed_by_steps,
     solved,
 )
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import (
-    LARGEST,
-    array_of,
-    require_finite,
-)
-from safe_envs.wrappers.learning.regression import Gaussian
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,9 +201,7 @@ class Posterior(LearnedModel):
         """See `LearnedModel.details`."""
         noise = self.diffusion
         return {
-            "degree": self.features.degree,
-            "region": [list(bounds) for bounds in self.features.region],
-            "angles": list(self.features.angles),
+            **self.features.details(),
             "diffusion_degree": 0 if noise.features is None else noise.features.degree,
             "dt": self.dt,
             "count": noise.count,
@@ -218,17 +219,14 @@ class Posterior(LearnedModel):
     ) -> Self:
         """See `LearnedModel.restored`. The region is the one in which was learned."""
 
-        def features(degree: int) -> Features:
-            return Features.from_json(
-                problem.plant.states, details["region"], degree, details["angles"]
-            )
-
         def numbers(name: str, *shape: int) -> np.ndarray:
             return array_of(arrays, name, shape)
 
-        n, m, phi = problem.plant.n, problem.plant.m, features(details["degree"])
+        n, m = problem.plant.n, problem.plant.m
+        phi = Features.restored(problem.plant.states, details)
         count, degree = phi.count * (1 + m), details["diffusion_degree"]
-        varying = features(degree) if degree else None
+        also = {**details, "degree": degree}
+        varying = Features.restored(problem.plant.states, also) if degree else None
         noise = Diffusion(
             numbers("squares", n),
             correlation=numbers("correlation", n, n),
@@ -278,7 +276,5 @@ def _entries(system: ControlAffineSDE, x: np.ndarray) -> dict[str, np.ndarray]:
         for j, t in enumerate(system.states)
         if i <= j
     }
-    compiled = compile_function(
-        system.states, [system.numeric(e) for e in named.values()], "arrays"
-    )
-    return dict(zip(named, stacked(compiled(*np.ascontiguousarray(x.T)), len(x)).T, strict=True))
+    values = tabulated(system.states, [system.numeric(e) for e in named.values()])(x)
+    return dict(zip(named, values.T, strict=True))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
+from safe_envs.wrappers.learning.data.values import LearnedFileError
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.values import LearnedFileError
 
 _SIGNIFICANT = 0.999
 _POINTS = 256

@@ -13,14 +13,15 @@ import sympy as sp
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.dynamics.lie import derivatives, lie_derivative_f, lie_derivative_g
 from safe_envs.dynamics.sde import ControlAffineSDE
+from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.base import LearnedModel, Record
 from safe_envs.wrappers.learning.checks import (
     require_degrees,
 )
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.models.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.network import Network, require_activation
-from safe_envs.wrappers.learning.models.signature import Signature
 
 _ROUNDING = 1e-12
 
@@ -217,8 +218,7 @@ def lie_derivatives(
     expressions = [
         system.numeric(e) for e in (*along, *lie_derivative_g(system, along[degree - 1]))
     ]
-    compiled = compile_function(system.states, expressions, "arrays")
-    return lambda x: stacked(compiled(*np.ascontiguousarray(x.T)), len(x))
+    return tabulated(system.states, expressions)
 
 
 def _remedy(level: float, heldout: int) -> str:

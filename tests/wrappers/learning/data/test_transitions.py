@@ -10,11 +10,11 @@ import pytest
 
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.registry import make_problem
+from safe_envs.wrappers.learning.data import files
 from safe_envs.wrappers.learning.data.collection import collect
+from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.models import files
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import LearnedFileError
+from safe_envs.wrappers.learning.data.values import LearnedFileError
 
 DISK = make_problem("safe_envs/CubicSDEDisk-v0")
 SIGNATURE = Signature.of(DISK)

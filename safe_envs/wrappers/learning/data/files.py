@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -23,8 +23,8 @@ from safe_envs.bounded_reading import (
     open_regular,
 )
 from safe_envs.errors import ConfigurationError, shortened, shown
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import LearnedFileError, require_text
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.data.values import LearnedFileError, require_text
 
 DATA = "transitions"
 """Kind of a file that holds data; others hold models or policies."""
@@ -136,15 +136,10 @@ def save(
 
     def write(part: Path) -> None:
         with part.open("wb") as stream:
-            _savez(stream, {_HEADER: encoded, **arrays})
+            plain = {name: np.asarray(array) for name, array in arrays.items()}
+            np.savez(stream, allow_pickle=False, header=encoded, **plain)
 
     write_atomically(path, write)
-
-
-def _savez(stream: BinaryIO, arrays: Mapping[str, np.ndarray]) -> None:
-    np.savez(
-        stream, allow_pickle=False, **{name: np.asarray(array) for name, array in arrays.items()}
-    )  # pyright: ignore[reportArgumentType]
 
 
 def _plain(value: Any) -> Any:

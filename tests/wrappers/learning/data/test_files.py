@@ -1,4 +1,4 @@
-"""Files of learned models and data: exact copies, refused where they are not what was written."""
+"""Files of learned models and data: kept exactly, refused where they are not what was written."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import pytest
 from safe_envs.errors import ConfigurationError
 from safe_envs.registry import make_problem
 from safe_envs.wrappers.learning import load_learned
-from safe_envs.wrappers.learning.models.files import load, save
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import LearnedFileError
+from safe_envs.wrappers.learning.data.files import load, save
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.data.values import LearnedFileError
 
 DISK = make_problem("safe_envs/CubicSDEDisk-v0")
 SIGNATURE = Signature.of(DISK)

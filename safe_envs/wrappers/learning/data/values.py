@@ -1,4 +1,4 @@
-"""Values that a file holds, each of which is checked before it is used."""
+"""Values from files and callers, each of which is checked before it is used."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.errors import ConfigurationError, shown
+from safe_envs.errors import ConfigurationError, InvalidInputError, shown
 
 LARGEST = 1e100
 """Largest number in a file: a product of a few of them is still a number."""
@@ -53,3 +53,32 @@ def array_of(arrays: Mapping[str, np.ndarray], name: str, shape: tuple[int, ...]
             f" above {LARGEST:g}"
         )
     return array
+
+
+def numbers(name: str, given: Any) -> np.ndarray:
+    """Return numbers as an array of floats, with nothing left out.
+
+    Args:
+        name: of what was given, for the message.
+        given: anything.
+
+    Raises:
+        InvalidInputError: it is none, entries of it are masked, or it is complex.
+    """
+    parts = given if isinstance(given, list | tuple) else (given,)
+    if any(np.ma.is_masked(part) for part in parts):
+        raise InvalidInputError(
+            f"{name} has masked entries, whose values mean nothing; drop such rows, as by"
+            " numpy.ma.compress_rows"
+        )
+    try:
+        found = np.asarray(given)
+        if not np.iscomplexobj(found):
+            return found.astype(float, copy=False)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(
+            f"{name} is no array of numbers ({error}); give rows of equal length"
+        ) from error
+    raise InvalidInputError(
+        f"{name} is complex; give real numbers, the parts of a complex state as two states"
+    )

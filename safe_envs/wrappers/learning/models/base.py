@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -13,16 +13,13 @@ import numpy as np
 
 from safe_envs.errors import require_whole, shortened
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.models.files import Content, checksum, save
-from safe_envs.wrappers.learning.models.signature import Signature
-from safe_envs.wrappers.learning.models.values import (
+from safe_envs.wrappers.learning.data.files import Content, checksum, save
+from safe_envs.wrappers.learning.data.signature import Signature
+from safe_envs.wrappers.learning.data.values import (
     LearnedFileError,
     require_finite,
     require_text,
 )
-
-Progress = Callable[[float], None]
-"""Called with the part of the work that is done, from 0 to 1."""
 
 
 @dataclass(frozen=True)
@@ -145,7 +142,7 @@ class LearnedModel(ABC):
         return checksum(self.method, self.signature, saved, self.arrays())
 
     def save(self, path: Path) -> None:
-        """Write the model as data; see `safe_envs.wrappers.learning.models.files.save`."""
+        """Write the model as data; see `safe_envs.wrappers.learning.data.files.save`."""
         save(path, self.method, self.signature, self._saved(), self.arrays())
 
     @classmethod

@@ -1,0 +1,24 @@
+"""Functions of many states at once, from a table of states to a table of values."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import sympy as sp
+
+from safe_envs.dynamics.codegen import compile_function, stacked
+
+
+def tabulated(
+    states: Sequence[sp.Symbol], expressions: Sequence[Any]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Return the function that gives the values (B, k) of expressions at states (B, n).
+
+    Args:
+        states: n symbols.
+        expressions: k of them, with numbers for all parameters.
+    """
+    compiled = compile_function(tuple(states), tuple(expressions), "arrays")
+    return lambda x: stacked(compiled(*np.ascontiguousarray(x.T)), len(x))
