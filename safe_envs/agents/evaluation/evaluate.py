@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
@@ -28,21 +29,33 @@ from safe_envs.agents.evaluation.spec import (
 from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import Condition
+from safe_envs.wrappers import Condition, FilterSpec
+from safe_envs.wrappers.learning import LearnedModel
 
 
-def evaluate(
+def evaluate(  # noqa: PLR0913  (the friendly form of EvaluationSpec and RunSettings)
     problem: SafetyProblem | str,
     policy: Any = "nominal",
     filters: Sequence[Filter] | Filter | None = None,
     *,
+    trust: bool = False,
+    options: Mapping[str, Any] | None = None,
+    episodes: int = 1000,
+    seed: int = 0,
     num_envs: int = 1024,
+    knowledge: str = "model",
+    objective: str = "nearest",
+    confidence: float = 0.95,
+    bounds: bool = True,
+    filter_spec: FilterSpec | str | None = None,
+    learned: Sequence[LearnedModel | Path | str] = (),
+    repeats: int = 1,
+    monitoring: str = "discrete",
     jobs: int = 1,
-    record: bool = False,
     progress: Progress | None = None,
-    **fields: Any,
+    record: bool = False,
 ) -> Evaluation:
-    """RareEstimate the safety of a policy under each filter.
+    """Estimate the safety of a policy under each filter.
 
     An episode is safe if every barrier is positive at every control instant, its start included;
     with continuous monitoring between them too, see `BrownianBridge`, which changes neither control
@@ -63,22 +76,48 @@ def evaluate(
     `safe_envs.agents.evaluation.statistics.repeated_interval`.
 
     Args:
-        problem: a `SafetyProblem`, or the id of an env.
+        problem: see `EvaluationSpec`, as for all arguments but the last ones.
         policy: a name, a path, an object with `predict`, a class, or a function of a batch.
         filters: texts and conditions, or one of them; by default "none" and the problem's own.
+        trust: load a policy's .zip, which runs code that it contains.
+        options: arguments of `gym.make` for an id.
+        episodes: number for each filter.
+        seed: whole number from 0.
         num_envs: how many episodes to simulate side by side.
+        knowledge: what the filters know, "model" or "plant".
+        objective: of the filters, "nearest" or "clf".
+        confidence: of all intervals, between 0 and 1.
+        bounds: look for bounds, which takes a search of the safe set for each filter.
+        filter_spec: how filters see a third-party env.
+        learned: models, or files of `safe-envs identify`, to use in place of learning.
+        repeats: number of identifications of what is learned.
+        monitoring: where h is checked, "discrete" or "continuous".
         jobs: number of processes; the result is the same.
-        record: keep trajectories for pictures.
         progress: called with the part of the work that is done, from 0 to 1.
-        **fields: all else that determines the result, such as `episodes`, `seed`, `options`,
-            `knowledge`, `learned`, `repeats` and `monitoring`: see `EvaluationSpec`.
+        record: keep trajectories for pictures.
 
     Raises:
         ConfigurationError: An argument names something unknown or is out of range.
         RelativeDegreeError: A condition does not suit a barrier.
         NumericalError: A simulation or a condition left the finite numbers.
     """
-    spec = EvaluationSpec(problem, policy, listed(filters), **fields)
+    spec = EvaluationSpec(
+        problem=problem,
+        policy=policy,
+        filters=listed(filters),
+        options=options or {},
+        filter_spec=filter_spec,
+        learned=learned,
+        trust=trust,
+        episodes=episodes,
+        seed=seed,
+        knowledge=knowledge,
+        objective=objective,
+        confidence=confidence,
+        bounds=bounds,
+        repeats=repeats,
+        monitoring=monitoring,
+    )
     return run_evaluation(spec, RunSettings(num_envs, jobs, record, progress))
 
 

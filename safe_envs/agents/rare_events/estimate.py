@@ -76,7 +76,7 @@ def estimate_rare(
     progress: Progress | None = None,
     **fields: Any,
 ) -> RareEvaluation:
-    """RareEstimate the probability of a violation under each filter, by splitting on h.
+    """Estimate the probability of a violation under each filter, by splitting on h.
 
     See `safe_envs.agents.rare_events.splitting.Splitting`.
 

@@ -194,7 +194,7 @@ class ImportanceSampling:
     def estimate(
         self, length: float, episodes: int, repetitions: int, progress: Progress | None = None
     ) -> tuple[np.ndarray, int]:
-        """RareEstimate the probability.
+        """Estimate the probability.
 
         Args:
             length: of the drift, in 1/sqrt(s).

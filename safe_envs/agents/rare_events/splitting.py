@@ -87,7 +87,7 @@ class Splitting:
         repetitions: int,
         progress: Callable[[float], None] | None = None,
     ) -> Repetitions:
-        """RareEstimate the probability.
+        """Estimate the probability.
 
         Args:
             power: of the score.

@@ -15,7 +15,7 @@ import pytest
 
 from safe_envs.agents import evaluate
 from safe_envs.agents.policies.base import Policy
-from safe_envs.errors import ConfigurationError, WorkersLostError
+from safe_envs.errors import ConfigurationError, InvalidInputError, WorkersLostError
 
 pytestmark = pytest.mark.slow
 
@@ -69,9 +69,10 @@ class _Failing(Policy):
         raise TypeError("of the policy's own")
 
 
-def test_an_error_of_a_policy_stays_what_it_is():
-    with pytest.raises(TypeError, match="of the policy's own"):
-        evaluate("Scalar-v0", _Failing(), filters=["none"], episodes=4, jobs=2)
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_of_a_policy_is_told_as_its_own(jobs):
+    with pytest.raises(InvalidInputError, match=r"_Failing failed .*TypeError: of the policy's own"):
+        evaluate("Scalar-v0", _Failing(), filters=["none"], episodes=4, jobs=jobs)
 
 
 class _Watched(Policy):
@@ -86,7 +87,7 @@ def test_the_processes_of_an_evaluation_watch_their_parent():
     assert evaluate(
         "Scalar-v0", _Watched(), filters=["none"], episodes=4, bounds=False, jobs=2
     ).rows
-    with pytest.raises(AssertionError):
+    with pytest.raises(InvalidInputError, match="AssertionError"):
         evaluate("Scalar-v0", _Watched(), filters=["none"], episodes=4, bounds=False, jobs=1)
 
 
