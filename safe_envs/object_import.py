@@ -18,13 +18,7 @@ from typing import Any
 import cloudpickle
 
 from safe_envs.bounded_reading import MOST_BYTES_OF_TEXT, open_regular
-from safe_envs.errors import (
-    ConfigurationError,
-    SafeEnvsError,
-    nearest,
-    shortened,
-    shown,
-)
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shortened, shown
 
 _ADVICE = "give the path of a Python file, as in my_system.py:problem"
 

@@ -18,8 +18,10 @@ def full_id(env_id: str) -> str:
     """Return the registered id, which may be given without its namespace.
 
     Raises:
-        ConfigurationError: there is no such id.
+        ConfigurationError: there is no such id, or it is no text.
     """
+    if not isinstance(env_id, str):
+        raise ConfigurationError(f"env_id = {shown(env_id)}; give the id of an env as text")
     for candidate in (env_id, f"safe_envs/{env_id}"):
         if candidate in gym.registry:
             return candidate

@@ -41,3 +41,8 @@ def test_arguments_of_foreign_envs_are_errors_too(env_id):
 def test_ids_with_an_impossible_module_are_errors(env_id):
     with pytest.raises(ConfigurationError):
         make_problem(env_id)
+
+
+def test_an_id_that_is_no_text_is_refused():
+    with pytest.raises(ConfigurationError, match="env_id = 3; give the id of an env as text"):
+        make_problem(3)  # pyright: ignore[reportArgumentType]

@@ -17,11 +17,7 @@ from safe_envs.agents.evaluation.statistics import (
 )
 from safe_envs.agents.policies.base import Policy
 from safe_envs.agents.policies.clf import CLFController
-from safe_envs.agents.policies.nominal import (
-    NominalController,
-    RandomPolicy,
-    ZeroController,
-)
+from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
 from safe_envs.agents.policies.registry import POLICIES, make_policy
 from safe_envs.registry import make_problem
 

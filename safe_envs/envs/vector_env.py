@@ -16,12 +16,7 @@ from safe_envs.envs.info import Info, with_masks
 from safe_envs.envs.seeding import Generators, Seeds
 from safe_envs.envs.simulation import NoiseStreams, Simulation, steps_until
 from safe_envs.envs.spaces import BatchActions, action_box, observation_box
-from safe_envs.errors import (
-    ConfigurationError,
-    InvalidInputError,
-    NumericalError,
-    require_whole,
-)
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.rendering.viewer import RENDER_MODES, frames_a_second, open_viewer
 

@@ -13,13 +13,7 @@ from rich.table import Table
 from safe_envs.bounded_reading import read_json
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import (
-    Json,
-    require_result,
-    say,
-    stdout,
-    write_result,
-)
+from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
 from safe_envs.scripts.reports.tables import make_table
 
 _ADVICE = "give what `safe-envs benchmark --json FILE` wrote"

@@ -98,10 +98,7 @@ def _evaluate(
 ) -> None:
     """Evaluate, print and write."""
     from safe_envs.agents.evaluation import evaluate, refinement
-    from safe_envs.scripts.reports.evaluation_report import (
-        print_evaluation,
-        print_refinement,
-    )
+    from safe_envs.scripts.reports.evaluation_report import print_evaluation, print_refinement
 
     json, episodes_out, plot = outputs
     found: Any

@@ -53,8 +53,7 @@ def identify(
         ),
     ] = None,
     settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help=SETTINGS_HELP),
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help=SETTINGS_HELP)
     ] = None,
     seed: text_options.Seed = 0,
     json: Annotated[
@@ -81,11 +80,7 @@ def identify(
     states of the sampling domain, is that of the plant, with its --noise.
     """
     from safe_envs.registry import make_problem, title_of
-    from safe_envs.scripts.reports.identify_answer import (
-        IdentifyAnswer,
-        Source,
-        compare,
-    )
+    from safe_envs.scripts.reports.identify_answer import IdentifyAnswer, Source, compare
     from safe_envs.scripts.reports.identify_report import print_report
     from safe_envs.wrappers.learning import learner_of
     from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning

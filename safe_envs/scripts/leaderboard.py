@@ -68,15 +68,9 @@ def leaderboard(
     training of each kind, and another seed gives another agent.
     """
     from safe_envs.agents.jobs.fingerprint import package_versions
-    from safe_envs.agents.training.leaderboard import (
-        LeaderboardOptions,
-        leaderboard_rows,
-    )
+    from safe_envs.agents.training.leaderboard import LeaderboardOptions, leaderboard_rows
     from safe_envs.registry import full_id
-    from safe_envs.scripts.reports.leaderboard_report import (
-        leaderboard_markdown,
-        leaderboard_table,
-    )
+    from safe_envs.scripts.reports.leaderboard_report import leaderboard_markdown, leaderboard_table
 
     require_result(json_file)
     ids = list(dict.fromkeys(full_id(env_id) for env_id in env_ids or ENV_IDS))

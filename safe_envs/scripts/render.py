@@ -14,13 +14,7 @@ from safe_envs.errors import ConfigurationError, shown
 from safe_envs.scripts.figures.film import require_film, steps_a_frame, write_film
 from safe_envs.scripts.options import evaluation_options, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import (
-    Json,
-    progress_bar,
-    say,
-    stdout,
-    write_result,
-)
+from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 
 if TYPE_CHECKING:

@@ -10,13 +10,7 @@ import typer
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import (
-    Json,
-    require_result,
-    say,
-    stdout,
-    write_result,
-)
+from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
 from safe_envs.scripts.options.job_progress import run_jobs
 
 

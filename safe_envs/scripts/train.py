@@ -13,13 +13,7 @@ import typer
 from safe_envs.errors import ConfigurationError
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import (
-    Json,
-    progress_bar,
-    say,
-    stdout,
-    write_result,
-)
+from safe_envs.scripts.options.console import Json, progress_bar, say, stdout, write_result
 from safe_envs.scripts.options.env_options import EnvOptions, with_env
 from safe_envs.scripts.options.hyperparameter_options import read_hyperparameters
 

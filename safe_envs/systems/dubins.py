@@ -27,11 +27,7 @@ HEADING = (
 )
 """The heading, as it is observed."""
 
-SHOWN: dict[str, Any] = {
-    "noise": ("sigma_1", "sigma_2"),
-    "plane": ("x", "y"),
-    "scene": "top-view",
-}
+SHOWN: dict[str, Any] = {"noise": ("sigma_1", "sigma_2"), "plane": ("x", "y"), "scene": "top-view"}
 """Attributes of every problem with the vehicle."""
 
 UNIFORMS = uniforms(3)
@@ -125,11 +121,7 @@ def disk_problem(
             Variable(y, -2 * r, 2 * r, "m"),
             Variable(theta, -math.inf, math.inf, "rad"),
         ),
-        features=(
-            Feature("x", x, -2 * r, 2 * r),
-            Feature("y", y, -2 * r, 2 * r),
-            *HEADING,
-        ),
+        features=(Feature("x", x, -2 * r, 2 * r), Feature("y", y, -2 * r, 2 * r), *HEADING),
         reward=reward,
         nominal=(turn_rate,),
         starts={**starts, "uniform": Start(anywhere(r), UNIFORMS)},

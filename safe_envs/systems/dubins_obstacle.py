@@ -14,16 +14,7 @@ from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.systems._common import positive, uniform_box
-from safe_envs.systems.dubins import (
-    HEADING,
-    SHOWN,
-    omega,
-    theta,
-    turn_rate_towards,
-    vehicle,
-    x,
-    y,
-)
+from safe_envs.systems.dubins import HEADING, SHOWN, omega, theta, turn_rate_towards, vehicle, x, y
 
 x_o, y_o, v_o = sp.symbols("x_o y_o v_o", real=True)
 

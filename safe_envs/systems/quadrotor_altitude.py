@@ -116,10 +116,7 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         inputs=(Variable(U_1, 0.0, _MOST_THRUST, "N"),),
         features=(*(Feature(s.symbol.name, s.symbol, s.low, s.high) for s in HEIGHT), *FOLLOWED),
         nominal=(thrust_law(),),
-        starts={
-            "spread": uniform_box((5.0, 0.0), (0.5, 0.5)),
-            "thesis": Start.at((5.0, 0.0)),
-        },
+        starts={"spread": uniform_box((5.0, 0.0), (0.5, 0.5)), "thesis": Start.at((5.0, 0.0))},
         noise=("sigma_z",),
         plane=("z", "zdot"),
         scene="altitude",

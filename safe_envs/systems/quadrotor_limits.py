@@ -23,13 +23,7 @@ from safe_envs.systems.quadrotor import (
     theta,
     x,
 )
-from safe_envs.systems.quadrotor_altitude import (
-    ALTITUDE_REWARD,
-    HEIGHT,
-    PLANT_MASS,
-    z,
-    zdot,
-)
+from safe_envs.systems.quadrotor_altitude import ALTITUDE_REWARD, HEIGHT, PLANT_MASS, z, zdot
 
 x_ref, x_ref_rate = sp.symbols("x_ref x_ref_rate", real=True)
 

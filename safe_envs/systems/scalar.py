@@ -47,10 +47,7 @@ def scalar(*, limit: float = 1.0) -> SafetyProblem:
         inputs=(Variable(u, -10.0, 10.0, "1/s"),),
         reward=sp.exp(-((2 * (x / edge - 1)) ** 2)),
         nominal=(-x + edge - x,),
-        starts={
-            "spread": uniform_box((0.0,), (0.9 * edge,)),
-            "origin": Start.at((0.0,)),
-        },
+        starts={"spread": uniform_box((0.0,), (0.9 * edge,)), "origin": Start.at((0.0,))},
         dt=0.01,
         horizon=5.0,
         noise=("sigma",),

@@ -8,15 +8,7 @@ from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import Variable
 from safe_envs.systems._common import positive
-from safe_envs.systems.dubins import (
-    UNIFORMS,
-    anywhere,
-    disk_problem,
-    omega,
-    vehicle,
-    x,
-    y,
-)
+from safe_envs.systems.dubins import UNIFORMS, anywhere, disk_problem, omega, vehicle, x, y
 
 
 def stochastic_dubins(*, radius: float = 3.0) -> SafetyProblem:

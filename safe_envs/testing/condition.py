@@ -17,12 +17,7 @@ from safe_envs.errors import (
 )
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.registry import make_problem
-from safe_envs.wrappers.conditions import (
-    AffineConstraint,
-    Condition,
-    parse_conditions,
-    spec_of,
-)
+from safe_envs.wrappers.conditions import AffineConstraint, Condition, parse_conditions, spec_of
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification.safe_set import draw_starts
 
@@ -244,11 +239,7 @@ def _along(value: Field, x: np.ndarray, direction: np.ndarray, twice: bool = Fal
 
 
 def _check_decisions(
-    safety_filter: SafetyFilter,
-    x: np.ndarray,
-    u: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
+    safety_filter: SafetyFilter, x: np.ndarray, u: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> None:
     name = ", ".join(sorted({condition.name for _, condition in safety_filter.pairs}))
     try:

@@ -10,12 +10,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.dynamics.lie import (
-    generator,
-    ito_correction,
-    lie_derivative_f,
-    lie_derivative_g,
-)
+from safe_envs.dynamics.lie import generator, ito_correction, lie_derivative_f, lie_derivative_g
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.envs.env import SafeEnv
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -23,6 +18,8 @@ from safe_envs.errors import SafeEnvsError
 from safe_envs.problem.factory import load_system
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.validation import degree_of, require_sound
+from safe_envs.registry import make_problem
+from safe_envs.systems import ENV_IDS
 
 _NUM_ENVS = 3
 _STATES = 8
@@ -42,8 +39,8 @@ def check_system(system: System, *, steps: int = 50, seed: int = 0) -> None:
     "derivatives" of the barriers that agree with finite differences.
 
     Args:
-        system: a problem, a function that returns one, FILE.py:NAME, MODULE:NAME or the name of an
-            entry point.
+        system: a problem, a function that returns one, the id of an env of this project,
+            FILE.py:NAME, MODULE:NAME or the name of an entry point.
         steps: control periods to simulate.
         seed: of starts, actions and noise.
 
@@ -67,6 +64,8 @@ def check_system(system: System, *, steps: int = 50, seed: int = 0) -> None:
 def _built(system: System) -> SafetyProblem:
     if isinstance(system, SafetyProblem):
         return system
+    if isinstance(system, str) and {system, f"safe_envs/{system}"} & {*ENV_IDS}:
+        return make_problem(system)
     found = (load_system(system) if isinstance(system, str) else system)()
     _require("definition", isinstance(found, SafetyProblem), f"{system} gives {found!r}")
     return found

@@ -6,9 +6,7 @@ from safe_envs.wrappers.env_wrappers.external_env import ActionMap, FilterSpec
 from safe_envs.wrappers.env_wrappers.monitor import SafetyMonitor
 from safe_envs.wrappers.env_wrappers.monitor_vector import SafetyMonitorVector
 from safe_envs.wrappers.env_wrappers.safety_filter import SafetyFilterWrapper
-from safe_envs.wrappers.env_wrappers.safety_filter_vector import (
-    SafetyFilterVectorWrapper,
-)
+from safe_envs.wrappers.env_wrappers.safety_filter_vector import SafetyFilterVectorWrapper
 from safe_envs.wrappers.filter_qp import FilterDecision
 from safe_envs.wrappers.safety_filter import SafetyFilter
 

@@ -9,19 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.dynamics.codegen import (
-    Flavour,
-    compile_function,
-    finite,
-    stacked,
-)
+from safe_envs.dynamics.codegen import Flavour, compile_function, finite, stacked
 from safe_envs.dynamics.sde import ControlAffineSDE
-from safe_envs.errors import (
-    ConfigurationError,
-    InvalidInputError,
-    SystemDefinitionError,
-    nearest,
-)
+from safe_envs.errors import ConfigurationError, InvalidInputError, SystemDefinitionError, nearest
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
@@ -30,11 +20,7 @@ from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.conditions.spec_text import Conditions, conditions_for
 from safe_envs.wrappers.filter_qp import FilterDecision, FilterQP
 from safe_envs.wrappers.filter_qp.component_filter import NO_VALUE, ComponentFilter
-from safe_envs.wrappers.filter_qp.qp import (
-    control_period,
-    input_bounds,
-    positive_weights,
-)
+from safe_envs.wrappers.filter_qp.qp import control_period, input_bounds, positive_weights
 
 _DOUBLE = np.dtype(np.float64)
 

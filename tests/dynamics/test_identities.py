@@ -11,12 +11,7 @@ import sympy as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from safe_envs import (
-    ControlAffineSDE,
-    RelativeDegreeError,
-    SystemDefinitionError,
-    state_problem,
-)
+from safe_envs import ControlAffineSDE, RelativeDegreeError, SystemDefinitionError, state_problem
 from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.dynamics.identities import is_zero
 from safe_envs.dynamics.lie import relative_degree, vanishes

@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import (
-    ControlAffineSDE,
-    NumericalError,
-    SafeEnv,
-    SafeVectorEnv,
-    state_problem,
-)
+from safe_envs import ControlAffineSDE, NumericalError, SafeEnv, SafeVectorEnv, state_problem
 from safe_envs.dynamics.integrators import Integrator
 from safe_envs.problem.signals import Feature
 

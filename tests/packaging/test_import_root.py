@@ -101,10 +101,7 @@ else:
 
 @pytest.mark.parametrize(
     ("script", "shown"),
-    [
-        (["scripts/evaluate.py", "--help"], "Usage"),
-        (["-m", "scripts.listing"], "Scalar-v0"),
-    ],
+    [(["scripts/evaluate.py", "--help"], "Usage"), (["-m", "scripts.listing"], "Scalar-v0")],
 )
 def test_a_command_runs_as_a_script_of_the_checkout(script: list[str], shown: str):
     assert shown in run(ROOT, *script, path=str(ROOT))

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import (
-    Barrier,
-    ConfigurationError,
-    ControlAffineSDE,
-    SafeEnv,
-    SafetyProblem,
-)
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, SafeEnv, SafetyProblem
 from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Feature, Variable
 from safe_envs.rendering import style

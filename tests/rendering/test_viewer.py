@@ -11,15 +11,7 @@ from safe_envs import ConfigurationError, ControlAffineSDE, SafeEnv, SafeVectorE
 from safe_envs.rendering import style
 from safe_envs.wrappers import SafetyFilterVectorWrapper, SafetyFilterWrapper
 from tests.conftest import problem_of
-from tests.rendering.drawn import (
-    DUBINS,
-    FILTER_STATUS,
-    PANEL,
-    SAFETY_STATUS,
-    SCENE,
-    shown,
-    stepped,
-)
+from tests.rendering.drawn import DUBINS, FILTER_STATUS, PANEL, SAFETY_STATUS, SCENE, shown, stepped
 
 pytestmark = pytest.mark.slow
 

@@ -42,11 +42,9 @@ USER_ERRORS = (
     ([DUBINS, "--policy", "nominl"], ["unknown policy 'nominl'", "did you mean 'nominal'"]),
     ([DUBINS, "--policy", "missing.zip"], ["'missing.zip'", "there is no such file"]),
     ([DUBINS, "--policy", __file__], ["not a policy that Stable-Baselines3 saved"]),
+    ([DUBINS, "--episodes-out", "out.csv"], ["out.csv", "give FILE.parquet"]),
     ([DUBINS, "--policy", __file__, "--trust"], ["not a policy that Stable-Baselines3 saved"]),
-    (
-        [DUBINS, "--policy", "."],
-        ["policy.npz does not exist", "`safe-envs train`"],
-    ),
+    ([DUBINS, "--policy", "."], ["policy.npz does not exist", "`safe-envs train`"]),
     ([DUBINS, "--plant", "vv=1"], ["unknown parameter 'vv'", "did you mean 'v'"]),
     ([DUBINS, "--plant", "v=fast"], ["--plant 'v=fast'", "not a number"]),
     ([DUBINS, "--plant", "v"], ["NAME=VALUE"]),

@@ -12,11 +12,7 @@ import pytest
 
 from safe_envs.agents.jobs.fingerprint import package_versions
 from safe_envs.registry import make_problem
-from safe_envs.scripts.options.method_settings import (
-    SETTINGS,
-    read_settings,
-    settings_of,
-)
+from safe_envs.scripts.options.method_settings import SETTINGS, read_settings, settings_of
 from safe_envs.scripts.reports.identify_answer import Function, Source, unit_of
 from safe_envs.scripts.reports.quantities import relative_text
 from safe_envs.wrappers.learning import METHODS, learner_of, load_learned

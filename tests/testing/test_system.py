@@ -27,7 +27,7 @@ def test_every_registered_system_passes(env_id):
     check_system(problem_of(env_id))
 
 
-@pytest.mark.parametrize("system", [stated, stated(), f"{__name__}:stated"])
+@pytest.mark.parametrize("system", [stated, stated(), f"{__name__}:stated", "Scalar-v0"])
 def test_a_problem_a_function_and_a_place_pass(system):
     check_system(system)
 

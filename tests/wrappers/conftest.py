@@ -8,10 +8,7 @@ import pytest
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.generator import learn_generator
-from safe_envs.wrappers.learning.models.generator import (
-    GeneratorModel,
-    LearnedGenerator,
-)
+from safe_envs.wrappers.learning.models.generator import GeneratorModel, LearnedGenerator
 from safe_envs.wrappers.learning.models.residual import LearnedResidual, ResidualModel
 from tests.conftest import problem_of
 from tests.wrappers.learned import NO_RECORD, some_network

@@ -10,12 +10,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import compile_function, filled, stacked
-from safe_envs.dynamics.lie import (
-    derivatives,
-    generator,
-    lie_derivative_f,
-    lie_derivative_g,
-)
+from safe_envs.dynamics.lie import derivatives, generator, lie_derivative_f, lie_derivative_g
 from safe_envs.wrappers.learning.data.collection import draw_states
 from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.models.base import Record

@@ -107,10 +107,7 @@ def assert_sound(safety_filter, x, u):
 @st.composite
 def situations(draw, names):
     safety_filter = filter_of(*draw(st.sampled_from(names)))
-    n, ends = (
-        safety_filter.model.n,
-        zip(safety_filter.qp.low, safety_filter.qp.high, strict=True),
-    )
+    n, ends = (safety_filter.model.n, zip(safety_filter.qp.low, safety_filter.qp.high, strict=True))
     x, near = (
         draw(st.lists(ENTRY, min_size=n, max_size=n)),
         st.tuples(*[st.floats(2 * lo - hi, 2 * hi - lo) for lo, hi in ends]),

@@ -9,11 +9,7 @@ import numpy as np
 from safe_envs.agents.evaluation.rounding import may_touch, touches
 from safe_envs.agents.evaluation.rows import EpisodeResults, EpisodeSummary
 from safe_envs.agents.evaluation.running_sum import RunningSum
-from safe_envs.agents.evaluation.statistics import (
-    rate_interval,
-    safety_curve,
-    share,
-)
+from safe_envs.agents.evaluation.statistics import rate_interval, safety_curve, share
 from safe_envs.agents.evaluation.visited_states import StateWatch, VisitedStates
 from safe_envs.dynamics.codegen import Components
 from safe_envs.envs.info import Info

@@ -19,13 +19,7 @@ from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
 from safe_envs.agents.evaluation.results import Evaluation, FilterTiming, Timing
 from safe_envs.agents.evaluation.rollout import play, play_in_processes
 from safe_envs.agents.evaluation.rows import EvaluationRow
-from safe_envs.agents.evaluation.spec import (
-    EvaluationSpec,
-    Filter,
-    Progress,
-    RunSettings,
-    listed,
-)
+from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, RunSettings, listed
 from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.problem.problem import SafetyProblem

@@ -8,11 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.brownian_bridge import (
-    BrownianBridge,
-    Exponentials,
-    smallest,
-)
+from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, Exponentials, smallest
 from safe_envs.agents.evaluation.episode_batch import EpisodeBatch, PlayedBatch
 from safe_envs.agents.evaluation.spec import Progress
 from safe_envs.agents.evaluation.targets import Env
@@ -205,7 +201,7 @@ def _acted(policy: Any, observation: np.ndarray, state: Any, start: np.ndarray) 
         actions, state = policy.predict(observation, state, start, deterministic=True)
     except SafeEnvsError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise InvalidInputError(
             f"the policy {policy_name(policy)} failed on observations of shape {observation.shape}"
             f" ({type(error).__name__}: {shortened(error)}); predict(observation, state,"

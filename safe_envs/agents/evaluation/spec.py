@@ -123,10 +123,12 @@ class EvaluationSpec:
     def as_dict(self) -> dict[str, Any]:
         """Return the spec as JSON-able data, from which `from_dict` makes one with the same result.
 
+        `trust` is left out: no file may grant itself the right to run code.
+
         Raises:
             ConfigurationError: A part is an object that has no text, such as a policy.
         """
-        found = {f.name: getattr(self, f.name) for f in fields(self)}
+        found = {name: getattr(self, name) for name in _WRITTEN}
         if self.filters is not None:
             found["filters"] = [filter_text(each) for each in self.filters]
         found["options"] = dict(self.options)
@@ -142,21 +144,28 @@ class EvaluationSpec:
         return found
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> EvaluationSpec:
+    def from_dict(cls, data: Mapping[str, Any], trust: bool = False) -> EvaluationSpec:
         """Make a spec from what `as_dict` returned.
+
+        Args:
+            data: as `as_dict` returned it.
+            trust: load a policy's .zip, which runs code that it contains.
 
         Raises:
             ConfigurationError: A key is unknown, `problem` is missing, or a value is out of range.
         """
-        names = [f.name for f in fields(cls)]
         for key in data:
-            if key not in names:
+            if key not in _WRITTEN:
                 raise ConfigurationError(
-                    f"an evaluation has no {shown(key)}; {nearest(key, names)}"
+                    f"an evaluation has no {shown(key)}; {nearest(key, _WRITTEN)}"
                 )
         if "problem" not in data:
             raise ConfigurationError("an evaluation needs problem, the id of an env")
-        return cls(**data)
+        return cls(**data, trust=trust)
+
+
+_WRITTEN = tuple(each.name for each in fields(EvaluationSpec) if each.name != "trust")
+"""Fields that are written as data."""
 
 
 @dataclass(frozen=True)

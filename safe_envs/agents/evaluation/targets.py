@@ -11,11 +11,7 @@ from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.registry import full_id, make_problem, title_of
-from safe_envs.wrappers import (
-    FilterSpec,
-    SafetyFilterVectorWrapper,
-    SafetyMonitorVector,
-)
+from safe_envs.wrappers import FilterSpec, SafetyFilterVectorWrapper, SafetyMonitorVector
 
 Env = SafeVectorEnv | SafetyMonitorVector | SafetyFilterVectorWrapper
 """A batch of envs."""
@@ -117,9 +113,7 @@ class ExternalTarget:
 
 
 def make_target(
-    problem: SafetyProblem | str,
-    options: Mapping[str, Any],
-    filter_spec: FilterSpec | str | None,
+    problem: SafetyProblem | str, options: Mapping[str, Any], filter_spec: FilterSpec | str | None
 ) -> NativeTarget | ExternalTarget:
     """Return what to simulate; see `EvaluationSpec` for the arguments.
 

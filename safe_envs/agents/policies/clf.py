@@ -9,11 +9,7 @@ from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import ConfigurationError, NumericalError
 from safe_envs.problem.clf import CLF
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.filter_qp import (
-    FilterQP,
-    FilterQPSolver,
-    UndefinedConstraintError,
-)
+from safe_envs.wrappers.filter_qp import FilterQP, FilterQPSolver, UndefinedConstraintError
 
 
 class CLFController(StatelessPolicy):

@@ -10,12 +10,7 @@ import gymnasium as gym
 import numpy as np
 
 from safe_envs.agents.policies.base import Spaces, StatelessPolicy
-from safe_envs.errors import (
-    ConfigurationError,
-    InvalidInputError,
-    SafeEnvsError,
-    shortened,
-)
+from safe_envs.errors import ConfigurationError, InvalidInputError, SafeEnvsError, shortened
 from safe_envs.problem.problem import SafetyProblem
 
 

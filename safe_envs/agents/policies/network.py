@@ -200,6 +200,11 @@ def load_policy(path: str | Path, problem: SafetyProblem) -> NetworkPolicy:
             or belongs to another problem.
     """
     file = saved_policy_file(Path(path)) or Path(path)
+    if not file.exists() and (file.parent / "policy.safetensors").exists():
+        raise ConfigurationError(
+            f"the policy in {shortened(file.parent)} was saved by an older version, in another"
+            f" format; train it again by `{_WRITER}`"
+        )
     if not file.exists() and (file.parent / "config.json").exists():
         raise ConfigurationError(
             f"the training in {file.parent} is not finished: go on with it by `{_WRITER}`"

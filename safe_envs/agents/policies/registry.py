@@ -7,19 +7,10 @@ import re
 from pathlib import Path
 from typing import Any
 
-from safe_envs.agents.policies.base import (
-    POLICY_FILE,
-    Policy,
-    Spaces,
-    saved_policy_file,
-)
+from safe_envs.agents.policies.base import POLICY_FILE, Policy, Spaces, saved_policy_file
 from safe_envs.agents.policies.clf import CLFController
 from safe_envs.agents.policies.custom import as_policy
-from safe_envs.agents.policies.nominal import (
-    NominalController,
-    RandomPolicy,
-    ZeroController,
-)
+from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
 from safe_envs.agents.policies.third_party import ModelPolicy
 from safe_envs.envs.env import action_box, observation_box
 from safe_envs.errors import ConfigurationError, nearest, shown

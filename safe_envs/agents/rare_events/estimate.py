@@ -21,13 +21,7 @@ from safe_envs.agents.rare_events.importance_sampling import (
     TiltedNoiseEnv,
     optimal_tilt,
 )
-from safe_envs.agents.rare_events.rows import (
-    BETTER,
-    PlainEpisodes,
-    RareEstimate,
-    RareRow,
-    verdict,
-)
+from safe_envs.agents.rare_events.rows import BETTER, PlainEpisodes, RareEstimate, RareRow, verdict
 from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Repetitions, Splitting
 from safe_envs.errors import NumericalError, require_whole
 from safe_envs.problem.problem import SafetyProblem

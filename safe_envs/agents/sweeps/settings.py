@@ -9,13 +9,7 @@ from dataclasses import fields
 from typing import Any, get_type_hints
 
 from safe_envs.agents.evaluation.spec import UNFILTERED, EvaluationSpec
-from safe_envs.errors import (
-    ConfigurationError,
-    nearest,
-    require_whole,
-    shortened,
-    shown,
-)
+from safe_envs.errors import ConfigurationError, nearest, require_whole, shortened, shown
 from safe_envs.number_text import real
 from safe_envs.problem.options import OPTION_NAMES, PARAMETER_GROUPS
 from safe_envs.registry import full_id

@@ -12,12 +12,7 @@ from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.agents.jobs.fingerprint import file_checksum
 from safe_envs.agents.sweeps.cell import Cell, Sweep, versions
-from safe_envs.agents.sweeps.dependencies import (
-    absolute,
-    installed,
-    read_by,
-    with_imported,
-)
+from safe_envs.agents.sweeps.dependencies import absolute, installed, read_by, with_imported
 from safe_envs.agents.sweeps.document import document_in
 from safe_envs.agents.sweeps.settings import Settings, complete, sections, text_of
 from safe_envs.errors import ConfigurationError, SafeEnvsError

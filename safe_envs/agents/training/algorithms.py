@@ -127,10 +127,7 @@ def _normalized(envs: VecEnv, normalize: Any, gamma: float) -> VecEnv:
 
 
 def _action_noise(kind: str | None, deviation: float | None, inputs: int) -> dict[str, Any]:
-    from stable_baselines3.common.noise import (
-        NormalActionNoise,
-        OrnsteinUhlenbeckActionNoise,
-    )
+    from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 
     kinds = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
     if kind is None and deviation is None:

@@ -249,11 +249,7 @@ def _moments(scales: Any) -> Iterator[tuple[str, Any]]:
 
 def _sums(envs: VecEnv) -> list[tuple[Any, str]]:
     """Return the wrappers with the names of their sums over an episode."""
-    from stable_baselines3.common.vec_env import (
-        VecMonitor,
-        VecNormalize,
-        unwrap_vec_wrapper,
-    )
+    from stable_baselines3.common.vec_env import VecMonitor, VecNormalize, unwrap_vec_wrapper
 
     monitor, scales = (unwrap_vec_wrapper(envs, layer) for layer in (VecMonitor, VecNormalize))
     of_monitor = (

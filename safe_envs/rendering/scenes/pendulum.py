@@ -12,17 +12,7 @@ from safe_envs.rendering.safe_set import Barriers, tint
 from safe_envs.rendering.scenes.base import Scene, warning_color
 from safe_envs.rendering.scenes.plane import StatePlane
 from safe_envs.rendering.snapshot import EpisodeSnapshot
-from safe_envs.rendering.style import (
-    EDGE,
-    GREY,
-    HATCH,
-    INK,
-    PAPER,
-    SMALL,
-    UNSAFE,
-    mix,
-    number,
-)
+from safe_envs.rendering.style import EDGE, GREY, HATCH, INK, PAPER, SMALL, UNSAFE, mix, number
 
 _ROD: Box = (76, 30, 504, 178)
 _PLANE: Box = (76, 244, 504, 242)

@@ -69,6 +69,10 @@ def require_outputs(
         from safe_envs.agents.evaluation.episodes_file import require_parquet
 
         require_parquet()
+        if episodes_out.suffix != ".parquet":
+            raise ConfigurationError(
+                f"--episodes-out {episodes_out} is no name of a Parquet file; give FILE.parquet"
+            )
     if plot is not None:
         _require_format(plot)
 

@@ -21,12 +21,7 @@ from safe_envs.scripts.reports.benchmark_cases import (
     several_constraints,
     vector_steps,
 )
-from safe_envs.wrappers import (
-    DDSCBF,
-    BayesianSCBF,
-    LearnedHOCBF,
-    SafetyFilter,
-)
+from safe_envs.wrappers import DDSCBF, BayesianSCBF, LearnedHOCBF, SafetyFilter
 from safe_envs.wrappers.learning import LearnedModel, learner_of
 from safe_envs.wrappers.learning.data.collection import draw_states
 

@@ -100,10 +100,7 @@ def print_refinement(console: Console, refinement: Refinement) -> None:
         return
     for row in refinement.rows:
         change = _points(row.change, row.change_low, row.change_high)
-        say(
-            console,
-            f"  {row.filter}: {_VERDICTS[row.verdict].format(change, row.withheld)}",
-        )
+        say(console, f"  {row.filter}: {_VERDICTS[row.verdict].format(change, row.withheld)}")
     reach = f"{100 * TOLERANCE:g} points"
     say(
         console,

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from safe_envs.scripts.reproduce.chapter_3 import (
-    dubins_disk,
-    dubins_obstacle,
-    quadrotor,
-)
+from safe_envs.scripts.reproduce.chapter_3 import dubins_disk, dubins_obstacle, quadrotor
 from safe_envs.scripts.reproduce.chapter_4 import (
     cruise,
     cruise_effort,

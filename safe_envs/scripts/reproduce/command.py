@@ -13,13 +13,7 @@ import typer
 from safe_envs.errors import ConfigurationError, nearest
 from safe_envs.scripts.options import completion, text_options
 from safe_envs.scripts.options.app import run_alone
-from safe_envs.scripts.options.console import (
-    Json,
-    require_result,
-    say,
-    stdout,
-    write_result,
-)
+from safe_envs.scripts.options.console import Json, require_result, say, stdout, write_result
 from safe_envs.scripts.options.job_progress import run_jobs
 
 if TYPE_CHECKING:
@@ -70,10 +64,7 @@ def reproduce(
     from safe_envs.scripts.reproduce.framework.artefact import Workload
     from safe_envs.scripts.reproduce.framework.page import write_page
     from safe_envs.scripts.reproduce.framework.store import read, require_same_sample
-    from safe_envs.scripts.reproduce.framework.summary import (
-        summary_document,
-        summary_table,
-    )
+    from safe_envs.scripts.reproduce.framework.summary import summary_document, summary_table
 
     require_result(json_file)
     sample = Workload(episodes, seed, quick)

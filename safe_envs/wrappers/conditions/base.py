@@ -12,12 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import sympy as sp
 
 from safe_envs.dynamics.identities import pieces_fit
-from safe_envs.dynamics.lie import (
-    Derivative,
-    generator,
-    lie_derivative_f,
-    lie_derivative_g,
-)
+from safe_envs.dynamics.lie import Derivative, generator, lie_derivative_f, lie_derivative_g
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.errors import ConfigurationError, SafeEnvsError, shortened, shown
 from safe_envs.problem.barrier import Barrier
@@ -117,7 +112,7 @@ class Condition(ABC):
             return _constraint(self, model, barrier)
         except SafeEnvsError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise ConfigurationError(
                 f"{self.name} cannot derive its constraint on {barrier.name}"
                 f" ({type(error).__name__}: {shortened(error)}); correct its class"

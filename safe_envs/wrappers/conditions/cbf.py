@@ -17,13 +17,7 @@ from safe_envs.errors import ConfigurationError, RelativeDegreeError, shortened,
 from safe_envs.problem.barrier import Barrier
 from safe_envs.wrappers.conditions.base import Condition
 from safe_envs.wrappers.conditions.chain import chain_of
-from safe_envs.wrappers.conditions.class_k import (
-    ClassK,
-    Rate,
-    entries_of,
-    positive_rates,
-    rates,
-)
+from safe_envs.wrappers.conditions.class_k import ClassK, Rate, entries_of, positive_rates, rates
 from safe_envs.wrappers.conditions.constraint import AffineConstraint
 
 _STEPS = 100

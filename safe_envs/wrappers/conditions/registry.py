@@ -34,9 +34,12 @@ def is_built_in(name: str) -> bool:
 
 
 def condition_names() -> tuple[str, ...]:
-    """Return the names of all conditions: the built-in ones, then those of installed packages."""
+    """Return the names of all conditions: the built-in ones, then those of installed packages.
+
+    A package can take neither a built-in name nor "none", which stands for the unfiltered env.
+    """
     declared = plugins.plugin_names(plugins.CONDITIONS)
-    return (*_BUILT_IN, *(name for name in declared if name not in _BUILT_IN))
+    return (*_BUILT_IN, *(name for name in declared if name not in (*_BUILT_IN, "none")))
 
 
 def condition_class(name: str) -> type[Condition]:

@@ -12,13 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from safe_envs.errors import (
-    ConfigurationError,
-    SafeEnvsError,
-    nearest,
-    shortened,
-    shown,
-)
+from safe_envs.errors import ConfigurationError, SafeEnvsError, nearest, shortened, shown
 from safe_envs.number_text import real_or_complex
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions.base import Condition

@@ -66,9 +66,7 @@ class MonitorLayer:
 
 
 class SafetyMonitor(
-    MonitorLayer,
-    gym.Wrapper[np.ndarray, Any, np.ndarray, Any],
-    gym.utils.RecordConstructorArgs,
+    MonitorLayer, gym.Wrapper[np.ndarray, Any, np.ndarray, Any], gym.utils.RecordConstructorArgs
 ):
     """Adds cost, violation, barrier, h_min and episode_cost to `info`, by a model's barriers.
 

@@ -16,11 +16,7 @@ from safe_envs.envs.vector_env import VectorStep
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.validators import real_array
 from safe_envs.wrappers.env_wrappers.external_env import FilterSpec
-from safe_envs.wrappers.env_wrappers.monitor import (
-    MonitorLayer,
-    barrier_table,
-    doubt_layers,
-)
+from safe_envs.wrappers.env_wrappers.monitor import MonitorLayer, barrier_table, doubt_layers
 
 
 class SafetyMonitorVector(MonitorLayer, gym.vector.VectorWrapper):

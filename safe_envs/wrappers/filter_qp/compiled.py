@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
-from safe_envs.dynamics.codegen import (
-    Components,
-    Flavour,
-    compile_function,
-    constants,
-    finite,
-)
+from safe_envs.dynamics.codegen import Components, Flavour, compile_function, constants, finite
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.filter_qp.decision import UndefinedConstraintError
 from safe_envs.wrappers.filter_qp.qp import FilterQP
@@ -41,10 +35,7 @@ class CompiledQP:
         self._uncertain = [i for i, c in enumerate(qp.constraints) if c.uncertainty is not None]
         arrays = flavour == "arrays"
         self._terms = [term.arrays if arrays else term.floats for term in qp.terms]
-        self._symbols = (
-            *qp.model.states,
-            *(s for term in qp.terms for s in term.symbols),
-        )
+        self._symbols = (*qp.model.states, *(s for term in qp.terms for s in term.symbols))
         self._low: Sequence[Any] = constants(qp.low) if arrays else qp.low
         self._high: Sequence[Any] = constants(qp.high) if arrays else qp.high
         self._weights = qp.weights

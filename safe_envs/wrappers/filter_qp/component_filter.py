@@ -8,10 +8,7 @@ import numpy as np
 
 from safe_envs.dynamics.codegen import Components, filled
 from safe_envs.errors import NumericalError
-from safe_envs.wrappers.filter_qp.decision import (
-    FilterDecision,
-    UndefinedConstraintError,
-)
+from safe_envs.wrappers.filter_qp.decision import FilterDecision, UndefinedConstraintError
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.filter_qp.solver import FilterQPSolver
 

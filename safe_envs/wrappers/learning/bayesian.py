@@ -22,11 +22,7 @@ from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.data.steps import Step
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.drift_checks import region_warnings
-from safe_envs.wrappers.learning.identifiability import (
-    IdentifiabilityWarning,
-    misfits,
-    weaknesses,
-)
+from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning, misfits, weaknesses
 from safe_envs.wrappers.learning.models.base import Record
 from safe_envs.wrappers.learning.models.distributions import Gaussian, require_prior
 from safe_envs.wrappers.learning.models.features import Features

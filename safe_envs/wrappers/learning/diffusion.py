@@ -22,10 +22,7 @@ _EXACT = 1e-12
 
 
 def learn_diffusion(
-    problem: SafetyProblem,
-    data: Transitions,
-    rate: np.ndarray,
-    allowed: np.ndarray | float = 0.0,
+    problem: SafetyProblem, data: Transitions, rate: np.ndarray, allowed: np.ndarray | float = 0.0
 ) -> tuple[LearnedDiffusion, dict[str, float]]:
     """Regress the covariances by least squares, with the degree of least BIC.
 

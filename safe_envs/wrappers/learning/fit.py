@@ -14,11 +14,7 @@ import numpy as np
 from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole, shown
 from safe_envs.wrappers.learning.checks import Progress, Purpose, random_stream
 from safe_envs.wrappers.learning.data.values import LARGEST
-from safe_envs.wrappers.learning.models.network import (
-    Activation,
-    Network,
-    require_activation,
-)
+from safe_envs.wrappers.learning.models.network import Activation, Network, require_activation
 
 LEAST_ROWS = 10
 """Fewest rows from which anything is learned."""

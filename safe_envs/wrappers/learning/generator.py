@@ -9,12 +9,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
-from safe_envs.dynamics.lie import (
-    derivatives,
-    gradient,
-    lie_derivative_f,
-    relative_degree,
-)
+from safe_envs.dynamics.lie import derivatives, gradient, lie_derivative_f, relative_degree
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem
@@ -24,11 +19,7 @@ from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.steps import Step
 from safe_envs.wrappers.learning.data.transitions import Transitions
 from safe_envs.wrappers.learning.diffusion import learn_diffusion
-from safe_envs.wrappers.learning.drift_checks import (
-    drift_warnings,
-    region_warnings,
-    slack,
-)
+from safe_envs.wrappers.learning.drift_checks import drift_warnings, region_warnings, slack
 from safe_envs.wrappers.learning.estimators import (
     Estimator,
     in_bulk,

@@ -19,12 +19,7 @@ from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import ConfigurationError, require_whole
 from safe_envs.number_text import finite_number
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.checks import (
-    Progress,
-    Purpose,
-    random_stream,
-    require_problem,
-)
+from safe_envs.wrappers.learning.checks import Progress, Purpose, random_stream, require_problem
 from safe_envs.wrappers.learning.data.collection import collect_paths, draw_states
 from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.steps import Step
@@ -100,12 +95,7 @@ def learn_residual(
     parts, errors = [], {}
     for i, (barrier, (targets, sizes)) in enumerate(zip(problem.barriers, labels, strict=True)):
         trained = train(
-            inputs,
-            targets,
-            how,
-            seed=seed,
-            sizes=sizes,
-            progress=_share(progress, i, len(labels)),
+            inputs, targets, how, seed=seed, sizes=sizes, progress=_share(progress, i, len(labels))
         )
         degree = targets.shape[1] - problem.plant.m
         parts.append(

@@ -23,14 +23,7 @@ from safe_envs.wrappers.qp import (
     plane_batch,
     single_active_constraint,
 )
-from safe_envs.wrappers.qp.rounding import (
-    ArrayAnswer,
-    Arrays,
-    Entries,
-    FloatAnswer,
-    Floats,
-    stack,
-)
+from safe_envs.wrappers.qp.rounding import ArrayAnswer, Arrays, Entries, FloatAnswer, Floats, stack
 
 
 def project_floats(

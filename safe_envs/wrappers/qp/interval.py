@@ -71,12 +71,7 @@ def project_floats(a: Floats, b: Floats, v: float, low: float, high: float) -> F
 
 @np.errstate(all="ignore")
 def project_arrays(
-    a: Entries,
-    b: Entries,
-    v: np.ndarray,
-    low: Any,
-    high: Any,
-    priority: Floats,
+    a: Entries, b: Entries, v: np.ndarray, low: Any, high: Any, priority: Floats
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Project the input of each of B states.
 
@@ -108,12 +103,7 @@ def project_arrays(
 
 
 def _project(
-    a: np.ndarray,
-    b: np.ndarray,
-    v: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    priority: Floats,
+    a: np.ndarray, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, priority: Floats
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return what `project_arrays` does, for states that violate a constraint."""
     root = -b / a
@@ -134,11 +124,7 @@ def _project(
 
 
 def least_violating(
-    a: np.ndarray,
-    b: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    priority: Floats | np.ndarray,
+    a: np.ndarray, b: np.ndarray, low: np.ndarray, high: np.ndarray, priority: Floats | np.ndarray
 ) -> np.ndarray:
     """Minimise sum_i priority_i max(0, -(a_i u + b_i))^2 where no input meets all constraints.
 

@@ -19,14 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from safe_envs.wrappers.qp.rounding import (
-    ROUNDING,
-    Arrays,
-    Entries,
-    Floats,
-    tolerance,
-    tolerances,
-)
+from safe_envs.wrappers.qp.rounding import ROUNDING, Arrays, Entries, Floats, tolerance, tolerances
 
 _EXCESS = 1e3
 """A constraint that holds with so many times its rounding to spare is not on the nearest action:
@@ -37,12 +30,7 @@ _CORRECTIONS = 3
 
 
 def project_floats(
-    a: Floats,
-    b: float,
-    u: Floats,
-    low: Floats,
-    high: Floats,
-    w: Floats,
+    a: Floats, b: float, u: Floats, low: Floats, high: Floats, w: Floats
 ) -> tuple[list[float], float, bool, bool]:
     """Project the input of one state.
 
@@ -105,12 +93,7 @@ def _project_scalar(
 
 
 def _follow_multiplier(
-    a: Floats,
-    b: float,
-    v: Floats,
-    low: Floats,
-    high: Floats,
-    w: Floats,
+    a: Floats, b: float, v: Floats, low: Floats, high: Floats, w: Floats
 ) -> tuple[list[float], list[float]]:
     """Return the minimiser, and the way of each component along a / w, 0 for those not free."""
     size = max([abs(aj) for aj in a]) or 1.0
@@ -152,12 +135,7 @@ def _follow_multiplier(
 
 
 def project_arrays(
-    a: Entries,
-    b: Any,
-    v: Arrays,
-    low: Entries,
-    high: Entries,
-    w: Entries,
+    a: Entries, b: Any, v: Arrays, low: Entries, high: Entries, w: Entries
 ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
     """Project the inputs of a batch of B states.
 

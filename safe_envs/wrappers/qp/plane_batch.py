@@ -13,14 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from safe_envs.wrappers.qp.min_slack import is_unique, least_violating
-from safe_envs.wrappers.qp.rounding import (
-    ROUNDING,
-    Arrays,
-    Entries,
-    Floats,
-    stack,
-    tolerances,
-)
+from safe_envs.wrappers.qp.rounding import ROUNDING, Arrays, Entries, Floats, stack, tolerances
 
 
 class Plane(NamedTuple):

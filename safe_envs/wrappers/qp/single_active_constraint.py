@@ -15,12 +15,7 @@ Answer = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
 
 def project_arrays(
-    a: Arrays,
-    b: np.ndarray,
-    v: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-    w: Entries,
+    a: Arrays, b: np.ndarray, v: np.ndarray, low: np.ndarray, high: np.ndarray, w: Entries
 ) -> tuple[Answer, np.ndarray]:
     """Project the proposed inputs of the states in which at most one constraint binds.
 

@@ -10,13 +10,7 @@ import sympy as sp
 
 from safe_envs.wrappers.verification.formulas import Formulas
 from safe_envs.wrappers.verification.safe_set import workspace_of
-from safe_envs.wrappers.verification.search import (
-    Region,
-    Score,
-    largest,
-    search,
-    towards_zero,
-)
+from safe_envs.wrappers.verification.search import Region, Score, largest, search, towards_zero
 
 _POOL_LOG2 = 15
 _GROWTH = 1.01

@@ -15,12 +15,7 @@ from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.conditions import Condition
 from safe_envs.wrappers.safety_filter import SafetyFilter
 from safe_envs.wrappers.verification import bounds
-from safe_envs.wrappers.verification.assumptions import (
-    RELATIVE,
-    kinked,
-    reaches,
-    violated_by,
-)
+from safe_envs.wrappers.verification.assumptions import RELATIVE, kinked, reaches, violated_by
 from safe_envs.wrappers.verification.safe_set import (
     draw_starts,
     in_workspace,

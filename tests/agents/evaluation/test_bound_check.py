@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 
 from safe_envs.agents.evaluation import bound_check
-from safe_envs.agents.evaluation.bound_check import (
-    Horizon,
-    Measurement,
-    measure,
-    starts_of,
-)
+from safe_envs.agents.evaluation.bound_check import Horizon, Measurement, measure, starts_of
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers import parse_conditions
 from safe_envs.wrappers.verification.results import Bound

@@ -13,11 +13,7 @@ from scipy.stats import kstest
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import evaluate, make_problem
-from safe_envs.agents.evaluation.brownian_bridge import (
-    BrownianBridge,
-    Exponentials,
-    bridge_notes,
-)
+from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, Exponentials, bridge_notes
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.policies.nominal import RandomPolicy
 from tests.oracles.laws import X, brownian, first_passage, walk_passage

@@ -70,11 +70,7 @@ def test_confidence_is_that_of_every_interval():
 
 def test_episodes_that_are_all_safe_have_the_exact_interval():
     (row,) = evaluate("ACC-v0", filters=["scbf"], options={"horizon": 0.2}, episodes=1000).rows
-    assert (row.safe, row.ci_low, row.ci_high) == (
-        1000,
-        pytest.approx(0.025 ** (1 / 1000)),
-        1.0,
-    )
+    assert (row.safe, row.ci_low, row.ci_high) == (1000, pytest.approx(0.025 ** (1 / 1000)), 1.0)
 
 
 def test_a_filter_that_never_acts_leaves_everything_as_it_is():

@@ -155,11 +155,7 @@ def test_rows_of_repeats_are_sums_means_and_wider_intervals(repeated):
             assert row == single
             continue
         learning = row.learning
-        assert (learning.repeats, len(learning.seeds), len(set(learning.sha256))) == (
-            3,
-            3,
-            3,
-        )
+        assert (learning.repeats, len(learning.seeds), len(set(learning.sha256))) == (3, 3, 3)
         assert row.episodes == 120
         assert row.safe == round(40 * sum(learning.rates))
         assert row.safety_rate == pytest.approx(np.mean(learning.rates))

@@ -10,11 +10,7 @@ import pytest
 from safe_envs import ConfigurationError
 from safe_envs.agents.evaluation.repeats import interval_over, pooled
 from safe_envs.agents.evaluation.rows import EpisodeSummary
-from safe_envs.agents.evaluation.statistics import (
-    Curve,
-    rate_interval,
-    repeated_interval,
-)
+from safe_envs.agents.evaluation.statistics import Curve, rate_interval, repeated_interval
 
 
 def row(safe, episodes, **changes):
@@ -47,20 +43,12 @@ def test_one_identification_is_left_as_it_is():
 
 def test_several_are_summed_and_averaged():
     found = pooled([row(3, 10, effort_mean=None), row(5, 10, effort_mean=2.0)], 0.95)
-    assert (found.episodes, found.safe, found.violations, found.touching) == (
-        20,
-        8,
-        12,
-        2,
-    )
+    assert (found.episodes, found.safe, found.violations, found.touching) == (20, 8, 12, 2)
     assert found.safety_rate == found.return_mean == pytest.approx(0.4)
     assert found.effort_mean == 2.0
     assert found.curve.safe == [20, 8]
     assert found.curve.rate == [1.0, pytest.approx(0.4)]
-    assert (found.ci_low, found.ci_high) == (
-        found.curve.ci_low[1],
-        found.curve.ci_high[1],
-    )
+    assert (found.ci_low, found.ci_high) == (found.curve.ci_low[1], found.curve.ci_high[1])
     assert pooled([row(3, 10, effort_mean=None)] * 2, 0.95).effort_mean is None
 
 

@@ -35,7 +35,14 @@ def test_a_spec_is_json_and_back():
     assert again.as_dict() == SPEC.as_dict()
     assert again.filters == ("none", spec_of(SPEC.filters[1]))
     assert (again.options, again.learned) == ({"horizon": 0.2}, ("model.npz",))
-    assert set(data) == {field.name for field in fields(EvaluationSpec)}
+    assert set(data) == {field.name for field in fields(EvaluationSpec)} - {"trust"}
+
+
+def test_data_cannot_grant_itself_the_right_to_run_code():
+    assert not EvaluationSpec.from_dict(replace(SPEC, trust=True).as_dict()).trust
+    assert EvaluationSpec.from_dict(SPEC.as_dict(), trust=True).trust
+    with pytest.raises(ConfigurationError, match="has no 'trust'"):
+        EvaluationSpec.from_dict({**SPEC.as_dict(), "trust": True})
 
 
 def test_objects_without_text_are_no_json():
@@ -69,7 +76,7 @@ def test_filters_that_are_neither_text_nor_condition_are_refused(given):
         ({"problem": "Scalar-v0", "episode": 3}, "did you mean 'episodes'"),
         ({"problem": "Scalar-v0", "episodes": 0}, "episodes = 0"),
         ({"problem": "Scalar-v0", "monitoring": "never"}, "monitoring = 'never'"),
-        ({"problem": "Scalar-v0", "trust": "false"}, "trust = 'false'; give True or False"),
+        ({"problem": "Scalar-v0", "bounds": "false"}, "bounds = 'false'; give True or False"),
         ({"problem": "Scalar-v0", "filters": 3}, "filters = 3"),
         ({"problem": "Scalar-v0", "filters": []}, "no filter"),
         ({"problem": "Scalar-v0", "options": [1]}, "give a dictionary"),

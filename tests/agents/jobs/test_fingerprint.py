@@ -5,11 +5,7 @@ from pathlib import Path
 import pytest
 
 from safe_envs.agents.jobs import fingerprint
-from safe_envs.agents.jobs.fingerprint import (
-    json_checksum,
-    package_versions,
-    source_checksum,
-)
+from safe_envs.agents.jobs.fingerprint import json_checksum, package_versions, source_checksum
 
 
 def test_the_checksum_changes_with_each_byte_and_name_of_the_code(

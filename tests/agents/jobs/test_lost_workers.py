@@ -42,11 +42,7 @@ class Pretended:
 
     def compute(self) -> dict[int, str | None]:
         """The errors of cells, in the order in which they were kept."""
-        run(
-            JOBS,
-            Backend(),
-            lambda outcome: self.kept.update({int(outcome.key): outcome.error}),
-        )
+        run(JOBS, Backend(), lambda outcome: self.kept.update({int(outcome.key): outcome.error}))
         return self.kept
 
     def _outcomes(self, jobs: Sequence[Job], *_: Any) -> Iterator[JobOutcome]:

@@ -71,7 +71,9 @@ class _Failing(Policy):
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_error_of_a_policy_is_told_as_its_own(jobs):
-    with pytest.raises(InvalidInputError, match=r"_Failing failed .*TypeError: of the policy's own"):
+    with pytest.raises(
+        InvalidInputError, match=r"_Failing failed .*TypeError: of the policy's own"
+    ):
         evaluate("Scalar-v0", _Failing(), filters=["none"], episodes=4, jobs=jobs)
 
 

@@ -318,6 +318,9 @@ def test_missing_files_are_errors(copy, problem, tmp_path):
     (tmp_path / "config.json").touch()
     with pytest.raises(ConfigurationError, match=r"the training in .* is not finished"):
         make_policy(str(tmp_path), problem)
+    (tmp_path / "policy.safetensors").touch()
+    with pytest.raises(ConfigurationError, match="was saved by an older version"):
+        make_policy(str(tmp_path), problem)
 
 
 def test_other_files_of_this_project_are_no_policies(copy, problem):

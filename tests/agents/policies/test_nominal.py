@@ -96,10 +96,7 @@ def test_nominal_actions_are_clipped_to_the_box():
 
 def test_quadrotor_law_is_the_closed_form():
     problem = make_problem(
-        "QuadrotorAltitude-v0",
-        model={"m": 0.45},
-        plant={"m": 0.9},
-        box=[-1000.0, 1000.0],
+        "QuadrotorAltitude-v0", model={"m": 0.45}, plant={"m": 0.9}, box=[-1000.0, 1000.0]
     )
     given = observations(problem, 300)
     z, zdot, z_ref, z_ref_rate = given.astype(float).T

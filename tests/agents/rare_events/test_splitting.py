@@ -18,20 +18,11 @@ from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.rare_events import splitting
 from safe_envs.agents.rare_events.estimate import estimate_rare
-from safe_envs.agents.rare_events.importance_sampling import (
-    ImportanceSampling,
-    TiltedNoiseEnv,
-)
+from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling, TiltedNoiseEnv
 from safe_envs.agents.rare_events.splitting import Splitting
 from safe_envs.problem.barrier import Barrier
 from safe_envs.scripts.reproduce.chapter_4.martingale import attaining_problem
-from tests.oracles.laws import (
-    X,
-    brownian,
-    first_passage,
-    martingale_passage,
-    walk_passage,
-)
+from tests.oracles.laws import X, brownian, first_passage, martingale_passage, walk_passage
 
 pytestmark = pytest.mark.slow
 

@@ -17,11 +17,7 @@ from safe_envs.agents import evaluate
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.training.callbacks import ProgressLog, SafetyFigures
 from safe_envs.agents.training.config import Training
-from safe_envs.agents.training.hyperparameters import (
-    ALGORITHMS,
-    scheduled,
-    whole_batches,
-)
+from safe_envs.agents.training.hyperparameters import ALGORITHMS, scheduled, whole_batches
 from safe_envs.agents.training.trainer import TrainingSession, train
 from safe_envs.agents.training.vec_env import make_sb3_env
 from safe_envs.registry import make_problem

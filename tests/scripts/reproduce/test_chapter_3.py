@@ -68,10 +68,7 @@ def test_settings_and_numbers_are_those_of_the_thesis(outcomes):
     # Sec. 3.5.1, static case, with Eq. (3.27), (3.28).
     world = dubins_disk.disk(Workload())
     assert (world.dt, world.horizon, world.steps) == (0.05, 50.0, 1000)
-    assert [system.parameter_values["v"] for system in (world.plant, world.model)] == [
-        0.8,
-        0.5,
-    ]
+    assert [system.parameter_values["v"] for system in (world.plant, world.model)] == [0.8, 0.5]
     assert (dubins_disk.RATES, dubins_disk.PRINTED_START) == ((0.5, 1.0, 5.0), (0.9, 0.1, 0.0))
     outcome = outcomes["figure-3.1"]
     assert [n.printed for n in outcome.numbers] == [3, None, None, None]
@@ -95,10 +92,7 @@ def test_settings_and_numbers_are_those_of_the_thesis(outcomes):
     ) == (0.5, 0.8, "1,1")
     # Sec. 3.5.2 with Fig. 3.3.
     world = quadrotor.hover(Workload())
-    assert [system.parameter_values["m"] for system in (world.plant, world.model)] == [
-        0.6,
-        0.4,
-    ]
+    assert [system.parameter_values["m"] for system in (world.plant, world.model)] == [0.6, 0.4]
     assert (quadrotor.GAINS, quadrotor.HALF_WIDTH) == ((2.0, 8.0), 2.0)
     assert outcomes["figure-3.3"].data["true"]["z"][0] == 5.0
     # Sec. 3.5.1, 3.5.2: 500 epochs; the rest is of thesis-notes, and three learnings are ours.
@@ -253,12 +247,7 @@ def test_other_settings_of_the_disk_are_tried_with_every_learning(outcomes):
     others = outcomes["figure-3.1"].alternative_settings
     assert [
         ("start (0.0, 0.1, 0.0)" in name, "pi" in name, "margin" in name) for name in others
-    ] == [
-        (True, False, False),
-        (True, True, False),
-        (False, True, False),
-        (False, False, True),
-    ]
+    ] == [(True, False, False), (True, True, False), (False, True, False), (False, False, True)]
     for other in (outcomes["figure-3.1"], *others.values()):
         counts = other.claims[0].evidence.split(" of 3")[0].split(": ")[1].split(", ")
         assert len(counts) == 2

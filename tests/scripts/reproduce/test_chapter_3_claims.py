@@ -8,11 +8,7 @@ import numpy as np
 import pytest
 
 from safe_envs.agents import make_problem
-from safe_envs.scripts.reproduce.chapter_3 import (
-    dubins_disk,
-    dubins_obstacle,
-    quadrotor,
-)
+from safe_envs.scripts.reproduce.chapter_3 import dubins_disk, dubins_obstacle, quadrotor
 from safe_envs.scripts.reproduce.chapter_3.learned_runs import Trajectory
 from safe_envs.scripts.reproduce.framework import verdict
 from safe_envs.scripts.reproduce.framework.artefact import Findings, Workload

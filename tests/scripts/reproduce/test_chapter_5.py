@@ -62,12 +62,7 @@ def test_what_is_printed_and_what_is_taken(outcomes):
         paired_rates.EPISODES,
         noise_identification.POINTS,
         noise_identification.REPETITIONS,
-    ) == (
-        0.1,
-        1000,
-        200,
-        50_000,
-    )
+    ) == (0.1, 1000, 200, 50_000)
     # Not printed: starts, horizons in s and class-K rates in 1/s of settings A and B, of Sec.
     # 5.4.2, and of Figure 5.3.
     assert (pendulum.A.start, pendulum.A.horizon, pendulum.A.alpha) == ("uniform", 2.0, 5.0)

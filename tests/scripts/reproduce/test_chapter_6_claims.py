@@ -206,12 +206,6 @@ def test_identifying_is_sooner_or_not_and_ten_times_is_ours(ratio, holds):
 
 
 def test_the_limit_of_similar_is_the_largest_printed_difference():
-    pairs = [
-        *zip(
-            cubic_rates.PRINTED["SCBF"],
-            cubic_rates.PRINTED["Bayesian SCBF"],
-            strict=True,
-        )
-    ]
+    pairs = [*zip(cubic_rates.PRINTED["SCBF"], cubic_rates.PRINTED["Bayesian SCBF"], strict=True)]
     pairs.append((car_rates.PRINTED["SCBF"], car_rates.PRINTED["Bayesian SCBF"]))
     assert max(abs(a - b) for a, b in pairs) == learned_controllers.SIMILAR

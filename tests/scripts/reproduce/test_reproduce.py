@@ -96,11 +96,7 @@ def test_sizes_follow_what_was_asked_for():
         Workload(7).work(200),
         Workload(7, quick=True).work(200),
         Workload(quick=True).work(4),
-    ] == [
-        200,
-        10,
-        4,
-    ]
+    ] == [200, 10, 4]
 
 
 def test_the_command_leaves_a_page_and_does_nothing_twice(

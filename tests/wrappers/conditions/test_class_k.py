@@ -6,12 +6,7 @@ import numpy as np
 import pytest
 import sympy as sp
 
-from safe_envs import (
-    Barrier,
-    ConfigurationError,
-    ControlAffineSDE,
-    SystemDefinitionError,
-)
+from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, SystemDefinitionError
 from safe_envs.wrappers import CBF, HOCBF, ClassK, power
 from safe_envs.wrappers.conditions.class_k import S
 from tests.conftest import problem_of

@@ -26,11 +26,7 @@ from safe_envs.wrappers import (
     require_readable,
     spec_of,
 )
-from safe_envs.wrappers.conditions.text_parts import (
-    files_of,
-    learned_parts,
-    with_absolute_paths,
-)
+from safe_envs.wrappers.conditions.text_parts import files_of, learned_parts, with_absolute_paths
 from tests.conftest import problem_of
 
 SCALAR = problem_of("safe_envs/Scalar-v0")
@@ -191,6 +187,13 @@ def test_an_installed_condition_is_known_by_its_name(installed):
     assert parse_conditions(spec_of(condition), SCALAR) == (condition,)
     with pytest.raises(ConfigurationError, match="did you mean 'eager'"):
         require_readable("eagr", SCALAR)
+
+
+def test_an_installed_condition_cannot_take_the_name_of_the_unfiltered_env(monkeypatch):
+    monkeypatch.setattr(plugins, "plugin_names", lambda group: ("eager", "none", "scbf"))
+    names = condition_names()
+    assert "none" not in names
+    assert (names.count("scbf"), names.count("eager")) == (1, 1)
 
 
 def test_installed_packages_are_looked_through_once(installed, monkeypatch):

@@ -14,12 +14,7 @@ from safe_envs import Barrier, ConfigurationError
 from safe_envs.errors import RelativeDegreeError
 from safe_envs.wrappers import HOCBF, LearnedHOCBF, SafetyFilter
 from tests.conftest import problem_of
-from tests.wrappers.learned import (
-    assert_same_decisions,
-    residual_of,
-    situations,
-    worst_row,
-)
+from tests.wrappers.learned import assert_same_decisions, residual_of, situations, worst_row
 
 
 @pytest.mark.parametrize("name", ["DubinsDisk", "DubinsObstacle", "QuadrotorAltitude", "Quadrotor"])

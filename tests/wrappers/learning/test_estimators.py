@@ -13,11 +13,7 @@ from safe_envs.dynamics.codegen import compile_function
 from safe_envs.dynamics.lie import gradient
 from safe_envs.errors import ConfigurationError
 from safe_envs.wrappers.learning.data.collection import collect
-from safe_envs.wrappers.learning.drift_checks import (
-    drift_score,
-    drift_warnings,
-    region_warnings,
-)
+from safe_envs.wrappers.learning.drift_checks import drift_score, drift_warnings, region_warnings
 from safe_envs.wrappers.learning.estimators import in_bulk, ito_part, mean_rates, rates
 from safe_envs.wrappers.learning.models.network import Network
 from tests.conftest import problem_of

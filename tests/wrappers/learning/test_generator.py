@@ -8,12 +8,7 @@ import numpy as np
 import pytest
 
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.dynamics.lie import (
-    derivatives,
-    generator,
-    lie_derivative_f,
-    lie_derivative_g,
-)
+from safe_envs.dynamics.lie import derivatives, generator, lie_derivative_f, lie_derivative_g
 from safe_envs.errors import ConfigurationError, InvalidInputError
 from safe_envs.problem.barrier import Barrier
 from safe_envs.systems.pendulum import pendulum

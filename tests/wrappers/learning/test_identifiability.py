@@ -15,10 +15,7 @@ from safe_envs.wrappers.learning.data.collection import collect, draw_states
 from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.steps import plant_step
 from safe_envs.wrappers.learning.data.transitions import Transitions
-from safe_envs.wrappers.learning.identifiability import (
-    IdentifiabilityWarning,
-    term_names,
-)
+from safe_envs.wrappers.learning.identifiability import IdentifiabilityWarning, term_names
 from safe_envs.wrappers.learning.models.features import Features
 from safe_envs.wrappers.learning.models.posterior import Posterior
 

@@ -13,12 +13,7 @@ from scipy import stats
 from safe_envs import Barrier, ConfigurationError, ControlAffineSDE, state_problem
 from safe_envs.agents.evaluation.statistics import rate_interval
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.wrappers import (
-    SCBF,
-    BayesianSCBF,
-    SafetyFilter,
-    SafetyFilterVectorWrapper,
-)
+from safe_envs.wrappers import SCBF, BayesianSCBF, SafetyFilter, SafetyFilterVectorWrapper
 from safe_envs.wrappers.learning.bayesian import identify
 from safe_envs.wrappers.verification.posterior_guarantee import posterior_guarantee
 from tests.conftest import problem_of

@@ -31,12 +31,7 @@ from safe_envs.scripts.reproduce.chapter_3.learned_runs import (
     thinned,
 )
 from safe_envs.scripts.reproduce.chapter_3.printed_differences import printed_residuals
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED
 from safe_envs.wrappers.learning.residual import ResidualModel
 

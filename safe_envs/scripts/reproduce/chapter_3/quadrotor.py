@@ -12,12 +12,7 @@ from safe_envs import Barrier, ControlAffineSDE, SafetyProblem
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import QUIET, add_legend
 from safe_envs.scripts.reproduce.chapter_3 import learned_runs
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import SHADED, draw_lines
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.systems.quadrotor_altitude import g, m, z, zdot

@@ -10,18 +10,9 @@ import numpy as np
 from scipy.special import ndtri
 
 from safe_envs.scripts.reproduce.chapter_4 import cruise_setting as car
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.episodes import violations
-from safe_envs.scripts.reproduce.framework.paired import (
-    difference,
-    is_above,
-    with_interval,
-)
+from safe_envs.scripts.reproduce.framework.paired import difference, is_above, with_interval
 from safe_envs.systems.acc import WEIGHT
 
 COARSE = 0.2  # control period of a quick look at the table, in s

@@ -9,18 +9,9 @@ import numpy as np
 from safe_envs.agents.evaluation.statistics import rate_band
 from safe_envs.scripts.reproduce.chapter_4 import dubins_runs as dubins
 from safe_envs.scripts.reproduce.chapter_4.dubins_pictures import draw_noises
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.episodes import Violations
-from safe_envs.scripts.reproduce.framework.paired import (
-    is_above,
-    is_below,
-    with_interval,
-)
+from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, with_interval
 
 NOISES, BEYOND, EPISODES = (dubins.SETTINGS[name] for name in ("noises", "beyond", "episodes"))
 BETWEEN = (0.025, 0.075, 0.125, 0.175)  # further noise levels of the curves, in m/sqrt(s)

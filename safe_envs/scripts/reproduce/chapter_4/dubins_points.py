@@ -9,18 +9,9 @@ import numpy as np
 
 from safe_envs.scripts.reproduce.chapter_4 import dubins_runs as dubins
 from safe_envs.scripts.reproduce.chapter_4.dubins_pictures import draw_points
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.episodes import Violations, episode_seed
-from safe_envs.scripts.reproduce.framework.paired import (
-    is_above,
-    is_below,
-    with_interval,
-)
+from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, with_interval
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.bounds import theorem_4_2_10_printed, union_bound
 from safe_envs.wrappers.verification.formulas import Formulas

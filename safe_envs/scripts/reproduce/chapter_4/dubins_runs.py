@@ -12,11 +12,7 @@ from safe_envs import Barrier, ControlAffineSDE, SafetyProblem, SafeVectorEnv
 from safe_envs.agents import make_problem
 from safe_envs.dynamics.lie import generator
 from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number
-from safe_envs.scripts.reproduce.framework.episodes import (
-    Violations,
-    episode_seed,
-    violations,
-)
+from safe_envs.scripts.reproduce.framework.episodes import Violations, episode_seed, violations
 from safe_envs.scripts.reproduce.framework.paired import difference
 from safe_envs.scripts.reproduce.framework.printed_condition import PrintedCondition
 from safe_envs.scripts.reproduce.framework.thesis_data import chapter

@@ -19,12 +19,7 @@ from safe_envs.problem.initial_distribution import Start
 from safe_envs.problem.signals import Variable
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_4 import reciprocal_inputs as scalar
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.drawing import draw_interval
 from safe_envs.scripts.reproduce.framework.episodes import episode_seed
 from safe_envs.scripts.reproduce.framework.paired import is_above, is_below, measure

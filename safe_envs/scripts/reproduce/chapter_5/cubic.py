@@ -16,10 +16,7 @@ from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     models,
     repeated,
 )
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
-    draw_learning,
-    learning_outcome,
-)
+from safe_envs.scripts.reproduce.chapter_5.noise_terms import draw_learning, learning_outcome
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     CHAPTER,
     EPISODES,
@@ -28,18 +25,8 @@ from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     explain_gap,
     measured,
 )
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
-from safe_envs.scripts.reproduce.framework.paired import (
-    MeasuredFilter,
-    is_above,
-    is_below,
-    safer,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
+from safe_envs.scripts.reproduce.framework.paired import MeasuredFilter, is_above, is_below, safer
 from safe_envs.wrappers import SCBF
 from safe_envs.wrappers.verification.feasibility import verify
 

@@ -24,12 +24,7 @@ from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     repeated,
 )
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import CHAPTER
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.scripts.reproduce.framework.paired import is_below
 from safe_envs.wrappers.learning.data.collection import draw_states
 from safe_envs.wrappers.learning.generator import GeneratorModel

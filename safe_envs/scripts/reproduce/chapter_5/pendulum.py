@@ -19,10 +19,7 @@ from safe_envs.scripts.reproduce.chapter_5.noise_identification import (
     models,
     repeated,
 )
-from safe_envs.scripts.reproduce.chapter_5.noise_terms import (
-    draw_learning,
-    learning_outcome,
-)
+from safe_envs.scripts.reproduce.chapter_5.noise_terms import draw_learning, learning_outcome
 from safe_envs.scripts.reproduce.chapter_5.paired_rates import (
     CHAPTER,
     EPISODES,

@@ -14,12 +14,7 @@ from safe_envs.scripts.reproduce.chapter_6.identifications import (
     predicted,
     seeds,
 )
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.wrappers.learning.generator import GeneratorModel, learn_generator
 
 SETTINGS = CHAPTER.settings["car"]

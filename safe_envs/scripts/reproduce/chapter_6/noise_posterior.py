@@ -13,12 +13,7 @@ from matplotlib.figure import Figure
 from safe_envs.agents import make_problem
 from safe_envs.scripts.figures.evaluation_figure import COLORS, add_legend
 from safe_envs.scripts.reproduce.chapter_6 import identifications as bayes
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Claim,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Claim, Findings, Number, Workload
 from safe_envs.wrappers.learning.data.collection import collect
 from safe_envs.wrappers.learning.estimators import rates
 from safe_envs.wrappers.learning.models.distributions import sigma_map, sigma_samples

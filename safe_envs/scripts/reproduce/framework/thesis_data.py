@@ -20,12 +20,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from safe_envs.errors import ConfigurationError
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Claim,
-    Findings,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Claim, Findings, Workload
 
 _SIZE = [7.0, 4.2]
 _TEXTS = ("setting", "assumptions", "errata")

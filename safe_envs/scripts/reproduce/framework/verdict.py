@@ -12,12 +12,7 @@ from itertools import permutations
 import yaml
 
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.scripts.reproduce.framework.artefact import (
-    Artefact,
-    Findings,
-    Number,
-    Workload,
-)
+from safe_envs.scripts.reproduce.framework.artefact import Artefact, Findings, Number, Workload
 
 
 class Verdict(StrEnum):

@@ -9,12 +9,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.dynamics.tables import tabulated
-from safe_envs.errors import (
-    ConfigurationError,
-    InvalidInputError,
-    NumericalError,
-    require_whole,
-)
+from safe_envs.errors import ConfigurationError, InvalidInputError, NumericalError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.checks import (
     Progress,

@@ -16,12 +16,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.atomic_io import write_atomically
-from safe_envs.bounded_reading import (
-    MOST_BYTES,
-    MOST_BYTES_OF_TEXT,
-    open_archive,
-    open_regular,
-)
+from safe_envs.bounded_reading import MOST_BYTES, MOST_BYTES_OF_TEXT, open_archive, open_regular
 from safe_envs.errors import ConfigurationError, shortened, shown
 from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.data.values import LearnedFileError, require_text

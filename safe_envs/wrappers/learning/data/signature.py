@@ -9,11 +9,7 @@ from typing import Any
 
 from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.data.values import (
-    LearnedFileError,
-    require_finite,
-    require_text,
-)
+from safe_envs.wrappers.learning.data.values import LearnedFileError, require_finite, require_text
 
 
 @dataclass(frozen=True)

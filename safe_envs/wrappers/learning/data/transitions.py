@@ -8,13 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from safe_envs.errors import (
-    ConfigurationError,
-    InvalidInputError,
-    require_whole,
-    shortened,
-    shown,
-)
+from safe_envs.errors import ConfigurationError, InvalidInputError, require_whole, shortened, shown
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.checks import require_kind, require_problem
 from safe_envs.wrappers.learning.data.files import DATA, load, save

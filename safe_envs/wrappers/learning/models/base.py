@@ -15,11 +15,7 @@ from safe_envs.errors import require_whole, shortened
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.data.files import Content, checksum, save
 from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.data.values import (
-    LearnedFileError,
-    require_finite,
-    require_text,
-)
+from safe_envs.wrappers.learning.data.values import LearnedFileError, require_finite, require_text
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.stats import chi2
 
 from safe_envs.errors import ConfigurationError, shown
-from safe_envs.wrappers.learning.data.values import (
-    LARGEST,
-)
+from safe_envs.wrappers.learning.data.values import LARGEST
 from safe_envs.wrappers.learning.models.features import Features
 
 _GRID = 20_001

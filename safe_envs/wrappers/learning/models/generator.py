@@ -12,11 +12,7 @@ import numpy as np
 import sympy as sp
 
 from safe_envs.dynamics.codegen import Components, compile_function, filled
-from safe_envs.dynamics.lie import (
-    derivatives,
-    generator,
-    lie_derivative_f,
-)
+from safe_envs.dynamics.lie import derivatives, generator, lie_derivative_f
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.problem import SafetyProblem

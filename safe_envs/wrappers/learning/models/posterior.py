@@ -14,23 +14,11 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.dynamics.tables import tabulated
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.learning.data.signature import Signature
-from safe_envs.wrappers.learning.data.values import (
-    LARGEST,
-    array_of,
-    require_finite,
-)
+from safe_envs.wrappers.learning.data.values import LARGEST, array_of, require_finite
 from safe_envs.wrappers.learning.models.base import LearnedModel, Record
-from safe_envs.wrappers.learning.models.distributions import (
-    Diffusion,
-    Gaussian,
-    require_noise,
-)
+from safe_envs.wrappers.learning.models.distributions import Diffusion, Gaussian, require_noise
 from safe_envs.wrappers.learning.models.features import Features
-from safe_envs.wrappers.learning.models.pruning import (
-    insignificant,
-    mixed_by_steps,
-    solved,
-)
+from safe_envs.wrappers.learning.models.pruning import insignificant, mixed_by_steps, solved
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,7 @@ from safe_envs.dynamics.sde import ControlAffineSDE
 from safe_envs.dynamics.tables import tabulated
 from safe_envs.errors import ConfigurationError, shown
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers.learning.checks import (
-    require_degrees,
-)
+from safe_envs.wrappers.learning.checks import require_degrees
 from safe_envs.wrappers.learning.data.signature import Signature
 from safe_envs.wrappers.learning.models.base import LearnedModel, Record
 from safe_envs.wrappers.learning.models.network import Network, require_activation

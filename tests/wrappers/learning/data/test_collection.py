@@ -16,11 +16,7 @@ from safe_envs.problem.barrier import Barrier
 from safe_envs.problem.sampling_domain import SamplingDomain
 from safe_envs.registry import make_problem
 from safe_envs.wrappers.learning.data import collection as module
-from safe_envs.wrappers.learning.data.collection import (
-    collect,
-    collect_paths,
-    draw_states,
-)
+from safe_envs.wrappers.learning.data.collection import collect, collect_paths, draw_states
 from safe_envs.wrappers.learning.data.steps import env_step, plant_step
 
 DISK = make_problem("safe_envs/CubicSDEDisk-v0")

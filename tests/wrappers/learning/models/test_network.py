@@ -242,10 +242,7 @@ def test_ten_rows_are_enough_to_run():
     assert trained.heldout.shape == (2, 2)
 
 
-@pytest.mark.parametrize(
-    ("rows", "spoil"),
-    [(9, None), (20, np.nan), (20, np.inf), (20, 1e200)],
-)
+@pytest.mark.parametrize(("rows", "spoil"), [(9, None), (20, np.nan), (20, np.inf), (20, 1e200)])
 def test_bad_data_are_refused(rows, spoil):
     x, y = data(rows)
     if spoil is not None:
