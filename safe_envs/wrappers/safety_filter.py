@@ -192,16 +192,17 @@ class SafetyFilter(ComponentFilter):
             decision = self._decide(states, inputs)
             barriers = self._barriers_arrays(*states)
             action, margin, active, feasible, slack, cause, proposed, _ = decision
-            action, margin, active, slack, proposed, barrier = [
+            given = () if proposed is inputs else (proposed,)
+            action, margin, active, slack, barrier, *goal = [
                 stacked(part, len(inputs[0])).reshape(*batch, len(part))
-                for part in (action, margin, active, slack, proposed, barriers)
+                for part in (action, margin, active, slack, barriers, *given)
             ]
             if not finite(barrier.T):
                 self._require_values(barrier.reshape(-1, len(barriers)), states)
         cause = np.broadcast_to(cause, len(inputs[0])).reshape(batch)
         cause, feasible = np.where(active.any(axis=-1), cause, -1), feasible.reshape(batch)
         return FilterDecision(
-            action, margin, active > 0.0, feasible, slack, cause, proposed, barrier
+            action, margin, active > 0.0, feasible, slack, cause, goal[0] if goal else u, barrier
         )
 
     def _filter_one(self, x: np.ndarray, u: np.ndarray) -> FilterDecision:
