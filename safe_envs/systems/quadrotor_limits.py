@@ -6,10 +6,11 @@ import math
 
 import sympy as sp
 
-from safe_envs import Barrier, SafetyProblem
 from safe_envs.envs.system_env import SystemEnv
 from safe_envs.errors import ConfigurationError
 from safe_envs.number_text import finite_number
+from safe_envs.problem.barrier import Barrier
+from safe_envs.problem.problem import SafetyProblem
 from safe_envs.problem.signals import TIME, Feature
 from safe_envs.systems._common import around, uniforms
 from safe_envs.systems.quadrotor import (
