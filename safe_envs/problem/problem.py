@@ -62,8 +62,8 @@ class SafetyProblem:
         scene: how the problem is drawn, a name of `safe_envs.rendering.scenes`; "" for the drawing
             that fits every problem.
         clf: the task as a soft goal, if it is one.
-        explored: where and how the system is excited to learn from it, as far as the defaults do
-            not suit; see `exploration`.
+        sampling: where and how the system is excited to learn from it, as far as the defaults do
+            not suit; see `sampling_domain`.
 
     Raises:
         SystemDefinitionError: the parts do not fit together.
@@ -90,7 +90,7 @@ class SafetyProblem:
     plane: tuple[str, str] | None = None
     scene: str = ""
     clf: CLF | None = None
-    explored: SamplingDomain = field(default_factory=SamplingDomain)
+    sampling: SamplingDomain = field(default_factory=SamplingDomain)
     box: tuple[tuple[float, float], ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -143,19 +143,19 @@ class SafetyProblem:
                     f" {_WIDEST:g}, the lower one below the upper. Unbounded control is a wide box"
                 )
         self._check_timing()
-        for coordinate in self.explored.coordinates:
+        for coordinate in self.sampling.coordinates:
             plant.require_known(
-                "a coordinate of the exploration", coordinate.free_symbols, plant.states
+                "a coordinate of the sampling domain", coordinate.free_symbols, plant.states
             )
 
     @cached_property
-    def exploration(self) -> SamplingDomain:
+    def sampling_domain(self) -> SamplingDomain:
         """Where and how the system is excited to learn from it, complete.
 
         Raises:
-            SystemDefinitionError: a state without a finite range has none in `explored` either.
+            SystemDefinitionError: a state without a finite range has none in `sampling` either.
         """
-        return self.explored.completed(self.states, self.box)
+        return self.sampling.completed(self.states, self.box)
 
     def _check_feature_names(self) -> None:
         """Check that a symbol of the nominal controller means one thing."""

@@ -16,7 +16,7 @@ from safe_envs.problem.signals import Variable
 class SamplingDomain:
     """Where and how a system is excited to learn from it.
 
-    `SafetyProblem.exploration` completes what is empty.
+    `SafetyProblem.sampling_domain` completes what is empty.
 
     Attributes:
         region: (low, high) of each state. States are drawn uniformly from it, where every barrier
@@ -54,7 +54,7 @@ class SamplingDomain:
         )
         if len(region) != len(states):
             raise SystemDefinitionError(
-                f"the region of an exploration has {len(region)} ranges for {len(states)} states"
+                f"the region of a sampling domain has {len(region)} ranges for {len(states)} states"
             )
         for state, (low, high) in zip(states, region, strict=True):
             if not (math.isfinite(low) and math.isfinite(high) and low < high):
@@ -64,7 +64,8 @@ class SamplingDomain:
                 )
         if any(len(u) != len(box) or not all(map(math.isfinite, u)) for u in self.inputs):
             raise SystemDefinitionError(
-                f"an input of an exploration needs {len(box)} finite numbers; given {self.inputs}"
+                f"an input of a sampling domain needs {len(box)} finite numbers; given"
+                f" {self.inputs}"
             )
         clipped = tuple(
             tuple(min(max(v, low), high) for v, (low, high) in zip(u, box, strict=True))

@@ -125,7 +125,7 @@ def acc(*, tau: float = 1.8, rate: float = 5.0, slack_weight: float = 0.02) -> S
         gains=(1.0,),
         plane=("x_1", "x_3"),
         scene="road",
-        explored=SamplingDomain(
+        sampling=SamplingDomain(
             region=((10.0, 25.0), (15.0, 25.0), (20.0, 200.0)), inputs=((-4000.0,), (4000.0,))
         ),
     )

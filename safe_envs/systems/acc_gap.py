@@ -88,7 +88,7 @@ def acc_gap(
         gains=(1.0, 1.0),
         plane=("v", "z"),
         scene="road",
-        explored=SamplingDomain(region=((8.0, 24.0), (10.0, 32.0)), inputs=((-4000.0,), (4000.0,))),
+        sampling=SamplingDomain(region=((8.0, 24.0), (10.0, 32.0)), inputs=((-4000.0,), (4000.0,))),
     )
 
 

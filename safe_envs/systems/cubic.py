@@ -84,7 +84,7 @@ def cubic_sde(
         starts={"near-edge": uniform_box((-1.0, 0.0), (2.0, 2.0), sp.Min(h, 0.5 - h))},
         horizon=2.0,
         noise=("k",),
-        explored=SamplingDomain(region=((-1.0, 1.0), (-1.0, 1.0)), inputs=((-1.0,), (1.0,))),
+        sampling=SamplingDomain(region=((-1.0, 1.0), (-1.0, 1.0)), inputs=((-1.0,), (1.0,))),
     )
 
 
@@ -114,7 +114,7 @@ def cubic_sde_disk(*, radius: float = 1.0) -> SafetyProblem:
         },
         horizon=1.0,
         noise=("sigma_1", "sigma_2"),
-        explored=SamplingDomain(region=((-r, r), (-r, r)), inputs=((-1.0,), (1.0,))),
+        sampling=SamplingDomain(region=((-r, r), (-r, r)), inputs=((-1.0,), (1.0,))),
     )
 
 

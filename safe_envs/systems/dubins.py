@@ -128,7 +128,7 @@ def disk_problem(
         nominal=(turn_rate,),
         starts={**starts, "uniform": Start(anywhere(r), UNIFORMS)},
         **SHOWN,
-        explored=SamplingDomain(region=((-r, r), (-r, r), (-math.pi, math.pi))),
+        sampling=SamplingDomain(region=((-r, r), (-r, r), (-math.pi, math.pi))),
         **rest,
     )
 

@@ -128,7 +128,7 @@ def dubins_obstacle(*, radius: float = 0.5) -> SafetyProblem:
         gains=(1.0, 1.0),
         filter="hocbf",
         **SHOWN,
-        explored=SamplingDomain(
+        sampling=SamplingDomain(
             region=((-3.0, 4.0), (-3.0, 3.0), (-math.pi, math.pi), (-2.0, 7.0), (-1.0, 1.0)),
             coordinates=(sp.cos(theta), sp.sin(theta), x_o - x, y_o - y),
         ),

@@ -74,7 +74,7 @@ def pendulum(*, level: float = 0.2) -> SafetyProblem:
         filter="scbf",
         plane=("theta", "thetadot"),
         scene="pendulum",
-        explored=SamplingDomain(region=((-reach, reach), (-reach, reach))),
+        sampling=SamplingDomain(region=((-reach, reach), (-reach, reach))),
     )
 
 

@@ -168,7 +168,7 @@ def quadrotor_full(*, center: float = 5.0, half_width: float = 2.0) -> SafetyPro
             ),
             "thesis": start_at({z: 5}),
         },
-        explored=SamplingDomain(
+        sampling=SamplingDomain(
             region=tuple(
                 {
                     z: (center - half_width, center + half_width),

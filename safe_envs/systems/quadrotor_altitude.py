@@ -122,7 +122,7 @@ def quadrotor_altitude(*, center: float = 5.0, half_width: float = 2.0) -> Safet
         noise=("sigma_z",),
         plane=("z", "zdot"),
         scene="altitude",
-        explored=SamplingDomain(region=((center - half_width, center + half_width), CLIMB_RATES)),
+        sampling=SamplingDomain(region=((center - half_width, center + half_width), CLIMB_RATES)),
     )
 
 

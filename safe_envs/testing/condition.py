@@ -121,7 +121,7 @@ def _states(problem: SafetyProblem, count: int, rng: np.random.Generator, seed: 
     """Draw states where the problem is explored, inside and outside the safe set, and starts."""
     starts = draw_starts(problem, count, seed)
     try:
-        low, high = np.array(problem.exploration.region).T
+        low, high = np.array(problem.sampling_domain.region).T
     except SystemDefinitionError:
         return starts
     return np.where(rng.random((count, 1)) < 0.5, rng.uniform(low, high, starts.shape), starts)

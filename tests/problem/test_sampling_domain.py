@@ -19,20 +19,20 @@ x, theta, w = sp.symbols("x theta w", real=True)
 
 
 def bare(**changes):
-    """The disk, of whose exploration nothing is said."""
-    return replace(DISK, **{"explored": SamplingDomain(), **changes})
+    """The disk, of whose domain nothing is said."""
+    return replace(DISK, **{"sampling": SamplingDomain(), **changes})
 
 
 def test_defaults_are_the_workspace_and_halfway_inputs():
-    exploration = bare().exploration
-    assert exploration.region == ((-2.0, 2.0), (-2.0, 2.0))
-    assert exploration.inputs == ((-5.0,), (5.0,))
-    assert exploration.coordinates == DISK.plant.states
+    domain = bare().sampling_domain
+    assert domain.region == ((-2.0, 2.0), (-2.0, 2.0))
+    assert domain.inputs == ((-5.0,), (5.0,))
+    assert domain.coordinates == DISK.plant.states
 
 
 def test_what_is_given_is_kept():
     given = SamplingDomain(((0.0, 1.0), (-1.0, 0.0)), ((0.5,),), (DISK.plant.states[0] ** 2,))
-    assert bare(explored=given).exploration == given
+    assert bare(sampling=given).sampling_domain == given
 
 
 def test_an_angle_is_explored_over_a_whole_turn():
@@ -48,14 +48,16 @@ def test_only_unbounded_radians_are_angles():
     turning = bare(
         states=(Variable(x_1, -1.0, 1.0, "rad"), Variable(x_2, -math.inf, math.inf, "rad"))
     )
-    assert turning.exploration.region == ((-1.0, 1.0), (-math.pi, math.pi))
-    assert turning.exploration.coordinates == (x_1, sp.cos(x_2), sp.sin(x_2))
+    assert turning.sampling_domain.region == ((-1.0, 1.0), (-math.pi, math.pi))
+    assert turning.sampling_domain.coordinates == (x_1, sp.cos(x_2), sp.sin(x_2))
     with pytest.raises(SystemDefinitionError, match=r"cannot explore x_2 in \[-inf, inf\]"):
         _ = bare(
             states=(Variable(x_1, -1.0, 1.0), Variable(x_2, -math.inf, math.inf, "m"))
-        ).exploration
+        ).sampling_domain
     with pytest.raises(SystemDefinitionError, match=r"cannot explore x_2 in \[0\.0, inf\]"):
-        _ = bare(states=(Variable(x_1, -1.0, 1.0), Variable(x_2, 0.0, math.inf, "rad"))).exploration
+        _ = bare(
+            states=(Variable(x_1, -1.0, 1.0), Variable(x_2, 0.0, math.inf, "rad"))
+        ).sampling_domain
 
 
 def test_each_input_goes_halfway_with_the_others_at_the_centre():
@@ -74,22 +76,26 @@ def test_each_input_goes_halfway_with_the_others_at_the_centre():
         ),
         (SamplingDomain(region=((0.0, 1.0), (math.nan, 1.0))), "cannot explore x_2"),
         (SamplingDomain(region=((0.0, 1.0), (1.0, 1.0))), r"cannot explore x_2 in \[1\.0, 1\.0\]"),
-        (SamplingDomain(inputs=((1.0, 2.0),)), "an input of an exploration needs 1 finite numbers"),
-        (SamplingDomain(inputs=((1.0,), ())), "an input of an exploration needs 1 finite numbers"),
-        (SamplingDomain(coordinates=(w,)), r"(?s)a coordinate of the exploration.*w"),
+        (
+            SamplingDomain(inputs=((1.0, 2.0),)),
+            "an input of a sampling domain needs 1 finite numbers",
+        ),
+        (
+            SamplingDomain(inputs=((1.0,), ())),
+            "an input of a sampling domain needs 1 finite numbers",
+        ),
+        (SamplingDomain(coordinates=(w,)), r"(?s)a coordinate of the sampling domain.*w"),
     ],
 )
 def test_what_does_not_fit_is_refused(given, message):
     with pytest.raises(SystemDefinitionError, match=message):
-        _ = bare(explored=given).exploration
+        _ = bare(sampling=given).sampling_domain
 
 
 def test_every_problem_can_be_explored(env_id):
     problem = make_problem(env_id)
-    exploration = problem.exploration
-    assert len(exploration.region) == len(problem.states)
+    domain = problem.sampling_domain
+    assert len(domain.region) == len(problem.states)
     low, high = np.array(problem.box).T
-    assert all(((low <= u) & (u <= high)).all() for u in np.array(exploration.inputs))
-    assert set().union(*(c.free_symbols for c in exploration.coordinates)) <= set(
-        problem.plant.states
-    )
+    assert all(((low <= u) & (u <= high)).all() for u in np.array(domain.inputs))
+    assert set().union(*(c.free_symbols for c in domain.coordinates)) <= set(problem.plant.states)

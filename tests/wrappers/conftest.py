@@ -41,7 +41,7 @@ def rotors():
 
 @pytest.fixture(scope="session")
 def residual(disk):
-    rng, coordinates = np.random.default_rng(0), disk.exploration.coordinates
+    rng, coordinates = np.random.default_rng(0), disk.sampling_domain.coordinates
     network, heldout = (
         some_network(rng, len(coordinates), 3, "relu"),
         abs(rng.normal(size=(40, 3))) * 0.05,
@@ -55,7 +55,7 @@ def residual(disk):
 
 @pytest.fixture(scope="session")
 def network(top):
-    coordinates = top.exploration.coordinates
+    coordinates = top.sampling_domain.coordinates
     network = some_network(np.random.default_rng(1), len(coordinates), 1, "tanh")
     return GeneratorModel(
         Signature.of(top), NO_RECORD, (LearnedGenerator(top.plant.states, coordinates, (network,)),)

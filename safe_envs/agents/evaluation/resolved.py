@@ -147,8 +147,8 @@ class ResolvedEvaluation:
     @property
     def is_frozen(self) -> bool:
         """Whether nothing is random after the start of an episode."""
-        plan, policy = self.problem, self.policy
-        noise = Integrator(plan.plant, plan.dt, plan.substeps, "arrays").channels
+        problem, policy = self.problem, self.policy
+        noise = Integrator(problem.plant, problem.dt, problem.substeps, "arrays").channels
         return not noise and (policy.deterministic if isinstance(policy, Policy) else True)
 
     @property

@@ -77,7 +77,7 @@ class Scene(ABC):
         if math.isfinite(state.low) and math.isfinite(state.high):
             return state.low, state.high
         try:
-            return self.problem.exploration.region[i]
+            return self.problem.sampling_domain.region[i]
         except SystemDefinitionError:
             return first_range(self.problem, i)
 

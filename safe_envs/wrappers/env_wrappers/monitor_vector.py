@@ -1,4 +1,4 @@
-"""The same for vector envs of any make: see `safe_envs.wrappers.env_wrappers.monitor`."""
+"""Safety of third-party vector envs, in `info`; see `safe_envs.wrappers.env_wrappers.monitor`."""
 
 from __future__ import annotations
 

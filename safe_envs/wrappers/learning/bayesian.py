@@ -59,7 +59,7 @@ def identify(  # noqa: PLR0913 - the friendly keyword form
     from what the fit leaves.
 
     Args:
-        problem: its exploration says where and under which inputs data are collected.
+        problem: its sampling domain says where and under which inputs data are collected.
         starts: number of trajectories.
         steps: of each.
         repetitions: K of each step.
@@ -108,7 +108,7 @@ def identify(  # noqa: PLR0913 - the friendly keyword form
     varying = (
         Features.of(problem, diffusion_degree, "diffusion_degree") if diffusion_degree else None
     )
-    half = 0.5 * np.ptp(problem.exploration.region, axis=1)
+    half = 0.5 * np.ptp(problem.sampling_domain.region, axis=1)
     largest = abs(rows.u).max(axis=0)
     scale = 1.0 / np.where(largest > 0, largest, 1.0)
     design, believed = rows.design(features, scale), Prior(prior * half**2, alpha, beta)

@@ -132,7 +132,7 @@ def region_warnings(problem: SafetyProblem, data: Transitions) -> tuple[str, ...
     """
     found = []
     for variable, (low, high), column in zip(
-        problem.states, problem.exploration.region, data.x.T, strict=True
+        problem.states, problem.sampling_domain.region, data.x.T, strict=True
     ):
         # Of an unbounded angle any turn will do.
         bounded = np.isfinite(variable.low) or np.isfinite(variable.high)

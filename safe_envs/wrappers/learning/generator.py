@@ -124,7 +124,7 @@ def learn_generator(  # noqa: PLR0913 - the friendly keyword form
         # The printed estimator has the bias that it was printed with.
         taken = rate if estimator == "printed" else mean
         for barrier, degree in zip(problem.barriers, degrees, strict=True):
-            found = LearnedGenerator(problem.plant.states, problem.exploration.coordinates, ())
+            found = LearnedGenerator(problem.plant.states, problem.sampling_domain.coordinates, ())
             for _ in range(degree):
                 how = {
                     "seed": seed,

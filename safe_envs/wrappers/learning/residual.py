@@ -54,8 +54,8 @@ def learn_residual(
 ) -> ResidualModel:
     """Learn the residuals of a problem's barriers where it is explored.
 
-    From each state every input of the exploration is held for r + 2 steps, r the largest relative
-    degree.
+    From each state every input of the sampling domain is held for r + 2 steps, r the largest
+    relative degree.
 
     Args:
         problem: whose plant is observed, and whose model is corrected.
@@ -90,7 +90,7 @@ def learn_residual(
         )
     x = draw_states(problem, states, random_stream(seed, Purpose.STATES))
     labels, transitions = residual_labels(problem, x, label_dt, seed, step)
-    coordinates = problem.exploration.coordinates
+    coordinates = problem.sampling_domain.coordinates
     inputs = tabulated(problem.plant.states, coordinates)(x)
     parts, errors = [], {}
     for i, (barrier, (targets, sizes)) in enumerate(zip(problem.barriers, labels, strict=True)):
@@ -131,7 +131,7 @@ def residual_labels(
     squares over the inputs.
 
     Args:
-        problem: whose plant, model, barriers and inputs of exploration are taken.
+        problem: whose plant, model, barriers and sampling domain are taken.
         x: states (N, n).
         label_dt: length of a step in s.
         seed: of the plant's randomness, if it has any.
@@ -150,7 +150,7 @@ def residual_labels(
         central second difference, half of which lies under another input: it gives half of the
         input's gain for every step.
     """
-    tried = np.array(problem.exploration.inputs, dtype=float)
+    tried = np.array(problem.sampling_domain.inputs, dtype=float)
     split = _split_by_input(problem, tried)
     degrees = [relative_degree(problem.model, b.expression) for b in problem.barriers]
     steps = max(degrees) + 2
@@ -197,9 +197,9 @@ def _split_by_input(problem: SafetyProblem, tried: np.ndarray) -> np.ndarray:
     )
     if np.linalg.matrix_rank(design) < design.shape[1]:
         raise ConfigurationError(
-            f"the inputs {problem.exploration.inputs} of the exploration of {problem.name} cannot"
-            f" tell {design.shape[1]} numbers apart; give {design.shape[1]} or more that do not lie"
-            " in a plane"
+            f"the inputs {problem.sampling_domain.inputs} of the sampling domain of {problem.name}"
+            f" cannot tell {design.shape[1]} numbers apart; give {design.shape[1]} or more that do"
+            " not lie in a plane"
         )
     solved = np.linalg.pinv(design)
     gains = solved[1:] / scale[:, None]

@@ -136,14 +136,14 @@ def test_what_is_told_of_the_learning_is_so(outcomes):
         told = {"states": 400, "label_dt": 1e-3, "hidden": [100, 30], "epochs": 80}
         assert [model.record.settings for model in models] == [told, told]
     coordinates = [
-        list(map(str, make_problem(env_id).exploration.coordinates))
+        list(map(str, make_problem(env_id).sampling_domain.coordinates))
         for env_id in (dubins_disk.DISK, dubins_obstacle.OBSTACLE)
     ]
     assert coordinates == [
         ["x", "y", "cos(theta)", "sin(theta)"],
         ["cos(theta)", "sin(theta)", "-x + x_o", "-y + y_o"],
     ]
-    assert make_problem(quadrotor.QUADROTOR).exploration.inputs == ((3.0,), (9.0,))
+    assert make_problem(quadrotor.QUADROTOR).sampling_domain.inputs == ((3.0,), (9.0,))
     for name in ("figure-3.1", "figure-3.2a", "figure-3.2b"):
         assert any("3 inputs; " in line for line in ARTEFACTS[name].errata)
     assert all(

@@ -152,7 +152,7 @@ def test_learned_rows_stand_beside_reciprocal_ones(request, top, cubic, name):
     both, turned = (replace(problem, barriers=pair) for pair in ((first, second), (second, first)))
     rng = np.random.default_rng(0)
     x, u = (
-        rng.uniform(*np.array(problem.exploration.region).T, (25, 2)),
+        rng.uniform(*np.array(problem.sampling_domain.region).T, (25, 2)),
         rng.uniform(-9, 9, (25, 1)),
     )  # on both sides of the edge
     alone = SafetyFilter.for_problem(problem, learned).filter(x, u)

@@ -146,5 +146,5 @@ def test_few_data_make_both_regions_wider():
             BayesianSCBF(posterior, **{kind: 0.9}).variance_factors(outputs)[0]
             for kind in ("confidence", "simultaneous")
         ]
-        assert noise.count == len(DISK.exploration.inputs) * 30 * (repetitions - 1)
+        assert noise.count == len(DISK.sampling_domain.inputs) * 30 * (repetitions - 1)
     assert (np.array(sizes[4]) > np.array(sizes[50])).all()

@@ -44,7 +44,7 @@ def entry_at(problem, expression, x):
 def largest_error(problem, diffusion):
     """Of each entry over the region, as part of the largest entry there."""
     x = np.random.default_rng(5).uniform(
-        *np.array(problem.exploration.region).T, (500, problem.plant.n)
+        *np.array(problem.sampling_domain.region).T, (500, problem.plant.n)
     )
     truth = problem.plant.numeric(problem.plant.diffusion * problem.plant.diffusion.T)
     pairs = [

@@ -41,7 +41,7 @@ def direct(gap):
 
 def states_in(problem, count=300):
     x = np.random.default_rng(9).uniform(
-        *np.array(problem.exploration.region).T, (count, problem.plant.n)
+        *np.array(problem.sampling_domain.region).T, (count, problem.plant.n)
     )
     return x[
         np.broadcast_to(
@@ -210,7 +210,7 @@ def test_only_noise_may_differ_from_what_was_learned_of(top, gap, first_order, d
 def test_other_coordinates_are_refused(top, first_order, tmp_path):
     first_order.save(tmp_path / "model.npz")
     coordinates = tuple(2 * s for s in top.plant.states)
-    other = replace(top, explored=replace(top.explored, coordinates=coordinates))
+    other = replace(top, sampling=replace(top.sampling, coordinates=coordinates))
     with pytest.raises(LearnedFileError, match="coordinates"):
         GeneratorModel.from_content(load(tmp_path / "model.npz"), other)
 

@@ -58,7 +58,7 @@ def test_the_labels_are_the_exact_residuals(name):
     # Derivative j errs by less than dt^(5 - j) h^(5), with h^(5) below (10/s)^(5 - j) times
     # derivative j in these systems, and by the rounding of h over dt^j; Sigma by the error of
     # derivative 2 over the range of an input, Delta_2 by that brought to u = 0.
-    inputs = np.array(problem.exploration.inputs)
+    inputs = np.array(problem.sampling_domain.inputs)
     (h,) = compile_function(problem.plant.states, [problem.barriers[0].expression], "arrays")(
         *np.ascontiguousarray(x.T)
     )
@@ -68,7 +68,7 @@ def test_the_labels_are_the_exact_residuals(name):
     bound = np.hstack((error[0], 3 * error[1], error[1] / np.ptp(inputs, axis=0)))
     assert (np.abs(labels - exact).max(axis=0) < bound).all()
     assert (bound[2:] < 1e-3 * sizes[2:]).all()
-    assert transitions == 300 * len(problem.exploration.inputs) * 4
+    assert transitions == 300 * len(problem.sampling_domain.inputs) * 4
 
 
 def test_halving_the_step_divides_the_error_by_what_the_order_says():
@@ -193,7 +193,7 @@ def test_a_model_of_something_else_is_refused(tmp_path, disk, learned):
         disk.configured(model={"v": 0.6}),
         problem_of("safe_envs/DubinsDisk-v0", barrier={"radius": 2.0}),
         problem_of("safe_envs/QuadrotorAltitude-v0"),
-        replace(disk, explored=replace(disk.exploration, coordinates=disk.plant.states)),
+        replace(disk, sampling=replace(disk.sampling_domain, coordinates=disk.plant.states)),
     )
     for other in others:
         with pytest.raises(LearnedFileError):
@@ -249,12 +249,12 @@ def test_a_noisy_plant_is_refused(disk):
 
 def test_inputs_that_tell_nothing_apart_are_refused(disk):
     quadrotor = problem_of("safe_envs/Quadrotor-v0")
-    four = quadrotor.exploration.inputs[:4]
+    four = quadrotor.sampling_domain.inputs[:4]
     for problem, inputs in ((disk, ((1.0,),)), (disk, ((1.0,), (1.0,))), (quadrotor, four)):
         poor = replace(
             problem,
-            explored=SamplingDomain(
-                problem.exploration.region, inputs, problem.exploration.coordinates
+            sampling=SamplingDomain(
+                problem.sampling_domain.region, inputs, problem.sampling_domain.coordinates
             ),
         )
         with pytest.raises(ConfigurationError, match="apart"):

@@ -35,7 +35,7 @@ def printed_residuals(
     count, epochs = learning_sizes(sample)
     before = draw_states(problem, count, np.random.default_rng(seed))
     x = _stepped(problem, before, 0.0)
-    first, second = problem.exploration.inputs[0][0], problem.exploration.inputs[-1][0]
+    first, second = problem.sampling_domain.inputs[0][0], problem.sampling_domain.inputs[-1][0]
     known, true = (
         _lie_derivatives(system, problem, x) for system in (problem.model, problem.plant)
     )
@@ -45,7 +45,7 @@ def printed_residuals(
     ]
     gain = (excess[1] - excess[0]) / (second - first)
     targets = np.stack([slope - known[1], excess[0] - gain * first, gain], axis=1)
-    coordinates = problem.exploration.coordinates
+    coordinates = problem.sampling_domain.coordinates
     inputs = stacked(
         compile_function(problem.plant.states, coordinates, "arrays")(*np.ascontiguousarray(x.T)),
         count,

@@ -90,7 +90,7 @@ def learning_outcome(
     )
     term = compile_function((problem.plant.states[state],), (expression,), "arrays")
     missed = {name: values - term(first.x[:, state])[0] for name, values in first.labels.items()}
-    grid = np.linspace(*problem.exploration.region[state], 200)
+    grid = np.linspace(*problem.sampling_domain.region[state], 200)
     unit = f" ({problem.states[state].unit})" if problem.states[state].unit else ""
     return Findings(
         numbers=[

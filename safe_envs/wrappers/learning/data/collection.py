@@ -51,13 +51,13 @@ def draw_states(problem: SafetyProblem, count: int, rng: np.random.Generator) ->
     require_room(
         float(count) * len(problem.states), f"{count} states of {problem.name}", "their number"
     )
-    low, high = np.array(problem.exploration.region).T
+    low, high = np.array(problem.sampling_domain.region).T
     found, accepted, tried = [], 0, 0
     while accepted < count:
         if tried >= _TRIES_BEFORE_DESPAIR and accepted < _SMALLEST_SHARE * tried:
             raise ConfigurationError(
                 f"only {accepted} of {tried} states drawn from the region"
-                f" {problem.exploration.region} of {problem.name} have positive barriers; give"
+                f" {problem.sampling_domain.region} of {problem.name} have positive barriers; give"
                 " SamplingDomain(region=...) ranges nearer to the safe set"
             )
         drawn = rng.uniform(low, high, (max(count, _TRIES_AT_ONCE), len(low)))
@@ -85,10 +85,10 @@ def collect(  # noqa: PLR0913 - the friendly keyword form
     barrier is not positive.
 
     Args:
-        problem: of what system; its exploration says where and under which inputs.
+        problem: of what system; its sampling domain says where and under which inputs.
         points: number of start states.
         repetitions: K, how often each step is repeated.
-        inputs: J physical inputs (m,) that are tried; None for those of the exploration.
+        inputs: J physical inputs (m,) that are tried; None for those of the sampling domain.
         steps: states of each trajectory.
         seed: of all randomness.
         step: how the system is stepped; None for `plant_step(problem, dt)`.
@@ -110,7 +110,7 @@ def collect(  # noqa: PLR0913 - the friendly keyword form
     for name, value in (("points", points), ("repetitions", repetitions), ("steps", steps)):
         require_whole(name, value, 1)
     tried, period = (
-        _allowed(problem, problem.exploration.inputs if inputs is None else inputs),
+        _allowed(problem, problem.sampling_domain.inputs if inputs is None else inputs),
         period_of(problem, dt),
     )
     n, rows = len(problem.states), points * len(tried)
@@ -220,7 +220,7 @@ def _allowed(problem: SafetyProblem, inputs: Any) -> np.ndarray:
 
 def _explored(problem: SafetyProblem, x: np.ndarray) -> np.ndarray:
     """Return whether states (B, n) are in the region with positive barriers, shape (B,)."""
-    low, high = np.array(problem.exploration.region).T
+    low, high = np.array(problem.sampling_domain.region).T
     barriers = [problem.plant.numeric(b.expression) for b in problem.barriers]
     with np.errstate(all="ignore"):
         values = tabulated(problem.plant.states, barriers)(x)

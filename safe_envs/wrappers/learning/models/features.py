@@ -72,7 +72,7 @@ class Features:
             ConfigurationError: the degree is not allowed.
         """
         require_whole(name, degree, 0)
-        return cls(problem.plant.states, problem.exploration.region, degree, _angles(problem))
+        return cls(problem.plant.states, problem.sampling_domain.region, degree, _angles(problem))
 
     def details(self) -> dict[str, Any]:
         """Return all but the states, for JSON."""

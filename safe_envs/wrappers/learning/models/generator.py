@@ -175,7 +175,7 @@ class GeneratorModel(LearnedModel):
         Raises:
             LearnedFileError: the networks are functions of other coordinates.
         """
-        states, coordinates = problem.plant.states, problem.exploration.coordinates
+        states, coordinates = problem.plant.states, problem.sampling_domain.coordinates
         if details["way"] == "direct":
             return cls(
                 Signature.of(problem),

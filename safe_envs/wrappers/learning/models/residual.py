@@ -149,7 +149,7 @@ class ResidualModel(LearnedModel):
             ConfigurationError: the problem is explored in other coordinates now, or the numbers do
                 not fit.
         """
-        coordinates = problem.exploration.coordinates
+        coordinates = problem.sampling_domain.coordinates
         if [str(c) for c in coordinates] != details["coordinates"]:
             raise ConfigurationError(
                 f"it has the coordinates {shown(details['coordinates'])}, those of {problem.name}"

@@ -55,7 +55,7 @@ def test_every_input_is_tried_at_every_state():
 
 
 def test_inputs_of_the_exploration_are_the_default():
-    np.testing.assert_array_equal(collect(DISK, 2).u, np.tile(DISK.exploration.inputs, (2, 1)))
+    np.testing.assert_array_equal(collect(DISK, 2).u, np.tile(DISK.sampling_domain.inputs, (2, 1)))
 
 
 @pytest.mark.parametrize("steps", [1, 5])
@@ -122,7 +122,7 @@ def test_dt_is_that_of_the_step():
 def test_all_data_are_from_where_a_problem_is_explored(env_id):
     problem = make_problem(env_id)
     data = collect(problem, 5, steps=20)
-    low, high = np.array(problem.exploration.region).T
+    low, high = np.array(problem.sampling_domain.region).T
     assert ((low <= data.x) & (data.x <= high)).all()
     barriers = sp.lambdify(problem.plant.states, [b.expression for b in problem.barriers], "numpy")
     assert all((np.asarray(h) > 0).all() for h in barriers(*data.x.T))
@@ -226,7 +226,7 @@ def test_a_step_that_is_not_finite_names_its_state_and_input():
         SMOOTH.plant, drift=[1 / (DISK.plant.states[0] - DISK.plant.states[0] ** 2 * 0 - 1), 0]
     )
     region = SamplingDomain(region=((1.0, 1.0 + 1e-15), (-1.0, 1.0)))
-    singular = replace(SMOOTH, plant=plant, barriers=(Barrier(sp.Integer(1)),), explored=region)
+    singular = replace(SMOOTH, plant=plant, barriers=(Barrier(sp.Integer(1)),), sampling=region)
     with pytest.raises(NumericalError, match="give a smaller dt"):
         collect(singular, 200)
 
