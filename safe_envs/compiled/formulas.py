@@ -46,7 +46,8 @@ class _KernelPrinter(FloatPrinter):
         self._data = data
 
     def _print_Float(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
-        return f"data[{self._data.add([float(expr)])}]"
+        # As the other printers write it: a number of low precision is rounded.
+        return f"data[{self._data.add([float(super()._print_Float(expr))])}]"
 
 
 def formulas(
