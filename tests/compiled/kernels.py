@@ -25,7 +25,7 @@ def scaled(values: tuple[float, ...]) -> float:
 
 
 def read(values: np.ndarray) -> float:
-    return reward_of(values)
+    return reward_of(values)  # pyright: ignore[reportArgumentType]
 
 
 def root(value: float) -> float:

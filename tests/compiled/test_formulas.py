@@ -22,7 +22,8 @@ POINTS = [(0.3, 1.7, 0.5), (0.9, 1.1, 2.0), (0.2, 2.9, -1.0)]
 
 def program(expressions: list, data: Data) -> Program:
     source = formulas("values_of", {"values": (x, y), "time": t}, expressions, data)
-    call = "def reward_of(values):\n    return values_of((values[0], values[1]), values[2], values[3:])[0]\n"
+    values = "values_of((values[0], values[1]), values[2], values[3:])"
+    call = f"def reward_of(values):\n    return {values}[0]\n"
     return Program("formulas", [kernels.read], source + Source(call))
 
 
@@ -74,7 +75,8 @@ def test_numbers_are_data_and_not_text() -> None:
         text = program([sp.Float(number) * sp.sin(x) + sp.Float(number + 1) * y], data).text
         found.append((text, data.array().tolist()))
     assert found[0][0] == found[1][0]
-    assert sorted(found[0][1]) == [0.5, 1.5] and sorted(found[1][1]) == [12.25, 13.25]
+    assert sorted(found[0][1]) == [0.5, 1.5]
+    assert sorted(found[1][1]) == [12.25, 13.25]
 
 
 def test_what_has_no_number_is_refused_as_elsewhere() -> None:
@@ -85,7 +87,8 @@ def test_what_has_no_number_is_refused_as_elsewhere() -> None:
 
 def test_a_function_returns_floats_and_reads_what_it_needs() -> None:
     source = formulas("f", {"values": (x, y), "time": t}, [1, 2 * y], Data())
-    assert "values[0]" not in source.text and "time\n" not in source.text
-    names: dict = {}
-    exec(source.text, vars(math), names)
+    assert "values[0]" not in source.text
+    assert "time\n" not in source.text
+    names: dict = dict(vars(math))
+    exec(source.text, names)
     assert names["f"]((math.nan, 3.0), math.nan, np.array([1.0])) == (1.0, 6.0)

@@ -34,8 +34,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_a_program_holds_what_is_reached_and_nothing_else() -> None:
     text = small().text
-    assert "def total_reward" in text and "def scaled" in text and "FACTOR = 2.0" in text
-    assert "root" not in text and "sqrt" not in text and "philox_block" not in text
+    assert "def total_reward" in text
+    assert "def scaled" in text
+    assert "FACTOR = 2.0" in text
+    assert "root" not in text
+    assert "sqrt" not in text
+    assert "philox_block" not in text
     assert text.count("@entry") == 1
     assert small().plain()["total_reward"](VALUES) == 7.0
 
@@ -74,7 +78,8 @@ def test_compiled_programs_are_kept_and_a_changed_one_is_another(
     assert found(VALUES) == found(VALUES) == 7.0
     assert not caplog.records
     assert small(HALF.replace("0.5", "1.0")).compiled()["total_reward"](VALUES) == 14.0
-    assert len(list(folder.iterdir())) == 2 and len(caplog.records) == 1
+    assert len(list(folder.iterdir())) == 2
+    assert len(caplog.records) == 1
 
 
 def test_a_damaged_program_is_compiled_again(folder: Path) -> None:
