@@ -14,7 +14,7 @@ from numba.extending import intrinsic
 
 __all__ = ["entry", "kernel", "philox_block", "single", "uniform_of"]
 
-kernel = numba.njit(nogil=True, error_model="numpy")
+kernel = numba.njit(nogil=True, error_model="numpy", forceinline=True)
 entry = numba.njit(nogil=True, error_model="numpy", cache=True)
 
 _WORD = np.uint64
