@@ -31,3 +31,23 @@ def random_action(place: int, k0: int, k1: int) -> float:
     """
     block = philox_block(place // 4 + 1, 0, POLICY, 0, k0, k1)
     return 2.0 * uniform_of(block[place % 4]) - 1.0
+
+
+def within(value: float, bound: float) -> float:
+    """Return a number, or the end of [-bound, bound] that it lies beyond; NaN for NaN."""
+    return -bound if value < -bound else bound if value > bound else value
+
+
+def action_in_another_box(
+    action: float, center: float, half: float, new_center: float, new_half: float
+) -> float:
+    """Return the action that stands for the same or the nearest input in other input bounds.
+
+    Args:
+        action: in the old bounds.
+        center: of the old bounds.
+        half: width of the old bounds, halved.
+        new_center: of the new bounds.
+        new_half: width of the new bounds, halved.
+    """
+    return within((center + half * action - new_center) / new_half, 1.0)

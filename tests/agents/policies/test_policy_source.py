@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from safe_envs.agents.policies.custom import as_policy
+from safe_envs.agents.policies.network_policy import NetworkPolicy, Normalization
 from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
 from safe_envs.agents.policies.policy_source import policy_source
 from safe_envs.compiled import slots
@@ -16,6 +18,7 @@ from safe_envs.compiled.draws import POLICY
 from safe_envs.compiled.program import Program
 from safe_envs.envs.spaces import BatchActions
 from safe_envs.errors import NotCompilableError
+from safe_envs.wrappers.learning.models.network import Network
 from tests.conftest import problem_of
 
 DUBINS = "safe_envs/StochasticDubins-v0"
@@ -68,6 +71,43 @@ def test_random_actions_are_the_words_of_a_stream(env_id, key):
     found = inputs_of(RandomPolicy(problem), problem, seen, key)
     np.testing.assert_array_equal(found, executed(problem, actions))
     assert len(np.unique(found)) == COUNT * m
+
+
+def some_network(inputs, outputs, activation, hidden=(7, 5)):
+    rng, sizes = np.random.default_rng(3), [inputs, *hidden, outputs]
+    weights = [0.4 * rng.normal(size=(b, a)) / a**0.5 for a, b in pairwise(sizes)]
+    biases = [0.3 * rng.normal(size=b) for b in sizes[1:]]
+    return Network.unscaled(weights, biases, activation)
+
+
+@pytest.mark.parametrize(
+    ("activation", "output", "hidden", "normal", "other_box"),
+    [
+        ("tanh", "clip", (7, 5), False, False),
+        ("relu", "tanh", (6,), True, False),
+        ("silu", "tanh", (4, 4, 4), False, True),
+        ("elu", "clip", (5,), True, True),
+        ("leaky_relu", "tanh", (3, 2), False, False),
+        ("identity", "tanh", (), False, False),
+    ],
+)
+@pytest.mark.parametrize("env_id", [DUBINS, "safe_envs/Quadrotor-v0"])
+def test_networks(env_id, activation, output, hidden, normal, other_box):
+    problem = problem_of(env_id)
+    k, box = len(problem.features), np.array(problem.box)
+    numbers = tuple(0.5 * i for i in range(k))
+    scaling = Normalization(numbers, numbers, 1.5, 1e-3) if normal else None
+    boxes = (0.7 * box + 0.1, box) if other_box else None
+    network = some_network(k, len(problem.inputs), activation, hidden)
+    policy = NetworkPolicy(network, output, scaling, boxes)
+    seen = observations_of(problem)
+    found = inputs_of(policy, problem, seen)
+    actions, _ = policy.predict(seen)
+    # Rounded to single precision, which sums in another order seldom change.
+    apart = found != executed(problem, actions)
+    assert apart.mean() <= 0.1
+    np.testing.assert_allclose(found, executed(problem, actions), rtol=3e-7, atol=1e-7)
+    assert len(np.unique(found)) > COUNT / 4
 
 
 def test_nan_stays_nan():
