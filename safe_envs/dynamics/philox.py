@@ -9,6 +9,8 @@ Source: Salmon, Moraes, Dror, Shaw: Parallel random numbers: as easy as 1, 2, 3.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from safe_envs.errors import require_whole
@@ -92,17 +94,24 @@ class StreamReader:
 
 
 class EpisodeUniforms:
-    """Uniforms of the episodes of an evaluation side by side, which do not depend on each other.
+    """Uniforms of the first episodes of seeds, side by side, which do not depend on each other.
 
     Args:
-        seed: of the evaluation.
-        episodes: their numbers, one for each row.
+        seeds: of the episodes.
         purpose: of what is drawn.
         width: how many numbers a control period takes.
+        periods: control period of each episode that comes next; None for the first of all.
     """
 
-    def __init__(self, seed: int, episodes: range, purpose: int, width: int) -> None:
-        self._keys = [(g, 0) for g in episode_seeds(seed, episodes)]
+    def __init__(
+        self,
+        seeds: Sequence[int],
+        purpose: int,
+        width: int,
+        periods: Sequence[int] | None = None,
+    ) -> None:
+        self._keys = [key_of(seed) for seed in seeds]
+        self._periods = [0] * len(self._keys) if periods is None else periods
         self._purpose, self._width = purpose, width
         self._reader = StreamReader()
         self._chunk = np.empty((len(self._keys), 0, width))
@@ -123,8 +132,9 @@ class EpisodeUniforms:
         # An episode that has lasted is likely to last: chunks grow with it.
         count = min(max(self._drawn, _FIRST_CHUNK), _CHUNK)
         self._chunk = np.empty((len(self._keys), count, self._width))
-        for key, out in zip(self._keys, self._chunk, strict=True):
-            self._reader.seek(key, 0, self._purpose, self._drawn * self._width).fill(out)
+        for key, begin, out in zip(self._keys, self._periods, self._chunk, strict=True):
+            word = (begin + self._drawn) * self._width
+            self._reader.seek(key, 0, self._purpose, word).fill(out)
         self._drawn += count
         self._position = 0
 

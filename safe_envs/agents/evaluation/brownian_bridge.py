@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -143,13 +144,15 @@ class Exponentials:
     The draws of an episode do not depend on its neighbours.
 
     Args:
-        seed: of the evaluation.
-        episodes: one for each row.
+        seeds: of the episodes, one for each row.
         width: how many a row gets at a time.
+        periods: control period of each row that comes next; None for the first of all.
     """
 
-    def __init__(self, seed: int, episodes: range, width: int) -> None:
-        self._uniforms = EpisodeUniforms(seed, episodes, BRIDGE, width)
+    def __init__(
+        self, seeds: Sequence[int], width: int, periods: Sequence[int] | None = None
+    ) -> None:
+        self._uniforms = EpisodeUniforms(seeds, BRIDGE, width, periods)
 
     def next(self) -> np.ndarray:
         """Return the draws of the next control period, shape (rows, width)."""

@@ -71,12 +71,13 @@ def play(
         with blas_threads.limited():
             if isinstance(policy, Policy):
                 policy.begin(rows, seed)
-            started = env.reset(seed=episode_seeds(seed, rows))
+            seeds = episode_seeds(seed, rows)
+            started = env.reset(seed=seeds)
             starts = world.components
             watch = (
                 None
                 if bridge is None
-                else _MinimumWatch(bridge, Exponentials(seed, rows, bridge.draws), starts, started)
+                else _MinimumWatch(bridge, Exponentials(seeds, bridge.draws), starts, started)
             )
             batch = _play(env, policy, started, first, count, progress, trajectories, watch)
         yield PlayedBatch(

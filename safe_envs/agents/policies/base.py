@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,18 @@ class Policy(ABC):
             episodes: one for each row, surplus rows of the last batch included.
             seed: of the evaluation.
         """
+
+    def resume(self, rows: range, seeds: Sequence[int], periods: Sequence[int]) -> None:
+        """Receive episodes that go on in their midst, before each batch of them.
+
+        The actions may depend on an episode's seed and control period, and on its row.
+
+        Args:
+            rows: one for each episode.
+            seeds: of the episodes.
+            periods: control period of each that comes next.
+        """
+        self.begin(rows, seeds[0])
 
     @abstractmethod
     def predict(

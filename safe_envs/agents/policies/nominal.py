@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from safe_envs.agents.policies.base import CHOOSE, StatelessPolicy
@@ -9,7 +11,7 @@ from safe_envs.agents.policies.policy_kernel import action_of_input, random_acti
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.dynamics.codegen import compile_function
-from safe_envs.dynamics.philox import POLICY, EpisodeUniforms
+from safe_envs.dynamics.philox import POLICY, EpisodeUniforms, episode_seeds
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import NumericalError
 from safe_envs.problem.problem import SafetyProblem
@@ -124,7 +126,11 @@ class RandomPolicy(StatelessPolicy):
 
     def begin(self, episodes: range, seed: int) -> None:
         """Give each episode its stream; see `Policy.begin`."""
-        self._uniforms = EpisodeUniforms(seed, episodes, POLICY, self._m)
+        self._uniforms = EpisodeUniforms(episode_seeds(seed, episodes), POLICY, self._m)
+
+    def resume(self, rows: range, seeds: Sequence[int], periods: Sequence[int]) -> None:
+        """Go on in each episode's stream; see `Policy.resume`."""
+        self._uniforms = EpisodeUniforms(seeds, POLICY, self._m, periods)
 
     def actions(self, given: np.ndarray) -> np.ndarray:
         """Draw actions; see `StatelessPolicy.actions`."""

@@ -8,26 +8,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
-from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.resolved import ResolvedEvaluation, WorkParts
 from safe_envs.agents.evaluation.spec import EvaluationSpec, Filter, Progress, listed
 from safe_envs.agents.evaluation.statistics import rate_interval
-from safe_envs.agents.evaluation.targets import Env
 from safe_envs.agents.jobs.fingerprint import package_versions
-from safe_envs.agents.rare_events.importance_sampling import (
-    ImportanceSampling,
-    TiltedNoiseEnv,
-    optimal_tilt,
-)
+from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling, optimal_tilt
+from safe_envs.agents.rare_events.particles import PathPlayer
+from safe_envs.agents.rare_events.path_players import player_of
 from safe_envs.agents.rare_events.rows import BETTER, PlainEpisodes, RareEstimate, RareRow, verdict
 from safe_envs.agents.rare_events.splitting import LEAST, POWERS, Repetitions, Splitting
+from safe_envs.compiled.engine import require_engine
 from safe_envs.errors import NumericalError, require_whole
 from safe_envs.problem.problem import SafetyProblem
 
 PARTICLES = 250
 REPETITIONS = 20
+
+_EPISODES = 5
+"""Plain episodes that take as long as a particle with all of its continuations, about."""
 
 _FEWEST_PARTICLES = 20
 _FEWEST_REPETITIONS = 10
@@ -67,6 +65,7 @@ def estimate_rare(
     particles: int = PARTICLES,
     repetitions: int = REPETITIONS,
     num_envs: int = 4096,
+    engine: str = "auto",
     progress: Progress | None = None,
     **fields: Any,
 ) -> RareEvaluation:
@@ -89,8 +88,10 @@ def estimate_rare(
         filters: as for `evaluate`.
         particles: episodes of a repetition.
         repetitions: independent ones, at least 10.
-        num_envs: the most episodes side by side; another number is another draw of the same
-            estimate.
+        num_envs: the most episodes that NumPy simulates side by side; all but `timing` is the same,
+            to the last bit, for any.
+        engine: "numpy", "compiled", or "auto" for the compiled one where it is there, can do it,
+            and saves time. Their numbers agree but for rounding.
         progress: called with the part of the work that is done, from 0 to 1.
         **fields: `seed`, `options`, `knowledge`, `objective`, `confidence`, `learned`, `monitoring`
             and `trust` of `EvaluationSpec`; what is missing is learned once.
@@ -107,6 +108,7 @@ def estimate_rare(
         ("num_envs", num_envs, 1),
     ):
         require_whole(name, value, least)
+    require_engine(engine)
     # Those that are given here have no meaning for splitting, and are refused among the fields.
     spec = EvaluationSpec(
         problem,
@@ -119,18 +121,15 @@ def estimate_rare(
         **fields,
     )
     resolved = ResolvedEvaluation(spec)
-    work = WorkParts(progress, len(resolved.learning.missing()) + 3 * len(resolved.names))
+    work = WorkParts(progress, len(resolved.learning.missing()) + 2 * len(resolved.names))
     resolved.learn(work.part)
     config = {**resolved.config(), "particles": particles, "repetitions": repetitions}
-    estimator = _Estimator(resolved, particles, repetitions, num_envs, work)
+    estimator = _Estimator(resolved, particles, repetitions, num_envs, engine, work)
     rows, speeds = [], []
     for name in resolved.names:
-        begun = time.perf_counter()
-        rows.append(estimator.row(name, config["policy"]["name"]))
-        seconds = time.perf_counter() - begun
-        speeds.append(
-            {"filter": name, "seconds": seconds, "steps_per_second": rows[-1].steps / seconds}
-        )
+        row, speed = estimator.row(name, config["policy"]["name"])
+        rows.append(row)
+        speeds.append({"filter": name, **speed})
     return RareEvaluation(resolved.problem, config, rows, {"num_envs": num_envs, "rows": speeds})
 
 
@@ -142,30 +141,39 @@ class _Estimator:
     particles: int
     repetitions: int
     num_envs: int
+    engine: str
     work: WorkParts
 
-    def row(self, name: str, policy: str) -> RareRow:
-        """Return the row of a filter."""
-        resolved, spec = self.resolved, self.resolved.spec
-        problem = resolved.problem
+    def row(self, name: str, policy: str) -> tuple[RareRow, dict[str, Any]]:
+        """Return the row of a filter, and its timing."""
+        resolved = self.resolved
         nothing = RareRow(filter=name, policy=policy, status="none")
         if resolved.is_frozen:
             reason = (
                 "nothing is random after the start, so that copies of an episode go on like it;"
                 " plain episodes find all that there is"
             )
-            return replace(nothing, reason=reason)
-        bridge = BrownianBridge(problem) if spec.monitoring == "continuous" else None
+            return replace(nothing, reason=reason), {"seconds": 0.0, "steps_per_second": 0.0}
+        periods = _EPISODES * self.particles * self.repetitions * resolved.problem.steps
+        chosen = player_of(resolved, resolved.filters[name][0], self.num_envs, self.engine, periods)
+        begun = time.perf_counter()
+        row = self._estimated(nothing, chosen.player)
+        seconds = time.perf_counter() - begun
+        return row, {**chosen.how, "seconds": seconds, "steps_per_second": row.steps / seconds}
 
-        def make(lengths: np.ndarray) -> Env:
-            tilted = TiltedNoiseEnv(problem, lengths)
-            return resolved.filtered(tilted, resolved.filters[name][0])
+    def _estimated(self, nothing: RareRow, player: PathPlayer) -> RareRow:
+        """Fill the row of a filter.
 
-        how = (make, resolved.policy, spec.seed, self.num_envs, bridge)
+        Args:
+            nothing: the row without an estimate.
+            player: simulates the paths.
+        """
+        spec, problem = self.resolved.spec, self.resolved.problem
+        how = (player, spec.seed)
         splitting, work = Splitting(*how), self.work
         power, pilot_steps = splitting.choose(self.particles, work.part())
         found = splitting.estimate(power, self.particles, self.repetitions, work.part())
-        last_part, paths = work.part(), found.paths
+        paths = found.paths
         low, high = rate_interval(found.first, paths.lowest.size, spec.confidence)
         plain = PlainEpisodes(
             paths.lowest.size, found.first, low, high, paths.outside, paths.kept_length
@@ -178,9 +186,7 @@ class _Estimator:
         split = RareEstimate.of(by, found.estimates, spec.confidence)
         if not found.levels.any():
             split = replace(split, method="plain episodes", ci_low=low, ci_high=high)
-        drift, drift_steps = self._by_drift(
-            ImportanceSampling(*how), found, split.relative_error, last_part
-        )
+        drift, drift_steps = self._by_drift(ImportanceSampling(*how), found, split.relative_error)
         best, check, doubt = verdict(split, drift, plain)
         p, error = best.probability, best.relative_error
         needed = (1.0 - p) / (p * error**2) if error else None
@@ -200,7 +206,6 @@ class _Estimator:
         drifting: ImportanceSampling,
         found: Repetitions,
         to_beat: float,
-        progress: Progress | None,
     ) -> tuple[RareEstimate | None, int]:
         """Return the estimate by importance sampling, and the control periods that it took.
 
@@ -211,7 +216,7 @@ class _Estimator:
         if not BETTER * deviation / math.sqrt(math.prod(sizes)) < to_beat:
             return None, 0
         try:
-            estimates, steps = drifting.estimate(length, *sizes, progress)
+            estimates, steps = drifting.estimate(length, *sizes)
         except NumericalError:
             # Pushed far out, a system may leave the finite numbers.
             return None, 0

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
-from safe_envs.agents.jobs import blas_threads
-from safe_envs.agents.rare_events.particles import MakeTiltedEnv, Particles
+from safe_envs.agents.rare_events.particles import Particles, PathPlayer
+from safe_envs.agents.rare_events.path_keys import PILOTS, SPLIT, PathKeys
 
 KILLED = 0.75
 """Share of a repetition's paths that are killed at a level, at least."""
@@ -20,7 +18,7 @@ LEAST = 1e-20
 
 POWERS = (0.0, 0.5)
 """Of the time that is left, in the two scores: see
-`safe_envs.agents.rare_events.particles.Particles`."""
+`safe_envs.agents.rare_events.heights.Heights`."""
 
 _PILOTS = 10
 _FEWEST_PARTICLES = 50
@@ -39,11 +37,8 @@ class Splitting:
     unbiased for any share and for any score; both count for the spread alone.
 
     Attributes:
-        make: a filtered env, which is made without a drift.
-        policy: anything with Stable-Baselines3's `predict`, without memory.
+        player: simulates the episodes.
         seed: of all randomness.
-        num_envs: the most episodes side by side.
-        bridge: gives the minimum h between control instants too.
         killed: share at a level, at least, between 0 and 1.
 
     Source: C.-E. Brehier, M. Gazeau, L. Goudenege, T. Lelievre, M. Rousset, Unbiasedness of some
@@ -51,11 +46,8 @@ class Splitting:
         (2016) 3559-3601.
     """
 
-    make: MakeTiltedEnv
-    policy: Any
+    player: PathPlayer
     seed: int
-    num_envs: int
-    bridge: BrownianBridge | None = None
     killed: float = KILLED
 
     def choose(
@@ -73,7 +65,7 @@ class Splitting:
             One of `POWERS`, and the control periods that were simulated.
         """
         count = max(particles // 5, _FEWEST_PARTICLES)
-        run = Repetitions(self, np.repeat(POWERS, _PILOTS), count, spawn_key=(0, 2))
+        run = Repetitions(self, np.repeat(POWERS, _PILOTS), count, PILOTS)
         often = run.first > _OFTEN * run.paths.lowest.size
         if not often:
             run.finish(progress)
@@ -101,7 +93,7 @@ class Splitting:
         Raises:
             ConfigurationError: the policy has a memory.
         """
-        run = Repetitions(self, np.full(repetitions, power), particles, spawn_key=(1, 2))
+        run = Repetitions(self, np.full(repetitions, power), particles, SPLIT)
         run.finish(progress)
         return run
 
@@ -119,10 +111,10 @@ class Repetitions:
     """Independent estimates of one probability, which are final after `finish`.
 
     Args:
-        how: the envs, the policy and the seed.
+        how: who simulates, and the seed.
         powers: of the score of each repetition, shape (R,).
         particles: N.
-        spawn_key: of their seed.
+        purpose: of the streams of keys, see `safe_envs.agents.rare_events.path_keys`.
 
     Attributes:
         estimates: unbiased, shape (R,); those that were given up are 0.
@@ -134,41 +126,34 @@ class Repetitions:
         endless: for each one that fell below `LEAST`, h of its last level.
     """
 
-    def __init__(
-        self, how: Splitting, powers: np.ndarray, particles: int, spawn_key: Sequence[int]
-    ) -> None:
-        seed = np.random.SeedSequence(how.seed, spawn_key=spawn_key)
+    def __init__(self, how: Splitting, powers: np.ndarray, particles: int, purpose: int) -> None:
+        keys = PathKeys(how.seed, purpose)
         self._particles = particles
         self._rank = min(max(round(how.killed * particles), 1), particles - 1)
-        self._generator = np.random.default_rng(seed.spawn(1)[0])
-        self.paths = Particles(
-            how.make, how.policy, np.repeat(powers, particles), seed, how.num_envs, how.bridge
-        )
+        self._generators = [keys.generator(r) for r in range(len(powers))]
+        self.paths = Particles(how.player, keys, np.repeat(powers, particles))
         self.estimates, self.levels = np.ones(len(powers)), np.zeros(len(powers), dtype=np.int64)
         self.stuck: list[float] = []
         self.endless: list[float] = []
-        with blas_threads.limited():
-            self.paths.begin()
         self.first = int(np.count_nonzero(self.paths.lowest <= 0.0))
         self.length = self.paths.steps / self.paths.lowest.size
 
     def finish(self, progress: Callable[[float], None] | None) -> None:
         """Go from level to level until every repetition has its estimate or is given up."""
         active, highest = range(len(self.estimates)), 0.0
-        with blas_threads.limited():
-            while True:
-                found = {r: kill for r in active if (kill := self._next_level(r)) is not None}
-                if not found:
-                    return
-                active = list(found)
-                killed, parents, levels = (
-                    np.concatenate(parts) for parts in zip(*found.values(), strict=True)
-                )
-                self.levels[active] += 1
-                highest = max(highest, float(levels.max()))
-                if progress:
-                    progress(1.0 - float(levels.mean()) / highest)
-                self.paths.branch(killed, parents, levels)
+        while True:
+            found = {r: kill for r in active if (kill := self._next_level(r)) is not None}
+            if not found:
+                return
+            active = list(found)
+            killed, parents, levels = (
+                np.concatenate(parts) for parts in zip(*found.values(), strict=True)
+            )
+            self.levels[active] += 1
+            highest = max(highest, float(levels.max()))
+            if progress:
+                progress(1.0 - float(levels.mean()) / highest)
+            self.paths.branch(killed, parents, levels)
 
     def violating(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the `girsanov_integrals` of the paths that violate, and their shares.
@@ -200,4 +185,5 @@ class Repetitions:
             kept.append(float(self.paths.h_at_lowest(killed).min()))
             self.estimates[r] = 0.0
             return None
-        return killed, self._generator.choice(survivors, killed.size), np.full(killed.size, level)
+        parents = self._generators[r].choice(survivors, killed.size)
+        return killed, parents, np.full(killed.size, level)

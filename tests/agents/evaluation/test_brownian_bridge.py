@@ -17,7 +17,7 @@ from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge, Exponent
 from safe_envs.agents.evaluation.rollout import episode_seed
 from safe_envs.agents.policies.nominal import RandomPolicy
 from safe_envs.dynamics.normal import standard_exponentials
-from safe_envs.dynamics.philox import BRIDGE, POLICY, StreamReader
+from safe_envs.dynamics.philox import BRIDGE, POLICY, StreamReader, episode_seeds
 from tests.oracles.laws import X, brownian, first_passage, walk_passage
 
 pytestmark = pytest.mark.slow
@@ -136,7 +136,7 @@ def test_bridges_and_policies_draw_from_the_streams_of_their_episodes():
     """More control periods than there are numbers drawn ahead."""
     policy, periods = RandomPolicy(make_problem("Quadrotor-v0")), 400
     policy.begin(range(2, 5), 7)
-    exponentials = Exponentials(7, range(2, 5), 3)
+    exponentials = Exponentials(episode_seeds(7, range(2, 5)), 3)
     actions = np.stack([policy.predict(np.zeros((3, 15)))[0] for _ in range(periods)], axis=1)
     drawn = np.stack([exponentials.next() for _ in range(periods)], axis=1)
     reader = StreamReader()

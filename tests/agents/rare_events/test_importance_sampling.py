@@ -11,37 +11,31 @@ import sympy as sp
 
 from safe_envs import ControlAffineSDE, state_problem
 from safe_envs.agents import NominalController, evaluate
-from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.agents.rare_events.importance_sampling import (
     ImportanceSampling,
-    TiltedNoiseEnv,
     log_ratio,
     optimal_tilt,
 )
 from safe_envs.agents.rare_events.rows import PlainEpisodes, RareEstimate, verdict
 from safe_envs.agents.rare_events.splitting import Splitting
+from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
+from tests.agents.rare_events.conftest import paths_of
 from tests.oracles.laws import X, brownian, first_passage, walk_passage
 
 pytestmark = pytest.mark.slow
 
 
-def both(problem, bridge=None):
-    how = (
-        lambda lengths: TiltedNoiseEnv(problem, lengths),
-        NominalController(problem),
-        0,
-        4096,
-        bridge,
-    )
-    return Splitting(*how), ImportanceSampling(*how)
+def both(problem, continuous=False):
+    player = paths_of(problem, NominalController(problem), continuous=continuous)
+    return Splitting(player, 0), ImportanceSampling(player, 0)
 
 
 def test_exact_for_several_barriers_and_substeps():
     # The walls are so far apart that a path does not meet both: the probabilities add.
     problem = replace(brownian(0.1, 1.0, 0.0, 0.3, [1 - X, 1 + X]), substeps=2)
-    splitting, drifting = both(problem, BrownianBridge(problem))
+    splitting, drifting = both(problem, continuous=True)
     found = splitting.estimate(0.5, 100, 10)
     length, deviation = optimal_tilt(*found.violating(), 1.0)
     estimates, steps = drifting.estimate(length, 250, 20)

@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from safe_envs.agents import ZeroController
-from safe_envs.agents.rare_events.importance_sampling import TiltedNoiseEnv
-from safe_envs.agents.rare_events.particles import Particles, Records
+from safe_envs.agents.rare_events.numpy_paths import NumpyPaths
+from safe_envs.agents.rare_events.particles import Particles
+from safe_envs.agents.rare_events.path_keys import SPLIT, PathKeys
+from safe_envs.agents.rare_events.records import Records
+from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
 from tests.oracles.laws import X, brownian
 
 pytestmark = pytest.mark.slow
@@ -31,9 +34,7 @@ def particles_of(problem, policy, count):
         policy.env = env
         return env
 
-    paths = Particles(make, policy, np.zeros(count), np.random.SeedSequence(0), count)
-    paths.begin()
-    return paths
+    return Particles(NumpyPaths(problem, make, policy, count), PathKeys(0, SPLIT), np.zeros(count))
 
 
 def test_paths_go_on_from_where_others_fell_below_a_level():
@@ -73,7 +74,7 @@ def test_records_find_the_first_one_below_a_level():
     generator = np.random.default_rng(0)
     paths, steps = 7, 300
     records, heights = (
-        Records(paths, 2, 1),
+        Records(paths, 2),
         np.minimum.accumulate(
             generator.standard_normal((steps, paths)).cumsum(axis=0) - 0.1, axis=0
         ),
@@ -87,11 +88,10 @@ def test_records_find_the_first_one_below_a_level():
             np.full(len(fell), k),
             np.zeros(len(fell), dtype=bool),
             state,
-            state[:, :1].astype(np.float32),
             -state,
         )
     levels = heights[-1] + generator.uniform(0.1, 3.0, paths)
-    height, time, _, state, _, girsanov_integrals = records.first_below(levels, np.arange(paths))
+    height, time, _, state, girsanov_integrals = records.first_below(levels, np.arange(paths))
     wanted = [int(np.argmax(heights[:, i] < levels[i])) for i in range(paths)]
     assert time.tolist() == wanted
     assert height.tolist() == [heights[k, i] for i, k in enumerate(wanted)]
@@ -100,12 +100,11 @@ def test_records_find_the_first_one_below_a_level():
         == (-girsanov_integrals).tolist()
         == [[heights[k, i], k] for i, k in enumerate(wanted)]
     )
-    records.clear(np.array([3]))
+    records.keep(np.array([3]), 0)
     records.add(
         np.array([3]),
         *(np.array([v]) for v in (0.5, 4, True)),
         np.zeros((1, 2)),
-        np.zeros((1, 1), dtype=np.float32),
         np.zeros((1, 2)),
     )
     assert records.first_below(np.array([1.0]), np.array([3]))[1].tolist() == [4]

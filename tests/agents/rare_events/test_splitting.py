@@ -14,19 +14,22 @@ from scipy.stats import t as student
 
 from safe_envs import ConfigurationError
 from safe_envs.agents import NominalController, ZeroController, evaluate
-from safe_envs.agents.evaluation.brownian_bridge import BrownianBridge
 from safe_envs.agents.evaluation.statistics import log_normal_interval
 from safe_envs.agents.rare_events import splitting
 from safe_envs.agents.rare_events.estimate import estimate_rare
-from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling, TiltedNoiseEnv
+from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling
 from safe_envs.agents.rare_events.splitting import Splitting
 from safe_envs.problem.barrier import Barrier
 from safe_envs.scripts.reproduce.chapter_4.martingale import attaining_problem
+from tests.agents.rare_events.conftest import paths_of
 from tests.oracles.laws import X, brownian, first_passage, martingale_passage, walk_passage
 
 pytestmark = pytest.mark.slow
 
 SHORT: dict[str, Any] = {"particles": 100, "repetitions": 10}
+
+SCALAR: dict[str, Any] = {"noise": 0.3, "horizon": 1.0, "dt": 0.05, "box": [-1.0, 1.0]}
+"""Random starts, and a box that is too small for some of them."""
 
 
 def row_of(problem, filter_name="none", **arguments):
@@ -34,14 +37,8 @@ def row_of(problem, filter_name="none", **arguments):
     return row
 
 
-def splitting_of(problem, bridge=None):
-    return Splitting(
-        lambda lengths: TiltedNoiseEnv(problem, lengths),
-        NominalController(problem),
-        0,
-        4096,
-        bridge,
-    )
+def splitting_of(problem, continuous=False):
+    return Splitting(paths_of(problem, NominalController(problem), continuous=continuous), 0)
 
 
 def assert_holds(row, exact, within):
@@ -87,7 +84,7 @@ def test_first_passage_of_probability_1e_8_with_continuous_monitoring():
 def test_geometric_martingale_of_probability_1e_8():
     problem = replace(attaining_problem(1e-4), dt=0.1, horizon=14.0)
     exact = martingale_passage(1e-4, 140, 0.1)
-    row = row_of(problem, "scbf", particles=120)
+    row = row_of(problem, "scbf", particles=120, seed=1)
     assert_holds(row, exact, 3.0)
     assert_near(row.check if "drift" in row.method else row, exact, 4.0)
 
@@ -115,27 +112,29 @@ def test_splitting_is_unbiased_and_its_interval_covers():
 
 def test_splitting_looks_between_instants():
     problem = brownian(0.1, 1.0, 0.0, 0.3)
-    found = splitting_of(problem, BrownianBridge(problem)).estimate(0.5, 100, 150)
+    found = splitting_of(problem, continuous=True).estimate(0.5, 100, 150)
     low, high = log_normal_interval(found.estimates, 0.99)
     assert low < first_passage(1.0, 0.0, 0.3, 1.0) < high
     assert walk_passage(1.0, 10, 0.0, 0.3 * math.sqrt(0.1)) < low
 
 
 def test_pilots_and_estimates_have_noise_of_their_own():
-    problem, seeds = brownian(0.1, 1.0, 0.0, 0.3), []
+    problem = brownian(0.1, 1.0, 0.0, 0.3)
+    player = paths_of(problem, ZeroController(problem))
+    keys, play = [], player.play
 
-    class Noting(TiltedNoiseEnv):
-        def reset(self, *, seed=None, options=None):
-            if seed is not None:
-                seeds.append(set(np.atleast_1d(seed).tolist()))
-            return super().reset(seed=seed, options=options)
+    def noting(paths, all_keys, *arguments):
+        keys.append(all_keys[paths])
+        return play(paths, all_keys, *arguments)
 
-    how = (lambda lengths: Noting(problem, lengths), ZeroController(problem), 0, 64)
-    Splitting(*how).choose(50)
-    Splitting(*how).estimate(0.0, 50, 10)
-    ImportanceSampling(*how).estimate(3.0, 50, 2)
-    assert len(seeds) == 4
-    assert len(set.union(*seeds)) == sum(len(each) for each in seeds)
+    player.play = noting
+    Splitting(player, 0).choose(50)
+    Splitting(player, 0).estimate(0.0, 50, 10)
+    ImportanceSampling(player, 0).estimate(3.0, 50, 2)
+    # Every generation of every path has noise of its own too.
+    assert len(keys) > 10
+    found = np.concatenate(keys)
+    assert len(np.unique(found)) == len(found)
 
 
 @pytest.mark.slow
@@ -145,9 +144,7 @@ def test_pilots_and_estimates_have_noise_of_their_own():
     [("nominal", "discrete"), ("random", "discrete"), ("nominal", "continuous")],
 )
 def test_agrees_with_plain_episodes_where_these_do(policy, monitoring, episodes):
-    # Random starts, and a box that is too small for some of them.
-    options = {"noise": 0.3, "horizon": 1.0, "dt": 0.05, "box": [-1.0, 1.0]}
-    arguments = {"filters": ["szcbf"], "options": options, "monitoring": monitoring}
+    arguments = {"filters": ["szcbf"], "options": SCALAR, "monitoring": monitoring}
     (plain,) = evaluate(
         "Scalar-v0", policy, episodes=episodes, confidence=0.99, bounds=False, **arguments
     ).rows
@@ -177,9 +174,21 @@ def test_same_seed_is_the_same_answer_and_is_json():
     assert document["config"]["particles"] == 100
 
 
-def test_batches_do_not_change_what_is_estimated():
-    problem, exact = brownian(0.1, 1.0, 0.0, 0.3), walk_passage(1.0, 10, 0.0, 0.3 * math.sqrt(0.1))
-    assert_holds(row_of(problem, num_envs=300), exact, 2.0)
+@pytest.mark.parametrize(
+    ("problem", "filter_name", "arguments"),
+    [
+        (brownian(0.1, 1.0, 0.0, 0.3, [1 - X, 2 * (1 + X)]), "none", {"monitoring": "continuous"}),
+        ("Scalar-v0", "szcbf", {"policy": "random", "options": SCALAR}),
+    ],
+    ids=["two barriers", "random policy"],
+)
+def test_numbers_do_not_depend_on_the_envs_side_by_side(problem, filter_name, arguments):
+    wanted, other = (
+        row_of(problem, filter_name, engine="numpy", num_envs=n, **arguments, **SHORT)
+        for n in (4096, 150)
+    )
+    assert wanted.levels > 0
+    assert other == wanted
 
 
 def test_where_h_jumps_it_says_so():

@@ -1,0 +1,219 @@
+"""Paths from their last records to a violation or to their end, in one compiled function."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from safe_envs.agents.evaluation.episode_kernel import is_finite_input
+from safe_envs.agents.rare_events.path_slots import lowest_relative, state_in, tilt_direction
+from safe_envs.compiled.draws import (
+    BRIDGE,
+    NOISE,
+    draw_start,
+    fill_normals,
+    fill_uniforms,
+    store_row,
+)
+from safe_envs.compiled.slots import (
+    act,
+    advance,
+    barriers_of,
+    decide,
+    has_ended,
+    is_finite,
+    measure,
+    observation_of,
+    resting_input,
+)
+
+DONE = 0
+FULL = 1
+FAILED = 2
+
+
+def draw_path_starts(
+    keys: np.ndarray,
+    states: np.ndarray,
+    barriers: np.ndarray,
+    data: np.ndarray,
+    uniforms: np.ndarray,
+) -> int:
+    """Draw the starts of paths, and return how many there are before the first that has none.
+
+    Args:
+        keys: of the paths, uint64 (B,).
+        states: receives the states, (B, n).
+        barriers: receives the barriers there, (B, k).
+        data: numbers of the program.
+        uniforms: scratch array, with an entry for each uniform of the distribution.
+    """
+    for row in range(len(keys)):
+        x = draw_start(keys[row], 0, 0, uniforms, data)
+        values = measure(x, resting_input(data), 0.0, data)
+        if not is_finite(x, values):
+            return row
+        store_row(states[row], x)
+        store_row(barriers[row], barriers_of(values))
+    return len(keys)
+
+
+def play_paths(  # noqa: PLR0913
+    paths: np.ndarray,
+    keys: np.ndarray,
+    kinds: np.ndarray,
+    weights: np.ndarray,
+    units: np.ndarray,
+    sizes: tuple[int, int, int],
+    scales: tuple[float, float, float],
+    count: np.ndarray,
+    heights: np.ndarray,
+    instants: np.ndarray,
+    ended: np.ndarray,
+    states: np.ndarray,
+    integrals: np.ndarray,
+    ends: np.ndarray,
+    outcomes: np.ndarray,
+    data: np.ndarray,
+    noise: np.ndarray,
+    bridge: np.ndarray,
+    work: np.ndarray,
+) -> int:
+    """Play paths and return how many there are.
+
+    Each goes on from its last record to a violation, to the end of the episode, or until there is
+    no room for a record; then it can go on from its last one again.
+
+    Args:
+        paths: their numbers, int64 (B,).
+        keys: of all paths, uint64 (paths,), which give their noise.
+        kinds: columns of `weights` for all paths, int64 (paths,).
+        weights: heights over the smallest relative barriers, for each control instant, (steps + 1,
+            kinds).
+        units: of the barriers, (k,).
+        sizes: control periods that are drawn ahead, a multiple of 4, and standard normals and
+            uniforms of the bridges for each.
+        scales: control period in s, length of the drift against h in 1/sqrt(s), and root of the
+            integration step in sqrt(s).
+        count: as in `Records`, of all paths; so are the following.
+        heights: see above.
+        instants: see above.
+        ended: see above.
+        states: see above.
+        integrals: see above.
+        ends: receives the last control instant of each path, int64 (paths,).
+        outcomes: receives `DONE`, `FULL` (no room) or `FAILED` (what NumPy has an error for), int64
+            (paths,).
+        data: numbers of the program.
+        noise: scratch array for the normals that are drawn ahead.
+        bridge: the same for the uniforms of the bridges.
+        work: scratch array.
+    """
+    for i in range(len(paths)):
+        path = int(paths[i])
+        ends[path], outcomes[path], count[path] = play_path(
+            keys[path],
+            weights[:, kinds[path]],
+            units,
+            sizes,
+            scales,
+            count[path],
+            heights[path],
+            instants[path],
+            ended[path],
+            states[path],
+            integrals[path],
+            data,
+            noise,
+            bridge,
+            work,
+        )
+    return len(paths)
+
+
+def play_path(  # noqa: PLR0913
+    key: int,
+    weights: np.ndarray,
+    units: np.ndarray,
+    sizes: tuple[int, int, int],
+    scales: tuple[float, float, float],
+    count: int,
+    heights: np.ndarray,
+    instants: np.ndarray,
+    ended: np.ndarray,
+    states: np.ndarray,
+    integrals: np.ndarray,
+    data: np.ndarray,
+    noise: np.ndarray,
+    bridge: np.ndarray,
+    work: np.ndarray,
+) -> tuple[int, int, int]:
+    """Play a path; return its last control instant, the outcome, and the number of its records.
+
+    For the arguments see `play_paths`.
+    """
+    ahead, channels, draws = sizes
+    dt, length, root = scales
+    steps, row = len(weights) - 1, count - 1
+    lowest, begin = heights[row], instants[row]
+    if lowest <= 0.0 or ended[row]:
+        return begin, DONE, count
+    across, along = integrals[row, 0], integrals[row, 1]
+    x = state_in(states[row])
+    values = measure(x, resting_input(data), begin * dt, data)
+    barriers = barriers_of(values)
+    drawn = ahead
+    for k in range(begin, steps):
+        if drawn == ahead:
+            # Blocks of the streams have four words.
+            drawn = k % 4
+            fill_normals(noise, (k - drawn) * channels, 0, NOISE, key, 0)
+            fill_uniforms(bridge, (k - drawn) * draws, 0, BRIDGE, key, 0)
+        proposed = act(observation_of(values), k, key, 0, data, work)
+        action, _, _, _, _, _, sound = decide(x, proposed, data, work)
+        if channels:
+            direction = tilt_direction(x, barriers, data)
+            added = tilt(noise, drawn * channels, channels, direction, length * root)
+            across += root * added[0]
+            along += root * root * added[1]
+        moved = advance(x, action, noise, drawn * channels, data)
+        values = measure(moved, action, (k + 1) * dt, data)
+        if not (sound and is_finite_input(proposed) and is_finite(moved, values)):
+            return k + 1, FAILED, row + 1
+        after = barriers_of(values)
+        relative = lowest_relative(x, barriers, after, units, bridge, drawn * draws, data)
+        height = relative * weights[k + 1]
+        x, barriers = moved, after
+        drawn += 1
+        over = has_ended(values) or k + 1 == steps
+        if height < lowest:
+            lowest = height
+            row += 1
+            if row == len(heights):
+                return k + 1, FULL, row
+            heights[row], instants[row], ended[row] = height, k + 1, over
+            integrals[row, 0], integrals[row, 1] = across, along
+            store_row(states[row], x)
+        if over or lowest <= 0.0:
+            return k + 1, DONE, row + 1
+    return steps, DONE, row + 1
+
+
+def tilt(
+    noise: np.ndarray, place: int, channels: int, direction: tuple[float, ...], shift: float
+) -> tuple[float, float]:
+    """Add the drift to the standard normals of a period; return the sums of e z and of e e.
+
+    Args:
+        noise: standard normals, which are changed.
+        place: of the first one.
+        channels: how many there are, substep by substep.
+        direction: e.
+        shift: by which they move against it.
+    """
+    across, along = 0.0, 0.0
+    for i in range(channels):
+        e = direction[i % len(direction)]
+        noise[place + i] -= shift * e
+        across += e * noise[place + i]
+        along += e * e
+    return across, along

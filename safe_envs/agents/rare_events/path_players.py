@@ -1,0 +1,87 @@
+"""Who simulates the paths of an estimation: NumPy, or a compiled program."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from safe_envs.agents.evaluation.resolved import ResolvedEvaluation
+from safe_envs.agents.evaluation.targets import Env
+from safe_envs.agents.jobs.threads import available_threads
+from safe_envs.agents.rare_events.compiled_paths import CompiledPaths, PathProgram
+from safe_envs.agents.rare_events.numpy_paths import NumpyPaths
+from safe_envs.agents.rare_events.particles import PathPlayer
+from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
+from safe_envs.compiled.engine import compiled_or_none
+from safe_envs.wrappers import Condition, SafetyFilter
+
+
+class ChosenPlayer(NamedTuple):
+    """Who simulates, and what the timing says of that.
+
+    Attributes:
+        player: who simulates.
+        how: the engine, and the threads of the compiled one.
+    """
+
+    player: PathPlayer
+    how: dict[str, Any]
+
+
+def player_of(
+    resolved: ResolvedEvaluation,
+    conditions: tuple[Condition, ...],
+    num_envs: int,
+    engine: str,
+    periods: float,
+) -> ChosenPlayer:
+    """Return who simulates paths under a filter.
+
+    Args:
+        resolved: what to simulate.
+        conditions: of the filter; none for the unfiltered env.
+        num_envs: the most envs of NumPy side by side.
+        engine: one of `safe_envs.compiled.engine.ENGINES`.
+        periods: control periods to simulate, about.
+
+    Raises:
+        ConfigurationError: The compiled engine was asked for, and Numba is missing.
+        NotCompilableError: It was asked for, and cannot do this.
+    """
+    continuous = resolved.spec.monitoring == "continuous"
+    reference = NumpyPaths(
+        resolved.problem,
+        partial(_tilted_env, resolved, conditions),
+        resolved.policy,
+        num_envs,
+        continuous,
+    )
+    compiled = compiled_or_none(
+        engine, periods, partial(_compiled, resolved, conditions, continuous, reference)
+    )
+    return compiled or ChosenPlayer(reference, {"engine": "numpy"})
+
+
+def _tilted_env(
+    resolved: ResolvedEvaluation, conditions: tuple[Condition, ...], lengths: np.ndarray
+) -> Env:
+    return resolved.filtered(TiltedNoiseEnv(resolved.problem, lengths), conditions)
+
+
+def _compiled(
+    resolved: ResolvedEvaluation,
+    conditions: tuple[Condition, ...],
+    continuous: bool,
+    reference: PathPlayer,
+) -> ChosenPlayer:
+    problem, spec = resolved.problem, resolved.spec
+    qp = None
+    if conditions:
+        qp = SafetyFilter.for_problem(problem, conditions, spec.knowledge, spec.objective).qp
+    program = PathProgram(problem, resolved.policy, qp, continuous)
+    threads = available_threads()
+    functions = program.compiled()
+    player = CompiledPaths(program, functions, reference, threads)
+    return ChosenPlayer(player, {"engine": "compiled", "threads": threads})
