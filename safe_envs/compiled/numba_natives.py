@@ -13,7 +13,15 @@ from llvmlite import ir
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array, populate_array
 
-__all__ = ["entry", "kernel", "philox_block", "single", "uniform_of"]
+__all__ = [
+    "entry",
+    "kernel",
+    "philox_block",
+    "single",
+    "table_view",
+    "uniform_of",
+    "vector_view",
+]
 
 kernel = numba.njit(nogil=True, error_model="numpy", forceinline=True)
 entry = numba.njit(nogil=True, error_model="numpy", cache=True)

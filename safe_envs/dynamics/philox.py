@@ -75,9 +75,9 @@ class StreamReader:
         block, lane = divmod(word, _LANES)
         self._place["counter"] = (block, episode, purpose, 0)
         self._place["key"] = key
-        self._generator.bit_generator.state = self._state
+        self._generator.bit_generator.state = self._state  # pyright: ignore[reportAttributeAccessIssue]
         if lane:
-            self._generator.bit_generator.random_raw(lane, output=False)
+            self.words(lane)
         return self
 
     def words(self, count: int) -> np.ndarray:

@@ -56,7 +56,7 @@ class CompiledEpisodes:
         source = (
             world_source(problem, data)
             + policy_source(policy, problem, data)
-            + (unfiltered_source() if qp is None else filter_source(qp, data))
+            + (unfiltered_source(len(problem.inputs)) if qp is None else filter_source(qp, data))
             + bridge_source(problem, continuous, data)
         )
         self._problem, self._data, self._work = problem, data.array(), max(source.work, 1)

@@ -9,6 +9,7 @@ was smallest; `inputs` what was executed where the slack was largest.
 from __future__ import annotations
 
 from math import isfinite, nan, sqrt
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +20,10 @@ from safe_envs.compiled.draws import (
     episode_key,
     fill_normals,
     fill_uniforms,
-    store_row,
 )
 from safe_envs.compiled.slots import (
+    Input,
+    State,
     act,
     advance,
     barriers_of,
@@ -81,17 +83,34 @@ def play_episodes(  # noqa: PLR0913
     """
     for row in range(len(numbers)):
         key = episode_key(first + row, k0, k1)
-        found = numbers[row], counts[row], states[row], inputs[row]
-        if not play_episode(key, sizes, dt, found, data, noise, bridge, uniforms, work):
+        if not play_episode(
+            row,
+            key,
+            sizes,
+            dt,
+            numbers,
+            counts,
+            states,
+            inputs,
+            data,
+            noise,
+            bridge,
+            uniforms,
+            work,
+        ):
             return row
     return len(numbers)
 
 
 def play_episode(  # noqa: PLR0913
+    row: int,
     key: int,
     sizes: tuple[int, int, int, int],
     dt: float,
-    found: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    numbers: np.ndarray,
+    counts: np.ndarray,
+    states: np.ndarray,
+    inputs: np.ndarray,
     data: np.ndarray,
     noise: np.ndarray,
     bridge: np.ndarray,
@@ -101,10 +120,14 @@ def play_episode(  # noqa: PLR0913
     """Simulate an episode from its key, and return whether it came to an end.
 
     Args:
-        key: first word of its key.
+        row: of the arrays.
+        key: first word of the key of the episode.
         sizes: see `play_episodes`, as for the other arguments.
         dt: control period in s.
-        found: rows of numbers, counts, states and inputs.
+        numbers: receives results.
+        counts: receives results.
+        states: receives results.
+        inputs: receives results.
         data: numbers of the program.
         noise: scratch array.
         bridge: scratch array.
@@ -116,9 +139,8 @@ def play_episode(  # noqa: PLR0913
     values = measure(x, resting_input(data), 0.0, data)
     if not is_finite(x, values):
         return False
-    states, inputs = found[2], found[3]
-    for i in range(len(states)):
-        store_row(states[i], x)
+    for i in range(states.shape[1]):
+        store_state(states, row, i, x)
     barriers = barriers_of(values)
     h_min = depth = smallest_barrier(barriers)
     safe = h_min > 0.0
@@ -140,8 +162,8 @@ def play_episode(  # noqa: PLR0913
             slack = largest_slack(slacks)
             if slack > worst:
                 worst = slack
-                store_row(states[VIOLATING_STATE], x)
-                store_row(inputs, action)
+                store_state(states, row, VIOLATING_STATE, x)
+                store_entries(inputs, row, action)
         moved = advance(x, action, noise, drawn * channels, data)
         values = measure(moved, action, (k + 1) * dt, data)
         if not (sound and is_finite_input(proposed) and is_finite(moved, values)):
@@ -152,22 +174,34 @@ def play_episode(  # noqa: PLR0913
         length += 1
         if safe and h > depth:
             depth = h
-            store_row(states[DEEPEST_STATE], x)
+            store_state(states, row, DEEPEST_STATE, x)
         if h < h_min:
             h_min = h
             if h <= 0.0:
-                store_row(states[LOWEST_STATE], x)
+                store_state(states, row, LOWEST_STATE, x)
         safe = safe and h > 0.0
         returned += reward_of(values)
         if has_ended(values):
             break
     mean = effort / counted if counted else nan
-    store_row(found[0], (returned, h_min, mean, depth, worst))
-    store_row(found[1], (-1 if safe else counted, length, interventions, infeasible))
+    store_entries(numbers, row, (returned, h_min, mean, depth, worst))
+    store_entries(counts, row, (-1 if safe else counted, length, interventions, infeasible))
     return True
 
 
-def square_of_input(u: tuple[float, ...]) -> float:
+def store_entries(table: np.ndarray, row: int, values: tuple[Any, ...]) -> None:
+    """Write values to a row of a table."""
+    for j in range(len(values)):
+        table[row, j] = values[j]
+
+
+def store_state(states: np.ndarray, row: int, place: int, x: State) -> None:
+    """Write a state to a place of an episode."""
+    for j in range(len(x)):
+        states[row, place, j] = x[j]
+
+
+def square_of_input(u: Input) -> float:
     """Return |u|^2."""
     total = u[0] * u[0]
     for j in range(1, len(u)):
@@ -175,7 +209,7 @@ def square_of_input(u: tuple[float, ...]) -> float:
     return total
 
 
-def is_finite_input(u: tuple[float, ...]) -> bool:
+def is_finite_input(u: Input) -> bool:
     """Return whether the entries of an input, which lie within their bounds, are numbers."""
     total = 0.0
     for v in u:

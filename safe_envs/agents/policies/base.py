@@ -92,10 +92,7 @@ class Policy(ABC):
         Raises:
             NotCompilableError: There is no such function.
         """
-        raise NotCompilableError(
-            f"the policy {type(self).__name__} has no compiled form, and only the NumPy engine can"
-            " call it"
-        )
+        raise not_compilable(self)
 
 
 class StatelessPolicy(Policy):
@@ -152,6 +149,14 @@ class BlockPolicy(StatelessPolicy):
         padded[self._offset : end] = rows
         found = [self.act(padded[k : k + BLOCK]) for k in range(0, len(padded), BLOCK)]
         return np.concatenate(found)[self._offset : end].reshape(*given.shape[:-1], -1)
+
+
+def not_compilable(policy: Any) -> NotCompilableError:
+    """Return the error that says that a policy is no function of compiled programs."""
+    return NotCompilableError(
+        f"the policy {type(policy).__name__} has no compiled form, and only the NumPy engine can"
+        " call it"
+    )
 
 
 def checked_observation(observation: Any, width: int) -> np.ndarray:

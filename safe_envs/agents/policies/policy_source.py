@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from safe_envs.agents.policies.base import Policy
+from safe_envs.agents.policies.base import Policy, not_compilable
 from safe_envs.agents.policies.policy_kernel import input_of_action
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
+from safe_envs.compiled.own_source import has_own_source
 from safe_envs.envs.spaces import center_and_half_width
-from safe_envs.errors import NotCompilableError
 from safe_envs.problem.problem import SafetyProblem
+
+_COMPUTING = ("predict", "begin", "actions", "act")
+"""Methods of policies by which they compute, as far as they have them."""
 
 
 def policy_source(policy: Any, problem: SafetyProblem, data: Data) -> Source:
@@ -24,11 +27,9 @@ def policy_source(policy: Any, problem: SafetyProblem, data: Data) -> Source:
     Raises:
         NotCompilableError: The policy is more than formulas of an observation.
     """
-    if not isinstance(policy, Policy):
-        raise NotCompilableError(
-            f"the policy {type(policy).__name__} comes from outside this project, and only the"
-            " NumPy engine can call it"
-        )
+    own = isinstance(policy, Policy) and has_own_source(policy, *_COMPUTING)
+    if not own:
+        raise not_compilable(policy)
     chosen = policy.source(data)
     entries = ""
     for j, (center, half) in enumerate(zip(*center_and_half_width(problem), strict=True)):

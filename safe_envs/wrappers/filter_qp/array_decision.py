@@ -277,9 +277,7 @@ def _method(k: int, m: int, *, uncertain: bool) -> tuple[Callable[..., Any], int
         return project_interval, work_of_interval(k, m)
     if m == 2:
         return project_plane, work_of_plane(k, m)
-    raise NotCompilableError(
-        f"{k} constraints on {m} inputs, a goal's slack included, need a solver"
-    )
+    raise NotCompilableError(f"{k} constraints on {m} inputs need a solver")
 
 
 def pairs(m: int) -> list[tuple[int, int]]:

@@ -9,8 +9,8 @@ from math import inf, sqrt
 
 import numpy as np
 
-FAR = 1e4
-"""That of `safe_envs.wrappers.filter_qp.solver`."""
+FAR_AWAY = 1e4
+"""How many times further than the input bounds reach is far away; as in the solver."""
 
 
 def aim_outwards(
@@ -56,7 +56,7 @@ def aim_outwards(
         rise[j] /= size
         steepness += rise[j] * rise[j] / w[j]
         span += abs(rise[j]) * (high[j] - low[j])
-    far = FAR * span / (steepness if steepness > 0.0 else 1.0)
+    far = FAR_AWAY * span / (steepness if steepness > 0.0 else 1.0)
     for j in range(m):
         corner = high[j] if rise[j] > 0.0 else low[j] if rise[j] < 0.0 else aim[j]
         aim[j] = corner + far * rise[j] / w[j]

@@ -126,3 +126,13 @@ def test_policies_from_outside_are_refused(given):
     policy = as_policy(Outside() if given == "predict" else given, problem)
     with pytest.raises(NotCompilableError, match="only the NumPy engine can call it"):
         policy_source(policy, problem, Data())
+
+
+@pytest.mark.parametrize("method", ["actions", "predict", "begin"])
+def test_classes_that_compute_otherwise_are_refused(method):
+    derived = type("Derived", (NominalController,), {method: getattr(NominalController, method)})
+    problem = problem_of(DUBINS)
+    with pytest.raises(NotCompilableError, match="the policy Derived has no compiled form"):
+        policy_source(derived(problem), problem, Data())
+    as_before = type("AsBefore", (NominalController,), {})
+    assert policy_source(as_before(problem), problem, Data()).text

@@ -76,42 +76,38 @@ def add_products(
             work[y + i] += factor * data[row + i]
 
 
-def identity_units(y: int, size: int, work: np.ndarray) -> None:
-    """Leave the numbers of a layer as they are: an activation as the following ones.
+def tanh_units(y: int, size: int, work: np.ndarray) -> None:
+    """Replace the numbers of a layer by their activation.
 
     Args:
         y: where the numbers stand in the scratch array.
         size: how many there are.
         work: scratch array.
     """
-
-
-def tanh_units(y: int, size: int, work: np.ndarray) -> None:
-    """Replace the numbers of a layer by their activation; see `identity_units`."""
     for i in range(y, y + size):
         work[i] = tanh(work[i])
 
 
 def relu_units(y: int, size: int, work: np.ndarray) -> None:
-    """Replace the numbers of a layer by their activation; see `identity_units`."""
+    """Replace the numbers of a layer by their activation; see `tanh_units`."""
     for i in range(y, y + size):
         work[i] = 0.0 if work[i] < 0.0 else work[i]
 
 
 def leaky_relu_units(y: int, size: int, work: np.ndarray) -> None:
-    """Replace the numbers of a layer by their activation; see `identity_units`."""
+    """Replace the numbers of a layer by their activation; see `tanh_units`."""
     for i in range(y, y + size):
         work[i] = 0.01 * work[i] if work[i] < 0.0 else work[i]
 
 
 def elu_units(y: int, size: int, work: np.ndarray) -> None:
-    """Replace the numbers of a layer by their activation; see `identity_units`."""
+    """Replace the numbers of a layer by their activation; see `tanh_units`."""
     for i in range(y, y + size):
         work[i] = expm1(work[i]) if work[i] < 0.0 else work[i]
 
 
 def silu_units(y: int, size: int, work: np.ndarray) -> None:
-    """Replace the numbers of a layer by their activation; see `identity_units`."""
+    """Replace the numbers of a layer by their activation; see `tanh_units`."""
     for i in range(y, y + size):
         work[i] = 0.5 * work[i] * (1.0 + tanh(0.5 * work[i]))
 

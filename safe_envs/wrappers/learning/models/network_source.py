@@ -76,11 +76,12 @@ class _Layers:
 
     def forward(self, count: int) -> None:
         """Evaluate the first layers."""
-        activation = getattr(network_kernel, f"{self._network.activation}_units")
+        activation = getattr(network_kernel, f"{self._network.activation}_units", None)
         for k, (weights, bias) in enumerate(self._network.layers[:count], start=1):
             self._set(self.places[k], bias)
             self._add_products(self.places[k - 1], self.places[k], weights.T)
-            if k < len(self._network.layers):
+            # The identity has no kernel.
+            if activation is not None and k < len(self._network.layers):
                 self._call(activation, self.places[k], self.sizes[k])
 
     def backward(self, output: int) -> int:
