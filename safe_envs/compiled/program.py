@@ -102,7 +102,7 @@ class _KeptProgram:
     """A program in a folder of its own, where Numba keeps what it compiles."""
 
     def __init__(self, folder: Path, text: str, title: str) -> None:
-        self._folder, self._title = folder, title
+        self._folder, self._title, self._told = folder, title, False
         self._text = f"from safe_envs.compiled.numba_natives import *\n{text}"
         self._functions = self._load()
 
@@ -115,8 +115,9 @@ class _KeptProgram:
             nonlocal function, is_new
             if not is_new:
                 return function(*arguments)
-            if not any(self._folder.glob(f"__pycache__/*.{name}-*.nbi")):
+            if not (self._told or any(self._folder.glob(f"__pycache__/*.{name}-*.nbi"))):
                 _LOG.warning("compiling %s, which takes some seconds once", self._title)
+                self._told = True
             is_new = False
             try:
                 return function(*arguments)

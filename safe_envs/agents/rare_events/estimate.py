@@ -24,8 +24,8 @@ from safe_envs.problem.problem import SafetyProblem
 PARTICLES = 250
 REPETITIONS = 20
 
-_EPISODES = 5
-"""Plain episodes that take as long as a particle with all of its continuations, about."""
+_EPISODES = 10
+"""Plain episodes that take NumPy as long as a particle with all of its continuations, about."""
 
 _FEWEST_PARTICLES = 20
 _FEWEST_REPETITIONS = 10
