@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from safe_envs.agents.policies.base import CHOOSE, StatelessPolicy
-from safe_envs.agents.policies.clf_kernel import best_inputs, work_of_best_inputs
+from safe_envs.agents.policies.clf_kernel import best_inputs_for_goal, work_of_goal
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.envs.spaces import center_and_half_width
@@ -95,10 +95,10 @@ class CLFController(StatelessPolicy):
             f"(work[{j}] - data[{scales + j}]) / data[{scales + m + j}], " for j in range(m)
         )
         return rates + Source(
-            f"{CHOOSE}    best_inputs(goal_rates(({x}), data), {place}, data, work)\n"
+            f"{CHOOSE}    best_inputs_for_goal(goal_rates(({x}), data), {place}, data, work)\n"
             f"    return ({entries})\n",
-            (best_inputs,),
-            work_of_best_inputs(m),
+            (best_inputs_for_goal,),
+            work_of_goal(m),
         )
 
 

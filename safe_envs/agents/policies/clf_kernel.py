@@ -12,12 +12,14 @@ from safe_envs.wrappers.qp.kernels.one_constraint import (
 )
 
 
-def work_of_best_inputs(m: int) -> int:
-    """Return the length of the scratch array of `best_inputs` for m inputs."""
+def work_of_goal(m: int) -> int:
+    """Return the length of the scratch array of `best_inputs_for_goal` for m inputs."""
     return 6 * (m + 1) + 4 + work_of_one_constraint(1, m + 1)
 
 
-def best_inputs(goal: tuple[float, ...], place: int, data: np.ndarray, work: np.ndarray) -> None:
+def best_inputs_for_goal(
+    goal: tuple[float, ...], place: int, data: np.ndarray, work: np.ndarray
+) -> None:
     """Minimise w |u|^2 + w (d / unit)^2 subject to growth + b u <= d and the input bounds.
 
     It is what `safe_envs.wrappers.filter_qp.solver.FilterQPSolver.best` does.
