@@ -77,8 +77,8 @@ def test_random_actions_are_the_words_of_a_stream(env_id, key):
     assert len(np.unique(found)) == COUNT * m
 
 
-def some_network(inputs, outputs, activation, hidden=(7, 5)):
-    rng, sizes = np.random.default_rng(3), [inputs, *hidden, outputs]
+def some_network(inputs, outputs, activation, hidden=(7, 5), seed=3):
+    rng, sizes = np.random.default_rng(seed), [inputs, *hidden, outputs]
     weights = [0.4 * rng.normal(size=(b, a)) / a**0.5 for a, b in pairwise(sizes)]
     biases = [0.3 * rng.normal(size=b) for b in sizes[1:]]
     return Network.unscaled(weights, biases, activation)
@@ -112,6 +112,14 @@ def test_networks(env_id, activation, output, hidden, normal, other_box):
     assert apart.mean() <= 0.1
     np.testing.assert_allclose(found, executed(problem, actions), rtol=3e-7, atol=1e-7)
     assert len(np.unique(found)) > COUNT / 4
+
+
+def test_networks_of_one_shape_share_a_program():
+    problem, texts = problem_of(DUBINS), set()
+    for seed in (1, 2):
+        policy = NetworkPolicy(some_network(4, 1, "tanh", seed=seed), "tanh")
+        texts.add(policy_source(policy, problem, Data()).text)
+    assert len(texts) == 1
 
 
 def planar_problem():
