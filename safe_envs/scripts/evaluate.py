@@ -63,6 +63,7 @@ def evaluate(
         "confidence": confidence,
         "learned": learned or (),
         "monitoring": monitoring,
+        "engine": engine,
     }
     if rare:
         refused = {
@@ -72,7 +73,6 @@ def evaluate(
             "--episodes-out": episodes_out,
             "--repeats": repeats != 1,
             "--jobs": jobs is not None,
-            "--engine": engine != "auto",
             "--episodes": episodes is not None,
             "--num-envs": num_envs is not None,
         }
@@ -85,7 +85,7 @@ def evaluate(
             " place"
         )
     third_party = filter_spec and env.env_id and not env.system
-    common |= {"filter_spec": filter_spec, "repeats": repeats, "jobs": jobs, "engine": engine}
+    common |= {"filter_spec": filter_spec, "repeats": repeats, "jobs": jobs}
     common |= {"record": plot is not None, **_given({"episodes": episodes, "num_envs": num_envs})}
     problem = env.env_id if third_party else env.full_id
     _evaluate(problem, policy, refine, (json, episodes_out, plot), common)

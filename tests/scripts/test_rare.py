@@ -30,7 +30,9 @@ def test_acceptance_in_small(safe_envs_command):
     assert (status, err) == (0, "")
     assert "rare violations, 10 repetitions of 50 particles" in out
     assert "P(violation) [95 % interval]" in out
-    (row,) = strictly("rare.json")["rows"]
+    found = strictly("rare.json")
+    (row,), (speed,) = found["rows"], found["timing"]["rows"]
+    assert (speed["filter"], speed["engine"], speed["jobs"]) == ("scbf", "numpy", 1)
     # h_0 = 22 m is 5 deviations of the Gaussian law away: 2 Phi(-h_0/(tau sigma sqrt(T))), and a
     # little less at control instants.
     law = math.erfc((22 + 0.5826 * 1.8 * math.sqrt(0.1)) / (1.8 * math.sqrt(6)) / math.sqrt(2))
@@ -175,6 +177,7 @@ def test_continuous_monitoring_is_told_in_the_heading(safe_envs_command):
         (("--rare", "--particles", "3"), "particles = 3"),
         (("--monitoring", "often"), "monitoring = 'often'"),
         (("--rare", "--monitoring", "often"), "monitoring = 'often'"),
+        (("--rare", "--engine", "fast"), "engine = 'fast'"),
     ],
 )
 def test_mistakes_are_told(safe_envs_command, arguments, message):

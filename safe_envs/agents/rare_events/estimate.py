@@ -153,13 +153,15 @@ class _Estimator:
                 "nothing is random after the start, so that copies of an episode go on like it;"
                 " plain episodes find all that there is"
             )
-            return replace(nothing, reason=reason), {"seconds": 0.0, "steps_per_second": 0.0}
+            speed = {"seconds": 0.0, "steps_per_second": 0.0, "engine": "numpy", "jobs": 1}
+            return replace(nothing, reason=reason), speed
         periods = _EPISODES * self.particles * self.repetitions * resolved.problem.steps
         chosen = player_of(resolved, resolved.filters[name][0], self.num_envs, self.engine, periods)
         begun = time.perf_counter()
         row = self._estimated(nothing, chosen.player)
         seconds = time.perf_counter() - begun
-        return row, {**chosen.how, "seconds": seconds, "steps_per_second": row.steps / seconds}
+        speed = {"seconds": seconds, "steps_per_second": row.steps / seconds}
+        return row, {**speed, "engine": chosen.engine, "jobs": chosen.jobs}
 
     def _estimated(self, nothing: RareRow, player: PathPlayer) -> RareRow:
         """Fill the row of a filter.

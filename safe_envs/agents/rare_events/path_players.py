@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,15 +19,17 @@ from safe_envs.wrappers import Condition, SafetyFilter
 
 
 class ChosenPlayer(NamedTuple):
-    """Who simulates, and what the timing says of that.
+    """Who simulates, and how.
 
     Attributes:
         player: who simulates.
-        how: the engine, and the threads of the compiled one.
+        engine: "numpy" or "compiled".
+        jobs: threads.
     """
 
     player: PathPlayer
-    how: dict[str, Any]
+    engine: str
+    jobs: int
 
 
 def player_of(
@@ -61,7 +63,7 @@ def player_of(
     compiled = compiled_or_none(
         engine, periods, partial(_compiled, resolved, conditions, continuous, reference)
     )
-    return compiled or ChosenPlayer(reference, {"engine": "numpy"})
+    return compiled or ChosenPlayer(reference, "numpy", 1)
 
 
 def _tilted_env(
@@ -84,4 +86,4 @@ def _compiled(
     threads = available_threads()
     functions = program.compiled()
     player = CompiledPaths(program, functions, reference, threads)
-    return ChosenPlayer(player, {"engine": "compiled", "threads": threads})
+    return ChosenPlayer(player, "compiled", threads)

@@ -10,7 +10,12 @@ from safe_envs.agents.evaluation.brownian_bridge import bridge_notes
 from safe_envs.agents.rare_events.estimate import RareEvaluation
 from safe_envs.agents.rare_events.rows import RareRow
 from safe_envs.scripts.options.console import say
-from safe_envs.scripts.reports.evaluation_report import early_end, heading_of, unsafe_starts
+from safe_envs.scripts.reports.evaluation_report import (
+    early_end,
+    engine_notes,
+    heading_of,
+    unsafe_starts,
+)
 from safe_envs.scripts.reports.tables import make_table, print_whole
 
 _COLUMNS = (
@@ -74,6 +79,9 @@ def _notes(answer: RareEvaluation) -> list[str]:
     plain = [row.plain for row in rows if row.plain]
     if plain:
         notes += unsafe_starts(plain[0].outside / plain[0].episodes)
+    notes += engine_notes(
+        [(each["filter"], each["engine"], each["jobs"]) for each in answer.timing["rows"]]
+    )
     notes += [
         early_end(row.filter, "mean episode without a violation", length, steps)
         for row in rows
