@@ -158,11 +158,31 @@ def play_path(  # noqa: PLR0913
     if lowest <= 0.0 or ended[row]:
         return begin, DONE, count
     across, along = integrals[row, 0], integrals[row, 1]
-    x = state_in(states[row])
-    values = measure(x, resting_input(data), begin * dt, data)
-    barriers = barriers_of(values)
+    x = before = state_in(states[row])
+    action = resting_input(data)
+    barriers = barriers_of(measure(x, action, begin * dt, data))
     drawn = ahead
-    for k in range(begin, steps):
+    # A state is read in the period that it begins, so that functions of it are computed once.
+    for k in range(begin, steps + 1):
+        values = measure(x, action, k * dt, data)
+        after = barriers_of(values)
+        if k > begin:
+            if not is_finite(x, values):
+                return k, FAILED, row + 1
+            place = (drawn - 1) * draws
+            height = lowest_relative(before, barriers, after, units, bridge, place, data)
+            height *= weights[k]
+            over = has_ended(values) or k == steps
+            if height < lowest:
+                lowest = height
+                row += 1
+                if row == len(heights):
+                    return k, FULL, row
+                heights[row], instants[row], ended[row] = height, k, over
+                integrals[row, 0], integrals[row, 1] = across, along
+                store_row(states[row], x)
+            if over or lowest <= 0.0:
+                return k, DONE, row + 1
         if drawn == ahead:
             # Blocks of the streams have four words.
             drawn = k % 4
@@ -170,31 +190,16 @@ def play_path(  # noqa: PLR0913
             fill_uniforms(bridge, (k - drawn) * draws, 0, BRIDGE, key, 0)
         proposed = act(observation_of(values), k, key, 0, data, work)
         action, _, _, _, _, _, sound = decide(x, proposed, data, work)
+        if not (sound and is_finite_input(proposed)):
+            return k, FAILED, row + 1
         if channels:
-            direction = tilt_direction(x, barriers, data)
+            direction = tilt_direction(x, after, data)
             added = tilt(noise, drawn * channels, channels, direction, length * root)
             across += root * added[0]
             along += root * root * added[1]
-        moved = advance(x, action, noise, drawn * channels, data)
-        values = measure(moved, action, (k + 1) * dt, data)
-        if not (sound and is_finite_input(proposed) and is_finite(moved, values)):
-            return k + 1, FAILED, row + 1
-        after = barriers_of(values)
-        relative = lowest_relative(x, barriers, after, units, bridge, drawn * draws, data)
-        height = relative * weights[k + 1]
-        x, barriers = moved, after
+        before, barriers = x, after
+        x = advance(x, action, noise, drawn * channels, data)
         drawn += 1
-        over = has_ended(values) or k + 1 == steps
-        if height < lowest:
-            lowest = height
-            row += 1
-            if row == len(heights):
-                return k + 1, FULL, row
-            heights[row], instants[row], ended[row] = height, k + 1, over
-            integrals[row, 0], integrals[row, 1] = across, along
-            store_row(states[row], x)
-        if over or lowest <= 0.0:
-            return k + 1, DONE, row + 1
     return steps, DONE, row + 1
 
 
