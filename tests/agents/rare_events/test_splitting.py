@@ -28,6 +28,10 @@ pytestmark = pytest.mark.slow
 
 SHORT: dict[str, Any] = {"particles": 100, "repetitions": 10}
 
+both_engines = pytest.mark.parametrize(
+    "engine", ["numpy", pytest.param("compiled", marks=pytest.mark.oracle)]
+)
+
 SCALAR: dict[str, Any] = {"noise": 0.3, "horizon": 1.0, "dt": 0.05, "box": [-1.0, 1.0]}
 """Random starts, and a box that is too small for some of them."""
 
@@ -54,10 +58,11 @@ def assert_near(row, exact, within):
 
 
 @pytest.mark.slow
-def test_gaussian_walk_of_probability_1e_8():
+@both_engines
+def test_gaussian_walk_of_probability_1e_8(engine):
     exact = walk_passage(1.0, 40, -0.005, 0.15 * math.sqrt(0.05))
     assert 1e-8 < exact < 2e-8
-    row = row_of(brownian(0.05, 2.0, -0.1, 0.15))
+    row = row_of(brownian(0.05, 2.0, -0.1, 0.15), engine=engine)
     assert_holds(row, exact, 2.0)
     assert row.method.startswith("drift of ")
     assert row.check.method == "splitting on h/sqrt(T - t)"
@@ -72,31 +77,35 @@ def test_gaussian_walk_of_probability_1e_8():
 
 
 @pytest.mark.slow
-def test_first_passage_of_probability_1e_8_with_continuous_monitoring():
+@both_engines
+def test_first_passage_of_probability_1e_8_with_continuous_monitoring(engine):
     exact = first_passage(1.0, -0.1, 0.15, 2.0)
-    row = row_of(brownian(0.1, 2.0, -0.1, 0.15), monitoring="continuous", seed=1)
+    row = row_of(brownian(0.1, 2.0, -0.1, 0.15), monitoring="continuous", seed=1, engine=engine)
     assert_holds(row, exact, 2.0)
     # Looks at control instants only would see about half of it.
     assert walk_passage(1.0, 20, -0.01, 0.15 * math.sqrt(0.1)) < row.ci_low
 
 
 @pytest.mark.slow
-def test_geometric_martingale_of_probability_1e_8():
+@both_engines
+def test_geometric_martingale_of_probability_1e_8(engine):
     problem = replace(attaining_problem(1e-4), dt=0.1, horizon=14.0)
     exact = martingale_passage(1e-4, 140, 0.1)
-    row = row_of(problem, "scbf", particles=120, seed=1)
+    row = row_of(problem, "scbf", particles=120, seed=1, engine=engine)
     assert_holds(row, exact, 3.0)
     assert_near(row.check if "drift" in row.method else row, exact, 4.0)
 
 
 @pytest.mark.slow
-def test_cruise_control_under_its_filter_has_the_gaussian_law():
+@both_engines
+def test_cruise_control_under_its_filter_has_the_gaussian_law(engine):
     # At 10 m/s the desired speed is far off, so that the filter acts all the time and A h = 0: h is
     # a walk.
     exact = walk_passage(32.0, 50, 0.0, 1.8 * math.sqrt(0.2))
     assert 1e-8 < exact < 2e-8
     options = {"start": [10.0, 10.0, 50.0], "horizon": 10.0, "dt": 0.2}
-    assert_holds(row_of("safe_envs/ACC-v0", "scbf", options=options, particles=120), exact, 3.0)
+    row = row_of("safe_envs/ACC-v0", "scbf", options=options, particles=120, engine=engine)
+    assert_holds(row, exact, 3.0)
 
 
 @pytest.mark.slow
@@ -138,17 +147,26 @@ def test_pilots_and_estimates_have_noise_of_their_own():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("episodes", [6_000, pytest.param(100_000, marks=pytest.mark.oracle)])
+@pytest.mark.parametrize(
+    ("episodes", "engine"),
+    [
+        (6_000, "numpy"),
+        pytest.param(100_000, "numpy", marks=pytest.mark.oracle),
+        pytest.param(100_000, "compiled", marks=pytest.mark.oracle),
+    ],
+)
 @pytest.mark.parametrize(
     ("policy", "monitoring"),
     [("nominal", "discrete"), ("random", "discrete"), ("nominal", "continuous")],
 )
-def test_agrees_with_plain_episodes_where_these_do(policy, monitoring, episodes):
+def test_agrees_with_plain_episodes_where_these_do(policy, monitoring, episodes, engine):
     arguments = {"filters": ["szcbf"], "options": SCALAR, "monitoring": monitoring}
     (plain,) = evaluate(
         "Scalar-v0", policy, episodes=episodes, confidence=0.99, bounds=False, **arguments
     ).rows
-    (rare,) = estimate_rare("Scalar-v0", policy, seed=3, particles=100, **arguments).rows
+    (rare,) = estimate_rare(
+        "Scalar-v0", policy, seed=3, particles=100, engine=engine, **arguments
+    ).rows
     assert rare.ci_low < 1 - plain.ci_low
     assert rare.ci_high > 1 - plain.ci_high
     assert 0 < rare.plain.violations < rare.plain.episodes
