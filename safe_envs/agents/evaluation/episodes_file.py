@@ -123,6 +123,9 @@ def episodes_file(path: Path, dt: float) -> Iterator[EpisodesFile]:
         path: of the file.
         dt: control period in s.
 
+    Returns:
+        A context that gives the file.
+
     Raises:
         ConfigurationError: the file cannot be written.
     """
