@@ -11,6 +11,7 @@ import pytest
 
 from safe_envs import ConfigurationError, RelativeDegreeError
 from safe_envs.agents import NominalController, evaluate, make_problem
+from safe_envs.agents.evaluation import rollout
 from safe_envs.agents.evaluation.rollout import play
 from safe_envs.agents.evaluation.trajectories import Trajectories
 from safe_envs.envs.vector_env import SafeVectorEnv
@@ -206,6 +207,25 @@ def test_memory_does_not_grow_with_episodes():
     few, many = peak(512), peak(5120)
     # The results of an episode, of which one bit is kept, take 40 bytes.
     assert many - few < 2 * (5120 - 512)
+
+
+def test_parts_of_processes_do_not_grow_with_episodes(monkeypatch):
+    def largest(episodes):
+        sizes, told = [], []
+
+        def done(function, shared, parts, jobs):
+            sizes.extend(map(len, parts))
+            return ([] for _ in parts)
+
+        monkeypatch.setattr(rollout, "compute_in_order", done)
+        how = (episodes, 0, 1024, 2, False, told.append)
+        assert list(rollout.play_in_processes(print, None, *how)) == []
+        assert sum(sizes) == told[-1] == episodes
+        return max(sizes)
+
+    assert largest(5) == 1
+    assert largest(800) == 100
+    assert largest(10**7) == largest(10**8) == 65_536
 
 
 def test_progress_goes_from_nothing_to_all():

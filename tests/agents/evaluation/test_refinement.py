@@ -146,4 +146,4 @@ def test_the_file_of_episodes_is_of_the_first_evaluation(tmp_path):
     table = pq.read_table(path)
     first = answer.evaluations[0]
     assert table["return"].to_pylist() == first.episode_columns()["return"].tolist()
-    assert table["length"].to_pylist() == 12 * [first.problem.steps]
+    assert max(table["length"].to_pylist()) == first.problem.steps
