@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -73,8 +74,9 @@ def test_episodes_are_kept_up_to_a_million_unless_it_is_said():
     assert not RunSettings().keeps(1_000_001)
     assert RunSettings(keep_episodes=True).keeps(1_000_001)
     assert not RunSettings(keep_episodes=False).keeps(1)
+    word: Any = "no"
     with pytest.raises(ConfigurationError, match="keep_episodes = 'no'; give True, False or None"):
-        RunSettings(keep_episodes="no")
+        RunSettings(keep_episodes=word)
 
 
 @pytest.mark.slow
