@@ -141,8 +141,14 @@ def test_errors_are_those_of_an_evaluation():
 
 def test_the_file_of_episodes_is_of_the_first_evaluation(tmp_path):
     path = tmp_path / "out.parquet"
-    how = {"filters": ["none"], "options": {"horizon": 0.4, "noise": 0.8}, "episodes": 12}
-    answer = refine("Scalar-v0", "random", episodes_out=path, **how)
+    answer = refine(
+        "Scalar-v0",
+        "random",
+        episodes_out=path,
+        filters=["none"],
+        options={"horizon": 0.4, "noise": 0.8},
+        episodes=12,
+    )
     table = pq.read_table(path)
     first = answer.evaluations[0]
     assert table["return"].to_pylist() == first.episode_columns()["return"].tolist()
