@@ -90,9 +90,11 @@ class _Link:
         if node is None:
             return
         if name in self._found:
-            if self._found[name][0] != module:
+            other, found = self._found[name]
+            # A constant of one value may be stated in several modules.
+            if other != module and ast.unparse(found) != ast.unparse(node):
                 raise SystemDefinitionError(
-                    f"two kernels are called {name!r}, in {self._found[name][0]} and {module}"
+                    f"two kernels are called {name!r}, in {other} and {module}"
                 )
             return
         self._found[name] = module, node

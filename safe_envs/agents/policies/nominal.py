@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from safe_envs.agents.policies.base import StatelessPolicy
+from safe_envs.agents.policies.base import CHOOSE, StatelessPolicy
+from safe_envs.agents.policies.policy_kernel import action_of_input, random_action
+from safe_envs.compiled.data import Data
+from safe_envs.compiled.formulas import Source, formulas
 from safe_envs.dynamics.codegen import compile_function
+from safe_envs.dynamics.philox import POLICY, EpisodeUniforms
 from safe_envs.envs.spaces import center_and_half_width
 from safe_envs.errors import NumericalError
 from safe_envs.problem.problem import SafetyProblem
-
-_CHUNK = 128
 
 
 class NominalController(StatelessPolicy):
@@ -27,10 +29,10 @@ class NominalController(StatelessPolicy):
         self._name = problem.name
         self._box = problem.box
         self._center, self._half = center_and_half_width(problem)
-        symbols = tuple(f.symbol for f in problem.features)
-        laws = tuple(problem.model.numeric(law) for law in problem.nominal)
-        self._floats = compile_function(symbols, laws, "floats")
-        self._arrays = compile_function(symbols, laws, "arrays")
+        self._symbols = tuple(f.symbol for f in problem.features)
+        self._laws = tuple(problem.model.numeric(law) for law in problem.nominal)
+        self._floats = compile_function(self._symbols, self._laws, "floats")
+        self._arrays = compile_function(self._symbols, self._laws, "arrays")
 
     def actions(self, given: np.ndarray) -> np.ndarray:
         """Evaluate the laws; see `StatelessPolicy.actions`.
@@ -56,6 +58,20 @@ class NominalController(StatelessPolicy):
             raise self._undefined(rows[~np.isfinite(actions.reshape(len(rows), -1)).all(axis=1)][0])
         return actions
 
+    def source(self, data: Data) -> Source:
+        """See `Policy.source`."""
+        entries = ""
+        for j, ((low, high), c, w) in enumerate(
+            zip(self._box, self._center, self._half, strict=True)
+        ):
+            place = data.add([low, high, c, w])
+            numbers = ", ".join(f"data[{place + i}]" for i in range(4))
+            entries += f"action_of_input(inputs[{j}], {numbers}), "
+        return formulas("nominal_laws", {"observation": self._symbols}, self._laws, data) + Source(
+            f"{CHOOSE}    inputs = nominal_laws(observation, data)\n    return ({entries})\n",
+            (action_of_input,),
+        )
+
     def _undefined(self, observation: np.ndarray) -> NumericalError:
         return NumericalError(
             f"the nominal controller of {self._name!r} has no finite value at the observation"
@@ -80,6 +96,12 @@ class ZeroController(StatelessPolicy):
         """Return the one action for every observation; see `StatelessPolicy.actions`."""
         return np.tile(self._action, (*given.shape[:-1], 1))
 
+    def source(self, data: Data) -> Source:
+        """See `Policy.source`."""
+        place = data.add(self._action)
+        entries = "".join(f"data[{place + j}], " for j in range(len(self._action)))
+        return Source(f"{CHOOSE}    return ({entries})\n")
+
 
 class RandomPolicy(StatelessPolicy):
     """Independent actions, uniform in [-1, 1].
@@ -98,26 +120,22 @@ class RandomPolicy(StatelessPolicy):
         super().__init__(len(problem.features))
         self._m = len(problem.inputs)
         self._generator = np.random.default_rng(seed)
-        self._streams: list[np.random.Generator] = []
+        self._uniforms: EpisodeUniforms | None = None
 
     def begin(self, episodes: range, seed: int) -> None:
         """Give each episode its stream; see `Policy.begin`."""
-        # The env of episode i is seeded by the child (i,) of the seed; this is the child of that
-        # child.
-        self._streams = [
-            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i, 0))) for i in episodes
-        ]
-        self._drawn = np.empty((len(episodes), _CHUNK, self._m))
-        self._position = _CHUNK
+        self._uniforms = EpisodeUniforms(seed, episodes, POLICY, self._m)
 
     def actions(self, given: np.ndarray) -> np.ndarray:
         """Draw actions; see `StatelessPolicy.actions`."""
         batch = given.shape[:-1]
-        if batch != (len(self._streams),):
+        if self._uniforms is None or batch != (len(self._uniforms),):
             return self._generator.uniform(-1.0, 1.0, (*batch, self._m))
-        if self._position == _CHUNK:
-            for stream, drawn in zip(self._streams, self._drawn, strict=True):
-                stream.random(out=drawn)
-            self._position = 0
-        self._position += 1
-        return 2.0 * self._drawn[:, self._position - 1] - 1.0
+        return 2.0 * self._uniforms.next() - 1.0
+
+    def source(self, data: Data) -> Source:
+        """See `Policy.source`."""
+        entries = "".join(
+            f"random_action(step * {self._m} + {j}, k0, k1), " for j in range(self._m)
+        )
+        return Source(f"{CHOOSE}    return ({entries})\n", (random_action,))
