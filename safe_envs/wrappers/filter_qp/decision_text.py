@@ -9,6 +9,7 @@ import sympy as sp
 
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source, formulas
+from safe_envs.wrappers.conditions.constraint import terms_source
 from safe_envs.wrappers.filter_qp.qp import FilterQP
 from safe_envs.wrappers.filter_qp.solver import FilterQPSolver
 
@@ -34,7 +35,7 @@ class Values:
         calls = []
         for i, term in enumerate(qp.terms):
             name = f"filter_terms_{i}"
-            self._text += term.source(name, data)
+            self._text += terms_source(term, name, data)
             calls.append(f"{name}(x, data, work)")
         if calls:
             self._symbols["terms"] = tuple(s for term in qp.terms for s in term.symbols)
