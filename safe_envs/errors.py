@@ -28,6 +28,10 @@ class ConfigurationError(SafeEnvsError, ValueError):
     """An argument names something unknown or has a value outside its range."""
 
 
+class NotCompilableError(ConfigurationError):
+    """Something is asked of the compiled engine that only the NumPy engine can do."""
+
+
 class InvalidInputError(SafeEnvsError, ValueError):
     """A state or an action has the wrong shape or is not finite."""
 

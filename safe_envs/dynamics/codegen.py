@@ -115,7 +115,7 @@ def compile_function(
 def _compile(
     arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...], flavour: Flavour
 ) -> Callable[..., Components]:
-    names, formulas, numbers, shared = _prepared(arguments, expressions)
+    names, formulas, numbers, shared = prepared(arguments, expressions)
     printer = ArrayPrinter() if flavour == "arrays" else FloatPrinter()
     try:
         function = sp.lambdify(
@@ -138,7 +138,7 @@ def _compile(
 
 
 @lru_cache(maxsize=256)
-def _prepared(
+def prepared(
     arguments: tuple[sp.Symbol, ...], expressions: tuple[sp.Expr, ...]
 ) -> tuple[tuple[sp.Symbol, ...], Any, Any, Any]:
     """Prepare what both flavours share.

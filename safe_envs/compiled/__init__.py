@@ -1,0 +1,1 @@
+"""Compiled programs: kernels in plain Python, linked with the formulas of a problem."""

@@ -1,0 +1,71 @@
+"""Random numbers of episodes, as kernels: see `safe_envs.dynamics.philox` for the streams."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from safe_envs.compiled.plain_natives import philox_block, uniform_of
+from safe_envs.compiled.slots import State, no_state, start_margin, start_state
+from safe_envs.dynamics.normal_kernel import standard_normal
+
+NOISE = 0
+START = 1
+BRIDGE = 2
+POLICY = 3
+EPISODE = 4
+MOST_TRIES = 10000
+
+
+def fill_uniforms(
+    out: np.ndarray, first: int, episode: int, purpose: int, k0: int, k1: int
+) -> None:
+    """Fill `out` with the uniforms of a stream from word `first`, a multiple of 4, on."""
+    count = len(out)
+    for i in range(0, count, 4):
+        w0, w1, w2, w3 = philox_block((first + i) // 4 + 1, episode, purpose, 0, k0, k1)
+        out[i] = uniform_of(w0)
+        if i + 1 < count:
+            out[i + 1] = uniform_of(w1)
+        if i + 2 < count:
+            out[i + 2] = uniform_of(w2)
+        if i + 3 < count:
+            out[i + 3] = uniform_of(w3)
+
+
+def fill_normals(out: np.ndarray, first: int, episode: int, purpose: int, k0: int, k1: int) -> None:
+    """Fill `out` with standard normals of a stream from word `first`, a multiple of 4, on."""
+    fill_uniforms(out, first, episode, purpose, k0, k1)
+    for i in range(len(out)):
+        out[i] = standard_normal(out[i])
+
+
+def episode_key(episode: int, k0: int, k1: int) -> int:
+    """Return the seed of an episode of an evaluation, which is the first word of its key."""
+    return philox_block(episode + 1, 0, EPISODE, 0, k0, k1)[0]
+
+
+def draw_start(k0: int, k1: int, episode: int, uniforms: np.ndarray, data: np.ndarray) -> State:
+    """Return the start state of an episode; NaN where none was allowed in 10,000 tries.
+
+    Args:
+        k0: first word of the key of the env.
+        k1: second word.
+        episode: its number since the env was seeded.
+        uniforms: scratch array, with an entry for each uniform of the distribution.
+        data: numbers of the program.
+    """
+    for t in range(MOST_TRIES):
+        for j in range(len(uniforms)):
+            place = t * len(uniforms) + j
+            block = philox_block(place // 4 + 1, episode, START, 0, k0, k1)
+            uniforms[j] = uniform_of(block[place % 4])
+        x = start_state(uniforms, data)
+        if start_margin(x, data) > 0.0:
+            return x
+    return no_state(data)
+
+
+def store_row(row: np.ndarray, values: tuple[float, ...]) -> None:
+    """Write a tuple to an array of its length."""
+    for i in range(len(values)):
+        row[i] = values[i]

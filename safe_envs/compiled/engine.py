@@ -1,0 +1,47 @@
+"""The choice between NumPy and compiled programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from safe_envs.compiled.program import is_available
+from safe_envs.errors import ConfigurationError, NotCompilableError, nearest, shown
+
+ENGINES = ("auto", "numpy", "compiled")
+"""Engines by name; "auto" takes the compiled one for long work that it can do, if it is there."""
+
+LONG = 5_000_000
+"""Control periods from which "auto" takes the compiled engine: NumPy needs seconds for them, which
+a compilation takes as well. The choice depends on nothing else that changes from run to run, so
+that a command gives the same numbers each time."""
+
+_Found = TypeVar("_Found")
+
+
+def require_engine(engine: str) -> None:
+    """Raise ConfigurationError unless a word is one of `ENGINES`."""
+    if engine not in ENGINES:
+        raise ConfigurationError(f"engine = {shown(engine)}; {nearest(str(engine), ENGINES)}")
+
+
+def compiled_or_none(engine: str, periods: float, make: Callable[[], _Found]) -> _Found | None:
+    """Return what `make` makes for the compiled engine; None where NumPy is to do the work.
+
+    Args:
+        engine: one of `ENGINES`.
+        periods: control periods to simulate, about.
+        make: makes something of compiled programs, or raises `NotCompilableError`.
+
+    Raises:
+        ConfigurationError: The compiled engine was asked for, and Numba is missing.
+        NotCompilableError: It was asked for, and cannot do the work.
+    """
+    if engine == "numpy" or (engine == "auto" and not (periods >= LONG and is_available())):
+        return None
+    try:
+        return make()
+    except NotCompilableError:
+        if engine == "compiled":
+            raise
+        return None

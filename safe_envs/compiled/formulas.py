@@ -1,0 +1,106 @@
+"""Formulas of a problem as functions of a compiled program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import sympy as sp
+from sympy.printing.codeprinter import PrintMethodNotImplementedError
+
+from safe_envs.compiled.data import Data
+from safe_envs.dynamics.codegen import prepared
+from safe_envs.dynamics.computable import excerpt
+from safe_envs.dynamics.printers import FloatPrinter
+from safe_envs.errors import SystemDefinitionError
+
+_LARGE = 2**31
+
+
+@dataclass(frozen=True)
+class Source:
+    """Generated functions of a program.
+
+    Attributes:
+        text: their definitions.
+        uses: functions of kernel modules that they call.
+        work: entries that they need of the scratch array `work`.
+    """
+
+    text: str
+    uses: tuple[Callable[..., Any], ...] = ()
+    work: int = 0
+
+    def __add__(self, other: Source) -> Source:
+        return Source(
+            f"{self.text}\n{other.text}",
+            (*self.uses, *other.uses),
+            max(self.work, other.work),
+        )
+
+
+class _KernelPrinter(FloatPrinter):
+    """Prints numbers as entries of the program's data."""
+
+    def __init__(self, data: Data) -> None:
+        super().__init__()
+        self._data = data
+
+    def _print_Float(self, expr: Any) -> str:  # noqa: N802  (sympy's dispatch by name)
+        # By way of its digits, as plain floats get it: that may round differently.
+        return f"data[{self._data.add([float(super()._print_Float(expr))])}]"
+
+    def _print_Integer(self, expr: Any) -> str:  # noqa: N802
+        # Compiled code has whole numbers of 64 bits.
+        small = abs(expr) < _LARGE
+        return super()._print_Integer(expr) if small else self._print_Float(sp.Float(expr, 17))
+
+
+def formulas(
+    name: str,
+    arguments: Mapping[str, Sequence[sp.Symbol] | sp.Symbol],
+    expressions: Sequence[Any],
+    data: Data,
+) -> Source:
+    """Return a function that evaluates expressions.
+
+    It takes the arguments by position and the program's data after them, and returns a tuple of
+    floats, one for each expression.
+
+    Args:
+        name: of the function.
+        arguments: by name, the symbols that a tuple of floats stands for, or the symbol that a
+            float stands for.
+        expressions: real formulas of the symbols.
+        data: receives their numbers.
+
+    Raises:
+        SystemDefinitionError: See `safe_envs.dynamics.codegen.compile_function`.
+    """
+    symbols = [
+        s
+        for given in arguments.values()
+        for s in ([given] if isinstance(given, sp.Symbol) else given)
+    ]
+    exprs = tuple(sp.sympify(e) for e in expressions)
+    names, _, _, (shared, results) = prepared(tuple(symbols), exprs)
+    plain = dict(zip(symbols, names, strict=True))
+    used = {str(s) for e in (*results, *(value for _, value in shared)) for s in e.free_symbols}
+    printer = _KernelPrinter(data)
+    lines = [f"def {name}({', '.join([*arguments, 'data'])}):"]
+    for argument, given in arguments.items():
+        single = isinstance(given, sp.Symbol)
+        for i, symbol in enumerate([given] if single else given):
+            if str(plain[symbol]) in used:
+                entry = argument if single else f"{argument}[{i}]"
+                lines.append(f"    {plain[symbol]} = {entry}")
+    try:
+        lines += [f"    {symbol} = {printer.doprint(value)}" for symbol, value in shared]
+        entries = [f"float({printer.doprint(e)})," for e in results]
+    except PrintMethodNotImplementedError as error:
+        raise SystemDefinitionError(
+            f"{excerpt(exprs)} has no numerical form: {str(error).splitlines()[0]}"
+        ) from error
+    lines.append(f"    return ({' '.join(entries)})")
+    return Source("\n".join(lines) + "\n")

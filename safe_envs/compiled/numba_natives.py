@@ -1,0 +1,61 @@
+"""The operations of kernels that differ between plain Python and compiled code: in compiled code.
+
+See `plain_natives`. Only compiled programs import this module, which needs Numba.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba.extending import intrinsic
+
+__all__ = ["entry", "kernel", "philox_block", "single", "uniform_of"]
+
+kernel = numba.njit(nogil=True, error_model="numpy", _nrt=False, forceinline=True)
+entry = numba.njit(nogil=True, error_model="numpy", _nrt=False, cache=True)
+
+_WORD = np.uint64
+_FIRST, _SECOND = _WORD(0xD2E7470EE14C6C93), _WORD(0xCA5A826395121157)
+_FIRST_STEP, _SECOND_STEP = _WORD(0x9E3779B97F4A7C15), _WORD(0xBB67AE8584CAA73B)
+_ROUNDS = 10
+
+
+@intrinsic
+def _high_product(_: Any, a: Any, b: Any) -> Any:
+    """Return the upper half of the product of two words."""
+
+    def generate(_: Any, builder: Any, __: Any, arguments: Any) -> Any:
+        wide = ir.IntType(128)
+        product = builder.mul(*(builder.zext(word, wide) for word in arguments))
+        return builder.trunc(builder.lshr(product, ir.Constant(wide, 64)), ir.IntType(64))
+
+    return numba.types.uint64(a, b), generate
+
+
+@kernel
+def philox_block(c0: Any, c1: Any, c2: Any, c3: Any, k0: Any, k1: Any) -> Any:
+    """Return a Philox block; see `plain_natives`."""
+    c0, c1, c2, c3 = _WORD(c0), _WORD(c1), _WORD(c2), _WORD(c3)
+    k0, k1 = _WORD(k0), _WORD(k1)
+    for _ in range(_ROUNDS):
+        first_high, first_low = _high_product(_FIRST, c0), _FIRST * c0  # pyright: ignore[reportCallIssue]
+        second_high, second_low = _high_product(_SECOND, c2), _SECOND * c2
+        c0, c1, c2, c3 = second_high ^ c1 ^ k0, second_low, first_high ^ c3 ^ k1, first_low
+        k0 += _FIRST_STEP
+        k1 += _SECOND_STEP
+    return c0, c1, c2, c3
+
+
+@kernel
+def uniform_of(word: Any) -> Any:
+    """Return a word as a number in [0, 1)."""
+    return np.int64(word >> _WORD(11)) * 2.0**-53
+
+
+@kernel
+def single(value: Any) -> Any:
+    """Return a number rounded to single precision."""
+    return np.float64(np.float32(value))

@@ -1,0 +1,46 @@
+"""The operations of kernels that differ between plain Python and compiled code: in plain Python.
+
+Words are whole numbers below 2**64.
+
+Source: J. Salmon, M. Moraes, R. Dror, D. Shaw, Parallel Random Numbers: As Easy as 1, 2, 3, SC11,
+    2011.
+"""
+
+from __future__ import annotations
+
+import struct
+
+_MASK = (1 << 64) - 1
+_FIRST, _SECOND = 0xD2E7470EE14C6C93, 0xCA5A826395121157
+_FIRST_STEP, _SECOND_STEP = 0x9E3779B97F4A7C15, 0xBB67AE8584CAA73B
+_ROUNDS = 10
+
+Words = tuple[int, int, int, int]
+
+
+def philox_block(c0: int, c1: int, c2: int, c3: int, k0: int, k1: int) -> Words:
+    """Return the Philox 4x64-10 block of a counter (four words) under a key (two words)."""
+    c0, c1, c2, c3, k0, k1 = (int(word) & _MASK for word in (c0, c1, c2, c3, k0, k1))
+    for _ in range(_ROUNDS):
+        first, second = _FIRST * c0, _SECOND * c2
+        c0, c1, c2, c3 = (
+            (second >> 64) ^ c1 ^ k0,
+            second & _MASK,
+            (first >> 64) ^ c3 ^ k1,
+            first & _MASK,
+        )
+        k0, k1 = (k0 + _FIRST_STEP) & _MASK, (k1 + _SECOND_STEP) & _MASK
+    return c0, c1, c2, c3
+
+
+def uniform_of(word: int) -> float:
+    """Return a word as a number in [0, 1)."""
+    return (int(word) >> 11) * 2.0**-53
+
+
+def single(value: float) -> float:
+    """Return a number rounded to single precision."""
+    try:
+        return struct.unpack("f", struct.pack("f", value))[0]
+    except OverflowError:
+        return float("inf") if value > 0.0 else float("-inf")

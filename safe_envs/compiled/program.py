@@ -1,0 +1,143 @@
+"""Programs that are linked, compiled and loaded."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import inspect
+import logging
+import os
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from safe_envs.atomic_io import write_atomically
+from safe_envs.compiled import plain_natives
+from safe_envs.compiled.cache import cache_folder, forget_old_programs
+from safe_envs.compiled.formulas import Source
+from safe_envs.compiled.linker import linked
+from safe_envs.errors import ConfigurationError
+
+ADVICE = "install it with pip install 'safe-envs[fast]', or use the engine 'numpy'"
+
+_LOG = logging.getLogger("safe_envs")
+_FILE = "program.py"
+
+Functions = dict[str, Callable[..., Any]]
+"""Entry points by name."""
+
+
+def is_available() -> bool:
+    """Return whether Numba is installed, without importing it."""
+    return importlib.util.find_spec("numba") is not None
+
+
+class Program:
+    """Entry points, linked with the functions that were generated for a problem.
+
+    Args:
+        title: what the program computes, for the message that it is being compiled.
+        entries: functions of kernel modules.
+        generated: functions of this program alone.
+
+    Attributes:
+        text: of the program, in Python.
+
+    Raises:
+        SystemDefinitionError: Two functions have one name, or a generated one is missing.
+    """
+
+    def __init__(
+        self, title: str, entries: Sequence[Callable[..., Any]], generated: Source
+    ) -> None:
+        self._title = title
+        self._names = tuple(function.__name__ for function in entries)
+        self.text = linked(entries, generated)
+
+    def plain(self) -> Functions:
+        """Return the entry points as plain Python functions, which are slow."""
+        names: dict[str, Any] = {**vars(plain_natives), "entry": _unchanged, "kernel": _unchanged}
+        exec(self.text, names)
+        return {name: names[name] for name in self._names}
+
+    def compiled(self) -> Functions:
+        """Return the entry points; each is compiled, or read from disk, at its first call.
+
+        Raises:
+            ConfigurationError: Numba is not installed.
+        """
+        if not is_available():
+            raise ConfigurationError(f"the compiled engine needs Numba, which is missing; {ADVICE}")
+        return _loaded(self.text, self._names, self._title)
+
+
+def _unchanged(function: Callable[..., Any]) -> Callable[..., Any]:
+    return function
+
+
+@lru_cache(maxsize=64)
+def _loaded(text: str, names: tuple[str, ...], title: str) -> Functions:
+    from safe_envs.compiled import numba_natives
+
+    stamp = f"{inspect.getsource(numba_natives)}\n{text}"
+    digest = hashlib.sha256(stamp.encode()).hexdigest()[:32]
+    folder = cache_folder()
+    if folder is None:
+        _LOG.warning("compiling %s; there is no folder of yours to keep it in", title)
+        return _functions({**vars(numba_natives), "entry": numba_natives.kernel}, text, names)
+    program = _KeptProgram(folder / digest, text, title)
+    forget_old_programs(folder)
+    return {name: program.entry(name) for name in names}
+
+
+def _functions(names: dict[str, Any], text: str, wanted: Sequence[str]) -> Functions:
+    exec(text, names)
+    return {name: names[name] for name in wanted}
+
+
+class _KeptProgram:
+    """A program in a folder of its own, where Numba keeps what it compiles."""
+
+    def __init__(self, folder: Path, text: str, title: str) -> None:
+        self._folder, self._title = folder, title
+        self._text = f"from safe_envs.compiled.numba_natives import *\n{text}"
+        self._functions = self._load()
+
+    def entry(self, name: str) -> Callable[..., Any]:
+        """Return an entry point, which says so where it has to be compiled first."""
+        function = self._functions[name]
+        is_new = True
+
+        def call(*arguments: Any) -> Any:
+            nonlocal function, is_new
+            if not is_new:
+                return function(*arguments)
+            if not any(self._folder.glob(f"__pycache__/*.{name}-*.nbi")):
+                _LOG.warning("compiling %s, which takes some seconds once", self._title)
+            is_new = False
+            try:
+                return function(*arguments)
+            except Exception:
+                # Kernels raise nothing: what is kept cannot be read.
+                shutil.rmtree(self._folder, ignore_errors=True)
+                function = self._load()[name]
+                return function(*arguments)
+
+        return call
+
+    def _load(self) -> dict[str, Any]:
+        file = self._folder / _FILE
+        self._folder.mkdir(mode=0o700, exist_ok=True)
+        if not file.is_file() or file.read_text() != self._text:
+            write_atomically(file, lambda path: path.write_text(self._text))
+        os.utime(self._folder)
+        name = f"safe_envs_program_{self._folder.name}"
+        spec: Any = importlib.util.spec_from_file_location(name, file)
+        module = importlib.util.module_from_spec(spec)
+        # Numba finds a function's module by its name.
+        sys.modules[name] = module
+        spec.loader.exec_module(module)
+        return vars(module)

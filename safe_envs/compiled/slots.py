@@ -1,0 +1,103 @@
+"""Functions that are generated for each program: declarations, which kernels import.
+
+`x`, `u` and `observation` are tuples of floats, `data` the numbers of the program (see
+`safe_envs.compiled.data`), `work` a scratch array, and `values` what `measure` returns.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+State = tuple[float, ...]
+Input = tuple[float, ...]
+
+
+def start_state(uniforms: np.ndarray, data: np.ndarray) -> State:
+    """Return the start state that uniforms in [0, 1) stand for."""
+    raise NotImplementedError
+
+
+def start_margin(x: State, data: np.ndarray) -> float:
+    """Return a number that is positive where a start state is allowed."""
+    raise NotImplementedError
+
+
+def no_state(data: np.ndarray) -> State:
+    """Return a state of NaN."""
+    raise NotImplementedError
+
+
+def advance(x: State, u: Input, noise: np.ndarray, first: int, data: np.ndarray) -> State:
+    """Return the state one control period later, with standard normals from `noise[first]` on."""
+    raise NotImplementedError
+
+
+def measure(x: State, u: Input, time: float, data: np.ndarray) -> tuple[float, ...]:
+    """Return the features, the barriers, the reward, and how far the workspace and goal are off."""
+    raise NotImplementedError
+
+
+def observation_of(values: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the features, rounded to single precision."""
+    raise NotImplementedError
+
+
+def barriers_of(values: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the barriers."""
+    raise NotImplementedError
+
+
+def smallest_barrier(barriers: tuple[float, ...]) -> float:
+    """Return the smallest of the barriers; NaN where one is."""
+    raise NotImplementedError
+
+
+def reward_of(values: tuple[float, ...]) -> float:
+    """Return the reward."""
+    raise NotImplementedError
+
+
+def has_ended(values: tuple[float, ...]) -> bool:
+    """Return whether the workspace was left or the goal reached."""
+    raise NotImplementedError
+
+
+def is_finite(x: State, values: tuple[float, ...]) -> bool:
+    """Return whether a state and what an env reads off it are finite numbers."""
+    raise NotImplementedError
+
+
+def resting_input(data: np.ndarray) -> Input:
+    """Return the middle of the input bounds, which stands for the input before the first step."""
+    raise NotImplementedError
+
+
+def act(
+    observation: tuple[float, ...], step: int, k0: int, k1: int, data: np.ndarray, work: np.ndarray
+) -> Input:
+    """Return the physical input that a policy proposes in period `step` of an episode.
+
+    It lies within the input bounds; an entry is NaN where the policy has no finite value.
+
+    Args:
+        observation: features in single precision.
+        step: number of the control period, from 0.
+        k0: first word of the key of the episode.
+        k1: second word.
+        data: numbers of the program.
+        work: scratch array.
+    """
+    raise NotImplementedError
+
+
+def decide(x: State, u: Input, data: np.ndarray, work: np.ndarray) -> tuple[Any, ...]:
+    """Return what the filter decides on a proposed input.
+
+    These are the action (a tuple), the proposed input (a tuple: the given one, or that of the goal
+    of a joint QP), whether a constraint is active, whether all can be met, the slacks of the
+    constraints (a tuple), the number of the constraint that caused an intervention (without meaning
+    where none is active), and whether all numbers of the QP are finite; see `FilterDecision`.
+    """
+    raise NotImplementedError
