@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 
 from safe_envs.compiled.draws import (
-    BRIDGE,
-    NOISE,
     draw_start,
     episode_key,
     fill_normals,
@@ -38,6 +36,7 @@ from safe_envs.compiled.slots import (
     smallest_barrier,
 )
 from safe_envs.dynamics.normal_kernel import standard_exponential
+from safe_envs.dynamics.philox import BRIDGE, NOISE
 
 DEEPEST_STATE = 1
 VIOLATING_STATE = 2

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,25 +12,17 @@ import pytest
 import sympy as sp
 
 from safe_envs import (
-    CLF,
-    Barrier,
-    ConfigurationError,
-    ControlAffineSDE,
-    NumericalError,
     RelativeDegreeError,
-    SystemDefinitionError,
 )
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.program import Program
 from safe_envs.dynamics.codegen import filled
 from safe_envs.errors import NotCompilableError
 from safe_envs.problem.problem import SafetyProblem
-from safe_envs.wrappers import CBF, RCBF, SRCBF, SafetyFilter, parse_conditions
-from safe_envs.wrappers.filter_qp.decision import FilterDecision
-from safe_envs.wrappers.filter_qp.filter_source import filter_source, unfiltered_source
+from safe_envs.wrappers import SafetyFilter, parse_conditions
+from safe_envs.wrappers.filter_qp.filter_source import filter_source
 from tests.conftest import problem_of
 from tests.wrappers.filter_qp.decision_kernels import decided
-from tests.wrappers.learned import Terms
 
 x, y, u, w = sp.symbols("x y u w", real=True)
 
