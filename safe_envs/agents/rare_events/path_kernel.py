@@ -6,14 +6,7 @@ import numpy as np
 
 from safe_envs.agents.evaluation.episode_kernel import is_finite_input
 from safe_envs.agents.rare_events.path_slots import lowest_relative, state_in, tilt_direction
-from safe_envs.compiled.draws import (
-    BRIDGE,
-    NOISE,
-    draw_start,
-    fill_normals,
-    fill_uniforms,
-    store_row,
-)
+from safe_envs.compiled.draws import draw_start, fill_normals, fill_uniforms, store_row
 from safe_envs.compiled.slots import (
     act,
     advance,
@@ -25,6 +18,7 @@ from safe_envs.compiled.slots import (
     observation_of,
     resting_input,
 )
+from safe_envs.dynamics.philox import BRIDGE, NOISE
 
 DONE = 0
 FULL = 1
@@ -38,7 +32,7 @@ def draw_path_starts(
     data: np.ndarray,
     uniforms: np.ndarray,
 ) -> int:
-    """Draw the starts of paths, and return how many there are before the first that has none.
+    """Draw the starts of paths, up to the first path that has none.
 
     Args:
         keys: of the paths, uint64 (B,).
@@ -46,6 +40,9 @@ def draw_path_starts(
         barriers: receives the barriers there, (B, k).
         data: numbers of the program.
         uniforms: scratch array, with an entry for each uniform of the distribution.
+
+    Returns:
+        How many paths have one.
     """
     for row in range(len(keys)):
         x = draw_start(keys[row], 0, 0, uniforms, data)
@@ -78,7 +75,7 @@ def play_paths(  # noqa: PLR0913
     bridge: np.ndarray,
     work: np.ndarray,
 ) -> int:
-    """Play paths and return how many there are.
+    """Play paths.
 
     Each goes on from its last record to a violation, to the end of the episode, or until there is
     no room for a record; then it can go on from its last one again.
@@ -107,6 +104,9 @@ def play_paths(  # noqa: PLR0913
         noise: scratch array for the normals that are drawn ahead.
         bridge: the same for the uniforms of the bridges.
         work: scratch array.
+
+    Returns:
+        How many paths there are.
     """
     for i in range(len(paths)):
         path = int(paths[i])
@@ -206,7 +206,7 @@ def play_path(  # noqa: PLR0913
 def tilt(
     noise: np.ndarray, place: int, channels: int, direction: tuple[float, ...], shift: float
 ) -> tuple[float, float]:
-    """Add the drift to the standard normals of a period; return the sums of e z and of e e.
+    """Add the drift to the standard normals z of a period.
 
     Args:
         noise: standard normals, which are changed.
@@ -214,6 +214,9 @@ def tilt(
         channels: how many there are, substep by substep.
         direction: e.
         shift: by which they move against it.
+
+    Returns:
+        The sums of e z, with the drift in z, and of e e.
     """
     across, along = 0.0, 0.0
     for i in range(channels):

@@ -11,7 +11,7 @@ from safe_envs.dynamics.philox import StreamReader, key_of
 PILOTS = 5
 SPLIT = 6
 DRIFTING = 7
-"""Purposes of the streams of keys, beside those of `safe_envs.dynamics.philox`."""
+"""Purposes of the streams of keys, next to those of `safe_envs.dynamics.philox`."""
 
 
 @dataclass(frozen=True)

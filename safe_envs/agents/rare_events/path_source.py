@@ -11,7 +11,7 @@ from safe_envs.problem.problem import SafetyProblem
 
 
 def path_source(problem: SafetyProblem, bridged: bool, data: Data) -> Source:
-    """Return the functions that playing paths takes beside those of the world.
+    """Return the functions that playing paths takes next to those of the world.
 
     Args:
         problem: what is simulated.

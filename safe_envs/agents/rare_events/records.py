@@ -40,7 +40,12 @@ class Records:
         return self.heights.shape[1]
 
     def keep(self, paths: np.ndarray, count: int) -> None:
-        """Forget all but the first records of some paths."""
+        """Forget all but the first records of some paths.
+
+        Args:
+            paths: which.
+            count: of the records that each keeps.
+        """
         self.count[paths] = count
         self.heights[paths, count:] = -np.inf
 
