@@ -15,6 +15,7 @@ from scipy.stats import t as student
 from safe_envs import ConfigurationError
 from safe_envs.agents import NominalController, ZeroController, evaluate
 from safe_envs.agents.evaluation.statistics import log_normal_interval
+from safe_envs.agents.policies.base import BlockPolicy
 from safe_envs.agents.rare_events import splitting
 from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.agents.rare_events.importance_sampling import ImportanceSampling
@@ -192,13 +193,21 @@ def test_same_seed_is_the_same_answer_and_is_json():
     assert document["config"]["particles"] == 100
 
 
+class ByRow(BlockPolicy):
+    """Acts by the row of its block alone, on which the rounding of a network depends."""
+
+    def act(self, block):
+        return np.linspace(-1.0, 1.0, len(block))[:, None]
+
+
 @pytest.mark.parametrize(
     ("problem", "filter_name", "arguments"),
     [
         (brownian(0.1, 1.0, 0.0, 0.3, [1 - X, 2 * (1 + X)]), "none", {"monitoring": "continuous"}),
         ("Scalar-v0", "szcbf", {"policy": "random", "options": SCALAR}),
+        ("Scalar-v0", "szcbf", {"policy": ByRow(1), "options": SCALAR}),
     ],
-    ids=["two barriers", "random policy"],
+    ids=["two barriers", "random policy", "network"],
 )
 def test_numbers_do_not_depend_on_the_envs_side_by_side(problem, filter_name, arguments):
     wanted, other = (
