@@ -18,6 +18,7 @@ from safe_envs.agents.rare_events.records import Records
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.program import Functions, Program
 from safe_envs.envs.world_source import noise_channels, world_source
+from safe_envs.errors import NotCompilableError, shortened
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.filter_qp import FilterQP
 from safe_envs.wrappers.filter_qp.filter_source import filter_source, unfiltered_source
@@ -71,15 +72,22 @@ class PathProgram:
 
         Raises:
             ConfigurationError: Numba is not installed.
+            NotCompilableError: Numba cannot compile a formula.
         """
         functions = self.program.compiled()
-        # The first call compiles: timing is of steps.
         nothing = np.empty(0, dtype=np.int64)
         heights = Heights(np.empty(0), self.problem.steps, np.empty((0, 1)))
         records = Records(0, self.problem.plant.n)
         keys = nothing.astype(np.uint64)
-        self.starts(functions, keys)
-        self.play(functions, nothing, keys, heights, records, 0.0, nothing, nothing)
+        try:
+            # The first call compiles: an error shows before a long run, and timing is of steps.
+            self.starts(functions, keys)
+            self.play(functions, nothing, keys, heights, records, 0.0, nothing, nothing)
+        except Exception as error:
+            raise NotCompilableError(
+                f"Numba cannot compile {self.problem.name}: {shortened(error)}; use the engine"
+                " 'numpy'"
+            ) from error
         return functions
 
     def starts(self, functions: Functions, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:

@@ -19,6 +19,7 @@ from safe_envs.agents.rare_events.numpy_paths import NumpyPaths
 from safe_envs.agents.rare_events.particles import Particles
 from safe_envs.agents.rare_events.path_keys import SPLIT, PathKeys
 from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
+from safe_envs.compiled.program import Program
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper, parse_conditions
 from tests.oracles.laws import X, brownian
@@ -128,6 +129,16 @@ def test_what_has_no_end_has_the_error_of_numpy():
     for player in players_of(problem, NominalController(problem)):
         with pytest.raises(NumericalError, match="left the finite numbers"):
             played(player)
+
+
+def test_what_numba_cannot_compile_is_told(monkeypatch):
+    def fail(*arguments):
+        raise TypeError("no such operation")
+
+    entries = ("draw_path_starts", "play_paths")
+    monkeypatch.setattr(Program, "compiled", lambda self: dict.fromkeys(entries, fail))
+    with pytest.raises(NotCompilableError, match=r"Numba cannot compile .*: no such operation"):
+        estimate_rare(brownian(0.1, 0.5, 0.0, 0.3), filters=["none"], engine="compiled")
 
 
 def test_policies_that_only_numpy_can_call_are_told():
