@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import sympy as sp
 
+from safe_envs.agents.rare_events.path_noise import PathNoise
 from safe_envs.dynamics.codegen import compile_function, stacked
 from safe_envs.dynamics.lie import gradient
-from safe_envs.envs.noise import NoiseStreams
 from safe_envs.envs.vector_env import SafeVectorEnv
 from safe_envs.problem.problem import SafetyProblem
 
@@ -20,6 +20,8 @@ class TiltedNoiseEnv(SafeVectorEnv):
     """`SafeVectorEnv` with dW - c e dt in place of dW.
 
     Here e = sigma' grad h/|sigma' grad h| is the direction in which h rises fastest.
+
+    An env plays one episode after it was seeded; later ones have no noise.
 
     Of several barriers the smallest counts. Where no noise reaches it, e = 0. The e of a control
     period is that of its beginning.
@@ -47,7 +49,7 @@ class TiltedNoiseEnv(SafeVectorEnv):
         self._shape = (len(problem.barriers), len(plant.noise_channels), len(lengths))
         self._lengths = lengths
         self.girsanov_integrals = np.zeros((len(lengths), 2))
-        self._noise = _TiltedStreams(self, self._simulation.integrator.channels)
+        self._noise = _TiltedNoise(self, self._simulation.integrator.channels)
 
     def tilt_direction(self) -> np.ndarray:
         """Return the direction e of the coming period, shape (noise channels, num_envs)."""
@@ -101,7 +103,7 @@ def barrier_slopes(problem: SafetyProblem) -> list[sp.Expr]:
     return [row[0, j] for row in rows for j in plant.noise_channels]
 
 
-class _TiltedStreams(NoiseStreams):
+class _TiltedNoise(PathNoise):
     """The draws of an env with its drift."""
 
     def __init__(self, env: TiltedNoiseEnv, channels: int) -> None:
@@ -109,7 +111,7 @@ class _TiltedStreams(NoiseStreams):
         self._env = env
 
     def next(self, stepping: np.ndarray | None) -> np.ndarray:
-        """See `NoiseStreams.next`."""
+        """See `PathNoise.next`."""
         # A state that overflows is found by the env, whose message is better than a warning.
         with np.errstate(all="ignore"):
             return self._env.tilted(super().next(stepping))
