@@ -20,6 +20,10 @@ START = 1
 BRIDGE = 2
 POLICY = 3
 EPISODE = 4
+# Keys of paths of rare events: see `safe_envs.agents.rare_events.path_keys`.
+PILOTS = 5
+SPLIT = 6
+DRIFTING = 7
 
 Key = tuple[int, int]
 """The two words of a key, each below 2**64."""

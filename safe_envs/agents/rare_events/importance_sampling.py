@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.rare_events.particles import Particles, PathPlayer
-from safe_envs.agents.rare_events.path_keys import DRIFTING, PathKeys
+from safe_envs.agents.rare_events.path_keys import PathKeys
+from safe_envs.dynamics.philox import DRIFTING
 
 _STRONGEST = 64.0
 """The strongest drift that is thought of, in standard deviations of the noise over an episode."""

@@ -8,11 +8,6 @@ import numpy as np
 
 from safe_envs.dynamics.philox import StreamReader, key_of
 
-PILOTS = 5
-SPLIT = 6
-DRIFTING = 7
-"""Purposes of the streams of keys, next to those of `safe_envs.dynamics.philox`."""
-
 
 @dataclass(frozen=True)
 class PathKeys:
@@ -23,7 +18,8 @@ class PathKeys:
 
     Attributes:
         seed: of all randomness.
-        purpose: what the paths are for, one of the constants above.
+        purpose: what the paths are for: `PILOTS`, `SPLIT` or `DRIFTING` of
+            `safe_envs.dynamics.philox`.
     """
 
     seed: int

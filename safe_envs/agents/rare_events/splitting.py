@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from safe_envs.agents.rare_events.particles import Particles, PathPlayer
-from safe_envs.agents.rare_events.path_keys import PILOTS, SPLIT, PathKeys
+from safe_envs.agents.rare_events.path_keys import PathKeys
+from safe_envs.dynamics.philox import PILOTS, SPLIT
 
 KILLED = 0.75
 """Share of a repetition's paths that are killed at a level, at least."""
@@ -20,7 +21,7 @@ POWERS = (0.0, 0.5)
 """Of the time that is left, in the two scores: see
 `safe_envs.agents.rare_events.heights.Heights`."""
 
-_PILOTS = 10
+_PILOT_REPETITIONS = 10
 _FEWEST_PARTICLES = 50
 _OFTEN = 0.1
 
@@ -65,7 +66,7 @@ class Splitting:
             One of `POWERS`, and the control periods that were simulated.
         """
         count = max(particles // 5, _FEWEST_PARTICLES)
-        run = Repetitions(self, np.repeat(POWERS, _PILOTS), count, PILOTS)
+        run = Repetitions(self, np.repeat(POWERS, _PILOT_REPETITIONS), count, PILOTS)
         often = run.first > _OFTEN * run.paths.lowest.size
         if not often:
             run.finish(progress)
@@ -114,7 +115,7 @@ class Repetitions:
         how: who simulates, and the seed.
         powers: of the score of each repetition, shape (R,).
         particles: N.
-        purpose: of the streams of keys, see `safe_envs.agents.rare_events.path_keys`.
+        purpose: of the streams of keys, see `PathKeys`.
 
     Attributes:
         estimates: unbiased, shape (R,); those that were given up are 0.

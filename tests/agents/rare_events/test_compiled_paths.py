@@ -17,9 +17,10 @@ from safe_envs.agents.rare_events.compiled_paths import CompiledPaths, PathProgr
 from safe_envs.agents.rare_events.estimate import estimate_rare
 from safe_envs.agents.rare_events.numpy_paths import NumpyPaths
 from safe_envs.agents.rare_events.particles import Particles
-from safe_envs.agents.rare_events.path_keys import SPLIT, PathKeys
+from safe_envs.agents.rare_events.path_keys import PathKeys
 from safe_envs.agents.rare_events.tilted_env import TiltedNoiseEnv
 from safe_envs.compiled.program import Program
+from safe_envs.dynamics.philox import SPLIT
 from safe_envs.errors import NotCompilableError
 from safe_envs.wrappers import SafetyFilter, SafetyFilterVectorWrapper, parse_conditions
 from tests.oracles.laws import X, brownian
