@@ -23,8 +23,8 @@ __all__ = [
     "vector_view",
 ]
 
-kernel = numba.njit(nogil=True, error_model="numpy", forceinline=True)
-entry = numba.njit(nogil=True, error_model="numpy", cache=True)
+kernel = numba.njit(nogil=True, error_model="numpy", _nrt=False, forceinline=True)
+entry = numba.njit(nogil=True, error_model="numpy", _nrt=False, cache=True)
 
 _WORD = np.uint64
 _FIRST, _SECOND = _WORD(0xD2E7470EE14C6C93), _WORD(0xCA5A826395121157)
