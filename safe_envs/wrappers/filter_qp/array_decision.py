@@ -46,9 +46,9 @@ class ArrayDecision:
         self._reciprocal = [i for i, c in constraints if c.demand is not None]
         self._sampled = [i for i, c in constraints if c.change is not None]
         self._uncertain = [i for i, c in constraints if c.uncertainty is not None]
-        self._exact = bool(self._uncertain) and self._m == 1 and not self._goal
+        self._second_order = bool(self._uncertain) and self._m == 1 and not self._goal
         self._method, self._room = _method(
-            self._k + self._goal, self._m + self._goal, uncertain=self._exact
+            self._k + self._goal, self._m + self._goal, uncertain=self._second_order
         )
         self._values, self._body = Values(qp, data), Body(data)
         self._single = self._k == 1 and qp.plain
@@ -147,7 +147,7 @@ class ArrayDecision:
         self._offsets = [f"{self._asked}[{i}]" for i in range(k)]
         for place, i in enumerate(self._uncertain):
             self._form(place, i, rows)
-        if self._exact:
+        if self._second_order:
             forms = {i: place for place, i in enumerate(self._uncertain)}
             entries = [
                 [
@@ -177,14 +177,14 @@ class ArrayDecision:
         count = (m + 1) * (m + 2) // 2
         form = [f"values[{self._forms + place * count + e}]" for e in range(count)]
         self._finite.append(" + ".join(form))
-        if self._exact:
+        if self._second_order:
             return
         planes = self._values.solver.planes
         if i in planes:
             slopes, constant = planes[i]
             slopes, constant = [body.number(s) for s in slopes], body.number(constant)
         else:
-            entry = dict(zip(pairs(m), form, strict=True))
+            entry = dict(zip(_pairs(m), form, strict=True))
             square = range(m + 1)
             body.table(f"form_{i}", [[entry[min(j, e), max(j, e)] for e in square] for j in square])
             body.room(f"slopes_{i}", m)
@@ -206,7 +206,7 @@ class ArrayDecision:
         if not self._in_place:
             rows, offsets = "rows", "offsets"
             body.fill("offsets", self._offsets)
-        form = ", form" if self._exact else ""
+        form = ", form" if self._second_order else ""
         aim = "aim" if self._goal or self._reciprocal else "proposed"
         arguments = f"{rows}, {offsets}{form}, {aim}, low, high, w, priority, action, margin"
         body.call(self._method, f"{arguments}, active, scratch", "feasible = ")
@@ -256,14 +256,14 @@ class ArrayDecision:
             arguments = f"{m}, a, {self._asked}, proposed, w, inside, active"
             body.call(furthest_constraint, arguments, "cause = ")
         slack = "".join(f"0.0 if feasible else max(-{g}, 0.0), " for g in margin)
-        proposed = "".join(f"proposed[{j}], " for j in range(m)) if self._goal else "u"
+        proposed = "".join(f"proposed[{j}], " for j in range(m))
         body.add(
             f"acts = {' or '.join(f'active[{i}] > 0.0' for i in range(k))}",
             f"sound = {' and '.join(f'isfinite({total})' for total in self._finite)}",
-            f"action_given = ({''.join(f'{entry}, ' for entry in action)})",
+            f"chosen = ({''.join(f'{entry}, ' for entry in action)})",
             f"slack = ({slack})",
-            f"return action_given, {f'({proposed})' if self._goal else 'u'}, acts, feasible, slack,"
-            f" {cause}, sound",
+            f"wanted = {f'({proposed})' if self._goal else 'u'}",
+            f"return chosen, wanted, acts, feasible, slack, {cause}, sound",
         )
 
 
@@ -280,6 +280,6 @@ def _method(k: int, m: int, *, uncertain: bool) -> tuple[Callable[..., Any], int
     raise NotCompilableError(f"{k} constraints on {m} inputs need a solver")
 
 
-def pairs(m: int) -> list[tuple[int, int]]:
+def _pairs(m: int) -> list[tuple[int, int]]:
     """Return the places of the entries of an uncertainty in its symmetric matrix."""
     return list(itertools.combinations_with_replacement(range(m + 1), 2))

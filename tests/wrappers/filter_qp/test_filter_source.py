@@ -225,8 +225,13 @@ CASES: dict[str, tuple[int, list[tuple[Any, Any]], dict[str, Any]]] = {
     "reciprocal on three": (3, [(CURVED + y - z**2, RCBF(1.0))], {"weights": (1.0, 3.0, 0.5)}),
     "sampled on three": (3, [(CURVED + y - z**2, CBF(1.0, **EARLY))], {}),
     "several": (1, [(CURVED, CBF(1.0)), (STEEP, CBF(0.5)), (SLANTED, CBF(2.0, **EARLY))], {}),
+    "early reciprocal": (1, [(CURVED, RCBF(1.0, **EARLY)), (STEEP, CBF(1.0, **EARLY))], {}),
     "several reciprocal": (1, [(CURVED, RCBF(1.0)), (STEEP, CBF(0.5)), (SLANTED, SRCBF(2.0))], {}),
-    "plane": (2, [(ROUND, CBF(1.0)), (TILTED, CBF(2.0, **EARLY)), (ACROSS, CBF(0.5))], {}),
+    "plane": (
+        2,
+        [(ROUND, CBF(1.0)), (TILTED, CBF(2.0, **EARLY)), (ACROSS, CBF(0.5))],
+        {"weights": (5.0, 0.2)},
+    ),
     "reciprocal in a plane": (
         2,
         [(ROUND, RCBF(1.0)), (TILTED, SRCBF(1.0)), (ACROSS, CBF(0.5))],
@@ -283,7 +288,7 @@ def case_of(name: str) -> tuple[SafetyFilter, np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("name", CASES)
 def test_everything_that_a_filter_may_have(name: str) -> None:
-    assert check(*case_of(name)) == KINDS
+    assert check(*case_of(name), most=8) == KINDS
 
 
 @pytest.mark.parametrize("name", CASES)
