@@ -28,8 +28,8 @@ class ArrayDecision:
     """Writes `decide` as `FilterQPSolver.solve` decides; what a QP has not leaves no statement.
 
     The statements name these arrays, for k constraints on m inputs and with one more of both for a
-    goal: `a` and `b` as the conditions say, `asked` for b less what is asked for, `rows` and
-    `offsets` of the QP, `inside` with 0 for conditions outside their domain.
+    goal: `a` and `b` as the conditions say, `asked` for b less what is asked for, `coefficients`
+    and `offsets` of the QP, `inside` with 0 for conditions outside their domain.
 
     Args:
         qp: the QP.
@@ -74,7 +74,7 @@ class ArrayDecision:
         self._bounds()
         self._wish()
         self._domains()
-        self._rows()
+        self._constraints()
         self._minimise()
         if self._sampled:
             self._sample()
@@ -132,21 +132,21 @@ class ArrayDecision:
             body.room("rise", self._m)
             body.call(aim_outwards, f"{self._m}, a, inside, low, high, w, rise, aim")
 
-    def _rows(self) -> None:
+    def _constraints(self) -> None:
         """Write the QP's constraints."""
         body, k = self._body, self._k
-        asked, rows = list(self._b), [list(row) for row in self._a]
+        asked, held = list(self._b), [list(row) for row in self._a]
         for i in self._reciprocal:
             demand = self._values.call(f"filter_demand_{i}", [self._qp.constraints[i].demand])
             asked[i] = f"{asked[i]} - {demand}[0] if inside[{i}] > 0.0 else 0.0"
-            rows[i] = [f"({entry} if inside[{i}] > 0.0 else 0.0)" for entry in rows[i]]
+            held[i] = [f"({entry} if inside[{i}] > 0.0 else 0.0)" for entry in held[i]]
         changed = self._reciprocal or self._sampled
         self._asked = "asked" if changed else "b"
         if changed:
             body.vector("asked", asked)
         self._offsets = [f"{self._asked}[{i}]" for i in range(k)]
         for place, i in enumerate(self._uncertain):
-            self._form(place, i, rows)
+            self._form(place, i, held)
         if self._second_order:
             forms = {i: place for place, i in enumerate(self._uncertain)}
             entries = [
@@ -158,20 +158,20 @@ class ArrayDecision:
             ]
             body.table("form", entries)
         if self._goal:
-            rows = [*([*row, "0.0"] for row in rows), ["goal_row[0, 0]", "goal_row[0, 1]"]]
+            held = [*([*row, "0.0"] for row in held), ["goal_row[0, 0]", "goal_row[0, 1]"]]
             self._offsets.append("goal_offset[0]")
-        self._in_place = rows == self._a
+        self._in_place = held == self._a
         if not self._in_place:
-            body.table("rows", rows)
+            body.table("coefficients", held)
             body.room("offsets", k + self._goal)
 
-    def _form(self, place: int, i: int, rows: list[list[str]]) -> None:
+    def _form(self, place: int, i: int, held: list[list[str]]) -> None:
         """Take the uncertainty of a constraint into account: as it is, or as a plane above it.
 
         Args:
             place: its number among the uncertain ones.
             i: its number.
-            rows: coefficients of all, which are changed.
+            held: coefficients of all, which are changed.
         """
         body, m = self._body, self._m
         count = (m + 1) * (m + 2) // 2
@@ -197,24 +197,24 @@ class ArrayDecision:
                 f"{constant} = ",
             )
             slopes = [f"slopes_{i}[{j}]" for j in range(m)]
-        rows[i] = [f"{entry} - {slope}" for entry, slope in zip(rows[i], slopes, strict=True)]
+        held[i] = [f"{entry} - {slope}" for entry, slope in zip(held[i], slopes, strict=True)]
         self._offsets[i] += f" - {constant}"
 
     def _minimise(self) -> None:
         """Write the solution of the QP."""
-        body, rows, offsets = self._body, "a", self._asked
+        body, coefficients, offsets = self._body, "a", self._asked
         if not self._in_place:
-            rows, offsets = "rows", "offsets"
+            coefficients, offsets = "coefficients", "offsets"
             body.fill("offsets", self._offsets)
         form = ", form" if self._second_order else ""
         aim = "aim" if self._goal or self._reciprocal else "proposed"
-        arguments = f"{rows}, {offsets}{form}, {aim}, low, high, w, priority, action, margin"
-        body.call(self._method, f"{arguments}, active, scratch", "feasible = ")
+        arguments = f"{coefficients}, {offsets}{form}, {aim}, low, high, w, priority"
+        body.call(self._method, f"{arguments}, action, margin, active, scratch", "feasible = ")
         if self._goal:
             # The goal's constraint, which can always be met, has no say in that, nor has its
             # rounding.
             met = [
-                f"margin[{i}] >= -row_tolerance(rows, {i}, offsets[{i}], action)"
+                f"margin[{i}] >= -row_tolerance(coefficients, {i}, offsets[{i}], action)"
                 for i in range(self._k)
             ]
             body.add(f"feasible = {' and '.join(met)}")
