@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from safe_envs.agents.policies.base import CHOOSE, BlockPolicy
-from safe_envs.agents.policies.policy_kernel import action_in_another_box, within
+from safe_envs.agents.policies.policy_kernel import action_in_another_box, clip_to_bound
 from safe_envs.compiled.data import Data
 from safe_envs.compiled.formulas import Source
 from safe_envs.errors import ConfigurationError, nearest, shown
@@ -17,7 +17,7 @@ from safe_envs.wrappers.learning.models.network import Network
 from safe_envs.wrappers.learning.models.network_source import network_source
 
 _OUTPUTS = {"tanh": np.tanh, "clip": lambda x: np.clip(x, -1.0, 1.0)}
-_COMPILED_OUTPUTS = {"tanh": "tanh({})", "clip": "within({}, 1.0)"}
+_COMPILED_OUTPUTS = {"tanh": "tanh({})", "clip": "clip_to_bound({}, 1.0)"}
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Normalization:
         for i, (mean, root) in enumerate(zip(self.mean, roots.tolist(), strict=True)):
             place = data.add([mean, root, self.clip])
             share = f"({name}[{i}] - data[{place}]) / data[{place + 1}]"
-            entries += f"within({share}, data[{place + 2}]), "
+            entries += f"clip_to_bound({share}, data[{place + 2}]), "
         return entries
 
 
@@ -134,7 +134,7 @@ class NetworkPolicy(BlockPolicy):
 
     def source(self, data: Data) -> Source:
         """See `Policy.source`. A matrix product of NumPy rounds otherwise, by another order."""
-        network = network_source(self._network, "actor", data)
+        network = network_source(self._network, "policy_network", data)
         given, entries = "observation", ""
         if self._normalization is not None:
             given = f"({self._normalization.code(given, data)})"
@@ -146,8 +146,8 @@ class NetworkPolicy(BlockPolicy):
                 action = f"action_in_another_box({action}, {numbers})"
             entries += f"single({action}), "
         return network + Source(
-            f"{CHOOSE}    outputs = actor({given}, data, work)\n    return ({entries})\n",
-            (within, action_in_another_box),
+            f"{CHOOSE}    outputs = policy_network({given}, data, work)\n    return ({entries})\n",
+            (clip_to_bound, action_in_another_box),
         )
 
 

@@ -147,7 +147,6 @@ class RandomPolicy(StatelessPolicy):
 
     def source(self, data: Data) -> Source:
         """See `Policy.source`."""
-        entries = "".join(
-            f"random_action(step * {self._m} + {j}, k0, k1), " for j in range(self._m)
-        )
+        m = self._m
+        entries = "".join(f"random_action(step * {m} + {j}, k0, k1), " for j in range(m))
         return Source(f"{CHOOSE}    return ({entries})\n", (random_action,))

@@ -33,7 +33,7 @@ def random_action(place: int, k0: int, k1: int) -> float:
     return 2.0 * uniform_of(block[place % 4]) - 1.0
 
 
-def within(value: float, bound: float) -> float:
+def clip_to_bound(value: float, bound: float) -> float:
     """Return a number, or the end of [-bound, bound] that it lies beyond; NaN for NaN."""
     return -bound if value < -bound else bound if value > bound else value
 
@@ -50,4 +50,4 @@ def action_in_another_box(
         new_center: of the new bounds.
         new_half: width of the new bounds, halved.
     """
-    return within((center + half * action - new_center) / new_half, 1.0)
+    return clip_to_bound((center + half * action - new_center) / new_half, 1.0)

@@ -7,7 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import sympy as sp
 
+from safe_envs import ControlAffineSDE, state_problem
+from safe_envs.agents.policies.clf import CLFController
 from safe_envs.agents.policies.custom import as_policy
 from safe_envs.agents.policies.network_policy import NetworkPolicy, Normalization
 from safe_envs.agents.policies.nominal import NominalController, RandomPolicy, ZeroController
@@ -18,6 +21,7 @@ from safe_envs.compiled.draws import POLICY
 from safe_envs.compiled.program import Program
 from safe_envs.envs.spaces import BatchActions
 from safe_envs.errors import NotCompilableError
+from safe_envs.problem.clf import CLF
 from safe_envs.wrappers.learning.models.network import Network
 from tests.conftest import problem_of
 
@@ -73,8 +77,8 @@ def test_random_actions_are_the_words_of_a_stream(env_id, key):
     assert len(np.unique(found)) == COUNT * m
 
 
-def some_network(inputs, outputs, activation, hidden=(7, 5)):
-    rng, sizes = np.random.default_rng(3), [inputs, *hidden, outputs]
+def some_network(inputs, outputs, activation, hidden=(7, 5), seed=3):
+    rng, sizes = np.random.default_rng(seed), [inputs, *hidden, outputs]
     weights = [0.4 * rng.normal(size=(b, a)) / a**0.5 for a, b in pairwise(sizes)]
     biases = [0.3 * rng.normal(size=b) for b in sizes[1:]]
     return Network.unscaled(weights, biases, activation)
@@ -110,10 +114,42 @@ def test_networks(env_id, activation, output, hidden, normal, other_box):
     assert len(np.unique(found)) > COUNT / 4
 
 
-def test_nan_stays_nan():
-    problem = problem_of(DUBINS)
-    seen = np.full((1, len(problem.features)), math.nan)
-    assert np.isnan(inputs_of(NominalController(problem), problem, seen)).all()
+def test_networks_of_one_shape_share_a_program():
+    problem, texts = problem_of(DUBINS), set()
+    for seed in (1, 2):
+        policy = NetworkPolicy(some_network(4, 1, "tanh", seed=seed), "tanh")
+        texts.add(policy_source(policy, problem, Data()).text)
+    assert len(texts) == 1
+
+
+def planar_problem():
+    x, y, u, v = sp.symbols("x y u v", real=True)
+    system = ControlAffineSDE((x, y), (u, v), [x, -y], [[1, y], [0, 2]], [[0.3, 0.2], [0.0, 0.4]])
+    numbers = {"start": [0.0, 0.0], "dt": 0.1, "horizon": 0.5, "nominal": [0, 0]}
+    return state_problem(system, 3 - x - y, box=[(-1.0, 2.0), (-0.5, 0.5)], **numbers)
+
+
+@pytest.mark.parametrize("weight", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("kind", ["CubicSDE", "ACC", "two inputs"])
+def test_clf_controllers(kind, weight):
+    problem = planar_problem() if kind == "two inputs" else problem_of(f"safe_envs/{kind}-v0")
+    total = sum((state - 1.0) ** 2 for state in problem.model.states)
+    policy = CLFController(problem, CLF(total, 2.0, 0.3, weight))
+    shape = (COUNT, len(problem.features))
+    seen = np.random.default_rng(1).normal(1.0, 1.0, shape).astype("f4")
+    found = inputs_of(policy, problem, seen)
+    np.testing.assert_array_equal(found, executed(problem, predicted(policy, seen)))
+    assert len(np.unique(found)) > COUNT / 4
+
+
+@pytest.mark.parametrize("kind", [NominalController, CLFController, NetworkPolicy])
+def test_nan_stays_nan(kind):
+    problem = problem_of("safe_envs/CubicSDE-v0")
+    policy = kind(some_network(2, 1, "tanh"), "clip") if kind is NetworkPolicy else kind(problem)
+    seen = np.array([[0.5, math.nan], [0.5, 0.5]])
+    found = inputs_of(policy, problem, seen)
+    assert np.isnan(found[0]).all()
+    assert np.isfinite(found[1]).all()
 
 
 @pytest.mark.parametrize("given", [lambda rows: rows[:, 0], "predict"])

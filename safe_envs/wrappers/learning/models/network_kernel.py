@@ -10,7 +10,7 @@ from math import expm1, isfinite, nan, tanh
 import numpy as np
 
 
-def set_inputs(inputs: tuple[float, ...], work: np.ndarray) -> None:
+def set_network_inputs(inputs: tuple[float, ...], work: np.ndarray) -> None:
     """Write inputs to the beginning of the scratch array: all NaN if one is not finite.
 
     A saturated activation would hide it.
@@ -26,7 +26,7 @@ def set_inputs(inputs: tuple[float, ...], work: np.ndarray) -> None:
         work[i] = inputs[i] if sound else nan
 
 
-def set_numbers(y: int, size: int, place: int, data: np.ndarray, work: np.ndarray) -> None:
+def copy_layer_numbers(y: int, size: int, place: int, data: np.ndarray, work: np.ndarray) -> None:
     """Copy numbers of the program, the biases of a layer before all else.
 
     Args:
@@ -40,7 +40,7 @@ def set_numbers(y: int, size: int, place: int, data: np.ndarray, work: np.ndarra
         work[y + i] = data[place + i]
 
 
-def set_zeros(y: int, size: int, work: np.ndarray) -> None:
+def clear_layer(y: int, size: int, work: np.ndarray) -> None:
     """Write zeros.
 
     Args:
@@ -52,7 +52,7 @@ def set_zeros(y: int, size: int, work: np.ndarray) -> None:
         work[y + i] = 0.0
 
 
-def add_products(
+def add_layer_products(
     x: int, count: int, y: int, size: int, place: int, data: np.ndarray, work: np.ndarray
 ) -> None:
     """Add the product of a row of numbers and a matrix to another row of numbers.

@@ -58,7 +58,8 @@ class _Layers:
         self._network, self._data = network, data
         self.sizes = [network.layers[0][0].shape[1], *(len(b) for _, b in network.layers)]
         *self.places, self._end = accumulate(self.sizes, initial=0)
-        self._lines, self._uses = ["set_inputs(inputs, work)"], [network_kernel.set_inputs]
+        self._lines = ["set_network_inputs(inputs, work)"]
+        self._uses: list[Callable[..., Any]] = [network_kernel.set_network_inputs]
 
     def _call(self, kernel: Callable[..., Any], *numbers: int, data: str = "") -> None:
         self._lines.append(f"{kernel.__name__}({', '.join(map(str, numbers))}, {data}work)")
@@ -66,13 +67,13 @@ class _Layers:
 
     def _set(self, y: int, values: np.ndarray) -> None:
         self._call(
-            network_kernel.set_numbers, y, len(values), self._data.add(values), data="data, "
+            network_kernel.copy_layer_numbers, y, len(values), self._data.add(values), data="data, "
         )
 
     def _add_products(self, x: int, y: int, matrix: np.ndarray) -> None:
         place = self._data.add(matrix.ravel())
         count, size = matrix.shape
-        self._call(network_kernel.add_products, x, count, y, size, place, data="data, ")
+        self._call(network_kernel.add_layer_products, x, count, y, size, place, data="data, ")
 
     def forward(self, count: int) -> None:
         """Evaluate the first layers."""
@@ -92,7 +93,7 @@ class _Layers:
         for k in range(len(self._network.layers) - 1, 0, -1):
             self._call(slopes, self.places[k], s, self.sizes[k])
             t = s + self.sizes[k]
-            self._call(network_kernel.set_zeros, t, self.sizes[k - 1])
+            self._call(network_kernel.clear_layer, t, self.sizes[k - 1])
             self._add_products(s, t, self._network.layers[k - 1][0])
             s = t
         self._end = s + self.sizes[0]
