@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from safe_envs.dynamics.codegen import Components, compile_function, stacked
 from safe_envs.dynamics.lie import quadratic_variation_rate, vanishes
+from safe_envs.dynamics.normal import standard_exponentials
+from safe_envs.dynamics.philox import BRIDGE, EpisodeUniforms
 from safe_envs.errors import ConfigurationError, nearest, shown
 from safe_envs.problem.problem import SafetyProblem
 
 MONITORING = ("discrete", "continuous")
 """Where h is checked: at control instants, or between them too."""
-
-_CHUNK = 256
 
 
 def require_monitoring(monitoring: str) -> None:
@@ -56,13 +56,8 @@ class BrownianBridge:
 
     def __init__(self, problem: SafetyProblem) -> None:
         plant = problem.plant
-        rates = [
-            quadratic_variation_rate(plant, barrier.expression) for barrier in problem.barriers
-        ]
-        self.reached = tuple(not vanishes(plant, rate) for rate in rates)
-        self._rates = compile_function(
-            plant.states, [2.0 * problem.dt * plant.numeric(rate) for rate in rates], "arrays"
-        )
+        self.reached = reached_by_noise(problem)
+        self._rates = compile_function(plant.states, bridge_rates(problem), "arrays")
         self._h = compile_function(
             plant.states,
             [plant.numeric(barrier.expression) for barrier in problem.barriers],
@@ -100,6 +95,22 @@ class BrownianBridge:
         return ends
 
 
+def reached_by_noise(problem: SafetyProblem) -> tuple[bool, ...]:
+    """Return for each barrier whether the noise reaches it directly."""
+    plant = problem.plant
+    return tuple(
+        not vanishes(plant, quadratic_variation_rate(plant, barrier.expression))
+        for barrier in problem.barriers
+    )
+
+
+def bridge_rates(problem: SafetyProblem) -> list[Any]:
+    """Return 2 s^2 dt of each barrier as a formula of the state."""
+    plant = problem.plant
+    rates = [quadratic_variation_rate(plant, barrier.expression) for barrier in problem.barriers]
+    return [2.0 * problem.dt * plant.numeric(rate) for rate in rates]
+
+
 def smallest(barriers: np.ndarray) -> np.ndarray:
     """Return the smallest of the barriers of each episode: shape (B,) for (B, k)."""
     return barriers[:, 0] if barriers.shape[1] == 1 else barriers.min(axis=1)
@@ -107,7 +118,7 @@ def smallest(barriers: np.ndarray) -> np.ndarray:
 
 def bridge_notes(problem: SafetyProblem) -> list[str]:
     """Return notes on how to read numbers of continuous monitoring."""
-    reached = BrownianBridge(problem).reached
+    reached = reached_by_noise(problem)
     smooth = [
         barrier.name
         for barrier, reaches in zip(problem.barriers, reached, strict=True)
@@ -137,20 +148,9 @@ class Exponentials:
         width: how many a row gets at a time.
     """
 
-    def __init__(self, seed: int, episodes: Sequence[int], width: int) -> None:
-        # The env of episode i is seeded by the child (i,) of the seed, and a random policy by (i,
-        # 0).
-        self._generators = [
-            np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i, 1))) for i in episodes
-        ]
-        self._drawn = np.empty((len(self._generators), _CHUNK, width))
-        self._position = _CHUNK
+    def __init__(self, seed: int, episodes: range, width: int) -> None:
+        self._uniforms = EpisodeUniforms(seed, episodes, BRIDGE, width)
 
     def next(self) -> np.ndarray:
         """Return the draws of the next control period, shape (rows, width)."""
-        if self._position == _CHUNK:
-            for generator, drawn in zip(self._generators, self._drawn, strict=True):
-                generator.standard_exponential(out=drawn)
-            self._position = 0
-        self._position += 1
-        return self._drawn[:, self._position - 1]
+        return standard_exponentials(self._uniforms.next())
