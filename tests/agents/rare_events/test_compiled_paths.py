@@ -153,3 +153,29 @@ def test_policies_that_only_numpy_can_call_are_told():
         estimate_rare(problem, custom, engine="compiled", **arguments)
     timing = estimate_rare(problem, custom, engine="auto", **arguments).timing
     assert timing["rows"][0]["engine"] == "numpy"
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize(
+    "env_id", ["Scalar-v0", "StochasticDubins-v0", "CubicSDEDisk-v0", "Pendulum-v0"]
+)
+def test_estimates_of_both_engines_are_equal_but_for_rounding(env_id):
+    numpy, compiled = (
+        estimate_rare(
+            env_id, particles=100, repetitions=10, monitoring="continuous", engine=engine
+        ).rows
+        for engine in ("numpy", "compiled")
+    )
+    assert sum(row.steps for row in numpy) > 100_000
+    for wanted, found in zip(numpy, compiled, strict=True):
+        assert (found.status, found.reason, found.method) == (
+            wanted.status,
+            wanted.reason,
+            wanted.method,
+        )
+        assert (found.levels, found.steps, found.plain) == (
+            wanted.levels,
+            wanted.steps,
+            wanted.plain,
+        )
+        assert found.estimates == pytest.approx(wanted.estimates, rel=1e-9)
