@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
@@ -17,6 +17,7 @@ from safe_envs.agents.evaluation.rows import EvaluationRow
 from safe_envs.agents.evaluation.spec import UNFILTERED
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.scripts.options.console import say
+from safe_envs.scripts.reports.engine_notes import engine_notes
 from safe_envs.scripts.reports.learned_columns import learned_columns, learned_notes
 from safe_envs.scripts.reports.tables import make_table, print_whole
 
@@ -204,21 +205,6 @@ def _notes(evaluation: Evaluation) -> list[str]:
             " episodes are one and the same: the interval has no meaning."
         )
     return notes
-
-
-def engine_notes(rows: Sequence[tuple[str, str, int]]) -> list[str]:
-    """Return which rows are of the compiled engine.
-
-    Args:
-        rows: filter, engine and threads of each.
-    """
-    compiled = [(name, jobs) for name, engine, jobs in rows if engine == "compiled"]
-    if not compiled:
-        return []
-    names = "" if len(compiled) == len(rows) else f" of {', '.join(name for name, _ in compiled)}"
-    jobs = compiled[0][1]
-    threads = f"{jobs} threads" if jobs > 1 else "one thread"
-    return [f"the steps/s{names} are those of the compiled engine, in {threads}."]
 
 
 def _of_bound(row: EvaluationRow) -> list[str]:
