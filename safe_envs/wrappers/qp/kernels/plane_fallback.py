@@ -66,7 +66,7 @@ def bounded_least_squares_in_plane(
 
 
 def squares_of_slacks(k: int, u1: float, u2: float, work: np.ndarray) -> float:
-    """Compute the margins, and return the sum of squared slacks.
+    """Return the sum of squared slacks, and record the margins.
 
     Args:
         k: number of constraints.
