@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import Any
@@ -84,7 +84,7 @@ class CompiledEpisodes:
         episodes: range,
         seed: int,
         threads: int,
-        again: Callable[[range], Iterator[PlayedBatch]],
+        again: Callable[[range], Iterable[PlayedBatch]],
     ) -> Iterator[PlayedBatch]:
         """Simulate consecutive episodes.
 
