@@ -22,6 +22,7 @@ from safe_envs.compiled.data import Data
 from safe_envs.compiled.program import Functions, Program
 from safe_envs.dynamics.philox import key_of
 from safe_envs.envs.world_source import noise_channels, world_source
+from safe_envs.errors import NotCompilableError, shortened
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.filter_qp import FilterQP
 from safe_envs.wrappers.filter_qp.filter_source import filter_source, unfiltered_source
@@ -72,10 +73,17 @@ class CompiledEpisodes:
 
         Raises:
             ConfigurationError: Numba is not installed.
+            NotCompilableError: Numba cannot compile a formula.
         """
         functions = self.program.compiled()
-        # The first call compiles: an error shows before a long run, and timing is of steps.
-        self._simulate(functions, range(0), _key(0))
+        try:
+            # The first call compiles: an error shows before a long run, and timing is of steps.
+            self._simulate(functions, range(0), _key(0))
+        except Exception as error:
+            raise NotCompilableError(
+                f"Numba cannot compile {self._problem.name}: {shortened(error)}; use the engine"
+                " 'numpy'"
+            ) from error
         return functions
 
     def play(

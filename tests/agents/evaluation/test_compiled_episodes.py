@@ -247,6 +247,18 @@ def test_what_the_compiled_engine_cannot_do_is_an_error(arguments, message):
         evaluate("Scalar-v0", filters=["none"], episodes=2, **arguments)
 
 
+def test_what_numba_cannot_compile_is_done_by_numpy(monkeypatch):
+    def refuse(*_):
+        raise TypeError("no such function")
+
+    monkeypatch.setattr(Program, "compiled", lambda _: {"play_episodes": refuse})
+    monkeypatch.setattr(engine_module, "LONG", 1)
+    given = {"filters": ["none"], "episodes": 2, "options": {"horizon": 0.05}, "bounds": False}
+    assert evaluate("Scalar-v0", **given).timing.rows[0].engine == "numpy"
+    with pytest.raises(NotCompilableError, match="cannot compile Scalar: no such function"):
+        evaluate("Scalar-v0", engine="compiled", **given)
+
+
 def test_without_numba_the_compiled_engine_says_what_to_install(monkeypatch):
     monkeypatch.setattr(program_module, "is_available", lambda: False)
     with pytest.raises(ConfigurationError, match=r"pip install 'safe-envs\[fast\]'"):
