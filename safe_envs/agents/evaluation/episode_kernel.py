@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 
 from safe_envs.compiled.draws import (
-    BRIDGE,
-    NOISE,
     draw_start,
     episode_key,
     fill_normals,
@@ -39,6 +37,7 @@ from safe_envs.compiled.slots import (
     smallest_barrier,
 )
 from safe_envs.dynamics.normal_kernel import standard_exponential
+from safe_envs.dynamics.philox import BRIDGE, NOISE
 
 FIRST_STATE = 0
 DEEPEST_STATE = 1
@@ -62,7 +61,7 @@ def play_episodes(  # noqa: PLR0913
     uniforms: np.ndarray,
     work: np.ndarray,
 ) -> int:
-    """Simulate consecutive episodes, and return how many ended before one that has no end.
+    """Simulate consecutive episodes, up to one that does not come to an end.
 
     That is one in which something has no finite value, or no start is allowed.
 
@@ -82,6 +81,9 @@ def play_episodes(  # noqa: PLR0913
         bridge: the same for the uniforms of the bridges.
         uniforms: scratch array for those of a start.
         work: scratch array.
+
+    Returns:
+        The number of episodes that came to an end.
     """
     for row in range(len(numbers)):
         key = episode_key(first + row, k0, k1)
@@ -195,13 +197,26 @@ def play_episode(  # noqa: PLR0913
 
 
 def store_entries(table: np.ndarray, row: int, values: tuple[Any, ...]) -> None:
-    """Write values to a row of a table."""
+    """Write values to a row of a table.
+
+    Args:
+        table: receives them, shape (E, k).
+        row: of the table.
+        values: k numbers.
+    """
     for j in range(len(values)):
         table[row, j] = values[j]
 
 
 def store_state(states: np.ndarray, row: int, place: int, x: State) -> None:
-    """Write a state to a place of an episode."""
+    """Write a state to a place of an episode.
+
+    Args:
+        states: receives it, shape (E, 4, n).
+        row: of the episode.
+        place: `FIRST_STATE` or another one.
+        x: the state.
+    """
     for j in range(len(x)):
         states[row, place, j] = x[j]
 

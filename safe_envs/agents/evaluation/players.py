@@ -55,6 +55,9 @@ class NumpyPlayer:
         Args:
             progress: called with the number of episodes that are done.
             trajectories: is filled, if given.
+
+        Returns:
+            The batches in the order of the episodes.
         """
         spec = self._spec
         if self.jobs == 1:
