@@ -66,7 +66,8 @@ class CompiledEpisodes:
         ahead = 4 * math.ceil(problem.steps / (4 * parts))
         self._sizes = problem.steps, ahead, channels, draws
         self._uniforms = len(problem.starts[problem.start].uniforms)
-        self.program = Program(problem.name, (play_episodes,), source)
+        what = "episodes" if qp is None else "filtered episodes"
+        self.program = Program(f"{what} of {problem.name}", (play_episodes,), source)
 
     def compiled(self) -> Functions:
         """Return the entry points of the program, compiled.
@@ -81,8 +82,7 @@ class CompiledEpisodes:
             self._simulate(functions, range(0), _key(0))
         except Exception as error:
             raise NotCompilableError(
-                f"Numba cannot compile {self._problem.name}: {shortened(error)}; use the engine"
-                " 'numpy'"
+                f"Numba cannot compile {self._problem.name}: {shortened(error)}"
             ) from error
         return functions
 

@@ -116,13 +116,11 @@ class CompiledPlayer:
         spec = self._spec = resolved.spec
         if resolved.target.filter_spec is not None:
             raise NotCompilableError(
-                f"{resolved.target.title} is a third-party env, which only its own code can step;"
-                " use the engine 'numpy'"
+                f"{resolved.target.title} is a third-party env, which only its own code can step"
             )
         if settings.record:
             raise NotCompilableError(
-                "trajectories for pictures are kept by the engine 'numpy' alone; use that, or leave"
-                " the picture out"
+                "trajectories for pictures are kept by the engine 'numpy' alone"
             )
         problem = resolved.problem
         safety_filter = (
