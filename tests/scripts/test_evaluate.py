@@ -322,15 +322,15 @@ def test_refinement_says_which_rates_have_converged(safe_envs_command):
     assert "  scbf: not resolved, +0.0 points [-27.8, 27.8]: more episodes are needed" in few
     coarse = (
         "--dt",
-        ".4",
+        ".1",
         "--horizon",
-        "1.6",
+        ".4",
         "--start",
-        ".5",
+        ".8",
         "--noise",
         ".8",
         "--episodes",
-        "500",
+        "1000",
     )
     changing = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", *coarse, "--refine")[
         1
