@@ -41,7 +41,9 @@ def compiled_or_none(engine: str, periods: float, make: Callable[[], _Found]) ->
         return None
     try:
         return make()
-    except NotCompilableError:
+    except NotCompilableError as error:
         if engine == "compiled":
-            raise
+            raise NotCompilableError(
+                f"engine = 'compiled': {error}; use 'numpy', or 'auto'"
+            ) from error
         return None

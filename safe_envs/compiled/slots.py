@@ -100,6 +100,11 @@ def lowest_between(
     raise NotImplementedError
 
 
+def no_barriers(data: np.ndarray) -> tuple[float, ...]:
+    """Return barriers of NaN."""
+    raise NotImplementedError
+
+
 def reward_of(values: tuple[float, ...]) -> float:
     """Return the reward."""
     raise NotImplementedError

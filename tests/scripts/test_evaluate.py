@@ -77,6 +77,7 @@ def test_json_has_the_documented_keys(safe_envs_command):
     assert {"safe-envs", "python", "numpy", "gymnasium"} <= set(document["versions"])
     assert document["timing"]["num_envs"] == 1024
     assert [row["filter"] for row in document["timing"]["rows"]] == ["none", "hocbf:p=1,2"]
+    assert {(row["engine"], row["jobs"]) for row in document["timing"]["rows"]} == {("numpy", 1)}
     assert [p.name for p in Path().iterdir()] == ["out.json"]
 
 
@@ -321,15 +322,15 @@ def test_refinement_says_which_rates_have_converged(safe_envs_command):
     assert "  scbf: not resolved, +0.0 points [-27.8, 27.8]: more episodes are needed" in few
     coarse = (
         "--dt",
-        ".4",
+        ".1",
         "--horizon",
-        "1.6",
+        ".4",
         "--start",
-        ".5",
+        ".8",
         "--noise",
         ".8",
         "--episodes",
-        "500",
+        "1000",
     )
     changing = safe_envs_command("evaluate", "Scalar-v0", "--filter", "none", *coarse, "--refine")[
         1

@@ -22,13 +22,18 @@ def bridge_draws(problem: SafetyProblem, continuous: bool) -> int:
 
 
 def bridge_source(problem: SafetyProblem, continuous: bool, data: Data) -> Source:
-    """Return `lowest_between` of `safe_envs.compiled.slots`.
+    """Return `lowest_between` and `no_barriers` of `safe_envs.compiled.slots`.
 
     Args:
         problem: whose barriers are looked at.
         continuous: whether to look between control instants too.
         data: receives its numbers.
     """
+    nothing = Source(f"def no_barriers(data):\n    return ({'nan, ' * len(problem.barriers)})\n")
+    return nothing + _lowest(problem, continuous, data)
+
+
+def _lowest(problem: SafetyProblem, continuous: bool, data: Data) -> Source:
     if not continuous:
         return Source(f"{_HEAD}    return smallest_barrier(after)\n")
     if not bridge_draws(problem, continuous):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from typing import Any
@@ -22,6 +22,7 @@ from safe_envs.compiled.data import Data
 from safe_envs.compiled.program import Functions, Program
 from safe_envs.dynamics.philox import key_of
 from safe_envs.envs.world_source import noise_channels, world_source
+from safe_envs.errors import NotCompilableError, shortened
 from safe_envs.problem.problem import SafetyProblem
 from safe_envs.wrappers.filter_qp import FilterQP
 from safe_envs.wrappers.filter_qp.filter_source import filter_source, unfiltered_source
@@ -65,17 +66,24 @@ class CompiledEpisodes:
         ahead = 4 * math.ceil(problem.steps / (4 * parts))
         self._sizes = problem.steps, ahead, channels, draws
         self._uniforms = len(problem.starts[problem.start].uniforms)
-        self.program = Program(problem.name, (play_episodes,), source)
+        what = "episodes" if qp is None else "filtered episodes"
+        self.program = Program(f"{what} of {problem.name}", (play_episodes,), source)
 
     def compiled(self) -> Functions:
         """Return the entry points of the program, compiled.
 
         Raises:
             ConfigurationError: Numba is not installed.
+            NotCompilableError: Numba cannot compile a formula.
         """
         functions = self.program.compiled()
-        # The first call compiles: an error shows before a long run, and timing is of steps.
-        self._simulate(functions, range(0), _key(0))
+        try:
+            # The first call compiles: an error shows before a long run, and timing is of steps.
+            self._simulate(functions, range(0), _key(0))
+        except Exception as error:
+            raise NotCompilableError(
+                f"Numba cannot compile {self._problem.name}: {shortened(error)}"
+            ) from error
         return functions
 
     def play(
@@ -84,7 +92,7 @@ class CompiledEpisodes:
         episodes: range,
         seed: int,
         threads: int,
-        again: Callable[[range], Iterator[PlayedBatch]],
+        again: Callable[[range], Iterable[PlayedBatch]],
     ) -> Iterator[PlayedBatch]:
         """Simulate consecutive episodes.
 

@@ -8,7 +8,7 @@ was smallest; `inputs` what was executed where the slack was largest.
 
 from __future__ import annotations
 
-from math import isfinite, nan, sqrt
+from math import inf, isfinite, nan, sqrt
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,7 @@ from safe_envs.compiled.slots import (
     is_finite,
     lowest_between,
     measure,
+    no_barriers,
     observation_of,
     resting_input,
     reward_of,
@@ -38,6 +39,7 @@ from safe_envs.compiled.slots import (
 from safe_envs.dynamics.normal_kernel import standard_exponential
 from safe_envs.dynamics.philox import BRIDGE, NOISE
 
+FIRST_STATE = 0
 DEEPEST_STATE = 1
 VIOLATING_STATE = 2
 LOWEST_STATE = 3
@@ -59,7 +61,7 @@ def play_episodes(  # noqa: PLR0913
     uniforms: np.ndarray,
     work: np.ndarray,
 ) -> int:
-    """Simulate consecutive episodes, and return how many ended before one that has no end.
+    """Simulate consecutive episodes, up to one that does not come to an end.
 
     That is one in which something has no finite value, or no start is allowed.
 
@@ -79,6 +81,9 @@ def play_episodes(  # noqa: PLR0913
         bridge: the same for the uniforms of the bridges.
         uniforms: scratch array for those of a start.
         work: scratch array.
+
+    Returns:
+        The number of episodes that came to an end.
     """
     for row in range(len(numbers)):
         key = episode_key(first + row, k0, k1)
@@ -135,23 +140,43 @@ def play_episode(  # noqa: PLR0913
     """
     steps, ahead, channels, draws = sizes
     x = draw_start(key, 0, 0, uniforms, data)
-    values = measure(x, resting_input(data), 0.0, data)
-    if not is_finite(x, values):
-        return False
-    for i in range(states.shape[1]):
-        store_state(states, row, i, x)
-    barriers = barriers_of(values)
-    h_min = depth = smallest_barrier(barriers)
-    safe = h_min > 0.0
-    worst, effort, returned = 0.0, 0.0, 0.0
-    counted, length, interventions, infeasible = 0, 0, 0, 0
-    for k in range(steps):
+    action = resting_input(data)
+    before, barriers = x, no_barriers(data)
+    h_min, depth, worst, effort, returned = inf, -inf, 0.0, 0.0, 0.0
+    counted, interventions, infeasible, length = 0, 0, 0, 0
+    safe = True
+    # What is read off a state and decided on it is in one round: compiled code then computes the
+    # sines and cosines of a state once.
+    for k in range(steps + 1):
+        values = measure(x, action, k * dt, data)
+        if not is_finite(x, values):
+            return False
+        after = barriers_of(values)
+        if k == 0:
+            h = smallest_barrier(after)
+            store_state(states, row, FIRST_STATE, x)
+        else:
+            h = lowest_between(before, barriers, after, bridge, (k - 1) % ahead * draws, data)
+            returned += reward_of(values)
+        if safe and h > depth:
+            depth = h
+            store_state(states, row, DEEPEST_STATE, x)
+        if h < h_min:
+            h_min = h
+            if h <= 0.0:
+                store_state(states, row, LOWEST_STATE, x)
+        safe = safe and h > 0.0
+        length = k
+        if (k > 0 and has_ended(values)) or k == steps:
+            break
         drawn = k % ahead
         if drawn == 0:
             fill_normals(noise, k * channels, 0, NOISE, key, 0)
             fill_uniforms(bridge, k * draws, 0, BRIDGE, key, 0)
         proposed = act(observation_of(values), k, key, 0, data, work)
         action, wanted, active, feasible, slacks, _, sound = decide(x, proposed, data, work)
+        if not (sound and is_finite_input(proposed)):
+            return False
         if safe:
             # The conditions mean nothing after a violation.
             counted += 1
@@ -163,25 +188,8 @@ def play_episode(  # noqa: PLR0913
                 worst = slack
                 store_state(states, row, VIOLATING_STATE, x)
                 store_entries(inputs, row, action)
-        moved = advance(x, action, noise, drawn * channels, data)
-        values = measure(moved, action, (k + 1) * dt, data)
-        if not (sound and is_finite_input(proposed) and is_finite(moved, values)):
-            return False
-        after = barriers_of(values)
-        h = lowest_between(x, barriers, after, bridge, drawn * draws, data)
-        x, barriers = moved, after
-        length += 1
-        if safe and h > depth:
-            depth = h
-            store_state(states, row, DEEPEST_STATE, x)
-        if h < h_min:
-            h_min = h
-            if h <= 0.0:
-                store_state(states, row, LOWEST_STATE, x)
-        safe = safe and h > 0.0
-        returned += reward_of(values)
-        if has_ended(values):
-            break
+        before, barriers = x, after
+        x = advance(x, action, noise, drawn * channels, data)
     mean = effort / counted if counted else nan
     store_entries(numbers, row, (returned, h_min, mean, depth, worst))
     store_entries(counts, row, (-1 if safe else counted, length, interventions, infeasible))
@@ -189,13 +197,26 @@ def play_episode(  # noqa: PLR0913
 
 
 def store_entries(table: np.ndarray, row: int, values: tuple[Any, ...]) -> None:
-    """Write values to a row of a table."""
+    """Write values to a row of a table.
+
+    Args:
+        table: receives them, shape (E, k).
+        row: of the table.
+        values: k numbers.
+    """
     for j in range(len(values)):
         table[row, j] = values[j]
 
 
 def store_state(states: np.ndarray, row: int, place: int, x: State) -> None:
-    """Write a state to a place of an episode."""
+    """Write a state to a place of an episode.
+
+    Args:
+        states: receives it, shape (E, 4, n).
+        row: of the episode.
+        place: `FIRST_STATE` or another one.
+        x: the state.
+    """
     for j in range(len(x)):
         states[row, place, j] = x[j]
 

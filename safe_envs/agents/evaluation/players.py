@@ -55,6 +55,9 @@ class NumpyPlayer:
         Args:
             progress: called with the number of episodes that are done.
             trajectories: is filled, if given.
+
+        Returns:
+            The batches in the order of the episodes.
         """
         spec = self._spec
         if self.jobs == 1:
@@ -113,13 +116,11 @@ class CompiledPlayer:
         spec = self._spec = resolved.spec
         if resolved.target.filter_spec is not None:
             raise NotCompilableError(
-                f"{resolved.target.title} is a third-party env, which only its own code can step;"
-                " use the engine 'numpy'"
+                f"{resolved.target.title} is a third-party env, which only its own code can step"
             )
         if settings.record:
             raise NotCompilableError(
-                "trajectories for pictures are kept by the engine 'numpy' alone; use that, or leave"
-                " the picture out"
+                "trajectories for pictures are kept by the engine 'numpy' alone"
             )
         problem = resolved.problem
         safety_filter = (

@@ -47,6 +47,9 @@ def touching(
         lowest: minimum h of each, shape (B,).
         largest: maximum h of each, shape (B,).
         x: the states where the minima were, shape (B, n).
+
+    Returns:
+        The number of such violations.
     """
     part = violating & may_touch(lowest, largest)
     return int(touches(problem, lowest[part], x[part]).sum()) if part.any() else 0

@@ -84,6 +84,7 @@ def test_an_agent_of_stable_baselines3_is_evaluated_behind_the_filter(tmp_path):
     [
         ({"filters": ["bayesian-scbf"]}, "learned from a log"),
         ({"policy": "clf"}, "Lyapunov"),
+        ({"engine": "compiled"}, "third-party env, which only its own code can step"),
         ({"knowledge": "plant"}, "nothing is known but the model"),
         ({"options": {"noise": 0.1}}, "without noise"),
         ({"problem": "safe_envs/Pendulum-v0"}, "barriers of its own"),
