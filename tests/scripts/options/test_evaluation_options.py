@@ -38,6 +38,7 @@ def test_a_default_is_that_of_the_spec(name):
 
 
 def test_all_that_a_spec_asks_is_an_option():
-    elsewhere = {"problem", "options", "bounds", "record", "progress"}
+    # A command keeps no episodes: --episodes-out writes them.
+    elsewhere = {"problem", "options", "bounds", "record", "progress", "keep_episodes"}
     names = {field.name for schema in (EvaluationSpec, RunSettings) for field in fields(schema)}
     assert names - elsewhere <= {*OF_COMMAND}

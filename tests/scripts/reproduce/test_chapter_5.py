@@ -28,12 +28,12 @@ PICTURES = [f"figure-5.3{key}" for key in "abcd"]
 EACH = pytest.mark.parametrize("name", list(ARTEFACTS))
 
 
-def compute(name):
-    """The quick outcome, with shorter episodes in pictures and in setting A."""
+def compute(name, sample=SAMPLE):
+    """The outcome, by default the quick one, with shorter episodes in pictures and in setting A."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pendulum, "A", replace(pendulum.A, horizon=0.5))
         patch.setattr(cubic_paths, "HORIZON", 2.0)
-        return ARTEFACTS[name].compute(SAMPLE)
+        return ARTEFACTS[name].compute(sample)
 
 
 @pytest.fixture(scope="module")
@@ -318,8 +318,9 @@ def test_each_picture_has_its_own_claim(outcomes):
     )
 
 
-def test_the_input_bounds_are_too_narrow_in_the_stated_setting(outcomes):
-    outcome = outcomes["figure-5.3b"]
+def test_the_input_bounds_are_too_narrow_in_the_stated_setting():
+    # One start in some hundred is too fast for the input.
+    outcome = compute("figure-5.3b", Workload(episodes=1000))
     assert not outcome.claims[0].holds
     assert outcome.numbers[0].ours < 100.0
     judged = judge(ARTEFACTS["figure-5.3b"], outcome, FULL)
