@@ -79,28 +79,41 @@ def standard_normal(uniform: float) -> float:
     # Both operations are exact, and q is never 0.
     q = (uniform - 0.5) + HALF_STEP
     if abs(q) <= CENTRAL:
-        r = CENTRAL_SQUARE - q * q
-        top = ((((((A7 * r + A6) * r + A5) * r + A4) * r + A3) * r + A2) * r + A1) * r + A0
-        low = ((((((B7 * r + B6) * r + B5) * r + B4) * r + B3) * r + B2) * r + B1) * r + 1.0
-        return q * (top / low)
+        return normal_center(q)
     return normal_tail(q)
+
+
+def normal_center(q: float) -> float:
+    """Return the standard normal number at 1/2 + q, where |q| <= `CENTRAL`."""
+    r = CENTRAL_SQUARE - q * q
+    top = ((((((A7 * r + A6) * r + A5) * r + A4) * r + A3) * r + A2) * r + A1) * r + A0
+    low = ((((((B7 * r + B6) * r + B5) * r + B4) * r + B3) * r + B2) * r + B1) * r + 1.0
+    return q * (top / low)
 
 
 def normal_tail(q: float) -> float:
     """Return the standard normal number at 1/2 + q, where |q| > `CENTRAL`."""
     r = sqrt(-log(0.5 - abs(q)))
-    if r <= NEAR_END:
-        r = r - NEAR_SHIFT
-        top = ((((((C7 * r + C6) * r + C5) * r + C4) * r + C3) * r + C2) * r + C1) * r + C0
-        low = ((((((D7 * r + D6) * r + D5) * r + D4) * r + D3) * r + D2) * r + D1) * r + 1.0
-    else:
-        r = r - FAR_SHIFT
-        top = ((((((E7 * r + E6) * r + E5) * r + E4) * r + E3) * r + E2) * r + E1) * r + E0
-        low = ((((((F7 * r + F6) * r + F5) * r + F4) * r + F3) * r + F2) * r + F1) * r + 1.0
-    found = top / low
+    found = near_tail(r) if r <= NEAR_END else far_tail(r)
     if q < 0.0:
         return -found
     return found
+
+
+def near_tail(root: float) -> float:
+    """Return the standard normal number of root = sqrt(-log p) up to `NEAR_END`."""
+    r = root - NEAR_SHIFT
+    top = ((((((C7 * r + C6) * r + C5) * r + C4) * r + C3) * r + C2) * r + C1) * r + C0
+    low = ((((((D7 * r + D6) * r + D5) * r + D4) * r + D3) * r + D2) * r + D1) * r + 1.0
+    return top / low
+
+
+def far_tail(root: float) -> float:
+    """Return the standard normal number of root = sqrt(-log p) above `NEAR_END`."""
+    r = root - FAR_SHIFT
+    top = ((((((E7 * r + E6) * r + E5) * r + E4) * r + E3) * r + E2) * r + E1) * r + E0
+    low = ((((((F7 * r + F6) * r + F5) * r + F4) * r + F3) * r + F2) * r + F1) * r + 1.0
+    return top / low
 
 
 def standard_exponential(uniform: float) -> float:

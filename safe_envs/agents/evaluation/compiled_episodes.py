@@ -153,7 +153,7 @@ class CompiledEpisodes:
             states,
             inputs,
             self._data,
-            np.empty(ahead * channels),
+            np.empty(3 * ahead * channels),
             np.empty(ahead * draws),
             np.empty(self._uniforms),
             np.empty(self._work),

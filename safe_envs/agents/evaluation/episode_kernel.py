@@ -16,9 +16,9 @@ import numpy as np
 from safe_envs.compiled.draws import (
     draw_start,
     episode_key,
-    fill_normals,
     fill_uniforms,
 )
+from safe_envs.compiled.normal_runs import fill_normal_run
 from safe_envs.compiled.slots import (
     Input,
     State,
@@ -77,7 +77,7 @@ def play_episodes(  # noqa: PLR0913
         states: shape (E, 4, n).
         inputs: shape (E, m).
         data: numbers of the program.
-        noise: scratch array for the normals that are drawn ahead.
+        noise: scratch array for the normals that are drawn ahead, with three entries for each.
         bridge: the same for the uniforms of the bridges.
         uniforms: scratch array for those of a start.
         work: scratch array.
@@ -171,7 +171,7 @@ def play_episode(  # noqa: PLR0913
             break
         drawn = k % ahead
         if drawn == 0:
-            fill_normals(noise, k * channels, 0, NOISE, key, 0)
+            fill_normal_run(noise, k * channels, 0, NOISE, key, 0)
             fill_uniforms(bridge, k * draws, 0, BRIDGE, key, 0)
         proposed = act(observation_of(values), k, key, 0, data, work)
         action, wanted, active, feasible, slacks, _, sound = decide(x, proposed, data, work)
