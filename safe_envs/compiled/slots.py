@@ -101,3 +101,28 @@ def decide(x: State, u: Input, data: np.ndarray, work: np.ndarray) -> tuple[Any,
     where none is active), and whether all numbers of the QP are finite; see `FilterDecision`.
     """
     raise NotImplementedError
+
+
+def has_left(values: tuple[float, ...]) -> bool:
+    """Return whether the workspace was left."""
+    raise NotImplementedError
+
+
+def observation_within(observation: tuple[float, ...], data: np.ndarray) -> tuple[float, ...]:
+    """Return an observation, clipped to the bounds of its space."""
+    raise NotImplementedError
+
+
+def state_of(row: np.ndarray) -> State:
+    """Return the state that the first entries of an array hold."""
+    raise NotImplementedError
+
+
+def input_of(row: np.ndarray) -> Input:
+    """Return the input that the first entries of an array hold."""
+    raise NotImplementedError
+
+
+def scaled_input(action: Input, data: np.ndarray) -> Input:
+    """Return the physical input of an action in [-1, 1], which is clipped to it."""
+    raise NotImplementedError

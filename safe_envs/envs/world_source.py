@@ -125,6 +125,7 @@ def _measure(problem: SafetyProblem, data: Data) -> Source:
         f"def barriers_of(values):\n    return ({shares})\n"
         "def smallest_barrier(barriers):\n" + "\n".join(smallest) + "\n    return h\n"
         f"def reward_of(values):\n    return values[{last}]\n"
+        f"def has_left(values):\n    return values[{last + 1}] > 0.0\n"
         f"def has_ended(values):\n    return values[{last + 1}] > 0.0 or values[{last + 2}] >= 0.0\n"
         f"def is_finite(x, values):\n    return isfinite({total})\n"
     )

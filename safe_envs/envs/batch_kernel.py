@@ -1,0 +1,272 @@
+"""One control period of all envs of a batch in one compiled function."""
+
+from __future__ import annotations
+
+from math import inf, isfinite
+
+import numpy as np
+
+from safe_envs.compiled.draws import NOISE, draw_start, fill_normals, store_row
+from safe_envs.compiled.slots import (
+    Input,
+    State,
+    advance,
+    barriers_of,
+    decide,
+    has_ended,
+    has_left,
+    input_of,
+    is_finite,
+    measure,
+    observation_of,
+    observation_within,
+    resting_input,
+    reward_of,
+    scaled_input,
+    smallest_barrier,
+    state_of,
+)
+
+DONE = 0
+BAD_ACTION = 1
+UNDEFINED_FILTER = 2
+NO_START = 3
+NOT_FINITE = 4
+
+PERIODS = 16
+"""Control periods of noise that are drawn at once. With a multiple of 4, whole blocks are."""
+
+STEPS, PERIOD = 0, 1
+COST, H_MIN, EPISODE_COST, BARRIERS = 0, 1, 2, 3
+TERMINATED, TRUNCATED, ENDED, VIOLATION, INTERVENTION, ACTIVE, FEASIBLE = 0, 1, 2, 3, 4, 5, 6
+INTERVENTIONS, INFEASIBLE, ACTIVE_BARRIER = 0, 1, 2
+
+
+def step_batch(  # noqa: PLR0913
+    actions: np.ndarray,
+    scaled: bool,
+    stepping: bool,
+    filtered: bool,
+    restarts: np.ndarray,
+    limit: int,
+    dt: float,
+    channels: int,
+    streams: np.ndarray,
+    chunks: np.ndarray,
+    noise: np.ndarray,
+    uniforms: np.ndarray,
+    work: np.ndarray,
+    data: np.ndarray,
+    rest: np.ndarray,
+    states_before: np.ndarray,
+    counts_before: np.ndarray,
+    tallies_before: np.ndarray,
+    states: np.ndarray,
+    counts: np.ndarray,
+    tallies: np.ndarray,
+    inputs: np.ndarray,
+    choices: np.ndarray,
+    flags: np.ndarray,
+    observations: np.ndarray,
+    rewards: np.ndarray,
+    readings: np.ndarray,
+) -> int:
+    """Step the envs of a batch, begin an episode in some of them, and read all states.
+
+    Nothing that is read here is written, but for scratch and the noise that is drawn ahead: where
+    the result is `BAD_ACTION`, `UNDEFINED_FILTER` or `NO_START`, nothing has happened.
+
+    Args:
+        actions: m numbers of each env.
+        scaled: whether the actions are physical inputs.
+        stepping: whether the envs step that begin no episode; otherwise they are only read.
+        filtered: whether `decide` chooses the input, and `inputs`, `choices` and `tallies` have
+            entries for it.
+        restarts: the envs that begin an episode.
+        limit: control periods until an episode is truncated.
+        dt: control period in s.
+        channels: standard normals of a control period.
+        streams: the two words of the key and the number of the episode, of each env.
+        chunks: number of the chunk of noise of each env, -1 without one.
+        noise: that chunk.
+        uniforms: scratch array, with an entry for each uniform of the start distribution.
+        work: scratch array.
+        data: numbers of the program.
+        rest: what a filter reports at reset, in the order of `inputs` after the executed one.
+        states_before: n states, smallest barrier and cost of the episode.
+        counts_before: steps of the episode, and period of its noise.
+        tallies_before: interventions and infeasible steps of the episode.
+        states: receives the same after the step.
+        counts: likewise.
+        tallies: likewise.
+        inputs: receives the executed input, and of the filter the proposed and the executed one,
+            the largest slack and the slacks.
+        choices: receives interventions, infeasible steps and the active barrier.
+        flags: receives rows of flags.
+        observations: receives the observations.
+        rewards: receives the rewards.
+        readings: receives cost, smallest barrier and cost of the episode, and the barriers.
+
+    Returns:
+        What happened, one of the constants of this module.
+    """
+    status = DONE
+    for i in range(len(restarts)):
+        u = resting_input(data)
+        if restarts[i]:
+            x = draw_start(streams[i, 0], streams[i, 1], streams[i, 2], uniforms, data)
+            if not isfinite(x[0]):
+                return NO_START
+            chunks[i] = -1
+            counts[i, STEPS] = 0
+            counts[i, PERIOD] = 0
+            states[i, len(x)] = inf
+            states[i, len(x) + 1] = 0.0
+            if filtered:
+                rest_filter(i, u, rest, inputs, tallies, choices, flags)
+            if stepping:
+                store_row(inputs[i, : len(u)], scaled_input(input_of(actions[i]), data))
+        else:
+            x = state_of(states_before[i])
+            states[i, len(x)] = states_before[i, len(x)]
+            states[i, len(x) + 1] = states_before[i, len(x) + 1]
+            period = counts_before[i, PERIOD]
+            counts[i, STEPS] = counts_before[i, STEPS] + stepping
+            counts[i, PERIOD] = period + stepping
+            if stepping:
+                u = input_of(actions[i])
+                if not scaled:
+                    for a in u:
+                        if not isfinite(a):
+                            return BAD_ACTION
+                    u = scaled_input(u, data)
+                if filtered:
+                    u, sound = filter_input(
+                        i, x, u, data, work, inputs, tallies_before, tallies, choices, flags
+                    )
+                    if not sound:
+                        return UNDEFINED_FILTER
+                store_row(inputs[i, : len(u)], u)
+                place = 0
+                if channels:
+                    place = (period % PERIODS) * channels
+                    if chunks[i] != period // PERIODS:
+                        chunks[i] = period // PERIODS
+                        first = (period - period % PERIODS) * channels
+                        fill_normals(
+                            noise[i], first, streams[i, 2], NOISE, streams[i, 0], streams[i, 1]
+                        )
+                x = advance(x, u, noise[i], place, data)
+        time = counts[i, STEPS] * dt
+        counted = stepping or restarts[i]
+        if not read_state(
+            i, x, u, time, counted, data, states, flags, observations, rewards, readings
+        ):
+            status = NOT_FINITE
+        if restarts[i]:
+            rewards[i] = 0.0
+        flags[TRUNCATED, i] = counts[i, STEPS] >= limit
+        flags[ENDED, i] = flags[TERMINATED, i] or flags[TRUNCATED, i]
+    return status
+
+
+def filter_input(  # noqa: PLR0913
+    i: int,
+    x: State,
+    u: Input,
+    data: np.ndarray,
+    work: np.ndarray,
+    inputs: np.ndarray,
+    tallies_before: np.ndarray,
+    tallies: np.ndarray,
+    choices: np.ndarray,
+    flags: np.ndarray,
+) -> tuple[Input, bool]:
+    """Decide on the proposed input of an env, report and count it.
+
+    Returns:
+        The input to execute, and whether the constraints have finite values.
+    """
+    action, proposed, active, feasible, slacks, cause, sound = decide(x, u, data, work)
+    slack = slacks[0]
+    for each in slacks:
+        slack = max(slack, each)
+    m = len(u)
+    store_row(inputs[i, m : 2 * m], proposed)
+    store_row(inputs[i, 2 * m : 3 * m], action)
+    inputs[i, 3 * m] = slack
+    store_row(inputs[i, 3 * m + 1 :], slacks)
+    intervened = active and action != proposed
+    tallies[i, INTERVENTIONS] = tallies_before[i, INTERVENTIONS] + intervened
+    tallies[i, INFEASIBLE] = tallies_before[i, INFEASIBLE] + (not feasible)
+    choices[i, INTERVENTIONS] = tallies[i, INTERVENTIONS]
+    choices[i, INFEASIBLE] = tallies[i, INFEASIBLE]
+    choices[i, ACTIVE_BARRIER] = cause if intervened else -1
+    flags[INTERVENTION, i] = intervened
+    flags[ACTIVE, i] = active
+    flags[FEASIBLE, i] = feasible
+    return action, sound
+
+
+def rest_filter(
+    i: int,
+    u: Input,
+    rest: np.ndarray,
+    inputs: np.ndarray,
+    tallies: np.ndarray,
+    choices: np.ndarray,
+    flags: np.ndarray,
+) -> None:
+    """Report of an env what a filter reports at reset."""
+    for j in range(len(rest)):
+        inputs[i, len(u) + j] = rest[j]
+    tallies[i, INTERVENTIONS] = 0
+    tallies[i, INFEASIBLE] = 0
+    choices[i, INTERVENTIONS] = 0
+    choices[i, INFEASIBLE] = 0
+    choices[i, ACTIVE_BARRIER] = -1
+    flags[INTERVENTION, i] = False
+    flags[ACTIVE, i] = False
+    flags[FEASIBLE, i] = True
+
+
+def read_state(  # noqa: PLR0913
+    i: int,
+    x: State,
+    u: Input,
+    time: float,
+    counted: bool,
+    data: np.ndarray,
+    states: np.ndarray,
+    flags: np.ndarray,
+    observations: np.ndarray,
+    rewards: np.ndarray,
+    readings: np.ndarray,
+) -> bool:
+    """Store the state of an env and what it reads off it; return whether all is finite."""
+    values = measure(x, u, time, data)
+    barriers = barriers_of(values)
+    h = smallest_barrier(barriers)
+    cost = 1.0 if h < 0.0 else 0.0
+    n = len(x)
+    store_row(states[i, :n], x)
+    h_min = states[i, n]
+    if not h >= h_min:
+        h_min = h
+    episode_cost = states[i, n + 1]
+    if counted:
+        episode_cost += cost
+    states[i, n] = h_min
+    states[i, n + 1] = episode_cost
+    readings[i, COST] = cost
+    readings[i, H_MIN] = h_min
+    readings[i, EPISODE_COST] = episode_cost
+    store_row(readings[i, BARRIERS:], barriers)
+    flags[VIOLATION, i] = h < 0.0
+    flags[TERMINATED, i] = has_ended(values)
+    if has_left(values):
+        store_row(observations[i], observation_within(observation_of(values), data))
+    else:
+        store_row(observations[i], observation_of(values))
+    rewards[i] = reward_of(values)
+    return is_finite(x, values)
